@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
+from PIL import Image
 
 from elsewhere import DEVICE, Elsewhere, MixedError, There, without_autocast
 from gscompleter import GSCompleter, load_reconstructor, load_renderer
+from gscompleter.apps.live.difference import PageScene
+from gscompleter.apps.live.session import Session, Step, apply_step, save_camera
 from gscompleter.config import CompleterConfig
 from gscompleter.evaluation.baselines.optimization import OptimizationConfig, optimize
 from gscompleter.evaluation.baselines.reggs import RegGSConfig, register_by_similarity
@@ -89,6 +94,31 @@ def test_a_completion_stays_on_the_device_of_its_views_and_is_that_of_the_cpu(vi
     assert len(done.added) > 0
     assert torch.equal(done.scene.means.cpu(), plain.scene.means)
     assert torch.equal(done.scene.opacities.cpu(), plain.scene.opacities)
+
+
+def test_a_session_in_the_browser_stays_on_the_device_of_its_views(views):
+    config = few_steps(CompleterConfig.splat())
+    completer = GSCompleter(renderer=REFERENCE, config=config)
+    scene = gaussians_of(VIEWS[0]).to(views[0].image.device)
+    begun = completer.begin(views, scene)
+    session = Session(completer, (begun,), np.eye(4), np.zeros(3))
+    page = PageScene(begun.context)
+    pixels = np.zeros((SIZE, SIZE), dtype=np.uint8)
+    pixels[6:14, 6:14] = 255
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, format="PNG")
+    marks = file.getvalue()
+    camera = save_camera(session, VIEWS[1].camera)
+    for step in (
+        Step("remove", camera, marks),
+        Step("fill", camera, marks),
+        Step("remove", camera, box=(-0.6, 0.2, 2.1, 0.4, 1.47, 3.1)),
+    ):
+        session, _ = apply_step(session, step)
+        chunks = page.describe(session.latest)["chunks"]
+        check_there(session.latest.scene)
+    assert len(session.steps) == 3
+    assert [chunk["name"] for chunk in chunks][:2] == ["observed", "added-1"]
 
 
 @pytest.mark.parametrize("ψ", ["mvsplat", "depthsplat", "volsplat"])

@@ -234,7 +234,6 @@ def test_a_device_and_a_pipe_stay_what_they_are(splat, tmp_path, monkeypatch, ca
 @pytest.mark.linux
 def test_the_host_is_wrong_and_not_the_port(tmp_path, monkeypatch, capsys):
     """It is said before the scene is read."""
-    pytest.importorskip("viser", reason="needs gscompleter[live]")
     monkeypatch.setattr(preparation, "open_scene", lambda *_: pytest.fail("it reads"))
     for host in ("no.such.host.invalid", "192.0.2.1", "a" * 70, "\udce4"):
         said = refused(monkeypatch, capsys, "live", tmp_path, "--no-open", "--host", host)

@@ -2,54 +2,54 @@
 
 from __future__ import annotations
 
+import base64
+import gzip
+import http.client
+import io
 import json
-import math
 import socket
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
-from io import StringIO
 from pathlib import Path
-from unittest.mock import MagicMock, Mock
 
 import numpy as np
 import pytest
 import torch
+from PIL import Image
 from rich.console import Console
 from scipy.spatial.transform import Rotation
 
-pytest.importorskip("viser", reason="needs gscompleter[live]")
-
-import viser
-
 from command import run
-from gscompleter import load_ply, save_ply
+from gscompleter import load_cameras, load_ply, save_ply
 from gscompleter.apps.commands.live import LiveOptions
 from gscompleter.apps.live import serving
-from gscompleter.apps.live.box import remove_in_box
-from gscompleter.apps.live.page import (
-    Address,
-    Page,
-    camera_from_page,
-    camera_to_page,
-    compute_page_unit,
-    describe_outcome,
-    make_page_splat,
-    resolve_host,
-    run_request,
-    start_server,
+from gscompleter.apps.live.addresses import Address, resolve_host
+from gscompleter.apps.live.difference import PageScene
+from gscompleter.apps.live.page import BUSY, LivePage
+from gscompleter.apps.live.request import parse_request
+from gscompleter.apps.live.server import LiveServer
+from gscompleter.apps.live.session import (
+    Session,
+    Step,
+    apply_step,
+    redo_step,
+    save_camera,
+    undo_step,
 )
-from gscompleter.apps.live.session import Session, complete_camera, undo_step
+from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.cli import parse_command
 from gscompleter.config import CompleterConfig
-from gscompleter.numerics.geometry import measure_rotation
+from gscompleter.data.scene import describe_camera
+from gscompleter.numerics.geometry import project
 from gscompleter.splats.alignment.similarity import make_similarity, transform_camera
+from gscompleter.splats.formats import load_splat
 from gscompleter.splats.transform import transform_gaussians
 from gscompleter.system.errors import InputError
 from gscompleter.system.progress import notify_of_stages
 from gscompleter.system.timing import STAGES
-from gscompleter.types import Camera, merge
-from scenes import Room, camera_at, gaussians_of, photographed, random_gaussians, view_of
+from gscompleter.types import Camera, ContextScene, Gaussians, merge
+from scenes import Room, camera_at, gaussians_of, photographed, view_of
 
 SIZE = 48
 CAMERAS = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in ((-0.3, 0), (0.1, 0), (0.4, 4))]
@@ -59,6 +59,25 @@ ELSEWHERE = make_similarity(
     0.3, Rotation.from_rotvec([0.9, -1.7, 0.4]).as_matrix(), np.array([5.0, 3.0, -2.0])
 )
 QUIET = Console(quiet=True)
+FIELDS = ("means", "scales", "quats", "opacities", "sh", "generated")
+
+
+def complete_camera(session: Session, camera: Camera) -> tuple[Session, str]:
+    """Complete the scene for a camera in the frame of the result."""
+    return apply_step(session, Step("complete", save_camera(session, camera)))
+
+
+def mark(rows: slice, columns: slice) -> bytes:
+    """Make the PNG of a mask that is white there."""
+    pixels = np.zeros((SIZE, SIZE), dtype=np.uint8)
+    pixels[rows, columns] = 255
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, format="PNG")
+    return file.getvalue()
+
+
+SPOT = mark(slice(18, 30), slice(20, 32))
+"""A mark in the middle of an image."""
 
 
 @pytest.fixture(scope="module")
@@ -83,15 +102,27 @@ def begun(ready) -> Session:
 
 
 def test_undo_goes_back_and_the_same_camera_leads_to_the_same_scene(begun):
-    one, result = complete_camera(begun, HOLES[0])
+    one, text = complete_camera(begun, HOLES[0])
     two, _ = complete_camera(one, HOLES[1])
-    assert result.hole_fraction > 0.1
+    assert "Gaussians are added in a hole" in text
+    assert one.latest.targets[-1].hole_fraction > 0.1
     assert len(begun.latest.added) < len(one.latest.added) < len(two.latest.added)
     assert undo_step(two) == one
     assert undo_step(undo_step(two)) == begun
     again, _ = complete_camera(undo_step(two), HOLES[1])
-    for name in ("means", "scales", "quats", "opacities", "sh", "generated"):
+    for name in FIELDS:
         assert torch.equal(getattr(again.latest.scene, name), getattr(two.latest.scene, name)), name
+
+
+def test_what_is_undone_is_done_again_until_something_else_is_done(begun):
+    two, _ = complete_camera(complete_camera(begun, HOLES[0])[0], HOLES[1])
+    back = undo_step(undo_step(two))
+    assert redo_step(redo_step(back)) == two
+    assert redo_step(back).latest is two.completions[1]
+    other, _ = complete_camera(back, HOLES[1])
+    for session in (two, other):
+        with pytest.raises(InputError, match="nothing to redo"):
+            redo_step(session)
 
 
 def test_there_is_nothing_to_undo_in_the_beginning(begun):
@@ -100,9 +131,9 @@ def test_there_is_nothing_to_undo_in_the_beginning(begun):
 
 
 def test_a_camera_that_adds_nothing_is_no_step(begun):
-    session, result = complete_camera(begun, begun.latest.views[0].camera)
+    session, text = complete_camera(begun, begun.latest.views[0].camera)
     assert session is begun
-    assert describe_outcome(result, 1.0) == "The target is a context view: nothing to complete."
+    assert text == "The target is a context view: nothing to complete."
 
 
 def test_stages_are_heard_as_they_begin(begun):
@@ -122,7 +153,8 @@ def the_same_as_complete(monkeypatch, ready: serving.Prepared, tmp_path: Path, *
     size = ("--resolution", SIZE, SIZE, "--near", 0.5, "--far", 20, "--quiet")
     assert run(monkeypatch, "complete", ready.options.folder, *arguments, *size, *more) == 0
     names = ("completed.ply", "context.ply", "generated.ply", "images/target1_after.png")
-    assert {path.name for path in out.iterdir()} == {path.name for path in other.iterdir()}
+    names_of_both = [{path.name for path in folder.iterdir()} for folder in (out, other)]
+    assert names_of_both[0] - names_of_both[1] == {"strokes.json"}
     return all((out / name).read_bytes() == (other / name).read_bytes() for name in names)
 
 
@@ -160,22 +192,18 @@ def test_what_is_saved_of_a_splat_in_a_frame_of_its_own_is_too(tmp_path, monkeyp
     assert ready.task.method == "dataparser"
     session = serving.begin_session(ready)
     target = transform_camera(HOLES[0], ready.task.frame)
-    session, result = complete_camera(session, target)
-    assert len(result.added) > 0
+    session, _ = complete_camera(session, target)
+    assert len(session.latest.added) > 0
     assert torch.allclose(session.cameras[0].c2w.float(), HOLES[0].c2w, atol=1e-6)
     serving.save_session(ready, session)
     assert the_same_as_complete(monkeypatch, ready, tmp_path, "--scene", options.scene)
 
 
-def test_an_antialiased_splat_is_named_so_and_saved_as_one(room, tmp_path):
+def test_an_antialiased_splat_is_saved_as_one(room, tmp_path):
     scene = merge([gaussians_of(view_of(Room(), camera)) for camera in CAMERAS[:2]])
     save_ply(tmp_path / "splat.ply", replace(scene, is_antialiased=True))
     options = options_for(room, tmp_path / "out", scene=tmp_path / "splat.ply")
-    console = Console(file=StringIO())
-    ready = serving.prepare(options, console)
-    said = console.file.getvalue().replace("\n", " ")
-    assert "antialiased Gaussians of SH degree 0" in said
-    assert "The page renders antialiased Gaussians as classic ones" in said
+    ready = serving.prepare(options, QUIET)
     session, _ = complete_camera(serving.begin_session(ready), HOLES[0])
     serving.save_session(ready, session)
     for name in ("context.ply", "completed.ply", "generated.ply"):
@@ -190,8 +218,8 @@ def test_a_splat_alone_is_completed_and_saved(tmp_path, monkeypatch):
     ready = serving.prepare(parse_command(words), QUIET)
     assert ready.opened.renders_from == "pixels"
     assert ready.options.config.trust == "full"
-    session, result = complete_camera(serving.begin_session(ready), HOLES[0])
-    assert len(result.added) > 0
+    session, _ = complete_camera(serving.begin_session(ready), HOLES[0])
+    assert len(session.latest.added) > 0
     serving.save_session(ready, session)
     assert (tmp_path / "out" / "renders.json").is_file()
     kept = load_ply(tmp_path / "out" / "completed.ply")
@@ -223,148 +251,344 @@ def test_the_frames_that_were_chosen_are_named(room, tmp_path):
 def test_a_hole_is_found_where_something_is_missing(ready, begun):
     camera = serving.find_next_target(ready, begun.latest)
     assert camera is not None
-    _, result = complete_camera(begun, camera)
-    assert result.hole_fraction > 0.05
-
-
-@pytest.mark.parametrize("unit", [1.0, 25.0])
-def test_a_camera_of_the_page_is_the_one_it_was_made_of(unit):
-    camera = replace(camera_at(0.3, -0.2, 0.5, yaw=200, size=SIZE), near=0.5, far=8.0)
-    back = camera_from_page(camera_to_page(camera, unit), SIZE, SIZE, unit)
-    assert measure_rotation(back, camera) < 1e-3
-    assert torch.allclose(back.center, camera.center, atol=1e-6)
-    assert torch.allclose(back.K, camera.K, rtol=1e-5)
-    assert compute_page_unit(camera) == pytest.approx(1.5)
-    assert camera_to_page(camera, unit).fov == pytest.approx(2 * math.atan(0.5 / 0.9))
-
-
-@pytest.mark.parametrize("unit", [1e-4, 1.0, 1e4])
-def test_a_splat_of_any_unit_survives_the_pages_precision(unit):
-    gaussians = random_gaussians(100)
-    scaled = replace(gaussians, means=unit * gaussians.means, scales=unit * gaussians.scales)
-    splat = make_page_splat(scaled, 1.0)
-    axes = Rotation.from_quat(gaussians.quats.numpy(), scalar_first=True).as_matrix()
-    true = axes @ (gaussians.scales.numpy()[:, :, None] ** 2 * axes.transpose(0, 2, 1))
-    shown = (
-        splat["covariances"].astype(np.float16).astype(np.float64) * (splat["scale"] / unit) ** 2
-    )
-    assert np.abs(shown - true).max() < 1e-3 * np.abs(true).max()
-    assert np.allclose(splat["centers"] * splat["scale"], scaled.means, rtol=1e-5)
-
-
-def test_an_error_is_a_sentence_and_ends_nothing(capsys):
-    def mended() -> str:
-        raise InputError("Name another one.")
-
-    def broken() -> str:
-        raise ZeroDivisionError("division by zero")
-
-    assert run_request(mended) == "Name another one."
-    assert "the scene is unchanged" in run_request(broken)
-    assert "ZeroDivisionError" in capsys.readouterr().err
-
-
-@pytest.fixture
-def page(begun) -> Iterator[Page]:
-    server = start_server("127.0.0.1", 0)
-    page = Page(begun, lambda _: None, lambda _: "Saved.", server)
-    yield page
-    page.close()
-
-
-def browser_at(page: Page, camera: Camera) -> MagicMock:
-    """Make a browser that shows the scene from a camera."""
-    seen = camera_to_page(camera, page._unit)
-    view = Mock(wxyz=seen.wxyz, position=seen.position, fov=seen.fov)
-    return MagicMock(spec=viser.ClientHandle, camera=view)
-
-
-def test_what_was_generated_is_shown_and_undone(page, begun):
-    client = browser_at(page, HOLES[0])
-    assert "Completed" in page.complete(client)
-    assert len(page._generated.buffer) == len(page.session.latest.added)
-    assert page.undo(client) == "Undone. Completions left: 0."
-    assert page.session == begun
-    assert page._generated is None
+    session, _ = complete_camera(begun, camera)
+    assert session.latest.targets[-1].hole_fraction > 0.05
 
 
 CRATE = (-0.6, 0.2, 2.1, 0.4, 1.47, 3.1)
 """A box around the one in the middle of the room."""
-UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 
 
-def test_a_box_is_removed_completed_undone_and_saved(room, tmp_path, monkeypatch):
-    scene = merge([gaussians_of(view_of(Room(), camera)) for camera in CAMERAS])
-    save_ply(tmp_path / "splat.ply", scene)
-    options = options_for(room, tmp_path / "out", scene=tmp_path / "splat.ply")
-    ready = serving.prepare(replace(options, config=CompleterConfig.splat()), QUIET)
-    begun = serving.begin_session(ready)
-    removed, count = remove_in_box(begun, CRATE, UPRIGHT)
-    assert count == removed.latest.source.gone_mask.sum() > 100
+@pytest.fixture(scope="module")
+def splat(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("splat") / "splat.ply"
+    save_ply(path, merge([gaussians_of(view_of(Room(), camera)) for camera in CAMERAS]))
+    return path
+
+
+@pytest.fixture(scope="module")
+def splat_ready(room, splat, tmp_path_factory) -> serving.Prepared:
+    out = tmp_path_factory.mktemp("outs") / "out"
+    options = options_for(room, out, scene=splat, config=CompleterConfig.splat())
+    return serving.prepare(options, QUIET)
+
+
+@pytest.fixture(scope="module")
+def splat_begun(splat_ready) -> Session:
+    return serving.begin_session(splat_ready)
+
+
+def remove_box(session: Session, box: tuple[float, ...]) -> tuple[Session, str]:
+    step = Step("remove", save_camera(session, CAMERAS[0]), box=box)
+    return apply_step(session, step)
+
+
+def test_a_box_is_removed_completed_undone_and_saved(
+    splat_ready, splat_begun, splat, tmp_path, monkeypatch
+):
+    begun = splat_begun
+    removed, text = remove_box(begun, CRATE)
+    count = int(removed.latest.source.gone_mask.sum())
+    assert count > 100
+    assert f"{count:,} Gaussians are removed" in text
+    assert "--box -0.6 0.2 2.1 0.4 1.47 3.1 --box-rotation 1 0 0 0" in text
     rest = removed.latest.added  # of what reached out of the box
     assert len(removed.latest.scene) == len(begun.latest.scene) - count + len(rest)
-    filled, result = complete_camera(removed, CAMERAS[2])
-    assert len(result.added) > 0
-    emptied, again = remove_in_box(filled, (-2.0, -1.0, 2.0, 2.0, 2.0, 6.0), UPRIGHT)
-    assert again > len(emptied.latest.added) - len(filled.latest.added)
+    filled, _ = complete_camera(removed, CAMERAS[2])
+    assert len(filled.latest.added) > len(rest)
+    emptied, _ = remove_box(filled, (-2.0, -1.0, 2.0, 2.0, 2.0, 6.0))
+    assert len(emptied.latest.scene) < len(filled.latest.scene)
     assert undo_step(emptied) == filled
     assert undo_step(filled) == removed
     assert undo_step(removed) == begun
     with pytest.raises(InputError, match="contains nothing"):
-        remove_in_box(removed, (50.0, 50.0, 50.0, 51.0, 51.0, 51.0), UPRIGHT)
-    serving.save_session(ready, filled)
-    out, restored = tmp_path / "out", tmp_path / "restored.ply"
+        remove_box(removed, (50.0, 50.0, 50.0, 51.0, 51.0, 51.0))
+    serving.save_session(splat_ready, filled)
+    out, restored = splat_ready.options.out, tmp_path / "restored.ply"
     assert json.loads((out / "summary.json").read_text())["gaussians"]["removed"] > 100
     assert run(monkeypatch, "strip", out / "completed.ply", "--out", restored, "--quiet") == 0
-    assert restored.read_bytes() == (tmp_path / "splat.ply").read_bytes()
-    serving.save_session(ready, removed)
+    assert restored.read_bytes() == splat.read_bytes()
+    serving.save_session(splat_ready, removed)
     assert json.loads((out / "summary.json").read_text())["gaussians"]["added"] == len(rest)
 
 
-def test_the_box_of_the_page_is_the_one_that_is_removed(page):
-    client = browser_at(page, HOLES[0])
-    with pytest.raises(InputError, match="Tick"):
-        page.remove(client)
-    low, high = np.array(CRATE[:3]) * page._unit, np.array(CRATE[3:]) * page._unit
-    page._box.shown.value = True
-    page._box.controls.position, page._box.size.value = (low + high) / 2, tuple(high - low)
-    corners, rotation = page._box.read(page._unit)
-    assert np.allclose(corners, CRATE)
-    assert rotation == UPRIGHT
-    assert "--box -0.6 0.2 2.1 0.4 1.47 3.1 --box-rotation 1 0 0 0" in page.remove(client)
-    assert page.session.latest.source.gone_mask.any()
-    page.undo(client)
+def test_after_a_removal_another_hole_is_completed_as_before(splat_begun):
+    removed, _ = remove_box(splat_begun, CRATE)
+    elsewhere, _ = complete_camera(removed, HOLES[1])
+    assert len(elsewhere.latest.added) > len(removed.latest.added)
+    assert elsewhere.latest.config == removed.latest.config
 
 
-def test_photographs_are_visited_one_after_the_other(page):
-    client = browser_at(page, HOLES[0])
-    for view in (*page.session.latest.views, page.session.latest.views[0]):
-        page.visit_photograph(client)
-        expected = camera_to_page(view.camera, page._unit)
-        assert np.array_equal(client.camera.position, expected.position)
-        assert client.camera.fov == expected.fov
+def marked(session: Session, action: str, mask: bytes | None = SPOT) -> Step:
+    return Step(action, save_camera(session, CAMERAS[1]), mask)
 
 
-def test_what_is_said_stays_text(page):
-    page.show_message("<b>A</b> & B\nmore")
-    assert "&lt;b&gt;A&lt;/b&gt; &amp; B<br>more" in page._status.content
+def test_what_is_marked_is_removed_filled_and_repaired(splat_begun):
+    removed, _ = apply_step(splat_begun, marked(splat_begun, "remove"))
+    gone = removed.latest.source.gone_mask
+    assert 50 < int(gone.sum()) < 0.2 * len(gone)
+    filled, _ = apply_step(removed, marked(removed, "fill"))
+    assert len(filled.latest.added) > 50
+    repaired, text = apply_step(splat_begun, marked(splat_begun, "repair"))
+    assert torch.equal(repaired.latest.source.gone_mask, gone)
+    assert "are removed" in text
+    # To touch the hole is enough.
+    dab, _ = apply_step(removed, marked(removed, "fill", mark(slice(22, 24), slice(24, 26))))
+    assert torch.equal(dab.latest.scene.means, filled.latest.scene.means)
+    assert repaired.cameras == (repaired.steps[0].camera,)
+    assert removed.cameras == ()
 
 
-def test_one_thing_is_done_at_a_time(page):
-    client = browser_at(page, HOLES[0])
-    event = Mock(spec=viser.GuiEvent, client=client)
-    page._submit(page.undo, event)
-    assert client.add_notification.call_count == 0
-    page._submit(page.undo, event)
-    assert client.add_notification.call_count == 1
-    assert page._requests.qsize() == 1
+def test_only_holes_that_are_marked_are_filled(splat_begun):
+    other = mark(slice(18, 28), slice(2, 12))
+    removed, _ = apply_step(splat_begun, marked(splat_begun, "remove"))
+    removed, _ = apply_step(removed, marked(removed, "remove", other))
+    filled, _ = apply_step(removed, marked(removed, "fill"))
+    camera = filled.latest.targets[-1].target
+    added = filled.latest.targets[-1].added
+    columns = project(added.means, camera)[0][:, 0]
+    assert len(added) > 50
+    assert columns.min() > 14
+    both, _ = complete_camera(removed, CAMERAS[1])
+    assert len(both.latest.added) > 1.2 * len(filled.latest.added)
 
 
-def test_a_port_that_is_taken_is_refused():
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        with pytest.raises(InputError, match=f"port {port}"):
-            start_server("127.0.0.1", port)
+def test_what_was_added_is_removed_by_marks_too(splat_begun):
+    repaired, _ = apply_step(splat_begun, marked(splat_begun, "repair"))
+    again, _ = apply_step(repaired, marked(repaired, "remove"))
+    assert len(again.latest.added) < 0.2 * len(repaired.latest.added)
+
+
+def test_marks_that_nothing_can_be_done_with_are_refused(splat_begun):
+    for action in ("fill", "remove", "repair"):
+        with pytest.raises(InputError, match="Nothing is marked"):
+            apply_step(splat_begun, marked(splat_begun, action, None))
+        with pytest.raises(InputError, match="marks nothing"):
+            nothing = mark(slice(0), slice(0))
+            apply_step(splat_begun, marked(splat_begun, action, nothing))
+
+
+def test_nothing_that_is_given_is_ignored(splat_begun):
+    camera = save_camera(splat_begun, CAMERAS[1])
+    for step in (
+        Step("fill", camera, SPOT, box=CRATE),
+        Step("remove", camera, SPOT, box=CRATE),
+        Step("complete", camera, SPOT),
+    ):
+        with pytest.raises(InputError, match=r"leave it out|takes no mask"):
+            apply_step(splat_begun, step)
+
+
+def test_nothing_more_is_removed_from_a_completed_splat(splat_begun):
+    first = splat_begun.latest
+    labels = first.context.generated.clone()
+    labels[:9] = 1
+    context = replace(first.context, generated=labels)
+    parts = (context, *first.parts[1:])
+    completed = replace(first, source=ContextScene.whole(context), parts=parts)
+    session = replace(splat_begun, completions=(completed,))
+    with pytest.raises(InputError, match="completed before"):
+        apply_step(session, marked(session, "remove"))
+
+
+# ------------------------------------------------------------------------- what a page is sent
+
+
+def shown_in(scene: PageScene, completion, given: Gaussians) -> int:
+    """Count the Gaussians that a page shows."""
+    counts = {"observed": len(given)}
+    total = 0
+    for chunk in scene.describe(completion)["chunks"]:
+        if chunk["hidden"] is None:
+            continue
+        packed = scene.get_chunk(chunk["name"])
+        if packed is not None:
+            counts[chunk["name"]] = read_count(packed)
+        hidden = np.frombuffer(base64.b64decode(chunk["hidden"]), "<u4")
+        assert len(np.unique(hidden)) == len(hidden)
+        total += counts[chunk["name"]] - len(hidden)
+    return total
+
+
+def read_count(packed: bytes) -> int:
+    return int.from_bytes(gzip.decompress(packed)[8:12], "little")
+
+
+def test_only_what_changed_is_sent(splat_begun, tmp_path):
+    given = splat_begun.latest.context
+    scene = PageScene(given)
+    assert shown_in(scene, splat_begun.latest, given) == len(splat_begun.latest.scene)
+    begun = set(scene._chunks)
+    repaired, _ = apply_step(splat_begun, marked(splat_begun, "repair"))
+    assert shown_in(scene, repaired.latest, given) == len(repaired.latest.scene)
+    (name,) = set(scene._chunks) - begun
+    path = tmp_path / "chunk.spz"
+    path.write_bytes(scene.get_chunk(name))
+    sent = load_splat(path)
+    new = len(repaired.latest.added) - len(splat_begun.latest.added)
+    assert len(sent) == new < 0.1 * len(given)
+    # What was removed of the additions is hidden, and nothing is sent again.
+    again, _ = apply_step(repaired, marked(repaired, "remove"))
+    for session in (again, repaired, splat_begun, repaired):
+        assert shown_in(scene, session.latest, given) == len(session.latest.scene)
+    assert set(scene._chunks) == begun | {name}
+    assert scene.get_chunk("added-99") is None
+    expected = scene.frame.normalize(repaired.latest.added[-new:]).means
+    assert (sent.means - expected).abs().max() < 1e-3
+
+
+# ------------------------------------------------------------------------------ the connection
+
+
+@pytest.fixture
+def page(splat_ready, splat_begun, monkeypatch) -> LivePage:
+    built = serving.build_page(splat_ready, splat_begun, Libraries({}, {}), QUIET)
+    monkeypatch.setattr(built, "_save", lambda _: "Saved.")
+    return built
+
+
+@pytest.fixture
+def server(page) -> Iterator[LiveServer]:
+    with_page = LiveServer(resolve_host("127.0.0.1"), "127.0.0.1", 0, page)
+    yield with_page
+    with_page.close()
+
+
+JSON = {"Content-Type": "application/json"}
+
+
+def ask(server: LiveServer, method: str, path: str, body: bytes | None = None, **headers: str):
+    """Send a request, and return the status and the bytes of the answer."""
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
+    named = {name.replace("_", "-"): value for name, value in headers.items()}
+    connection.request(method, path, body, {**JSON, **named})
+    response = connection.getresponse()
+    content = response.read()
+    connection.close()
+    return response.status, content
+
+
+def request_for(action: str, camera: Camera = CAMERAS[1], **more: object) -> bytes:
+    frame = describe_camera(camera)
+    told = {"camera_model": "PINHOLE", "frames": [frame]}
+    return json.dumps({"action": action, "client": "me", "camera": told, **more}).encode()
+
+
+def do(page: LivePage, body: bytes) -> dict:
+    """Run a request as the process does, and return the last message."""
+    page.submit(body)
+    page.handle(page._requests.get())
+    return page.channel.latest
+
+
+def test_the_page_is_that_of_the_viewer_with_a_connection(server, page):
+    status, content = ask(server, "GET", "/")
+    assert status == 200
+    assert b"connect-src 'self' data: blob:" in content
+    assert b'"live": true' in content
+    assert b'"layers": {"before": "observed", "observed": "observed"}' in content
+    assert ask(server, "GET", "/elsewhere")[0] == 404
+    assert ask(server, "GET", "/chunks/added-9")[0] == 404
+
+
+def test_a_step_is_asked_for_shown_undone_and_done_again(server, page):
+    mask = base64.b64encode(SPOT).decode()
+    said = do(page, request_for("repair", mask=mask))
+    assert "are removed" in said["text"]
+    assert (said["busy"], said["revision"], said["steps"]) == (False, 1, 1)
+    told = json.loads(ask(server, "GET", "/difference")[1])
+    assert told["revision"] == 1
+    name = told["chunks"][-1]["name"]
+    status, chunk = ask(server, "GET", f"/chunks/{name}")
+    assert (status, read_count(chunk)) == (200, len(page.session.latest.added))
+    said = do(page, request_for("undo"))
+    assert (said["steps"], said["undone"], said["revision"]) == (0, 1, 2)
+    assert json.loads(page.difference)["chunks"][-1]["hidden"] is None
+    said = do(page, request_for("redo"))
+    assert (said["steps"], said["undone"]) == (1, 0)
+    assert do(page, request_for("save"))["text"] == "Saved."
+    # The page's box is where the page has it.
+    said = do(page, request_for("remove", box=CRATE, box_rotation=(1.0, 0.0, 0.0, 0.0)))
+    assert "--box -0.6 0.2 2.1 0.4 1.47 3.1" in said["text"]
+
+
+def test_messages_arrive_as_they_are_sent(server, page):
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
+    connection.request("GET", "/events")
+    response = connection.getresponse()
+    assert response.getheader("Content-Type") == "text/event-stream"
+
+    def hear() -> dict:
+        line = response.readline()
+        assert response.readline() == b"\n"
+        return json.loads(line.removeprefix(b"data: "))
+
+    assert "Complete here" in hear()["text"]
+    page.tell("<b>Fish</b> & chips")
+    assert hear()["text"] == "<b>Fish</b> & chips"
+    connection.close()
+
+
+def test_a_hole_is_told_to_the_page_that_asks(page):
+    page._find_hole = lambda _: HOLES[0]
+    said = do(page, request_for("find"))
+    assert said["client"] == "me"
+    assert np.allclose(said["camera"]["transform_matrix"][0][3], HOLES[0].c2w[0, 3])
+    page._find_hole = lambda _: None
+    said = do(page, request_for("find"))
+    assert said["camera"] is None
+    assert "No large hole" in said["text"]
+
+
+def test_an_error_is_a_sentence_and_ends_nothing(page, monkeypatch, capsys):
+    before = page.session
+    said = do(page, request_for("undo"))
+    assert said["text"].startswith("There is nothing to undo")
+    monkeypatch.setitem(page._actions, "save", lambda _: 1 / 0)
+    assert "the scene is unchanged" in do(page, request_for("save"))["text"]
+    assert "ZeroDivisionError" in capsys.readouterr().err
+    assert page.session is before
+    assert do(page, request_for("find"))["busy"] is False
+
+
+def test_one_thing_is_done_at_a_time(server, page):
+    assert ask(server, "POST", "/do", request_for("undo"))[0] == 202
+    status, content = ask(server, "POST", "/do", request_for("undo"))
+    assert (status, json.loads(content)["text"]) == (409, BUSY)
+    page.handle(page._requests.get())
+    assert ask(server, "POST", "/do", request_for("undo"))[0] == 202
+
+
+@pytest.mark.parametrize(
+    ("body", "said"),
+    [
+        (b"\xff", "no JSON"),
+        (b"[" * 100_000, "no JSON"),
+        (b"[]", "is damaged"),
+        (b"{}", "action"),
+        (b'{"action": "format"}', "no action 'format'"),
+        (b'{"action": "remove", "box": [1, 2]}', "box"),
+    ],
+)
+def test_a_request_that_is_none_is_refused(server, body, said):
+    status, content = ask(server, "POST", "/do", body)
+    assert status == 400
+    assert said in json.loads(content)["text"]
+
+
+def test_what_a_request_lacks_is_said(page):
+    assert "no camera" in do(page, b'{"action": "complete"}')["text"]
+    assert "no base64" in do(page, request_for("fill", mask="*"))["text"]
+    empty = parse_request(b'{"action": "complete", "camera": {"frames": []}}', ("complete",))
+    with pytest.raises(InputError):
+        empty.read_camera()
+
+
+def test_a_request_has_a_size_and_a_kind(server):
+    body = request_for("undo")
+    assert ask(server, "POST", "/do", body, Content_Type="text/plain")[0] == 415
+    assert ask(server, "POST", "/do", body, Content_Length="9" * 12)[0] == 413
+    assert ask(server, "POST", "/elsewhere", body)[0] == 404
 
 
 def has_ipv6() -> bool:
@@ -384,39 +608,24 @@ def test_only_an_address_of_this_machine_alone_is_local(host, is_local):
     address = Address(family, host)
     assert address.is_local == is_local
     assert address.make_url(80) == (f"http://[{host}]:80/" if ":" in host else f"http://{host}:80/")
+    own = address.make_url(80).removeprefix("http://").removesuffix("/")
+    assert address.knows_host(own)
+    assert address.knows_host("evil.example:80") != is_local
 
 
-def test_a_malformed_message_leaves_no_traceback(capfd):
-    server = start_server("127.0.0.1", 0)
-    try:
-        for sent in (b"GET / HTTP/1.1\r\nUpgrade: websocket\r\n\r\n", b"\x00\xff" * 50, b"\r\n"):
-            with socket.create_connection(("127.0.0.1", server.get_port())) as browser:
-                browser.sendall(sent)
-        for message in (b"\xc1no message of the page", b"", b"\x81\xa4type\xa4none", "text"):
-            send_message(server.get_port(), message)
-    finally:
-        server.stop()
+def test_a_port_that_is_taken_is_refused(server, page):
+    with pytest.raises(InputError, match=f"port {server.server_port}"):
+        LiveServer(resolve_host("127.0.0.1"), "127.0.0.1", server.server_port, page)
+
+
+def test_a_malformed_request_leaves_no_traceback(server, capfd):
+    for sent in (b"GET / HTTP/1.1\r\nUpgrade: websocket\r\n\r\n", b"\x00\xff" * 50, b"\r\n"):
+        with socket.create_connection(("127.0.0.1", server.server_port)) as browser:
+            browser.sendall(sent)
+            browser.settimeout(0.3)
+            with suppress(TimeoutError, ConnectionError):
+                browser.recv(100)
     assert "Traceback" not in capfd.readouterr().err
-
-
-def send_message(port: int, message: bytes | str) -> None:
-    """Connect as a page does, send a message, and wait until the server has read it."""
-    from websockets.exceptions import ConnectionClosed
-    from websockets.sync.client import connect
-
-    page = {"subprotocols": [f"viser-v{viser.__version__}"], "max_size": None}
-    with connect(f"ws://127.0.0.1:{port}", **page) as browser:
-        browser.send(message)
-        with suppress(ConnectionClosed, TimeoutError):
-            while True:
-                browser.recv(timeout=0.5)
-
-
-def test_without_viser_a_sentence_says_what_to_install(room, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(serving, "find_spec", lambda _: None)
-    assert run(monkeypatch, "live", room, "--out", tmp_path / "out") == 2
-    assert "pip install 'gscompleter[live]'" in capsys.readouterr().err
-    assert not (tmp_path / "out").exists()
 
 
 def test_the_options_of_complete_are_those_of_live(room, tmp_path):
@@ -433,21 +642,144 @@ def test_the_options_of_complete_are_those_of_live(room, tmp_path):
 @pytest.mark.parametrize(
     "host", ["127.0.0.1", "localhost", "127.1", "127.0.0.2", "LOCALHOST", "0x7f.1", "::1"]
 )
-def test_pages_from_elsewhere_are_refused(host):
+def test_pages_from_elsewhere_are_refused(page, host):
     """The address that is bound decides, whatever its spelling."""
     if host == "::1" and not has_ipv6():
         pytest.skip("this machine has no IPv6")
-    from websockets.exceptions import InvalidStatus
-    from websockets.sync.client import connect
-
-    server = start_server(host, 0)
+    server = LiveServer(resolve_host(host), host, 0, page)
     try:
-        address = resolve_host(host).make_url(server.get_port()).replace("http:", "ws:")
-        for origin in ("http://elsewhere.example", "http://127.0.0.1.elsewhere.example", "null"):
-            with pytest.raises(InvalidStatus, match="403"):
-                connect(address, origin=origin, subprotocols=["viser-v0"], max_size=None)
         for name in ("localhost", "127.0.0.1", "LOCALHOST", "127.0.0.2", "[::1]"):
-            own = f"http://{name}:{server.get_port()}"
-            connect(address, origin=own, subprotocols=["viser-v0"], max_size=None).close()
+            own = f"{name}:{server.server_port}"
+            assert answer_of(server, own, None) == 202
+            page.handle(page._requests.get())
+            assert answer_of(server, own, f"http://{own}") == 202
+            page.handle(page._requests.get())
+            others = ("http://elsewhere.example", f"http://{own}.elsewhere.example")
+            for origin in (*others, "null", "http://["):
+                assert answer_of(server, own, origin) == 403
+        # A site whose name points here is its own origin.
+        assert answer_of(server, "elsewhere.example", "http://elsewhere.example") == 421
     finally:
-        server.stop()
+        server.close()
+
+
+def answer_of(server: LiveServer, name: str, origin: str | None) -> int:
+    """Ask as a page of `origin` does that calls the server by a name, and return the status."""
+    connection = http.client.HTTPConnection(server.address.host, server.server_port, timeout=10)
+    headers = {**JSON, "Host": name, **({} if origin is None else {"Origin": origin})}
+    connection.request("POST", "/do", request_for("undo"), headers)
+    status = connection.getresponse().status
+    connection.close()
+    return status
+
+
+# ----------------------------------------------------------------------------- saved and replayed
+
+
+def test_a_saved_session_is_replayed_to_the_same_bytes(
+    splat_ready, splat_begun, splat, room, tmp_path, monkeypatch
+):
+    session, _ = apply_step(splat_begun, marked(splat_begun, "repair"))
+    session, _ = complete_camera(session, HOLES[1])
+    removed = mark(slice(30, 40), slice(8, 20))
+    session, _ = apply_step(session, marked(session, "remove", removed))
+    session, _ = apply_step(session, marked(session, "fill", removed))
+    session, _ = remove_box(session, CRATE)
+    session = redo_step(undo_step(session))
+    serving.save_session(splat_ready, session)
+    saved, other = splat_ready.options.out, tmp_path / "other"
+    strokes = json.loads((saved / "strokes.json").read_text())
+    assert strokes["resolution"] == [SIZE, SIZE]
+    assert strokes["context"] == [0, 1]
+    actions = ["repair", "complete", "remove", "fill", "remove"]
+    assert [frame["action"] for frame in strokes["frames"]] == actions
+    assert strokes["frames"][4]["box"] == list(CRATE)
+    assert load_cameras(saved / "strokes.json")[1].width == SIZE
+
+    words = ("repair", room, "--scene", splat, "--strokes", saved, "--out", other, "--quiet")
+    assert run(monkeypatch, *words) == 0
+    names = ("completed.ply", "removed.ply", "generated.ply", "strokes.json", "targets.json")
+    for name in (*names, "images/stroke1.png", "images/stroke4.png"):
+        assert (saved / name).read_bytes() == (other / name).read_bytes(), name
+    restored = tmp_path / "restored.ply"
+    assert run(monkeypatch, "strip", other / "completed.ply", "--out", restored, "--quiet") == 0
+    assert restored.read_bytes() == splat.read_bytes()
+
+
+def test_a_session_of_a_splat_alone_is_replayed_to_the_same_bytes(tmp_path, monkeypatch):
+    splat = tmp_path / "splat.ply"
+    save_ply(splat, gaussians_of(view_of(Room(), camera_at(size=SIZE))))
+    words = ["live", str(splat), "--out", str(tmp_path / "out"), "--resolution", "64", "64"]
+    ready = serving.prepare(parse_command(words), QUIET)
+    begun = serving.begin_session(ready)
+    camera = replace(camera_at(0.05, size=64), near=None, far=None)
+    pixels = np.zeros((64, 64), dtype=np.uint8)
+    pixels[24:36, 28:40] = 255
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, format="PNG")
+    step = Step("repair", save_camera(begun, camera), file.getvalue())
+    session, _ = apply_step(begun, step)
+    serving.save_session(ready, session)
+    other = tmp_path / "other"
+    strokes = ("--strokes", tmp_path / "out" / "strokes.json")
+    assert run(monkeypatch, "repair", splat, *strokes, "--out", other, "--quiet") == 0
+    for name in ("completed.ply", "removed.ply"):
+        assert (tmp_path / "out" / name).read_bytes() == (other / name).read_bytes(), name
+
+
+FRAME = describe_camera(CAMERAS[0])
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ("{", "strokes.json"),
+        ({"version": "0", "frames": []}, "no steps"),
+        ({"version": "0", "frames": [{**FRAME, "action": "paint"}]}, "action"),
+        ({"version": "0", "frames": [{**FRAME, "action": "fill", "w": 0}]}, "no such camera"),
+        (
+            {"version": "0", "frames": [{**FRAME, "action": "fill", "mask_path": "../a.png"}]},
+            "beside it",
+        ),
+        ({"version": "0", "frames": [{**FRAME, "action": "fill", "mask_path": "a.png"}]}, "a.png"),
+        ({"version": "0", "frames": [{**FRAME, "action": "remove", "box": [0] * 6}]}, "six"),
+    ],
+)
+def test_strokes_that_are_none_are_refused(splat, tmp_path, monkeypatch, capsys, content, said):
+    path = tmp_path / "strokes.json"
+    path.write_text(content if isinstance(content, str) else json.dumps(content))
+    out = tmp_path / "out"
+    assert run(monkeypatch, "repair", splat, "--strokes", path, "--out", out, "--quiet") == 2
+    assert said in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ((), "Nothing is named that is wrong"),
+        (("--camera", "c.json"), "A camera alone"),
+        (("--mask", "m.png"), "painted at a camera"),
+        (("--strokes", "s.json", "--mask", "m.png"), "of their own"),
+    ],
+)
+def test_what_is_wrong_is_named_once(splat, tmp_path, monkeypatch, capsys, words, said):
+    assert run(monkeypatch, "repair", splat, *words, "--out", tmp_path / "out") == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_scene_of_photographs_is_repaired_and_replayed_too(
+    ready, begun, room, tmp_path, monkeypatch
+):
+    session, _ = apply_step(begun, marked(begun, "repair"))
+    out, other = tmp_path / "out", tmp_path / "other"
+    elsewhere = replace(ready, options=replace(ready.options, out=out))
+    serving.save_session(elsewhere, session)
+    words = ("repair", room, "--strokes", out / "strokes.json", "--out", other, "--quiet")
+    assert run(monkeypatch, *words) == 0
+    for name in ("completed.ply", "context.ply"):
+        assert (out / name).read_bytes() == (other / name).read_bytes(), name
+    # There is no file of a splat to give back: the context is the scene as it was.
+    assert len(load_ply(out / "context.ply")) == len(begun.latest.context)
+    kept = load_ply(out / "completed.ply")
+    assert int((kept.generated == 0).sum()) < len(begun.latest.context)

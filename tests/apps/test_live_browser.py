@@ -1,4 +1,4 @@
-"""`gscompleter live` in a real browser: fly, complete, undo, find a hole and save."""
+"""`gscompleter live` in a real browser: the room is completed, and the fox is repaired."""
 
 from __future__ import annotations
 
@@ -7,16 +7,16 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
-from browsing import PATIENCE, SWITCHES, launched
+from browsing import PATIENCE, SWITCHES, launched, pixels_of
 from command import run
 from scenes import camera_at, photographed
-
-pytest.importorskip("viser", reason="needs gscompleter[live]")
 
 pytestmark = pytest.mark.browser
 
@@ -25,80 +25,172 @@ PLACES = ((-0.3, 0), (0.1, 0), (0.4, 4))
 SMALL = ("--resolution", SIZE, SIZE, "--near", 0.5, "--far", 20, "--quiet")
 
 
-@pytest.fixture(scope="module")
-def room(tmp_path_factory) -> Path:
-    cameras = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in PLACES]
-    return photographed(tmp_path_factory.mktemp("live") / "room", cameras)
-
-
-@pytest.fixture(scope="module")
-def out(tmp_path_factory) -> Path:
-    return tmp_path_factory.mktemp("saved") / "out"
-
-
-@pytest.fixture(scope="module")
-def served(room, out) -> Iterator[str]:
-    """Address of the page; the process ends silently on SIGTERM."""
-    words = ["live", room, "--context", 0, 1, "--out", out, "--no-open", *SMALL]
+@contextmanager
+def served(*words: object) -> Iterator[str]:
+    """Serve the page in a process, which ends silently on SIGTERM, and return its address."""
     program = "from gscompleter.cli import main; main()"
     process = subprocess.Popen(
-        [sys.executable, "-c", program, *map(str, words)],
+        [sys.executable, "-c", program, "live", *map(str, words), "--no-open", "--quiet"],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     )
     assert process.stdout is not None
-    yield process.stdout.readline().split()[0]
-    process.send_signal(signal.SIGTERM)
-    rest, errors = process.communicate(timeout=30)
+    try:
+        yield process.stdout.readline().split()[0]
+    finally:
+        process.send_signal(signal.SIGTERM)
+        rest, errors = process.communicate(timeout=30)
     assert (process.returncode, rest, errors) == (0, "", "")
 
 
-@pytest.fixture(scope="module")
-def page(served) -> Iterator[Any]:
-    with launched(SWITCHES) as browser:
-        page = browser.new_page(viewport={"width": 640, "height": 360})
-        page.set_default_timeout(PATIENCE)
-        asked: list[str] = []
-        page.on("request", lambda request: asked.append(request.url))
-        page.goto(served)
-        wait_for(page, "Fly to a hole in the scene")
-        yield page
-        assert [url for url in asked if not url.startswith((served, "data:", "blob:"))] == []
+class LiveTab:
+    """The page in a browser."""
+
+    def __init__(self, browser: Any, address: str, **context: Any) -> None:
+        view = {"width": 640, "height": 560}
+        self.page = browser.new_context(viewport=view, **context).new_page()
+        self.page.set_default_timeout(PATIENCE)
+        self.address = address
+        self.asked: list[str] = []
+        self.errors: list[str] = []
+        self.page.on("request", lambda request: self.asked.append(request.url))
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.goto(address)
+        self.page.evaluate("gsc.ready")
+        self.page.evaluate("gsc.setMode('after')")
+
+    def ask(self, action: str) -> str:
+        """Ask for an action and wait until what came of it is shown; return what is said."""
+        said = self.page.evaluate(f"gsc.ask('{action}')")
+        self.page.evaluate("gsc.settled()")
+        assert said["text"] == self.page.evaluate("document.getElementById('message').textContent")
+        return said["text"]
+
+    def drag(self, *places: tuple[int, int]) -> None:
+        """Drag through places relative to the middle of the scene."""
+        box = self.page.locator("#stage").bounding_box()
+        x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+        for number, (right, down) in enumerate(places):
+            self.page.mouse.move(x + right, y + down, steps=3)
+            if number == 0:
+                self.page.mouse.down()
+        self.page.mouse.up()
+        self.page.evaluate("gsc.settled()")
+
+    def key(self, key: str) -> None:
+        self.page.keyboard.press(key)
+        self.page.evaluate("gsc.settled()")
+
+    def stats(self) -> dict[str, Any]:
+        return self.page.evaluate("gsc.stats()")
+
+    def picture(self) -> np.ndarray:
+        """Take a screenshot of the middle of the picture, without message and frame."""
+        picture = pixels_of(self.page.locator("#stage").screenshot())
+        row, column = picture.shape[0] // 2, picture.shape[1] // 2
+        return picture[row - 70 : row + 70, column - 70 : column + 70]
+
+    def check_quiet(self) -> None:
+        """Check that nothing went wrong, and that nobody else was asked."""
+        assert self.errors == []
+        allowed = (self.address, "data:", "blob:")
+        assert [url for url in self.asked if not url.startswith(allowed)] == []
 
 
-def press(page: Any, name: str) -> None:
-    page.get_by_role("button", name=name).click()
+@pytest.fixture
+def fox_splat(shared) -> Path:
+    path = shared / "splats" / "fox" / "splat.ply"
+    if not path.is_file():
+        pytest.skip("needs the splat of the fox in the shared data")
+    return path
 
 
-def wait_for(page: Any, said: str) -> str:
-    """Wait for a status text and return it."""
-    status = page.get_by_role("status").filter(has_text=said)
-    status.wait_for()
-    return status.text_content()
+def test_a_hole_that_is_flown_to_closes_opens_again_and_is_saved(tmp_path, monkeypatch):
+    cameras = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in PLACES]
+    room, out = photographed(tmp_path / "room", cameras), tmp_path / "out"
+    with (
+        served(room, "--context", 0, 1, "--out", out, *SMALL[:-1]) as address,
+        launched(SWITCHES) as browser,
+    ):
+        tab = LiveTab(browser, address)
+        assert "Fly to a hole" in tab.page.inner_text("#message")
+        assert tab.ask("undo").startswith("There is nothing to undo")
+        tab.drag((-60, 40), (0, 40))
+        assert "Gaussians are added" in tab.ask("complete")
+        assert tab.ask("undo") == "Undone. Steps left: 0."
+        assert "The scene has a hole here" in tab.ask("find")
+        assert "Gaussians are added" in tab.ask("complete")
+        assert "Saved in" in tab.ask("save")
+        # A page that is opened again shows the scene as it is.
+        again = LiveTab(browser, address)
+        again.page.evaluate("gsc.settled()")
+        assert again.stats()["live"]["steps"] == 1
+        for page in (tab, again):
+            page.check_quiet()
 
-
-def test_a_hole_that_is_flown_to_closes_opens_again_and_is_saved(
-    page, room, out, tmp_path, monkeypatch
-):
-    page.mouse.move(100, 250)
-    page.mouse.down()
-    page.mouse.move(160, 250, steps=4)
-    page.mouse.up()
-    press(page, "Complete what I see")
-    assert "Gaussians are added" in wait_for(page, "Completed in")
-    press(page, "Undo")
-    wait_for(page, "Undone. Completions left: 0.")
-    press(page, "Find a hole")
-    wait_for(page, "The scene has a hole here")
-    press(page, "Complete what I see")
-    wait_for(page, "Completed in")
-    press(page, "Save")
-    wait_for(page, "Saved in")
-
-    other, cameras = tmp_path / "out", out / "targets.json"
-    assert len(json.loads(cameras.read_text())["frames"]) == 1
-    words = ("complete", room, "--context", 0, 1, "--target", cameras, "--out", other, *SMALL)
+    saved, other = out / "targets.json", tmp_path / "other"
+    assert len(json.loads(saved.read_text())["frames"]) == 1
+    words = ("complete", room, "--context", 0, 1, "--target", saved, "--out", other, *SMALL)
     assert run(monkeypatch, *words) == 0
     for name in ("completed.ply", "context.ply", "generated.ply", "images/target1_after.png"):
         assert (out / name).read_bytes() == (other / name).read_bytes(), name
+
+
+@pytest.mark.slow
+def test_the_fox_is_painted_repaired_undone_saved_and_stripped(fox_splat, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    with (
+        served(fox_splat, "--out", out, "--resolution", 128, 128) as address,
+        launched(SWITCHES) as browser,
+    ):
+        tab = LiveTab(browser, address)
+        given = tab.picture()
+
+        # Strokes of the brush and the lasso are taken back and painted again.
+        tab.key("m")
+        tab.drag((-40, -10), (40, 30))
+        tab.key("l")
+        tab.drag((-30, 10), (0, 50), (30, 10))
+        tab.key("z")
+        assert tab.stats()["strokes"] == 1
+        tab.key("y")
+        assert tab.stats()["strokes"] == 2
+        painted = tab.picture()
+        assert (np.abs(painted - given).max(axis=-1) > 0.1).mean() > 0.01
+
+        said = tab.ask("repair")
+        assert "are removed" in said
+        assert tab.stats()["strokes"] == 0
+        repaired = tab.picture()
+        is_changed = np.abs(repaired - given).max(axis=-1) > 0.02
+        assert 0.005 < is_changed.mean() < 0.3
+        # Nothing black is left of what was removed.
+        assert repaired[is_changed].mean() > 0.7 * given[is_changed].mean()
+        tab.ask("undo")
+        assert np.abs(tab.picture() - given).max() < 0.02
+        sent = len(tab.asked)
+        tab.ask("redo")
+        assert np.abs(tab.picture() - repaired).max() < 0.02
+        # What was sent before is not sent again.
+        assert [url for url in tab.asked[sent:] if "chunks" in url] == []
+
+        # A box where the fox is, which takes more away.
+        tab.key("x")
+        assert tab.page.is_visible("#box")
+        boxed = tab.picture()
+        assert (np.abs(boxed - repaired).max(axis=-1) > 0.1).mean() > 0.005
+        assert "--box" in tab.ask("remove")
+        tab.ask("undo")
+        assert "Saved in" in tab.ask("save")
+        tab.check_quiet()
+
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["gaussians"]["removed"] > 50
+    assert summary["targets"][0]["added"] > 100
+    restored, other = tmp_path / "restored.ply", tmp_path / "other"
+    assert run(monkeypatch, "strip", out / "completed.ply", "--out", restored, "--quiet") == 0
+    assert restored.read_bytes() == fox_splat.read_bytes()
+    words = ("repair", fox_splat, "--strokes", out / "strokes.json", "--out", other, "--quiet")
+    assert run(monkeypatch, *words) == 0
+    assert (out / "completed.ply").read_bytes() == (other / "completed.ply").read_bytes()

@@ -236,7 +236,7 @@ def test_text_from_outside_cannot_leave_its_place():
 
 
 def test_our_program_writes_text_and_never_markup():
-    program = pages.read_asset("viewer.js")
+    program = pages.read_program()
     assert "textContent" in program
     for way in ("innerHTML", "outerHTML", "insertAdjacentHTML", "document.write", "eval("):
         assert way not in program

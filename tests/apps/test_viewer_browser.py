@@ -384,3 +384,77 @@ def test_what_is_painted_is_saved_with_its_camera_and_repaired(
     summary = json.loads((out / "summary.json").read_text())
     assert summary["gaussians"]["removed"] > 0
     assert summary["targets"][0]["added"] > 0
+
+
+def test_fingers_paint_and_move(browser, saved):
+    """One finger paints; with a second one both move the camera, and nothing is painted."""
+    options = {"viewport": {"width": 420, "height": 700}, "has_touch": True, "is_mobile": True}
+    context = browser.new_context(**options)
+    page = context.new_page()
+    page.goto(saved.as_uri() + "#camera=target-1")
+    page.evaluate("gsc.ready")
+    page.keyboard.press("m")
+    # The picture has room on a phone, too.
+    assert page.locator("#stage").bounding_box()["height"] > 300
+    assert page.evaluate("[innerWidth, innerHeight]") == [420, 700]
+    touch(page, 1)
+    assert page.evaluate("gsc.stats()")["strokes"] == 1
+    page.keyboard.press("z")
+    eye = page.evaluate("gsc.stats()")["eye"]
+    touch(page, 2)
+    stats = page.evaluate("gsc.stats()")
+    assert stats["strokes"] == 0
+    assert distance(stats["eye"], eye) > 0.01
+    context.close()
+
+
+def touch(page: Any, count: int) -> None:
+    """Drag with one finger, or two fingers apart, over the middle of the scene."""
+    session = page.context.new_cdp_session(page)
+    box = page.locator("#stage").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+
+    def send(kind: str, places: list[tuple[float, float]]) -> None:
+        points = [{"x": px, "y": py, "id": number} for number, (px, py) in enumerate(places)]
+        session.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    def places(apart: float) -> list[tuple[float, float]]:
+        return [(x - apart, y), (x + apart, y)][:count]
+
+    # One finger is down first, as with a hand.
+    send("touchStart", places(20)[:1])
+    if count == 2:
+        send("touchStart", places(20))
+    for apart in (30, 40, 60):
+        send("touchMove", places(apart))
+    send("touchEnd", [])
+    page.evaluate("gsc.settled()")
+
+
+def test_a_lasso_marks_its_inside_and_strokes_come_back(browser, saved, tmp_path):
+    tab = Window(browser, saved, 420, 400)
+    tab.do('gsc.goTo("target-1")')
+    tab.key("l")
+    box = tab.page.locator("#stage").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    tab.page.mouse.move(x - 60, y - 60)
+    tab.page.mouse.down()
+    for right, down in ((60, -60), (60, 60), (-60, 60)):
+        tab.page.mouse.move(x + right, y + down)
+    tab.page.mouse.up()
+
+    def share() -> float:
+        with tab.page.expect_download() as download:
+            tab.key("n")
+        download.value.save_as(tmp_path / "mask.png")
+        return float((read_image(tmp_path / "mask.png").mean(dim=-1) > 0.5).float().mean())
+
+    zoom = min(box["width"] / TARGET.width, box["height"] / TARGET.height)
+    expected = (120 / zoom) ** 2 / (TARGET.width * TARGET.height)
+    assert abs(share() - expected) < 0.15 * expected
+    tab.key("z")
+    assert tab.do("gsc.maskPng()") is None
+    tab.key("y")
+    assert abs(share() - expected) < 0.15 * expected
+    assert not tab.page.is_visible("#live")
+    tab.context.close()

@@ -29,7 +29,6 @@ PURPOSES = {
     "diffusion": "--generator pe-field and diffusers-inpaint",
     "onnx": "--generator migan and lama",
     "poses": "photographs whose cameras are not known",
-    "live": "completing in the browser with gscompleter live",
     "browser": "the picture of the viewer (examples/04_picture_of_the_viewer.py)",
     "film": "videos as SCENE, and complete --video",
     "ray": "batch --engine ray",

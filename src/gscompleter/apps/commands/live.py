@@ -12,7 +12,11 @@ from gscompleter.system.process import import_without_collection
 
 @dataclass(frozen=True, kw_only=True)
 class LiveOptions(CompletingOptions):
-    """Complete a scene in the browser: fly to a hole, press a button, and watch it close."""
+    """Complete and repair a scene in the browser: paint over what is wrong, or fly to a hole.
+
+    The page is that of `view`. What is painted or boxed is removed, filled or repaired, and undone;
+    Save also writes strokes.json, which `repair --strokes` does again.
+    """
 
     out: Path = Path("live")
     """Output folder of the Save button."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -11,6 +11,7 @@ import tyro
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.commands.shared_options import CompletingOptions
 from gscompleter.config import CompleterConfig
+from gscompleter.system.errors import InputError
 from gscompleter.system.process import import_without_collection
 
 REPAIR_CONFIG = CompleterConfig.splat().for_marks()
@@ -22,13 +23,16 @@ class RepairOptions(CompletingOptions):
 
     What is marked goes, up to the surface that is seen there, and is a hole whatever stands behind
     it. SCENE is the splat, or the photographs of the splat of `--scene`, which help. `gscompleter
-    strip` gives the splat back as it was.
+    live` marks and repairs in the browser. `gscompleter strip` gives the splat back as it was.
     """
 
-    camera: Path = field()
+    camera: Path | None = None
     """File with the camera of each mask, as of `--target`."""
-    mask: tuple[Path, ...] = field()
+    mask: tuple[Path, ...] = ()
     """Images of the splat from these cameras, in the same order: white where it is wrong."""
+    strokes: Path | None = None
+    """The strokes.json that `live` saved, in place of cameras and masks: its steps are done again,
+    at its resolution and with its photographs unless others are named."""
     out: Path
     """Folder for completed.ply, the report (report.html), images and summary.json."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = REPAIR_CONFIG
@@ -43,12 +47,37 @@ class RepairOptions(CompletingOptions):
         """Make the options of the completion, at the cameras of the masks, that a repair is."""
         shared = {**vars(self)}
         camera = shared.pop("camera")
+        del shared["strokes"]
         return CompleteOptions(**shared, target=(str(camera),))
 
 
 def run_repair(options: RepairOptions) -> int:
     """Repair the splat, and print a summary; exit codes as of `complete`."""
     # Imported here, so that help pages do not wait for torch.
+    check_marks_named(options)
+    if options.strokes is not None:
+        with import_without_collection():
+            from gscompleter.apps.live.replay import replay_strokes
+        return replay_strokes(options, options.strokes)
     with import_without_collection():
         from gscompleter.apps.completing.complete import complete_scene
     return complete_scene(options.make_completion())
+
+
+def check_marks_named(options: RepairOptions) -> None:
+    """Refuse options that do not say what is wrong, or say it twice."""
+    if options.strokes is not None:
+        if options.camera is not None or options.mask:
+            raise InputError(
+                "Strokes have cameras and masks of their own; leave --camera and --mask out.",
+                "strokes",
+            )
+    elif options.camera is None and not options.mask:
+        raise InputError(
+            "Nothing is named that is wrong; give --camera and --mask, or the --strokes of a "
+            "session of `live`."
+        )
+    elif options.camera is None:
+        raise InputError("A mask is painted at a camera; name the file of it.", "camera")
+    elif not options.mask:
+        raise InputError("A camera alone marks nothing; name the masks painted there.", "mask")

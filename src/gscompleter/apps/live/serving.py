@@ -5,8 +5,10 @@ from __future__ import annotations
 import webbrowser
 from contextlib import suppress
 from dataclasses import fields, replace
-from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
 
+from PIL import Image
 from rich.console import Console
 
 from gscompleter.apps.commands.complete import CompleteOptions
@@ -16,72 +18,92 @@ from gscompleter.apps.completing.complete import COMMAND, RESULTS, write_done
 from gscompleter.apps.completing.preparation import Prepared, prepare_completion
 from gscompleter.apps.inputs.describing import describe_opening, print_lines
 from gscompleter.apps.inputs.task import Target
+from gscompleter.apps.live.addresses import check_bindable, resolve_host
+from gscompleter.apps.live.difference import PageScene
+from gscompleter.apps.live.page import LivePage
+from gscompleter.apps.live.server import LiveServer
 from gscompleter.apps.live.session import Session
+from gscompleter.apps.live.strokes import STROKES, write_strokes
+from gscompleter.apps.viewer import packages
+from gscompleter.apps.viewer.exhibit import ViewerCamera, ViewerContent, shrink_image
+from gscompleter.apps.viewer.packages import Libraries
+from gscompleter.apps.viewer.page import make_page
+from gscompleter.data.photograph_names import name_photograph
 from gscompleter.data.scene import write_cameras
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.image import convert_to_pixels
 from gscompleter.system.files.output_folder import check_output, open_output_folder, reserve_output
 from gscompleter.system.files.writing import TARGETS_FILE
 from gscompleter.system.progress import show_progress
 from gscompleter.types import Camera
 
-# viser renders antialiased scenes differently.
-ANTIALIASED_NOTE = (
-    "The page renders antialiased Gaussians as classic ones, small ones too opaque; saved files "
-    "are correct, and so is `gscompleter view`."
-)
+LIVE_RESULTS = (*RESULTS, *STROKES)
+"""Globs of the files that a session may write."""
 
 
 def serve_live(options: LiveOptions) -> None:
     """Serve the page until Ctrl-C."""
-    if find_spec("viser") is None:
-        raise InputError(
-            "The live page needs viser, which is not installed; run "
-            "pip install 'gscompleter[live]'."
-        )
-    from gscompleter.apps.live.page import check_bindable, resolve_host
-
-    # A port in use is reported now, not after the scene is reconstructed.
+    # A port in use and a lack of the page's libraries are reported now, not after the scene is
+    # reconstructed.
     check_bindable(resolve_host(options.host), options.host, options.port)
-    with reserve_output(options.out, options.overwrite, COMMAND, RESULTS) as output:
+    libraries = packages.load_libraries()
+    with reserve_output(options.out, options.overwrite, COMMAND, LIVE_RESULTS) as output:
         console = Console(stderr=True, quiet=options.quiet)
         print_lines(console, *output.describe_others())
         with show_progress(console):
             ready = prepare(options, console)
             session = begin_session(ready)
-        serve(options, ready, session)
+            page = build_page(ready, session, libraries, console)
+        serve(options, page)
 
 
-def serve(options: LiveOptions, ready: Prepared, session: Session) -> None:
-    """Serve the page of a session until Ctrl-C."""
-    # Imported here because viser may be missing.
-    from gscompleter.apps.live.page import Page, resolve_host, start_server
-
-    server = start_server(options.host, options.port)
-    page = Page(
+def build_page(
+    ready: Prepared, session: Session, libraries: Libraries, console: Console
+) -> LivePage:
+    """Build the page of a session."""
+    scene = session.latest.context
+    kind = "Photograph" if ready.opened.renders_from is None else "Render"
+    shots = [
+        ViewerCamera(
+            f"photograph-{view.frame}",
+            f"{kind} {name_photograph(view.frame, ready.opened.files.get(view.frame))}",
+            view.camera.on_cpu,
+            shrink_image(Image.fromarray(convert_to_pixels(view.image))),
+        )
+        for view in session.latest.views
+    ]
+    title = ready.options.scene or ready.options.folder
+    assert title is not None
+    content = ViewerContent(title.name, scene, scene, tuple(shots))
+    page, notes = make_page(content, libraries, is_live=True)
+    print_lines(console, *notes)
+    return LivePage(
         session,
-        lambda now: find_next_target(ready, now),
+        page,
+        PageScene(scene),
+        lambda completion: find_next_target(ready, completion),
         lambda session: save_session(ready, session),
-        server,
-        ready.opened.files,
     )
-    address = resolve_host(options.host).make_url(server.get_port())
+
+
+def serve(options: LiveOptions, page: LivePage) -> None:
+    """Serve a page until Ctrl-C."""
+    server = LiveServer(resolve_host(options.host), options.host, options.port, page)
     # Printed once the server listens.
-    print(f"{address} (Ctrl-C ends it)", flush=True)
+    print(f"{server.url} (Ctrl-C ends it)", flush=True)
     if not options.no_open:
-        webbrowser.open(address)
+        webbrowser.open(server.url)
     with suppress(KeyboardInterrupt):
         page.handle_requests()
-    page.close()
+    server.close()
 
 
-def prepare(options: LiveOptions, console: Console) -> Prepared:
+def prepare(options: CompletingOptions, console: Console) -> Prepared:
     """Open the scene as `complete` does."""
     check_output(options.out, options.overwrite)
     ready = prepare_completion(make_complete_options(options), console)
     print_lines(console, *describe_opening(ready.opened, ready.task))
-    if ready.task.scene is not None and ready.task.scene.is_antialiased:
-        print_lines(console, ANTIALIASED_NOTE)
 
     # What the session chose is recorded in summary.json as options of `complete`: the context, and
     # the file into which the cameras of the session are saved.
@@ -90,7 +112,7 @@ def prepare(options: LiveOptions, console: Console) -> Prepared:
     return replace(ready, options=complete_options)
 
 
-def make_complete_options(options: LiveOptions) -> CompleteOptions:
+def make_complete_options(options: CompletingOptions) -> CompleteOptions:
     """Convert the options to those of `complete`."""
     shared = {field.name: getattr(options, field.name) for field in fields(CompletingOptions)}
     # A session begins wherever the splat looks well, if nothing tells where its cameras were.
@@ -105,6 +127,7 @@ def begin_session(ready: Prepared) -> Session:
         ready.task.frame,
         ready.opened.photographs.origin,
         ready.opened.request.resolution,
+        splat_origin=ready.task.origin,
     )
 
 
@@ -118,13 +141,21 @@ def save_session(ready: Prepared, session: Session) -> str:
     """Write the results of `complete`, in place of those saved before, and return a sentence."""
     # The first completion of a session is the context alone.
     if len(session.completions) == 1:
-        raise InputError("There is nothing to save; complete a hole first.")
-    out = ready.options.out
+        raise InputError("There is nothing to save; complete or repair something first.")
+    # Whether it may be replaced was decided when the session began.
+    with open_output_folder(ready.options.out, overwrite=True, command=COMMAND) as folder:
+        summary = write_session(folder, ready, session)
+    return f"Saved in {quote_value(ready.options.out)}. {summary['outcome']['headline']}"
+
+
+def write_session(folder: Path, ready: Prepared, session: Session) -> dict[str, Any]:
+    """Write the results of `complete` and the steps of a session, and return the summary."""
     targets = [Target(result.target) for result in session.latest.targets]
     with_targets = replace(ready, task=replace(ready.task, targets=targets))
-    # Whether it may be replaced was decided when the session began.
-    with open_output_folder(out, overwrite=True, command=COMMAND) as folder:
-        summary = write_done(folder, with_targets, session.latest)
-        if session.cameras:
-            write_cameras(folder / TARGETS_FILE, session.cameras)
-    return f"Saved in {quote_value(out)}. {summary['outcome']['headline']}"
+    summary = write_done(folder, with_targets, session.latest)
+    if session.cameras:
+        write_cameras(folder / TARGETS_FILE, session.cameras)
+    # Cameras that were found are found again.
+    context = ready.task.context_frames if ready.opened.has_numbered_frames else None
+    write_strokes(folder, session, ready.options, context)
+    return summary

@@ -1,22 +1,55 @@
-"""Immutable sessions: every step returns a new session, so undo returns to the one before."""
+"""Immutable sessions: every step returns a new session, and undo returns to the one before."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Literal
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from torch import Tensor
 
+from gscompleter.apps.inputs.hole_kinds import read_marks
+from gscompleter.apps.live.steps import (
+    Numbers,
+    complete_at,
+    fill_marked,
+    remove_in_box,
+    remove_marked,
+)
 from gscompleter.apps.viewer.exhibit import load_scene_cameras
 from gscompleter.completer import GSCompleter
 from gscompleter.data.photographs import Resolution
 from gscompleter.data.scene import write_cameras
 from gscompleter.splats.alignment.similarity import transform_camera_exactly
-from gscompleter.state import Completion, TargetResult
+from gscompleter.state import NOTHING_ADDED, Completion, TargetResult
 from gscompleter.system.errors import InputError
 from gscompleter.types import Camera
+
+Action = Literal["complete", "fill", "remove", "repair"]
+UPRIGHT = (1.0, 0.0, 0.0, 0.0)
+"""Rotation of a box that is not rotated, as a quaternion wxyz."""
+UNMARKED = "Nothing is marked: choose Brush or Lasso, and paint over what is meant."
+
+
+@dataclass(frozen=True)
+class Step:
+    """One thing that a person did: where the camera stood, and what was marked."""
+
+    action: Action
+    camera: Camera
+    """In the frame of the photographs, as it is saved."""
+    mask: bytes | None = None
+    """PNG of the marks at the camera, white there; None without marks."""
+    box: Numbers | None = None
+    """Smallest x, y and z, then largest, in the coordinates of the splat's file, of a box that is
+    removed; None without one."""
+    box_rotation: Numbers = UPRIGHT
+    """Rotation of the box about its centre, as a quaternion wxyz."""
 
 
 @dataclass(frozen=True)
@@ -31,42 +64,167 @@ class Session:
     origin: Float[np.ndarray, "3"]
     """Local origin of the coordinates, in the frame of the photographs."""
     resolution: Resolution = None
-    cameras: tuple[Camera, ...] = ()
-    """Target camera of each completion in the frame of the photographs, as it is saved."""
+    steps: tuple[Step, ...] = ()
+    """The steps, one for each completion but the first."""
+    splat_origin: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    """Origin of the result in the coordinates of the splat's file."""
+    undone: tuple[tuple[Completion, Step], ...] = field(default=(), compare=False)
+    """Steps that were undone, the last one to be done again first of all at the end."""
 
     @property
     def latest(self) -> Completion:
         """The completion after the last step."""
         return self.completions[-1]
 
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """Camera of each target that was completed, in the frame of the photographs."""
+        # A step that only removes has no target.
+        counts = [len(completion.targets) for completion in self.completions]
+        return tuple(
+            step.camera
+            for step, before, after in zip(self.steps, counts, counts[1:], strict=False)
+            if after > before
+        )
 
-def complete_camera(session: Session, camera: Camera) -> tuple[Session, TargetResult]:
-    """Complete the scene for a camera in the frame of the result.
+    def extended(self, completion: Completion, step: Step) -> Session:
+        """Return the session after one more step; what was undone cannot be done again."""
+        return replace(
+            self,
+            completions=(*self.completions, completion),
+            steps=(*self.steps, step),
+            undone=(),
+        )
 
-    Returns the same session if nothing was added or recoloured. The camera goes through a file
-    first, so that the saved file gives the very same result.
+
+def save_camera(session: Session, camera: Camera) -> Camera:
+    """Move a camera from the frame of the result to that of the photographs, as it is saved."""
+    return transform_camera_exactly(camera, np.linalg.inv(session.transform))
+
+
+def apply_step(session: Session, step: Step) -> tuple[Session, str]:
+    """Do one step, and describe it; the same session if nothing was changed.
+
+    Camera and mask go through files first, so that the saved ones give the very same result.
     """
-    saved_camera = transform_camera_exactly(camera, np.linalg.inv(session.transform))
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "target.json"
-        write_cameras(path, [saved_camera])
-        (target,) = load_scene_cameras(path, session.transform, session.origin, session.resolution)
-    target = target.to(session.latest.views[0].image.device)
-    completion = session.completer.advance(session.latest, target)
+    check_step(step)
+    start = time.perf_counter()
+    camera = place_camera(session, step.camera)
+    completion, text = PERFORM[step.action](session, step, camera)
+    seconds = time.perf_counter() - start
+    if completion is session.latest:
+        return session, text
+    return session.extended(completion, step), f"Done in {seconds:.1f} s: {text}"
+
+
+def check_step(step: Step) -> None:
+    """Refuse a box or a mask that the action would ignore."""
+    if step.box is not None and step.action != "remove":
+        raise InputError(f"Only Remove takes a box, and {step.action} has one; leave it out.")
+    if step.mask is not None and (step.action == "complete" or step.box is not None):
+        raise InputError("A step with a box, or that completes all holes, takes no mask.")
+
+
+def complete_step(session: Session, step: Step, camera: Camera) -> tuple[Completion, str]:
+    """Complete all holes that the camera sees."""
+    first = session.completions[0].config
+    return keep_change(session, complete_at(session.completer, first, session.latest, camera))
+
+
+def fill_step(session: Session, step: Step, camera: Camera) -> tuple[Completion, str]:
+    """Fill the holes that the marks touch."""
+    marked = read_step_marks(step, camera)
+    return keep_change(session, fill_marked(session.completer, session.latest, camera, marked))
+
+
+def remove_step(session: Session, step: Step, camera: Camera) -> tuple[Completion, str]:
+    """Remove what the box contains, or else what is marked."""
+    completer = session.completer
+    if step.box is None:
+        marked = read_step_marks(step, camera)
+        changed, count = remove_marked(completer, session.latest, camera, marked)
+        return changed, f"{count:,} Gaussians are removed; fill their place, or undo."
+
+    changed, count = remove_in_box(
+        completer, session.latest, step.box, step.box_rotation, session.splat_origin
+    )
+    corners = " ".join(f"{number:.4g}" for number in step.box)
+    rotation = " ".join(f"{number:.4g}" for number in step.box_rotation)
+    return changed, (
+        f"{count:,} Gaussians are removed; complete the hole, or undo.\n"
+        f"As options of remove: --box {corners} --box-rotation {rotation}"
+    )
+
+
+def repair_step(session: Session, step: Step, camera: Camera) -> tuple[Completion, str]:
+    """Remove what is marked, and fill its place."""
+    marked = read_step_marks(step, camera)
+    changed, count = remove_marked(session.completer, session.latest, camera, marked)
+    completion = session.completer.advance(changed, camera)
+    text = describe_outcome(completion.targets[-1])
+    return completion, f"{count:,} Gaussians are removed. {text}"
+
+
+PERFORM: dict[Action, Callable[[Session, Step, Camera], tuple[Completion, str]]] = {
+    "complete": complete_step,
+    "fill": fill_step,
+    "remove": remove_step,
+    "repair": repair_step,
+}
+"""What each action does to the latest completion, and the sentence about it."""
+
+
+def keep_change(session: Session, completion: Completion) -> tuple[Completion, str]:
+    """Return the completion, or the latest one if its last target changed nothing."""
     result = completion.targets[-1]
+    is_changed = bool(len(result.added)) or result.num_recolored > 0
+    return (completion if is_changed else session.latest), describe_outcome(result)
+
+
+def describe_outcome(result: TargetResult) -> str:
+    """Describe what was added at a camera: one sentence, then one line per note."""
     if not len(result.added) and not result.num_recolored:
-        return session, result
-    completions = (*session.completions, completion)
-    cameras = (*session.cameras, saved_camera)
-    return replace(session, completions=completions, cameras=cameras), result
+        return "\n".join(result.notes or (NOTHING_ADDED,))
+    text = (
+        f"{len(result.added):,} Gaussians are added in a hole of "
+        f"{100 * result.hole_fraction:.1f} % of the image."
+    )
+    return "\n".join((text, *result.notes))
+
+
+def place_camera(session: Session, saved: Camera) -> Camera:
+    """Move a saved camera to the frame of the result, through a file as `--target` reads it."""
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "camera.json"
+        write_cameras(path, [saved])
+        (camera,) = load_scene_cameras(path, session.transform, session.origin, session.resolution)
+    return camera.to(session.latest.views[0].image.device)
+
+
+def read_step_marks(step: Step, camera: Camera) -> Bool[Tensor, "h w"]:
+    """Read the marks of a step at the size of its camera."""
+    if step.mask is None:
+        raise InputError(UNMARKED)
+    with TemporaryDirectory() as folder:
+        path = Path(folder) / "mask.png"
+        path.write_bytes(step.mask)
+        return read_marks(path, camera)
 
 
 def undo_step(session: Session) -> Session:
-    """Remove the last step."""
+    """Take the last step back."""
     earlier = session.completions[:-1]
     if not earlier:
-        raise InputError("There is nothing to undo; complete something first.")
-    # A step may be a removal, which has no camera: the targets that are left tell how many there
-    # are.
-    cameras = session.cameras[: len(earlier[-1].targets)]
-    return replace(session, completions=earlier, cameras=cameras)
+        raise InputError("There is nothing to undo; complete or repair something first.")
+    last = (session.latest, session.steps[-1])
+    return replace(
+        session, completions=earlier, steps=session.steps[:-1], undone=(*session.undone, last)
+    )
+
+
+def redo_step(session: Session) -> Session:
+    """Do the last step that was undone again."""
+    if not session.undone:
+        raise InputError("There is nothing to redo; undo something first.")
+    completion, step = session.undone[-1]
+    return replace(session.extended(completion, step), undone=session.undone[:-1])

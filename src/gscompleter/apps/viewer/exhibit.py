@@ -193,6 +193,10 @@ def make_thumbnail(stored: Path, orientation: int = 1) -> bytes | None:
     """Make a small JPEG of an image file that EXIF turns; None if there is no file."""
     if not stored.is_file():
         return None
-    image = Image.fromarray(turn_upright(read_pixels(stored), orientation))
+    return shrink_image(Image.fromarray(turn_upright(read_pixels(stored), orientation)))
+
+
+def shrink_image(image: Image.Image) -> bytes:
+    """Make a small JPEG of an image."""
     image.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
     return encode_jpeg(image, THUMBNAIL_QUALITY)

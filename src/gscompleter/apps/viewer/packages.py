@@ -26,6 +26,10 @@ MODULES = {
     "three": ("three", "build/three.module.min.js"),
     "three-core": ("three", "build/three.core.min.js"),
     "three/addons/postprocessing/Pass.js": ("three", "examples/jsm/postprocessing/Pass.js"),
+    "three/addons/controls/TransformControls.js": (
+        "three",
+        "examples/jsm/controls/TransformControls.js",
+    ),
     "@sparkjsdev/spark": ("@sparkjsdev/spark", "dist/spark.module.min.js"),
 }
 """Package and file of each module, by its import name."""

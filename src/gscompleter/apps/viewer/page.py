@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.apps.viewer.exhibit import ViewerCamera, ViewerContent
@@ -29,6 +29,11 @@ from gscompleter.system.files.writing import encode_text
 from gscompleter.types import Camera, Gaussians
 
 ASSETS = Path(__file__).with_name("assets")
+PROGRAM = (
+    *("state", "libraries", "pictures", "camera", "path", "marks", "saving", "box", "connection"),
+    *("controls", "texts", "start"),
+)
+"""Files of the page's program in their order: each uses only names of those before it at once."""
 PAGE_EXTENT = 4.0
 """Median distance of Gaussians from the centre, within a factor of 2, in page units."""
 MAX_DISTANCE = 4096.0
@@ -57,7 +62,8 @@ class PageFrame:
 
     def normalize(self, gaussians: Gaussians) -> Gaussians:
         """Move Gaussians to the page's origin and unit; their axes stay."""
-        means = ((gaussians.means.double() - self.centre) / self.unit).float()
+        centre = self.centre.to(gaussians.means.device)
+        means = ((gaussians.means.double() - centre) / self.unit).float()
         return replace(gaussians, means=means, scales=gaussians.scales / self.unit, encoded=None)
 
     def move_camera(self, camera: Camera) -> Camera:
@@ -77,8 +83,19 @@ def compute_page_frame(gaussians: Gaussians) -> PageFrame:
     return PageFrame(centre, 2.0**power)
 
 
-def make_page(viewer_content: ViewerContent, libraries: Libraries) -> tuple[bytes, tuple[str, ...]]:
-    """Make the page, and sentences on missing content; the same values give the same bytes."""
+def is_within_page(gaussians: Gaussians, frame: PageFrame) -> Bool[Tensor, "n"]:
+    """Find the Gaussians that are near enough to be shown."""
+    # .spz has fixed-point positions: what lies beyond their range cannot be written.
+    return frame.normalize(gaussians).means.norm(dim=1) <= MAX_DISTANCE
+
+
+def make_page(
+    viewer_content: ViewerContent, libraries: Libraries, is_live: bool = False
+) -> tuple[bytes, tuple[str, ...]]:
+    """Make the page, and sentences on missing content; the same values give the same bytes.
+
+    A live page may ask the server that it came from, and no other.
+    """
     frame = compute_page_frame(viewer_content.after)
     after = viewer_content.after
     parts = {} if viewer_content.before is None else {"before": viewer_content.before}
@@ -86,9 +103,9 @@ def make_page(viewer_content: ViewerContent, libraries: Libraries) -> tuple[byte
         "observed": after[after.generated == 0],
         "generated": after[after.generated > 0],
     }
-    layers = {name: frame.normalize(part.to("cpu")) for name, part in parts.items()}
-    # .spz has fixed-point positions: what lies beyond their range cannot be written.
-    shown = {name: part[part.means.norm(dim=1) <= MAX_DISTANCE] for name, part in layers.items()}
+    parts = {name: part.to("cpu") for name, part in parts.items()}
+    layers = {name: frame.normalize(part) for name, part in parts.items()}
+    shown = {name: part[is_within_page(parts[name], frame)] for name, part in layers.items()}
     sources = {name: encode_spz(Path(name), part) for name, part in shown.items() if len(part) > 0}
     if not sources.keys() - {"before"}:
         raise InputError(f"{quote_value(viewer_content.title)} has nothing that a page can show.")
@@ -109,6 +126,7 @@ def make_page(viewer_content: ViewerContent, libraries: Libraries) -> tuple[byte
         "layers": layer_sources,
         "antialiased": {name: part.is_antialiased for name, part in layers.items()},
         "path": plan_path([camera.camera for camera in cameras]),
+        "live": is_live,
         "shots": [describe_camera(camera, frame, landmarks) for camera in cameras],
         **vars(libraries),
     }
@@ -183,13 +201,19 @@ def fill_template(content: Mapping[str, Any], scripts: Sequence[str]) -> str:
     """
     texts = {
         "title": html.escape(str(content["title"])),
+        "origins": "'self' data: blob:" if content["live"] else "data: blob:",
         "style": read_asset("viewer.css"),
-        "program": read_asset("viewer.js"),
+        "program": read_program(),
         "parts": "\n".join(scripts),
         # `</script>` in a text would end the element.
         "data": json.dumps(content, sort_keys=True).replace("<", "\\u003c"),
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda name: texts[name[1]], read_asset("viewer.html"))
+
+
+def read_program() -> str:
+    """Read the page's program: its files, one after the other, share their names."""
+    return "".join(read_asset(f"{name}.js") for name in PROGRAM)
 
 
 def read_asset(name: str) -> str:

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import os
-import sys
 import webbrowser
 from contextlib import suppress
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import ThreadingHTTPServer
 
 from gscompleter.apps.commands.view import ViewOptions
 from gscompleter.apps.viewer import packages
@@ -16,6 +15,7 @@ from gscompleter.apps.viewer.exhibit import (
     load_viewer_completion,
     load_viewer_files,
 )
+from gscompleter.apps.viewer.http import HTML, PageHandler, PageServer
 from gscompleter.apps.viewer.page import make_page
 from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.sog import META
@@ -88,35 +88,17 @@ def load_content(options: ViewOptions) -> ViewerContent:
 def make_page_server(page: bytes, port: int = 0) -> ThreadingHTTPServer:
     """Make a server on `port` (0 for any) that shows the page to browsers of this machine."""
 
-    class Handler(BaseHTTPRequestHandler):
+    class Handler(PageHandler):
         def do_GET(self) -> None:
             if self.headers.get("Host", "").rsplit(":", 1)[0].lower() not in HOST_NAMES:
                 self.send_error(421, "This server answers to 127.0.0.1 and localhost only")
             elif self.path != "/":
                 self.send_error(404)
             else:
-                self.send_page()
-
-        def send_page(self) -> None:
-            self.send_response(200)
-            self.send_header("Content-Type", "text/html; charset=utf-8")
-            self.send_header("Content-Length", str(len(page)))
-            self.send_header("Cross-Origin-Resource-Policy", "same-origin")
-            self.send_header("Cache-Control", "no-store")
-            self.end_headers()
-            self.wfile.write(page)
-
-        def log_message(self, format: str, *args: object) -> None:
-            """Log nothing."""
-
-    class Server(ThreadingHTTPServer):
-        def handle_error(self, request: object, client_address: object) -> None:
-            """Ignore a browser that leaves while it is answered; report any other error."""
-            if not isinstance(sys.exc_info()[1], ConnectionError):
-                super().handle_error(request, client_address)  # type: ignore[arg-type]
+                self.send_content(page, HTML)
 
     try:
-        return Server((ADDRESS, port), Handler)
+        return PageServer((ADDRESS, port), Handler)
     except OSError as error:
         raise InputError(
             f"Port {port} of {ADDRESS} is not available ({error.strerror}); name another one.",

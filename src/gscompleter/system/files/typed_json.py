@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TypeVar
 
@@ -16,15 +17,26 @@ def read_typed_json(kind: type[T], path: Path, advice: str) -> T:
 
     Keys that the dataclass does not have are ignored.
     """
+    return _validate(kind, read_json(path, advice), quote_value(path), advice)
+
+
+def parse_typed_json(kind: type[T], content: bytes, name: str, advice: str) -> T:
+    """Parse JSON as a dataclass; sentences call it `name`, and end with `advice`."""
+    try:
+        parsed = json.loads(content)
+    except (ValueError, RecursionError):
+        raise InputError(f"{name} is no JSON; {advice}.") from None
+    return _validate(kind, parsed, name, advice)
+
+
+def _validate(kind: type[T], content: object, name: str, advice: str) -> T:
     from pydantic import TypeAdapter, ValidationError  # no help page waits for it
 
-    content = read_json(path, advice)
     try:
         return TypeAdapter(kind).validate_python(content)
     except ValidationError as error:
         defect = error.errors(include_url=False)[0]
         place = ".".join(str(part) for part in defect["loc"]) or "its content"
         raise InputError(
-            f"{quote_value(path)} is damaged ({quote_value(place)}: {quote_value(defect['msg'])}); "
-            f"{advice}."
+            f"{name} is damaged ({quote_value(place)}: {quote_value(defect['msg'])}); {advice}."
         ) from None

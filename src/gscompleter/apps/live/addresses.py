@@ -1,0 +1,100 @@
+"""Where the live page is served, and who may ask for it."""
+
+from __future__ import annotations
+
+import errno
+import ipaddress
+import os
+import re
+import socket
+from dataclasses import dataclass
+from urllib.parse import urlsplit
+
+from gscompleter.system.errors import InputError, quote_value
+
+LOCAL_HOST = re.compile(r"(127(\.\d{1,3}){3}|\[::1\]|localhost)(:\d+)?", re.IGNORECASE)
+"""Names of this machine in a request; any other may be a DNS rebinding attack by a website."""
+
+
+@dataclass(frozen=True)
+class Address:
+    """An address of this machine, as the system knows it."""
+
+    family: socket.AddressFamily
+    host: str
+    """Number of the address, in which all spellings of it are the same."""
+
+    @property
+    def is_local(self) -> bool:
+        """Return True if only programs of this machine can reach it."""
+        # An IPv4 address may be written as IPv6, "::ffff:127.0.0.1"; a zone follows after "%".
+        number = ipaddress.ip_address(self.host.partition("%")[0])
+        return (getattr(number, "ipv4_mapped", None) or number).is_loopback
+
+    def make_url(self, port: int) -> str:
+        """Return the address of a page."""
+        host = f"[{self.host}]" if self.family == socket.AF_INET6 else self.host
+        return f"http://{host}:{port}/"
+
+    def knows_host(self, host: str) -> bool:
+        """Return True if a request for `host` may be meant for this address."""
+        if not self.is_local:
+            return True
+        own = self.make_url(0).removeprefix("http://").removesuffix(":0/")
+        name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
+        return LOCAL_HOST.fullmatch(host) is not None or name.lower() == own.lower()
+
+    def knows_origin(self, host: str, origin: str | None) -> bool:
+        """Return True if a request for `host` comes from the page itself, or from a program.
+
+        Any page in a browser may send requests here; only `Origin` shows its source. Programs send
+        none.
+        """
+        if origin is None:
+            return True
+        try:
+            return urlsplit(origin).netloc.lower() == host.lower() != ""
+        except ValueError:  # no address at all
+            return False
+
+
+def resolve_host(host: str) -> Address:
+    """Find the address that a host name stands for, or any spelling of an address."""
+    try:
+        family, *_, place = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
+    except (OSError, UnicodeError) as error:
+        reason = getattr(error, "strerror", None) or "no name of a host"
+        raise InputError(
+            f"'{quote_value(host)}' is no address of this machine ({reason}); name another one, "
+            "such as 127.0.0.1.",
+            "host",
+        ) from error
+    return Address(family, str(place[0]))
+
+
+def check_bindable(address: Address, host: str, port: int) -> None:
+    """Raise an InputError if a server cannot listen at an address, which `host` stands for."""
+    try:
+        socket.create_server((address.host, port), family=address.family).close()
+    except OSError as error:
+        raise explain_bind_error(error, host, port) from error
+
+
+def explain_bind_error(error: OSError, host: str, port: int) -> InputError:
+    """Make the sentence why a server cannot listen."""
+    if error.errno in (errno.EADDRINUSE, errno.EACCES):
+        return InputError(
+            f"{quote_value(host)} cannot use port {port} ({describe_error(error)}); choose "
+            "another port.",
+            "port",
+        )
+    return InputError(
+        f"{quote_value(host)} is no address of this machine ({describe_error(error)}); name "
+        "another one, such as 127.0.0.1.",
+        "host",
+    )
+
+
+def describe_error(error: OSError) -> str:
+    """Return the system's words for an error, without those that Python adds to some."""
+    return str(error) if error.errno is None else os.strerror(error.errno)
