@@ -342,6 +342,12 @@ def filmed(scene, tmp_path_factory) -> Path:
 def test_a_video_passes_the_targets(filmed):
     content = json.loads((filmed / "holes.json").read_text())
     path = content["path"]
+    # At a target the video has the mask of the target.
+    masks = list(read_video(filmed / path["hole_mask_path"], "null", is_grey=False))
+    for entry in content["frames"]:
+        own = np.asarray(Image.open(filmed / entry["hole_mask_path"]).convert("L")) > 127
+        shown = masks[entry["path_frame"]][..., 0] > 127
+        assert (own != shown).mean() < 0.01
     frames = list(read_video(filmed / path["video_path"], "null", is_grey=False))
     masks = list(read_video(filmed / path["hole_mask_path"], "null", is_grey=False))
     assert len(frames) == len(masks) == len(path["cameras"]) == path["num_frames"]

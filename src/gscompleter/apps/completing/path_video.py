@@ -26,10 +26,10 @@ from gscompleter.apps.report.film import (
 )
 from gscompleter.data.scene import describe_camera
 from gscompleter.generators.warp import BORDER_WIDTH
-from gscompleter.numerics.geometry import measure_baseline, resize_camera
+from gscompleter.numerics.geometry import measure_baseline, pad_camera, resize_camera
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.splats.alignment.similarity import transform_camera_exactly
-from gscompleter.stages.target_view import compute_hole_mask
+from gscompleter.stages.target_view import render_target
 from gscompleter.state import Completion
 from gscompleter.system.files.image import convert_to_pixels
 from gscompleter.system.files.reading import hash_file
@@ -107,12 +107,13 @@ def render_path(
     cameras: Sequence[Camera],
     masks: list[UInt8[np.ndarray, "h w 3"]],
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
-    """Render the scene along a path, and append the mask of each frame to `masks`."""
-    scenes = ready.completer.scenes
+    """Render the scene along a path, and append the mask of each frame to `masks`.
+
+    What a hole is, is decided as at a target: marked, enclosed by an object, or empty.
+    """
     for camera in track(cameras, "video"):
         placed = begun.with_depth_range(camera.to(ready.task.device))
-        frozen = scenes.freeze(begun.parts, placed)
-        alpha = begun.trust.compute_alpha(frozen, placed)
-        mask = dilate(compute_hole_mask(alpha, begun.config.holes), BORDER_WIDTH)
+        view = render_target(begun, pad_camera(placed, 0.0), ready.completer.scenes)
+        mask = dilate(view.holes, BORDER_WIDTH)
         masks.append(np.repeat(convert_to_pixels(mask)[..., None], 3, axis=-1))
-        yield convert_to_pixels(frozen.render.image)
+        yield convert_to_pixels(view.render.image)
