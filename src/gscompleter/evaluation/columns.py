@@ -97,6 +97,7 @@ def _make_agreements(path: str, title: str, key: str = "registered") -> tuple[Co
 # Places of PSNR at the target, beside it, and at the photographs of the context.
 BEFORE = "target_before.psnr"
 AFTER = "target_after.psnr"
+NEAR_GAPS = "neighbours_thin_gaps.after"
 NEAR_BEFORE = "neighbours_psnr.before"
 NEAR_AFTER = "neighbours_psnr.after"
 SEEN_BEFORE = "context_psnr.before"
@@ -132,6 +133,12 @@ GROUPS = {
         _make_median(
             "observed_gradients", "gradient energy (observed)", 2, "observed.gradient_energy"
         ),
+    ),
+    # Shares of the image; 0 is the best.
+    "Thin gaps": (
+        Column("thin_gaps", "thin gaps", 5, "thin_gaps.after"),
+        Column("neighbours_thin_gaps", "thin gaps (neighbour views)", 5, NEAR_GAPS),
+        Column("flight_thin_gaps", "thin gaps (flight to the target)", 5, "flight_thin_gaps.after"),
     ),
     "Geometry": (
         _make_geometry(

@@ -32,6 +32,7 @@ from gscompleter.config.settings import COVERED
 from gscompleter.editing.removal import hide_removed
 from gscompleter.evaluation.metrics.coverage import RenderPair, compute_coverage
 from gscompleter.evaluation.metrics.image import compute_masked_psnr, ssim
+from gscompleter.evaluation.metrics.thin_gaps import measure_thin_gaps
 from gscompleter.evaluation.verdict.held_out import HeldOut, render_before_after, score_held_out
 from gscompleter.evaluation.verdict.outcome import judge_completion
 from gscompleter.evaluation.verdict.rows import ScoreRow
@@ -246,6 +247,7 @@ def make_target_row(
         notes=result.notes,
         refused=result.refusal,
         offset=target.offset,
+        thin_gaps=measure_thin_gaps(result.after.alpha),
         painter=result.painter or None,
     )
 

@@ -89,6 +89,8 @@ class TargetRow(ScoreRow):
     """Move and turn from that photograph, in words."""
     anchor_file: str | None = None
     """File of the anchor's photograph."""
+    thin_gaps: float = 0.0
+    """Share of the image that is cracks thinner than 5 pixels, afterwards."""
     painter: str | None = None
     """Who painted the image from which Gaussians were added; None if a generator made it."""
 

@@ -22,6 +22,7 @@ from gscompleter.evaluation.metrics.image import (
     ssim,
 )
 from gscompleter.evaluation.metrics.perceptual import compute_flip_map, compute_lpips, haarpsi
+from gscompleter.evaluation.metrics.thin_gaps import measure_flight, measure_thin_gaps
 from gscompleter.render.protocols import Renderer
 from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.types import Camera, DepthMap, Gaussians, Render, View
@@ -95,6 +96,11 @@ class Scores:
     """Added Gaussians against the context (`geometry.measure_alignment`)."""
     registered: SurfaceAgreement | None
     """All registered Gaussians against the context, before filtering."""
+    thin_gaps: Change
+    """Share of thin gaps at the target (`thin_gaps.measure_thin_gaps`)."""
+    neighbours_thin_gaps: tuple[Change, ...]
+    flight_thin_gaps: Change
+    """The same on the way from the nearest photograph to the target."""
 
 
 @dataclass(frozen=True)
@@ -126,10 +132,9 @@ def score(
     holes = compute_hole_mask(was.alpha)
     covered = now.depth_map().valid & target.valid_mask
 
-    def render_both(views: Sequence[View]) -> list[list[Image]]:
+    def render_both(views: Sequence[View]) -> list[list[Render]]:
         return [
-            [renderer.render(scene, view.camera).image for scene in (before, after)]
-            for view in views
+            [renderer.render(scene, view.camera) for scene in (before, after)] for view in views
         ]
 
     context = render_both(truth.views)
@@ -148,6 +153,8 @@ def score(
     if added:
         seam_step = measure_seam_step(added, was, camera, renderer)
         agreement = measure_alignment(added, before, camera, renderer)
+    photographs = [view.camera for view in truth.views]
+    flights = [measure_flight(scene, photographs, camera, renderer) for scene in (before, after)]
     lifted = None
     if registered:
         lifted = measure_primitive_alignment(registered, before, camera, renderer)
@@ -165,6 +172,11 @@ def score(
         seam_step=seam_step,
         added=agreement,
         registered=lifted,
+        thin_gaps=Change(measure_thin_gaps(was.alpha), measure_thin_gaps(now.alpha)),
+        neighbours_thin_gaps=tuple(
+            Change(*(measure_thin_gaps(render.alpha) for render in pair)) for pair in beside
+        ),
+        flight_thin_gaps=Change(*flights),
     )
     return scores, TargetRenders(was, now, holes)
 
@@ -241,10 +253,12 @@ def compute_median(values: Float[Tensor, "h w"], where: Bool[Tensor, "h w"]) -> 
 
 
 def compare_views(
-    pairs: Sequence[Sequence[Image]],
+    pairs: Sequence[Sequence[Render]],
     views: Sequence[View],
     metric: Callable[[Image, View], float],
 ) -> tuple[Change, ...]:
     """Compute a metric for each view, whose renders before and after are `pairs`."""
     both = zip(pairs, views, strict=True)
-    return tuple(Change(metric(was, view), metric(now, view)) for (was, now), view in both)
+    return tuple(
+        Change(metric(was.image, view), metric(now.image, view)) for (was, now), view in both
+    )
