@@ -1,0 +1,176 @@
+"""What a GPU is asked to do, on a CUDA device that is none: see `support/fake_cuda.py`.
+
+No tensors of two devices meet, gsplat is given float32 alone, nothing reads memory that its kernels
+leave unset, and no stage makes the host wait more often than it has to.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+
+from fake_cuda import CUDA, Counts, FakeCudaTensor
+from fake_gsplat import WHEEL, fake_gsplat, find_gsplat
+from gscompleter import CompleterConfig, GSCompleter, load_renderer
+from gscompleter.render.device import Devices, choose_devices
+from gscompleter.render.gsplat import CudaRenderer
+from gscompleter.system.timing import STAGES
+from gscompleter.types import View
+from parity import assert_close
+from render_scenes import CAMERA, REFERENCE, SCENES, compute_gradients, in_dtype
+from scenes import Room, camera_at, view_of
+
+pytestmark = [
+    pytest.mark.skipif(
+        find_gsplat() is None,
+        reason=f"needs {WHEEL} in .whl: pip download --no-deps gsplat==1.5.3 -d .whl",
+    ),
+    pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU"),
+]
+
+CONFIGS = {"default": CompleterConfig(), "paper": CompleterConfig.paper()}
+SIZES = {"default": 32, "paper": 24}
+MOST_WAITS = {
+    "default": {"context": 127, "generate": 40, "lift": 46, "register": 65, "integrate": 169},
+    "paper": {"context": 72, "generate": 42, "lift": 59, "register": 143, "integrate": 15},
+}
+"""Waits of the host in each stage of a completion of two photographs (docs/performance.md)."""
+
+
+@pytest.fixture
+def device() -> Iterator[Counts]:
+    with fake_gsplat() as counts:
+        yield counts
+
+
+def make_views(size: int, places: tuple[float, ...] = (-0.3, 0.1)) -> list[View]:
+    return [view_of(Room(), camera_at(x, size=size), i) for i, x in enumerate(places)]
+
+
+def test_tensors_of_two_devices_do_not_meet(device):
+    there = torch.ones(2, 3).to("cuda")
+    assert there.device == CUDA
+    assert torch.zeros(2, device=there.device).is_cuda
+    assert there[:1].new_tensor([1.0, 2.0]).is_cuda
+    # A single number may be of the host; several, or a position to copy it to, may not.
+    assert (there * torch.tensor(2.0)).tolist() == [[2.0] * 3] * 2
+    for mix in (
+        lambda: there + torch.ones(2, 3),
+        lambda: torch.ones(2, 3) @ there.T,
+        lambda: torch.cat([there[0], torch.ones(3)]),
+        lambda: torch.stack([there.mean(), torch.tensor(1.0)]),
+        lambda: torch.ones(2)[there[0].long()],
+    ):
+        with pytest.raises(RuntimeError, match="same device"):
+            mix()
+    with pytest.raises(RuntimeError, match="generator"):
+        torch.rand(3, device="cuda", generator=torch.Generator())
+    for read in (there.numpy, lambda: np.asarray(there)):
+        with pytest.raises(TypeError, match="numpy"):
+            read()
+
+
+def test_gradients_cross_between_devices(device):
+    here = torch.ones(3, requires_grad=True)
+    loss = (here.to("cuda") ** 2).cpu().sum()
+    (gradient,) = torch.autograd.grad(loss, here)
+    assert gradient.device.type == "cpu"
+    assert gradient.tolist() == [2.0] * 3
+
+
+def test_waits_are_counted_where_the_host_reads_or_copies(device):
+    values = torch.arange(4.0).to("cuda")
+    assert device.waits.total() == 1
+    values[values > 2] = 0.0  # one number for all of them needs no positions
+    assert torch.where(values > 0, values, 1.0).sum().is_cuda
+    assert device.waits.total() == 1
+    for wait in (
+        lambda: values.sum().item(),
+        lambda: values[values > 0],
+        lambda: values.nonzero(),
+        lambda: values.cpu(),
+        lambda: values.tolist(),
+        lambda: values.new_tensor([1.0, 2.0]),
+        lambda: torch.linalg.inv(torch.eye(2, device="cuda")),
+        lambda: bool(values.any()),
+    ):
+        before = device.waits.total()
+        wait()
+        assert device.waits.total() == before + 1
+
+
+@pytest.mark.parametrize("name", ["strange-harmonics", "antialiased-random"])
+def test_gsplat_draws_what_the_reference_draws(device, name):
+    scene, exact = SCENES[name], in_dtype(SCENES[name], torch.float64)
+    drawn = CudaRenderer().render(scene.to("cuda"), CAMERA.to("cuda"))
+    truth = REFERENCE.render(exact, CAMERA)
+    for part in ("image", "alpha"):
+        assert_close(getattr(drawn, part).cpu(), getattr(truth, part), part, 1e-5)
+    covered = truth.alpha > 0.05
+    assert_close(drawn.depth.cpu() * covered, truth.depth * covered, "depth", 1e-5)
+    ours = compute_gradients(
+        CudaRenderer(), scene.to("cuda"), covered.to("cuda"), CAMERA.to("cuda")
+    )
+    for parameter, expected in compute_gradients(REFERENCE, exact, covered).items():
+        assert_close(ours[parameter].cpu(), expected, f"gradient of {parameter}", 1e-4)
+
+
+def test_what_kernels_leave_unset_is_nan_and_is_not_read(device):
+    scene = SCENES["strange"].to("cuda")
+    binned = CudaRenderer().bin_gaussians(scene, CAMERA.to("cuda"))
+    shown = CudaRenderer().find_visible(scene, CAMERA.to("cuda")).cpu()
+    assert 0 < shown.sum() < len(shown)
+    assert torch.equal(binned.means2d[0].cpu().isfinite().all(dim=-1), shown)
+    weights = binned.backproject(torch.zeros_like(scene.means), torch.ones(48, 48, 3).to("cuda"))
+    assert torch.equal((weights.cpu() > 0).all(dim=-1) & ~shown, torch.zeros_like(shown))
+    assert weights.cpu().isfinite().all()
+
+
+def test_the_compiled_module_is_given_float32_alone(device):
+    from gsplat import rasterize_to_pixels
+
+    scene = in_dtype(SCENES["harmonics"], torch.float64).to("cuda")
+    render = CudaRenderer().render(scene, CAMERA.to("cuda"))
+    assert render.image.dtype == torch.float32
+    # What the cast at the boundary prevents:
+    binned = CudaRenderer().bin_gaussians(scene, CAMERA.to("cuda"))
+    with pytest.raises(RuntimeError, match="Float but found torch.float64"):
+        rasterize_to_pixels(
+            binned.means2d,
+            binned.conics,
+            scene.means[None],
+            binned.opacities,
+            binned.width,
+            binned.height,
+            binned.tile_size,
+            binned.tile_offsets,
+            binned.rows,
+        )
+
+
+def test_auto_chooses_a_gpu_that_draws(device):
+    assert choose_devices("auto") == Devices("cuda", "cuda")
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_completion_stays_on_the_device_and_waits_no_more_than_it_has_to(device, name):
+    views = make_views(SIZES[name])
+    target = camera_at(0.5, yaw=10, size=SIZES[name])
+    complete = GSCompleter(renderer=load_renderer("cuda"), config=CONFIGS[name])
+    there = [view.to("cuda") for view in views]
+    target_there = target.to("cuda")
+    done = complete(there, target_there)
+    assert isinstance(done.scene.means, FakeCudaTensor)
+    assert done.scene.means.cpu().isfinite().all()
+    plain = replace(complete, renderer=load_renderer("cpu"))(views, target)
+    assert len(done.added) == len(plain.added) > 100
+    # Rounding grows in the optimisation, so that only what hardly moves is compared.
+    difference = (done.added.means.cpu() - plain.added.means).norm(dim=1)
+    assert difference.median() < 0.01
+    for stage in STAGES:
+        found = device.count_waits(stage)
+        assert found <= MOST_WAITS[name][stage], f"{stage}:\n{device.list_waits(stage)}"
