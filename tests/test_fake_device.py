@@ -6,23 +6,31 @@ leave unset, and no stage makes the host wait more often than it has to.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from command import run
 from fake_cuda import CUDA, Counts, FakeCudaTensor
 from fake_gsplat import WHEEL, fake_gsplat, find_gsplat
 from gscompleter import CompleterConfig, GSCompleter, load_renderer
+from gscompleter.apps.batch import engine
 from gscompleter.render.device import Devices, choose_devices
 from gscompleter.render.gsplat import CudaRenderer
 from gscompleter.system.timing import STAGES
-from gscompleter.types import View
+from gscompleter.splats.ply import load_ply, save_ply
+from gscompleter.system.jobs.jobs import Pool, Share
+from gscompleter.types import View, merge
 from parity import assert_close
 from render_scenes import CAMERA, REFERENCE, SCENES, compute_gradients, in_dtype
-from scenes import Room, camera_at, view_of
+from scenes import Room, camera_at, gaussians_of, photographed, view_of
 
 pytestmark = [
     pytest.mark.skipif(
@@ -174,3 +182,56 @@ def test_a_completion_stays_on_the_device_and_waits_no_more_than_it_has_to(devic
     for stage in STAGES:
         found = device.count_waits(stage)
         assert found <= MOST_WAITS[name][stage], f"{stage}:\n{device.list_waits(stage)}"
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Path:
+    """Write photographs of the room, and a splat of what the first two show."""
+    cameras = [camera_at(x, yaw=yaw, size=32) for x, yaw in ((-0.4, 4), (0.0, 0), (0.4, -4))]
+    folder = photographed(tmp_path_factory.mktemp("fake") / "room", cameras)
+    seen = [gaussians_of(view_of(Room(), camera)) for camera in cameras[:2]]
+    save_ply(folder / "splat.ply", merge(seen))
+    return folder
+
+
+def test_a_given_splat_is_completed_cut_and_cleaned(device, room, tmp_path, monkeypatch):
+    common = ("--scene", room / "splat.ply", "--device", "cuda", "--resolution", 32, 32, "--quiet")
+    planes = ("--near", 0.5, "--far", 20)
+    out = tmp_path / "completed"
+    words = ("complete", room, "--context", 0, 1, "--target", 2, "--out", out)
+    assert run(monkeypatch, *words, *common, *planes) == 0
+    assert json.loads((out / "summary.json").read_text())["device"] == "cuda"
+    assert len(load_ply(out / "completed.ply")) > len(load_ply(room / "splat.ply"))
+
+    box = ("--box", -0.6, 0.2, 2.1, 0.4, 1.47, 3.1)
+    words = ("remove", room, *box, "--auto", 1, "--out", tmp_path / "cut")
+    assert run(monkeypatch, *words, *common, *planes) == 0
+    assert len(load_ply(tmp_path / "cut" / "removed.ply")) > 50
+
+    words = ("clean", room, "--out", tmp_path / "cleaned")
+    assert run(monkeypatch, *words, *common) == 0
+    assert (tmp_path / "cleaned" / "completed.ply").is_file()
+
+
+@contextmanager
+def open_here(workers: int) -> Iterator[Pool]:
+    """Open a pool whose shares run in this process, which alone has the fake device."""
+
+    def start(share: Share) -> Future[Exception | None]:
+        future: Future[Exception | None] = Future()
+        future.set_result(share())
+        return future
+
+    yield Pool(workers, start)
+
+
+def test_a_batch_completes_on_the_device(device, room, tmp_path, monkeypatch):
+    row = {"folder": str(room), "context": [0, 1], "target": [2], "near": 0.5, "far": 20}
+    manifest = tmp_path / "manifest.jsonl"
+    manifest.write_text(json.dumps(row | {"resolution": 32, "device": "cuda"}) + "\n")
+    monkeypatch.setattr(engine, "open_local", open_here)
+    out = tmp_path / "out"
+    words = ("batch", manifest, "--out", out, "--workers", 1, "--quiet")
+    assert run(monkeypatch, *words) == 0
+    (summary,) = out.rglob("summary.json")
+    assert json.loads(summary.read_text())["device"] == "cuda"

@@ -13,6 +13,7 @@ handles what C++ would decide by the device.
 from __future__ import annotations
 
 import sys
+import threading
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -31,6 +32,7 @@ from gscompleter.system import timing
 
 CUDA = torch.device("cuda", 0)
 CPU = torch.device("cpu")
+_run_thread = threading.Thread.run
 BETWEEN_STAGES = "between stages"
 
 READING = {
@@ -49,6 +51,8 @@ READING = {
     "aten::linalg_lstsq": "check of a decomposition",
 }
 """Operations whose result, or its size, the host reads from the device."""
+TAKING_NUMBERS = ("aten::fill_", "aten::masked_fill_", "aten::masked_fill")
+"""Operations that take a single number of the CPU, beside those that work element by element."""
 ANY_DEVICE = ("aten::copy_", "aten::index", "aten::index_put", "aten::index_put_")
 """Operations that take tensors of the CPU beside those of the device."""
 NO_KERNEL = ("aten::empty", "aten::new_empty", "aten::detach", "aten::lift_fresh", "aten::alias")
@@ -229,13 +233,19 @@ class Download(torch.autograd.Function):
         return Upload.apply(gradient, False)
 
 
+class Thread(threading.local):
+    """What the device knows of a thread."""
+
+    is_in_call = False
+    """Whether a function of torch that was given tensors of the device is being run."""
+
+
 class FakeDevice:
     """The device: runs operations of torch, raises where devices mix, and counts."""
 
     def __init__(self) -> None:
         self.counts = Counts()
-        self.is_in_call = False
-        """Whether a function of torch that was given tensors of the device is being run."""
+        self.thread = Thread()
 
     def run(self, func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:
         """Run one operation of torch's C++ level, on tensors of either device."""
@@ -247,7 +257,7 @@ class FakeDevice:
             if name == "aten::_to_copy" and names_cuda:
                 return Upload.apply(func(*args, **kwargs | {"device": CPU}), False)
             # What a function of torch allocates for itself lies where its arguments are.
-            is_allocated = not given and self.is_in_call
+            is_allocated = not given and self.thread.is_in_call
             if not names_cuda and not is_allocated:
                 return func(*args, **kwargs)
         generator = kwargs.get("generator")
@@ -279,7 +289,7 @@ class FakeDevice:
         elif name in ANY_DEVICE:
             on_host = []
         # Kernels that work element by element take a single number from the host.
-        if torch.Tag.pointwise in func.tags or name in ANY_DEVICE:
+        if torch.Tag.pointwise in func.tags or name in (*ANY_DEVICE, *TAKING_NUMBERS):
             on_host = [x for x in on_host if x.dim() > 0]
         if on_host:
             raise RuntimeError(
@@ -384,14 +394,14 @@ class Functions(TorchFunctionMode):
                 kwargs = {name: value for name, value in kwargs.items() if name != "device"}
                 needs_gradient = kwargs.pop("requires_grad", False)
                 return move(func(*args, **kwargs), CUDA).requires_grad_(needs_gradient)
-        before = device.is_in_call
-        device.is_in_call = wanted is None and any(
+        before = device.thread.is_in_call
+        device.thread.is_in_call = wanted is None and any(
             isinstance(x, FakeCudaTensor) for x in find_tensors((args, kwargs))
         )
         try:
             return func(*args, **kwargs)
         finally:
-            device.is_in_call = before
+            device.thread.is_in_call = before
 
 
 _device: FakeDevice | None = None
@@ -407,6 +417,12 @@ def run_backward(*args: Any, **kwargs: Any) -> Any:
     """Run autograd's engine, with the mode of functions that its caller has left."""
     with Functions():  # for functions of autograd that are written in Python
         return _engine_run_backward(*args, **kwargs)
+
+
+def run_thread(thread: threading.Thread) -> None:
+    """Run a thread, with modes of its own."""
+    with Functions(), Operations():
+        _run_thread(thread)
 
 
 SEEN_BY_TORCH: dict[str, Any] = {
@@ -440,6 +456,7 @@ def fake_cuda() -> Iterator[Counts]:
     try:
         with (
             patch.multiple(torch.cuda, **SEEN_BY_TORCH),
+            patch.object(threading.Thread, "run", run_thread),
             patch.object(torch.autograd, "_engine_run_backward", run_backward),
             patch.object(timing, "record_function", _device.counts.inside),
             Functions(),
