@@ -41,7 +41,8 @@ pytestmark = [
 ]
 
 CONFIGS = {"default": CompleterConfig(), "paper": CompleterConfig.paper()}
-SIZES = {"default": 32, "paper": 24}
+SIZE = 24
+"""Sides of the photographs in pixels. The counts hardly depend on them."""
 MOST_WAITS = {
     "default": {"context": 127, "generate": 40, "lift": 46, "register": 65, "integrate": 169},
     "paper": {"context": 72, "generate": 42, "lift": 59, "register": 143, "integrate": 15},
@@ -55,8 +56,8 @@ def device() -> Iterator[Counts]:
         yield counts
 
 
-def make_views(size: int, places: tuple[float, ...] = (-0.3, 0.1)) -> list[View]:
-    return [view_of(Room(), camera_at(x, size=size), i) for i, x in enumerate(places)]
+def make_views(places: tuple[float, ...] = (-0.3, 0.1)) -> list[View]:
+    return [view_of(Room(), camera_at(x, size=SIZE), i) for i, x in enumerate(places)]
 
 
 def test_tensors_of_two_devices_do_not_meet(device):
@@ -166,8 +167,8 @@ def test_auto_chooses_a_gpu_that_draws(device):
 
 @pytest.mark.parametrize("name", CONFIGS)
 def test_a_completion_stays_on_the_device_and_waits_no_more_than_it_has_to(device, name):
-    views = make_views(SIZES[name])
-    target = camera_at(0.5, yaw=10, size=SIZES[name])
+    views = make_views()
+    target = camera_at(0.5, yaw=10, size=SIZE)
     complete = GSCompleter(renderer=load_renderer("cuda"), config=CONFIGS[name])
     there = [view.to("cuda") for view in views]
     target_there = target.to("cuda")
@@ -194,28 +195,31 @@ def room(tmp_path_factory) -> Path:
     return folder
 
 
-def test_a_given_splat_is_completed_cut_and_cleaned(device, room, tmp_path, monkeypatch):
-    common = ("--scene", room / "splat.ply", "--device", "cuda", "--resolution", 32, 32, "--quiet")
-    planes = ("--near", 0.5, "--far", 20)
-    out = tmp_path / "completed"
-    words = ("complete", room, "--context", 0, 1, "--target", 2, "--out", out)
-    assert run(monkeypatch, *words, *common, *planes) == 0
-    assert json.loads((out / "summary.json").read_text())["device"] == "cuda"
-    assert len(load_ply(out / "completed.ply")) > len(load_ply(room / "splat.ply"))
+def test_a_given_splat_is_completed_with_photographs_that_check_it(device):
+    views = [view.to("cuda") for view in make_views((-0.3, 0.1, 0.2))]
+    scene = merge([gaussians_of(view.to("cpu")) for view in views[:2]]).to("cuda")
+    complete = GSCompleter(renderer=load_renderer("cuda"))
+    target = camera_at(0.5, yaw=10, size=SIZE).to("cuda")
+    done = complete(views[:2], target, scene, check_views=views)
+    assert isinstance(done.scene.means, FakeCudaTensor)
+    assert len(done.added) > 30
 
+
+def test_something_is_removed_and_a_splat_cleaned(device, room, tmp_path, monkeypatch):
+    common = ("--scene", room / "splat.ply", "--device", "cuda", "--resolution", 32, 32, "--quiet")
     box = ("--box", -0.6, 0.2, 2.1, 0.4, 1.47, 3.1)
-    words = ("remove", room, *box, "--auto", 1, "--out", tmp_path / "cut")
-    assert run(monkeypatch, *words, *common, *planes) == 0
+    words = ("remove", room, *box, "--auto", 1, "--near", 0.5, "--far", 20)
+    assert run(monkeypatch, *words, *common, "--out", tmp_path / "cut") == 0
+    assert json.loads((tmp_path / "cut" / "summary.json").read_text())["device"] == "cuda"
     assert len(load_ply(tmp_path / "cut" / "removed.ply")) > 50
 
-    words = ("clean", room, "--out", tmp_path / "cleaned")
-    assert run(monkeypatch, *words, *common) == 0
+    assert run(monkeypatch, "clean", room, *common, "--out", tmp_path / "cleaned") == 0
     assert (tmp_path / "cleaned" / "completed.ply").is_file()
 
 
 @contextmanager
 def open_here(workers: int) -> Iterator[Pool]:
-    """Open a pool whose shares run in this process, which alone has the fake device."""
+    """Open a pool whose shares run in this process, which alone has the device."""
 
     def start(share: Share) -> Future[Exception | None]:
         future: Future[Exception | None] = Future()
@@ -228,7 +232,7 @@ def open_here(workers: int) -> Iterator[Pool]:
 def test_a_batch_completes_on_the_device(device, room, tmp_path, monkeypatch):
     row = {"folder": str(room), "context": [0, 1], "target": [2], "near": 0.5, "far": 20}
     manifest = tmp_path / "manifest.jsonl"
-    manifest.write_text(json.dumps(row | {"resolution": 32, "device": "cuda"}) + "\n")
+    manifest.write_text(json.dumps(row | {"resolution": SIZE, "device": "cuda"}) + "\n")
     monkeypatch.setattr(engine, "open_local", open_here)
     out = tmp_path / "out"
     words = ("batch", manifest, "--out", out, "--workers", 1, "--quiet")

@@ -377,6 +377,8 @@ class Functions(TorchFunctionMode):
 
     def __torch_function__(self, func, types, args=(), kwargs=None):
         kwargs = kwargs or {}
+        if func.__name__ == "__get__":  # attributes, such as the shape
+            return func(*args)
         device = get_device()
         if func is Tensor.to:
             return move(*args, **kwargs)

@@ -409,16 +409,17 @@ def rasterize_to_pixels_3dgs_bwd(
 
 
 @numba.njit(cache=True)
-def measure_alpha(center, conic, opacity, x, y):
+def measure_alpha(means2d, conics, opacities, row, x, y):
     """Return offset and fall-off of a Gaussian in a pixel, and its alpha: 0 if it is too faint."""
-    dx = center[0] - (x + np.float32(0.5))
-    dy = center[1] - (y + np.float32(0.5))
-    sigma = np.float32(0.5) * (conic[0] * dx * dx + conic[2] * dy * dy) + conic[1] * dx * dy
+    dx = means2d[row, 0] - (x + np.float32(0.5))
+    dy = means2d[row, 1] - (y + np.float32(0.5))
+    sigma = np.float32(0.5) * (conics[row, 0] * dx * dx + conics[row, 2] * dy * dy)
+    sigma += conics[row, 1] * dx * dy
     # No opacity makes up for so far a distance; NaN goes on, as it would in gsplat.
     if sigma < 0 or sigma > np.float32(MAX_SIGMA**2):
         return dx, dy, np.float32(0), np.float32(0)
     falloff = np.exp(-sigma)
-    alpha = min(np.float32(MAX_ALPHA), opacity * falloff)
+    alpha = min(np.float32(MAX_ALPHA), opacities[row] * falloff)
     return dx, dy, falloff, np.float32(0) if alpha < np.float32(MIN_ALPHA) else alpha
 
 
@@ -444,7 +445,7 @@ def composite_forward(
                 left = np.float32(1)
                 for entry in range(start, end):
                     row = entries[entry]
-                    _, _, _, alpha = measure_alpha(means2d[row], conics[row], opacities[row], x, y)
+                    _, _, _, alpha = measure_alpha(means2d, conics, opacities, row, x, y)
                     if alpha == 0:
                         continue
                     after = left * (1 - alpha)
@@ -490,10 +491,7 @@ def composite_backward(
                     continue
                 for entry in range(last[image, y, x], start - 1, -1):
                     row = entries[entry]
-                    conic = conics[row]
-                    dx, dy, falloff, alpha = measure_alpha(
-                        means2d[row], conic, opacities[row], x, y
-                    )
+                    dx, dy, falloff, alpha = measure_alpha(means2d, conics, opacities, row, x, y)
                     if alpha == 0:
                         continue
                     left /= 1 - alpha
@@ -508,8 +506,10 @@ def composite_backward(
                         v_conics[row, 0] += np.float32(0.5) * v_sigma * dx * dx
                         v_conics[row, 1] += v_sigma * dx * dy
                         v_conics[row, 2] += np.float32(0.5) * v_sigma * dy * dy
-                        v_means2d[row, 0] += v_sigma * (conic[0] * dx + conic[1] * dy)
-                        v_means2d[row, 1] += v_sigma * (conic[1] * dx + conic[2] * dy)
+                        across = conics[row, 0] * dx + conics[row, 1] * dy
+                        down = conics[row, 1] * dx + conics[row, 2] * dy
+                        v_means2d[row, 0] += v_sigma * across
+                        v_means2d[row, 1] += v_sigma * down
                         v_opacities[row] += falloff * v_alpha
 
 
