@@ -24,9 +24,9 @@ from gscompleter import CompleterConfig, GSCompleter, load_renderer
 from gscompleter.apps.batch import engine
 from gscompleter.render.device import Devices, choose_devices
 from gscompleter.render.gsplat import CudaRenderer
-from gscompleter.system.timing import STAGES
 from gscompleter.splats.ply import load_ply, save_ply
 from gscompleter.system.jobs.jobs import Pool, Share
+from gscompleter.system.timing import STAGES
 from gscompleter.types import View, merge
 from parity import assert_close
 from render_scenes import CAMERA, REFERENCE, SCENES, compute_gradients, in_dtype

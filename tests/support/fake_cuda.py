@@ -123,13 +123,15 @@ class FakeCudaTensor(Tensor):
     @staticmethod
     def __new__(cls, values: Tensor) -> FakeCudaTensor:
         assert not isinstance(values, FakeCudaTensor)
-        wrapper = Tensor._make_wrapper_subclass(
-            cls,
-            values.size(),
-            strides=values.stride(),
-            storage_offset=values.storage_offset(),
-            dtype=values.dtype,
-        )
+        # Never a tensor of the inference mode: it could be no view of one from outside of it.
+        with torch.inference_mode(False):
+            wrapper = Tensor._make_wrapper_subclass(
+                cls,
+                values.size(),
+                strides=values.stride(),
+                storage_offset=values.storage_offset(),
+                dtype=values.dtype,
+            )
         wrapper.values = values
         return wrapper
 
@@ -144,7 +146,7 @@ class FakeCudaTensor(Tensor):
     is_cpu = property(lambda self: False)
 
     def get_device(self) -> int:
-        return 0
+        return CUDA.index
 
     def to(self, *args: Any, **kwargs: Any) -> Tensor:
         return move(self, *args, **kwargs)
@@ -171,6 +173,9 @@ class FakeCudaTensor(Tensor):
     def __repr__(self) -> str:  # type: ignore[override]
         return f"FakeCudaTensor({self.values!r})"
 
+    def __format__(self, form: str) -> str:
+        return format(self.item(), form) if self.dim() == 0 else super().__format__(form)
+
     def __deepcopy__(self, memo: dict[int, Any]) -> Tensor:
         copied = self.detach().clone().requires_grad_(self.requires_grad)
         memo[id(self)] = copied
@@ -186,8 +191,10 @@ def move(tensor: Tensor, *args: Any, **kwargs: Any) -> Tensor:
     else:
         device, dtype, wants_no_wait, memory_format = torch._C._nn._parse_to(*args, **kwargs)
     is_there = device is None or device.type == tensor.device.type
+    if "meta" in (tensor.device.type, device and device.type):
+        return Tensor.to(tensor, *args, **kwargs)
     if not is_there:
-        # The values are converted before they travel, or after, as CUDA does: on the device.
+        # Values are converted on the device: before they leave it, or after they reach it.
         if tensor.is_cuda:
             tensor = tensor if dtype is None else convert(tensor, dtype)
             return Download.apply(tensor)
