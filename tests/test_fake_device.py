@@ -208,7 +208,7 @@ def test_a_given_splat_is_completed_with_photographs_that_check_it(device):
 def test_something_is_removed_and_a_splat_cleaned(device, room, tmp_path, monkeypatch):
     common = ("--scene", room / "splat.ply", "--device", "cuda", "--resolution", 32, 32, "--quiet")
     box = ("--box", -0.6, 0.2, 2.1, 0.4, 1.47, 3.1)
-    words = ("remove", room, *box, "--auto", 1, "--near", 0.5, "--far", 20)
+    words = ("remove", room, *box, "--target", 1, "--near", 0.5, "--far", 20)
     assert run(monkeypatch, *words, *common, "--out", tmp_path / "cut") == 0
     assert json.loads((tmp_path / "cut" / "summary.json").read_text())["device"] == "cuda"
     assert len(load_ply(tmp_path / "cut" / "removed.ply")) > 50
