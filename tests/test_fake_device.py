@@ -44,8 +44,8 @@ CONFIGS = {"default": CompleterConfig(), "paper": CompleterConfig.paper()}
 SIZE = 24
 """Sides of the photographs in pixels. The counts hardly depend on them."""
 MOST_WAITS = {
-    "default": {"context": 127, "generate": 40, "lift": 46, "register": 65, "integrate": 169},
-    "paper": {"context": 72, "generate": 42, "lift": 59, "register": 143, "integrate": 15},
+    "default": {"context": 127, "generate": 40, "lift": 41, "register": 20, "integrate": 30},
+    "paper": {"context": 72, "generate": 42, "lift": 54, "register": 106, "integrate": 10},
 }
 """Waits of the host in each stage of a completion of two photographs (docs/performance.md)."""
 

@@ -190,7 +190,7 @@ class Objective:
 
     target_depth: DepthMap
     anchor_depth: DepthMap
-    unit: float
+    unit: Float[Tensor, ""]
     """Divisor of depth residuals, in scene units."""
     config: RegistrationConfig
 
@@ -209,9 +209,10 @@ class Objective:
         """
         target_depth = mask_out_sky(at_target, reference.camera)
         anchor_depth = mask_out_sky(at_anchor, anchor)
-        seen = anchor_depth.depth[anchor_depth.valid]
         # Residuals are relative to the median depth, so that the unit of the scene does not matter.
-        unit = seen.median().item() if len(seen) > 0 else 1.0
+        # Without any depth they are 0 anyway.
+        seen = anchor_depth.depth.where(anchor_depth.valid, torch.nan)
+        unit = seen.nanmedian().nan_to_num(1.0)
         return Objective(target_depth, anchor_depth, unit, config)
 
     def __call__(self, at_target: Render, at_anchor: Render) -> Float[Tensor, ""]:
