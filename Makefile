@@ -30,7 +30,7 @@ endif
 test: $(VENV)/installed-test $(GSPLAT_WHEEL)
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
-test-slow: $(VENV)/installed-test
+test-slow: $(VENV)/installed-test $(GSPLAT_WHEEL)
 	$(BIN)/python -m pytest -m slow
 
 # The net under a restructuring: `make golden` before it, `make check-golden` after it. ONLY=scenes|room|texts.
