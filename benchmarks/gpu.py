@@ -5,7 +5,8 @@
 
 benchmarks/gpu.sh sets up what it needs: torch with CUDA, gsplat and the test dependencies. Data are
 synthetic rooms and weights are random, so nothing is downloaded. The most valuable parts come
-first, and the report is written after each of them.
+first, and the report is written after each of them. GPU_SIZES="64x64 64x80" measures images of
+other sizes.
 """
 
 from __future__ import annotations
@@ -501,7 +502,14 @@ def build_random_klein(device: str) -> Any:
     )
 
 
-BENCH = Bench()
+def parse_size(text: str) -> tuple[int, int]:
+    """Parse a height and a width, such as 256x448."""
+    height, width = map(int, text.split("x"))
+    return height, width
+
+
+SIZES = os.environ.get("GPU_SIZES")
+BENCH = Bench() if SIZES is None else Bench(sizes=tuple(map(parse_size, SIZES.split())))
 GPU_TESTS = "tests/render/test_render.py"
 """File with all tests marked `gpu`: collecting the others takes half a minute."""
 PARTS = {

@@ -279,5 +279,5 @@ class Completion:
 
 def find_last_target_id(scene: Gaussians) -> int:
     """Find the largest target id in a scene; 0 if nothing was generated for a target."""
-    ids = scene.generated[scene.generated != NEW_PHOTO_ID]
+    ids = scene.generated.where(scene.generated != NEW_PHOTO_ID, 0)
     return int(ids.max()) if len(ids) else 0

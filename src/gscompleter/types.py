@@ -415,6 +415,9 @@ class Gaussians(TensorDataclass):
 
     def __getitem__(self, index: Tensor | slice) -> Gaussians:
         """Return the Gaussians at a boolean mask [n], integer indices [m] or a slice."""
+        # Every property would look for the rows of a mask by itself.
+        if isinstance(index, Tensor) and index.dtype == torch.bool:
+            index = index.nonzero()[:, 0]
         rows: dict[str, Any] = {
             name: value[index] for name, value in vars(self).items() if isinstance(value, Tensor)
         }

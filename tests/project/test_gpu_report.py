@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import os
+import shutil
 import subprocess
 import sys
 import time
@@ -12,8 +14,9 @@ import pytest
 import torch
 
 import gpu
+from fake_gsplat import WHEEL, find_gsplat
 from gpu_report import PartResult, Row, format_page
-from paths import ROOT
+from paths import ROOT, SUPPORT
 
 BENCHMARKS = ROOT / "benchmarks"
 SMALL = gpu.Bench("cpu", ((64, 64), (64, 80)), ("plane-sweep", "mvsplat-re10k"), ("float32",), 1)
@@ -249,3 +252,38 @@ def test_free_models_run_where_their_files_are(monkeypatch):
         "moge-2-large",
     ]
     assert {row.note for row in others} == {"its file is not on this machine"}
+
+
+@pytest.mark.slow
+@pytest.mark.linux
+@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
+@pytest.mark.skipif(find_gsplat() is None, reason=f"needs {WHEEL}: `make test` fetches it")
+def test_the_script_runs_on_a_machine_without_a_network(tmp_path):
+    """The fake CUDA device stands for the GPU, and a copy of the wheel for the network."""
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    (programs / "nvidia-smi").write_text("#!/bin/sh\necho 'GPU 0: fake'\n")
+    (programs / "nvidia-smi").chmod(0o755)
+    wheels = tmp_path / "wheels"
+    wheels.mkdir()
+    shutil.copy(find_gsplat(), wheels)
+    folders = (SUPPORT / "fake_gpu_machine", SUPPORT, ROOT / "src")
+    environment = os.environ | {
+        "PATH": f"{programs}:{os.environ['PATH']}",
+        "PYTHONPATH": ":".join(map(str, folders)),
+        "PYTHON": sys.executable,
+        "WHEELS": str(wheels),
+        "GPU_SIZES": "24x24",
+    }
+    out = tmp_path / "out"
+    # The others take minutes there.
+    parts = ("build", "agreement", "renderer")
+    command = ["bash", str(BENCHMARKS / "gpu.sh"), "--out", str(out), "--only", *parts]
+    done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
+    assert done.returncode == 0, done.stdout + done.stderr
+    report = json.loads((out / "gpu.json").read_text())
+    assert report["machine"]["device"] == "fake device"
+    assert list(report["parts"]) == list(parts)
+    rows = [row for part in report["parts"].values() for row in part["rows"]]
+    assert not any(row["failed"] for row in rows)
+    assert {"first picture", "random: largest difference of image"} <= {row["what"] for row in rows}

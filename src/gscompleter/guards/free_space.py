@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import max_pool2d
 
@@ -31,6 +31,8 @@ SLIDE_STEP = 0.04
 CLEARANCE = 0.01
 """Least distance behind an observed surface, relative to its depth, that counts as occluded.
 A Gaussian there is invisible to the camera and still closes the hole."""
+STEPS_AT_ONCE = 8
+"""Steps that a GPU tests together, without an answer in between for which the host would wait."""
 BORDER = 3
 """Pixels beyond the border of an image up to which a Gaussian there still shows inside."""
 FOOTPRINT_RADIUS = 3.0
@@ -59,7 +61,7 @@ class Observed:
         depth = surfaces.depth.where(surfaces.valid, 0.0)
         # The footprint is given in pixels of the target. A camera with a longer focal length sees
         # it over more of its own.
-        zoom = (camera.K[0, 0] / target.K[0, 0]).item()
+        zoom = (camera.on_cpu.K[0, 0] / target.on_cpu.K[0, 0]).item()
         radius = round(FOOTPRINT_RADIUS * zoom)
         side = 2 * radius + 1
         farthest = max_pool2d(depth[None, None], side, stride=1, padding=radius)[0, 0]
@@ -137,44 +139,62 @@ def respect_free_space(
         Observed.from_render(render, camera, target)
         for render, camera in zip(renders, cameras, strict=True)
     ]
-    # A position along a ray is a multiple of the distance that a Gaussian had at first.
+    # A position along a ray is a multiple of the distance that a Gaussian had at first, so that the
+    # result does not depend on the scene unit.
     ratio = torch.ones_like(gaussians.opacities)
     offsets = gaussians.means - target.center
-    waiting = torch.arange(len(gaussians), device=ratio.device)
-    for step in range(config.num_steps):
-        means = target.center + ratio[waiting, None] * offsets[waiting]
-        waiting = waiting[find_in_free_space(means, observed)]
-        if len(waiting) == 0:
+    is_waiting = torch.ones_like(ratio, dtype=torch.bool)
+    at_once = STEPS_AT_ONCE if ratio.is_cuda else 1
+    for start in range(0, config.num_steps, at_once):
+        rows = list_rows(is_waiting)
+        if len(rows) == 0:
             break
-        # Relative to the distance, so that the result does not depend on the scene unit.
-        ratio[waiting] = (1 + SLIDE_STEP) ** (step + 1)
+        count = min(at_once, config.num_steps - start)
+        steps = [(1 + SLIDE_STEP) ** step for step in range(start, start + count + 1)]
+        ratios = torch.tensor(steps).to(ratio.device, non_blocking=True)
+        means = target.center + ratios[:-1, None, None] * offsets[rows]
+        is_free = find_in_free_space(means.flatten(0, 1), observed).view(count, -1)
+        # The place is the first that is not in free space. What has none yet goes on behind.
+        num_steps = is_free.int().cumprod(dim=0).sum(dim=0)
+        still = is_waiting[rows]
+        ratio[rows] = torch.where(still, ratios[num_steps], ratio[rows])
+        is_waiting[rows] = still & (num_steps == count)
 
     # The steps may end before the sky. What still waits is placed just behind the depth at which
     # the sky is drawn. There it counts as occluded, unless another camera sees through it.
-    if any(is_sky_visible(render, camera) for render, camera in zip(renders, cameras, strict=True)):
-        depths = compute_z_depths(gaussians.means[waiting], target)
+    if is_sky_visible(renders, cameras):
+        rows = list_rows(is_waiting)
+        depths = compute_z_depths(gaussians.means[rows], target)
         behind = (1 + SLIDE_STEP) * compute_sky_depth(target) / depths
-        means = target.center + behind[:, None] * offsets[waiting]
-        is_placed = ~find_in_free_space(means, observed)
-        ratio[waiting[is_placed]] = behind[is_placed]
-        waiting = waiting[~is_placed]
+        means = target.center + behind[:, None] * offsets[rows]
+        is_placed = is_waiting[rows] & ~find_in_free_space(means, observed)
+        ratio[rows] = torch.where(is_placed, behind, ratio[rows])
+        is_waiting[rows] = is_waiting[rows] & ~is_placed
 
-    has_place = torch.ones_like(ratio, dtype=torch.bool)
-    has_place[waiting] = False
-    return slide(gaussians, target, ratio, footprint), has_place
+    return slide(gaussians, target, ratio, footprint), ~is_waiting
+
+
+def list_rows(chosen: Bool[Tensor, "n"]) -> Int64[Tensor, "m"]:
+    """List the rows to compute: those that are chosen, or all of them on a GPU.
+
+    There the host would wait for the number of rows longer than it takes to compute all.
+    """
+    if chosen.is_cuda:
+        return torch.arange(len(chosen), device=chosen.device)
+    return chosen.nonzero()[:, 0]
 
 
 def find_in_free_space(
     points: Float[Tensor, "n 3"], observed: Sequence[Observed]
 ) -> Bool[Tensor, "n"]:
     """Find points in front of an observed surface, or inside the near distance of a camera."""
-    # One camera is enough to exclude a point, so each tests only those that none did before it:
-    # with 40 photographs this halves the time of stage 4 (decision 045).
-    allowed = torch.arange(len(points), device=points.device)
+    is_free = torch.zeros(len(points), dtype=torch.bool, device=points.device)
     for surfaces in observed:
-        allowed = allowed[~is_before_surface(points[allowed], surfaces)]
-    is_free = torch.ones(len(points), dtype=torch.bool, device=points.device)
-    return is_free.index_fill(0, allowed, False)
+        # One camera is enough to exclude a point, so each tests only those that none did before it:
+        # with 40 photographs this halves the time of stage 4 (decision 045).
+        rows = list_rows(~is_free)
+        is_free[rows] = is_free[rows] | is_before_surface(points[rows], surfaces)
+    return is_free
 
 
 def is_before_surface(points: Float[Tensor, "n 3"], observed: Observed) -> Bool[Tensor, "n"]:
@@ -185,21 +205,22 @@ def is_before_surface(points: Float[Tensor, "n 3"], observed: Observed) -> Bool[
     """
     camera = observed.camera
     pixels, z = project(points, camera)
-    size = torch.tensor([camera.width, camera.height], device=pixels.device)
-    visible = (z > 0) & (pixels > -BORDER).all(-1) & (pixels < size + BORDER).all(-1)
+    x, y = pixels.unbind(-1)
+    visible = (z > 0) & (pixels > -BORDER).all(-1)
+    visible &= (x < camera.width + BORDER) & (y < camera.height + BORDER)
 
     # A mean just outside of the image reads the pixel at its border, since the Gaussian still
     # covers that. The pixels of invisible means, which may be infinite, are replaced first.
-    nearest = torch.where(visible[:, None], pixels, 0.0).long().clamp_min(0)
-    x, y = torch.minimum(nearest, size - 1).unbind(-1)
-    depth = observed.depth[y, x]
+    column = torch.where(visible, x, 0.0).long().clamp(0, camera.width - 1)
+    row = torch.where(visible, y, 0.0).long().clamp(0, camera.height - 1)
+    depth = observed.depth[row, column]
 
     # Depth is 0 where no surface is seen, so that nothing is in front of it.
     before = z < (1 + CLEARANCE) * depth
     # Half-way between an object and the wall, a mean is hidden by the object, but its footprint
     # shows beside the edge, before the wall (decision 049). It has to slide on to the wall. Where
     # its own pixel shows no surface, nothing hides it: it is in a hole of this camera and may stay.
-    beside = (depth > 0) & (z < (1 - FOOTPRINT_CLEARANCE) * observed.farthest[y, x])
+    beside = (depth > 0) & (z < (1 - FOOTPRINT_CLEARANCE) * observed.farthest[row, column])
     # The near distance counts in any direction, in the image or not: without this rule,
     # photographs of a capture lost up to 8.6 dB (decision 029).
     is_near = (points - camera.center).norm(dim=-1) < (camera.near or 0.0)

@@ -66,7 +66,9 @@ class PsnrGuard(Guard):
         # Ignored pixels show the additions themselves, and so say nothing about their colours.
         # Painted as the scene is without them, the black of its holes would be wanted there.
         wanted = [
-            image.paint_ignored(scene.composite(added).image)
+            image
+            if image.ignore_mask is None
+            else image.paint_ignored(scene.composite(added).image)
             for image, scene in zip(images, frozen, strict=True)
         ]
         added = fit_colors(added, frozen, wanted, [RELAXATION] * COLOR_ROUNDS)

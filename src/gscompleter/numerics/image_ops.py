@@ -60,7 +60,8 @@ def _fill(
     """Fill what has no weight from an image of half the size, which is filled first."""
     own = weighted / weight.clamp_min(1e-8)
     size = (weight.shape[2], weight.shape[3])
-    if max(size) == 1 or bool((weight > 0).all()):
+    # A full image needs no smaller ones. To ask a GPU for that takes longer than to compute them.
+    if max(size) == 1 or (not weight.is_cuda and bool((weight > 0).all())):
         return own
     coarse = _fill(
         avg_pool2d(weighted, 2, ceil_mode=True, count_include_pad=False),
@@ -109,7 +110,7 @@ def label_regions(mask: Bool[Tensor, "h w"]) -> tuple[Int64[Tensor, "h w"], int]
     """Label the connected regions of `mask` (8 neighbours) from 1, and count the labels with 0."""
     pixels = mask.cpu().numpy().astype(np.uint8)
     count, labels = cv2.connectedComponents(pixels, connectivity=8)
-    return torch.from_numpy(labels).long().to(mask.device), count
+    return torch.from_numpy(labels).long().to(mask.device, non_blocking=True), count
 
 
 def find_largest_regions(

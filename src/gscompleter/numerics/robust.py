@@ -24,25 +24,29 @@ def find_affine_inliers(
 
 
 def fit_line_ransac(
-    x: Float[Tensor, "n"], y: Float[Tensor, "n"], rng: torch.Generator
+    x: Float[Tensor, "n"],
+    y: Float[Tensor, "n"],
+    rng: torch.Generator,
+    device: torch.device | None = None,
 ) -> tuple[float, float]:
     """Fit scale and shift to the most inliers of two-point hypotheses, then refit them.
 
     Residuals are relative to depth, so that distant pixels do not dominate. Returns (0, 0) if no
-    hypothesis has a positive scale.
+    hypothesis has a positive scale. Hypotheses are scored on `device`, by default that of `x`.
     """
+    device = device or x.device
     # A line through two points each. Equal x give a scale of 0, which no hypothesis may have.
     i, j = torch.randint(len(x), (2, MAX_TRIALS), generator=rng).to(x.device)
     scales = (y[i] - y[j]) / torch.where(x[i] == x[j], torch.inf, x[i] - x[j])
     shifts = y[i] - scales * x[i]
     # (scale x + shift - y) / y = scale (x / y) + shift (1 / y) - 1, for all pairs in one product.
-    points = torch.stack([x / y, 1 / y])
-    batches = torch.stack([scales, shifts], dim=1).split(HYPOTHESES_PER_BATCH)
+    points = torch.stack([x / y, 1 / y]).to(device, non_blocking=True)
+    lines = torch.stack([scales, shifts], dim=1).to(device, non_blocking=True)
     counts = []
-    for batch in batches:
+    for batch in lines.split(HYPOTHESES_PER_BATCH):
         residuals = (batch @ points).sub_(1).abs_()
         counts.append((residuals < RESIDUAL_THRESHOLD).sum(dim=1))
-    best = torch.cat(counts).where(scales > 0, -1).argmax()
+    best = torch.cat(counts).to(x.device).where(scales > 0, -1).argmax()
     if scales[best] <= 0:
         return 0.0, 0.0
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -34,10 +35,13 @@ def compute_sky_depth(camera: Camera) -> float:
     return SKY_DEPTH * camera.far
 
 
-def is_sky_visible(render: Render, camera: Camera) -> bool:
-    """Return True if a render shows sky."""
-    depth = render.depth_map()
-    return bool((depth.valid & is_sky(depth.depth, camera)).any())
+def is_sky_visible(renders: Sequence[Render], cameras: Sequence[Camera]) -> bool:
+    """Return True if any of the renders shows sky."""
+    shown = []
+    for render, camera in zip(renders, cameras, strict=True):
+        depth = render.depth_map()
+        shown.append((depth.valid & is_sky(depth.depth, camera)).any())
+    return bool(torch.stack(shown).any())
 
 
 def mask_out_sky(render: Render, camera: Camera) -> DepthMap:

@@ -34,16 +34,21 @@ def fit_colors(
     """
     change = torch.zeros_like(new.means)
 
-    def measure(scene: FrozenScene, view: View) -> ColorSums:
+    # A GPU keeps the bins of every view, as the host waits for each new one. A CPU makes them anew,
+    # since those of many photographs take more memory than time.
+    plans = [scene.vary_colors(new) for scene in frozen] if change.is_cuda else None
+
+    def measure(index: int, view: View) -> ColorSums:
+        plan = frozen[index].vary_colors(new) if plans is None else plans[index]
         colors = evaluate_colors(new.sh, new.means, view.camera.center)
-        return scene.vary_colors(new)(colors + change, view.image)
+        return plan(colors + change, view.image)
 
     # Each Gaussian moves by the mean residual of the pixels that show it, by their weight, over all
     # images; the next round sees what its neighbours did.
     for relaxation in relaxations:
         sums = change.new_zeros(change.shape)
         weights = change.new_zeros(len(change))
-        for pull, weight in get_view_map(change)(measure, frozen, images):
+        for pull, weight in get_view_map(change)(measure, range(len(frozen)), images):
             sums = sums + pull
             weights = weights + weight
         change = change + relaxation * sums / weights.clamp_min(MIN_WEIGHT)[:, None]

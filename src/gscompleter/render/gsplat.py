@@ -7,9 +7,9 @@ inevitably is the number of tile intersections, which gsplat reads to allocate m
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import torch
 from jaxtyping import Bool, Float, Int, Int64
@@ -25,6 +25,8 @@ EPS_2D = 0.3
 """Low-pass of 3DGS: pixels² that are added to the variances of each footprint."""
 MIN_ALPHA = 1e-10
 """Smallest alpha that gsplat divides a depth by."""
+TILE_SIZE = 16
+"""Side of a tile in pixels, gsplat's default."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +38,21 @@ class CudaRenderer:
 
     def render(self, gaussians: Gaussians, camera: Camera) -> Render:
         """Render `gaussians` from `camera`."""
+        (render,) = self.render_together(gaussians, [camera])
+        return render
+
+    def render_together(
+        self, gaussians: Gaussians, cameras: Sequence[Camera], num_only_first: int = 0
+    ) -> list[Render]:
+        """Render `gaussians` from all cameras at once; the host waits once for all of them.
+
+        The first `num_only_first` Gaussians show in the image of the first camera alone.
+        """
         if len(gaussians) == 0:
-            empty = torch.zeros(camera.height, camera.width, device=gaussians.means.device)
-            return Render(empty[..., None].expand(-1, -1, 3), empty, empty)
-        color_and_depth, alpha, _ = self.rasterize(gaussians, camera)
-        return Render(color_and_depth[0, ..., :3], color_and_depth[0, ..., 3], alpha[0, ..., 0])
+            return [make_empty_render(camera, gaussians.means.device) for camera in cameras]
+        binned = project_and_bin(gaussians, cameras, num_only_first)
+        colors = torch.stack([compute_colors(gaussians, camera) for camera in cameras])
+        return binned.render(colors)
 
     def freeze(self, context: Gaussians, camera: Camera) -> CudaFrozenScene:
         """Prepare `context` for many renders from `camera`."""
@@ -52,22 +64,7 @@ class CudaRenderer:
         """Return True for Gaussians whose box touches the image: gsplat gives them a radius."""
         if len(gaussians) == 0:
             return torch.zeros_like(gaussians.generated, dtype=torch.bool)
-        from gsplat import fully_fused_projection
-
-        camera = camera.to(gaussians.means.device)
-        radii, *_ = fully_fused_projection(
-            gaussians.means.float(),
-            None,  # covariances: quaternions and scales stand for them
-            gaussians.quats.float(),
-            gaussians.scales.float(),
-            camera.viewmat[None].float(),
-            camera.K[None].float(),
-            camera.width,
-            camera.height,
-            eps2d=EPS_2D,
-            near_plane=camera.near_plane,
-            opacities=gaussians.opacities.float(),
-        )
+        radii, *_ = project_gaussians(gaussians, [camera])
         return (radii[0] > 0).all(dim=-1)
 
     @torch.no_grad()
@@ -75,22 +72,7 @@ class CudaRenderer:
         """Project Gaussians, sort them by depth and bin them into the tiles of an image."""
         if len(gaussians) == 0:
             return BinnedGaussians.empty(camera, gaussians.means.device)
-        # Rasterizing also returns what gsplat projected and sorted; the image is not used.
-        _, _, projected = self.rasterize(gaussians, camera)
-        before = gaussians.opacities.float()
-        after = projected["opacities"].reshape(-1)
-        return BinnedGaussians(
-            means2d=projected["means2d"],
-            conics=projected["conics"],
-            depths=projected["depths"],
-            opacities=after[None],
-            antialiasing=torch.where(before > 0, after / before, 0.0),
-            tile_size=projected["tile_size"],
-            tile_offsets=projected["isect_offsets"],
-            rows=projected["flatten_ids"],
-            width=camera.width,
-            height=camera.height,
-        )
+        return project_and_bin(gaussians, [camera])
 
     def vary_opacities(self, gaussians: Gaussians, camera: Camera) -> OpacityRender:
         """Project, sort and bin once; the opacities [n] must not exceed those of `gaussians`.
@@ -98,46 +80,94 @@ class CudaRenderer:
         Fainter Gaussians render the same in the larger box, where alpha 1/255 drops the rest.
         """
         binned = self.bin_gaussians(gaussians, camera)
-        # The depth is composited as a fourth colour, and divided by alpha as in "RGB+ED".
         with torch.no_grad():
-            colors = compute_colors(gaussians, camera)
-            values = torch.cat([colors, binned.depths[0, :, None]], dim=-1)
+            colors = compute_colors(gaussians, camera)[None]
 
         def render(opacities: Float[Tensor, "n"]) -> Render:
-            sums, alpha = binned.composite(values, binned.antialiasing * opacities)
-            return Render(sums[..., :3], sums[..., 3] / alpha.clamp_min(MIN_ALPHA), alpha)
+            (found,) = binned.render(colors, binned.antialiasing * opacities)
+            return found
 
         return render
 
-    def rasterize(
-        self, gaussians: Gaussians, camera: Camera
-    ) -> tuple[Float[Tensor, "1 h w 4"], Float[Tensor, "1 h w 1"], dict[str, Any]]:
-        """Rasterize at least one Gaussian: colour and depth, alpha, and gsplat's metadata.
 
-        gsplat's kernels take float32 alone. Colours are computed here: given harmonics, gsplat
-        inverts the view matrix to find the camera's centre, and the host waits for that.
-        """
-        from gsplat import rasterization
+def make_empty_render(camera: Camera, device: torch.device) -> Render:
+    """Render nothing."""
+    empty = torch.zeros(camera.height, camera.width, device=device)
+    return Render(empty[..., None].expand(-1, -1, 3), empty, empty)
 
-        camera = camera.to(gaussians.means.device)
-        color_and_depth, alpha, metadata = rasterization(
-            means=gaussians.means.float(),
-            quats=gaussians.quats.float(),
-            scales=gaussians.scales.float(),
-            opacities=gaussians.opacities.float(),
-            colors=compute_colors(gaussians, camera),
-            viewmats=camera.viewmat[None].float(),
-            Ks=camera.K[None].float(),
-            width=camera.width,
-            height=camera.height,
-            near_plane=camera.near_plane,
-            eps2d=EPS_2D,
-            sh_degree=None,
-            packed=False,
-            render_mode="RGB+ED",  # the depth is already divided by alpha
-            rasterize_mode="antialiased" if gaussians.is_antialiased else "classic",
-        )
-        return color_and_depth, alpha, metadata
+
+def project_gaussians(
+    gaussians: Gaussians, cameras: Sequence[Camera]
+) -> tuple[
+    Int[Tensor, "c n 2"],
+    Float[Tensor, "c n 2"],
+    Float[Tensor, "c n"],
+    Float[Tensor, "c n 3"],
+    Float[Tensor, "c n"],
+]:
+    """Project at least one Gaussian into images of one size, with near planes at one depth.
+
+    Returns radii [c, n, 2] in pixels, which are 0 outside of the image, centres [c, n, 2], z-depths
+    [c, n], inverse covariances [c, n, 3], and the factors [c, n] by which antialiasing lowers
+    opacities. Gsplat's kernels take float32 alone.
+    """
+    from gsplat import fully_fused_projection
+
+    cameras = [camera.to(gaussians.means.device) for camera in cameras]
+    radii, means2d, depths, conics, antialiasing = fully_fused_projection(
+        gaussians.means.float(),
+        None,  # covariances: quaternions and scales stand for them
+        gaussians.quats.float(),
+        gaussians.scales.float(),
+        torch.stack([camera.viewmat for camera in cameras]).float(),
+        torch.stack([camera.K for camera in cameras]).float(),
+        cameras[0].width,
+        cameras[0].height,
+        eps2d=EPS_2D,
+        near_plane=cameras[0].near_plane,
+        calc_compensations=gaussians.is_antialiased,
+        opacities=gaussians.opacities.float(),
+    )
+    if antialiasing is None:
+        antialiasing = torch.ones_like(depths)
+    return radii, means2d, depths, conics, antialiasing
+
+
+def project_and_bin(
+    gaussians: Gaussians, cameras: Sequence[Camera], num_only_first: int = 0
+) -> BinnedGaussians:
+    """Project at least one Gaussian, sort them by depth and bin them into the tiles of images.
+
+    Images of several sizes share one that holds all of them. The first `num_only_first` Gaussians
+    are in the first image alone.
+    """
+    from gsplat import isect_offset_encode, isect_tiles
+
+    # Not as parts of a larger image: how much a Gaussian outside is distorted depends on the size.
+    are_alike = len({(camera.width, camera.height, camera.near_plane) for camera in cameras}) == 1
+    groups = [cameras] if are_alike else [[camera] for camera in cameras]
+    projected = [project_gaussians(gaussians, group) for group in groups]
+    radii, means2d, depths, conics, antialiasing = (
+        parts[0] if len(parts) == 1 else torch.cat(parts) for parts in zip(*projected, strict=True)
+    )
+    if num_only_first > 0:
+        radii = radii.clone()
+        radii[1:, :num_only_first] = 0
+    sizes = [(camera.width, camera.height) for camera in cameras]
+    num_tiles = tuple(-(-max(sides) // TILE_SIZE) for sides in zip(*sizes, strict=True))
+    _, entries, rows = isect_tiles(
+        means2d, radii, depths, TILE_SIZE, *num_tiles, n_images=len(cameras)
+    )
+    return BinnedGaussians(
+        means2d=means2d,
+        conics=conics,
+        depths=depths,
+        opacities=gaussians.opacities.float() * antialiasing,
+        antialiasing=antialiasing,
+        tile_offsets=isect_offset_encode(entries, len(cameras), *num_tiles),
+        rows=rows,
+        sizes=sizes,
+    )
 
 
 def compute_colors(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "n 3"]:
@@ -154,29 +184,28 @@ def compute_colors(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "n 3"]
 
 @dataclass(frozen=True)
 class BinnedGaussians:
-    """Gaussians that are projected, sorted and binned into the tiles of one camera's image.
+    """Gaussians that are projected, sorted and binned into the tiles of the images of c cameras.
 
-    As long as neither they nor the camera move, images in other colours and opacities need no more
-    than to composite them. Rows of Gaussians that the image does not show are unset memory, which
-    no tile names.
+    As long as neither they nor the cameras move, images in other colours and opacities need no more
+    than to composite them. Rows of Gaussians that an image does not show are unset memory, which no
+    tile names.
     """
 
-    means2d: Float[Tensor, "1 n 2"]
-    conics: Float[Tensor, "1 n 3"]
+    means2d: Float[Tensor, "c n 2"]
+    conics: Float[Tensor, "c n 3"]
     """Inverse covariances in the image, upper triangles, in 1/px²."""
-    depths: Float[Tensor, "1 n"]
+    depths: Float[Tensor, "c n"]
     """z-depths in scene units."""
-    opacities: Float[Tensor, "1 n"]
+    opacities: Float[Tensor, "c n"]
     """Opacities as they are composited, lowered if antialiased."""
-    antialiasing: Float[Tensor, "n"]
+    antialiasing: Float[Tensor, "c n"]
     """Factor by which antialiasing lowers each opacity; 1 without it."""
-    tile_size: int
-    tile_offsets: Int[Tensor, "1 tile_h tile_w"]
+    tile_offsets: Int[Tensor, "c tile_h tile_w"]
     """Index in `rows` of the first Gaussian of each tile."""
     rows: Int[Tensor, "intersections"]
     """Gaussians of the tiles, one tile after the other, the nearest first."""
-    width: int
-    height: int
+    sizes: Sequence[tuple[int, int]]
+    """Width and height of each image, which is the upper left part of a shared one."""
 
     @staticmethod
     def empty(camera: Camera, device: torch.device) -> BinnedGaussians:
@@ -188,51 +217,65 @@ class BinnedGaussians:
             conics=none[..., None].expand(-1, -1, 3),
             depths=none,
             opacities=none,
-            antialiasing=none[0],
-            tile_size=16,
+            antialiasing=none,
             tile_offsets=rows[None, None],
             rows=rows,
-            width=camera.width,
-            height=camera.height,
+            sizes=[(camera.width, camera.height)],
         )
 
+    def render(
+        self, colors: Float[Tensor, "c n 3"], opacities: Float[Tensor, "c n"] | None = None
+    ) -> list[Render]:
+        """Render in these colours, and opacities at most those of the Gaussians."""
+        # The depth is composited as a fourth colour, and divided by alpha as in "RGB+ED".
+        sums, alpha = self.composite(torch.cat([colors, self.depths[..., None]], dim=-1), opacities)
+        depth = sums[..., 3] / alpha.clamp_min(MIN_ALPHA)
+        return [
+            Render(
+                sums[i, :height, :width, :3], depth[i, :height, :width], alpha[i, :height, :width]
+            )
+            for i, (width, height) in enumerate(self.sizes)
+        ]
+
     def composite(
-        self, values: Float[Tensor, "n c"], opacities: Float[Tensor, "n"] | None = None
-    ) -> tuple[Float[Tensor, "h w c"], Float[Tensor, "h w"]]:
+        self, values: Float[Tensor, "c n v"], opacities: Float[Tensor, "c n"] | None = None
+    ) -> tuple[Float[Tensor, "c h w v"], Float[Tensor, "c h w"]]:
         """Composite values over zero: Σ_i w_ip value_i, and alpha; differentiable in both inputs.
 
         `opacities` are those to composite with, at most `self.opacities`, which are the default.
         """
-        if values.shape[0] == 0:
-            empty = values.new_zeros(self.height, self.width)
-            return empty[..., None].expand(-1, -1, values.shape[1]), empty
+        width = max(width for width, _ in self.sizes)
+        height = max(height for _, height in self.sizes)
+        if values.shape[1] == 0:
+            empty = values.new_zeros(len(self.sizes), height, width)
+            return empty[..., None].expand(-1, -1, -1, values.shape[2]), empty
         from gsplat import rasterize_to_pixels
 
         sums, alphas = rasterize_to_pixels(
             self.means2d,
             self.conics,
-            values[None],
-            self.opacities if opacities is None else opacities[None],
-            self.width,
-            self.height,
-            self.tile_size,
+            values,
+            self.opacities if opacities is None else opacities,
+            width,
+            height,
+            TILE_SIZE,
             self.tile_offsets,
             self.rows,
         )
-        return sums[0], alphas[0, ..., 0]
+        return sums, alphas[..., 0]
 
     def backproject(
-        self, values: Float[Tensor, "n c"], image: Float[Tensor, "h w c"]
-    ) -> Float[Tensor, "n c"]:
+        self, values: Float[Tensor, "n v"], image: Float[Tensor, "h w v"]
+    ) -> Float[Tensor, "n v"]:
         """Sum an image over the compositing weights of each Gaussian: Σ_p w_ip image_p.
 
         A compositing weight is the derivative of a pixel in the value of the Gaussian, whatever
-        the `values` are.
+        the `values` are. There is one camera.
         """
         with torch.enable_grad():
             leaf = values.detach().requires_grad_()
-            sums, _ = self.composite(leaf)
-        (gradient,) = torch.autograd.grad(sums, leaf, image)
+            sums, _ = self.composite(leaf[None])
+        (gradient,) = torch.autograd.grad(sums, leaf, image[None])
         return gradient
 
 
@@ -288,8 +331,16 @@ class CudaFrozenScene(RedrawnScene):
     def splat(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
         """Render the visible Gaussians with the values as grey."""
         seen = values[self.rows[self.visible_rows]]
-        sums, _ = self.visible_bins.composite(seen[:, None])
-        return sums[..., 0]
+        sums, _ = self.visible_bins.composite(seen[None, :, None])
+        return sums[0, ..., 0]
+
+    def composite_beside(self, new: Gaussians, other: Camera) -> tuple[Render, Render]:
+        """Render the visible Gaussians and `new`, and at once `new` alone from another camera."""
+        both = merge([self.visible_scene, new])
+        here, there = self.renderer.render_together(
+            both, [self.camera, other], num_only_first=len(self.visible_scene)
+        )
+        return here, there
 
     def vary_opacities(self, new: Gaussians) -> OpacityRender:
         """Fix all of `new` but the opacities, with boxes that hold for every opacity."""
@@ -311,12 +362,12 @@ class CudaFrozenScene(RedrawnScene):
                 # The fourth channel is not drawn: its gradient sums the weights alone.
                 leaf = torch.nn.functional.pad(colors.clamp_min(0), (0, 1)).requires_grad_()
                 drawn = torch.nn.functional.pad(context, (0, 1))
-                sums, _ = binned.composite(torch.cat([drawn, leaf]))
+                sums, _ = binned.composite(torch.cat([drawn, leaf])[None])
             # The gradient of Σ image · drawn in a colour is Σ_p w_ip image_p; ones in the fourth
             # channel give Σ_p w_ip.
-            missing = photograph - sums[..., :3].detach()
+            missing = photograph - sums[0, ..., :3].detach()
             image = torch.nn.functional.pad(missing, (0, 1), value=1.0)
-            (gradient,) = torch.autograd.grad(sums, leaf, image)
+            (gradient,) = torch.autograd.grad(sums, leaf, image[None])
             return gradient[:, :3], gradient[:, 3]
 
         return measure_errors

@@ -15,6 +15,8 @@ from gscompleter.render.protocols import (
     ColorErrors,
     ColorSums,
     DepthRender,
+    FrozenScene,
+    JointScene,
     OpacityRender,
     Renderer,
 )
@@ -83,6 +85,15 @@ class RedrawnScene:
     def vary_depths(self, new: Gaussians) -> DepthRender:
         """Fix all of `new` but its depths."""
         return lambda depths: self.composite(move_to_depths(new, self.camera, depths))
+
+
+def composite_beside(
+    frozen: FrozenScene, new: Gaussians, renderer: Renderer, other: Camera
+) -> tuple[Render, Render]:
+    """Render a scene with `new`, and `new` alone from another camera; at once where possible."""
+    if isinstance(frozen, JointScene):
+        return frozen.composite_beside(new, other)
+    return frozen.composite(new), renderer.render(new, other)
 
 
 def set_colors(gaussians: Gaussians, colors: Float[Tensor, "n 3"]) -> Gaussians:

@@ -37,13 +37,13 @@ def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> 
     if len(x) < MIN_PIXELS:
         return DepthAffine()
     if len(x) > MAX_PIXELS:
-        sample = torch.randperm(len(x), generator=rng)[:MAX_PIXELS].to(x.device)
+        sample = torch.randperm(len(x), generator=rng)[:MAX_PIXELS]
         x, y = x[sample], y[sample]
 
     # In a flat view, such as a wall from the front, scale and shift cannot be told apart.
     low, median, high = x.quantile(x.new_tensor([0.05, 0.5, 0.95])).tolist()
     if (high - low) / median >= MIN_DEPTH_SPREAD:
-        scale, shift = fit_line_ransac(x, y, rng)
+        scale, shift = fit_line_ransac(x, y, rng, predicted.depth.device)
         inliers = find_affine_inliers(x, y, scale, shift).double().mean().item()
         if scale > 0 and inliers >= MIN_INLIERS:
             return DepthAffine(scale, shift, inliers, "ransac")
@@ -56,9 +56,15 @@ def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> 
 def pair_depths(
     predicted: DepthMap, context: DepthMap
 ) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """Return both z-depths at the pixels where both are valid."""
+    """Return both z-depths at the pixels where both are valid, on the CPU.
+
+    A fit reads so many numbers that the host would wait for a GPU dozens of times. So it gets both
+    maps in one copy, and gives back what takes a GPU (the scores of hypotheses).
+    """
     comparable = predicted.valid & context.valid & (predicted.depth > 0) & (context.depth > 0)
-    return predicted.depth[comparable].double(), context.depth[comparable].double()
+    depths = torch.stack([predicted.depth, context.depth]).where(comparable, 0.0).cpu()
+    x, y = depths[:, depths[0] > 0].double()
+    return x, y
 
 
 @timed_stage("register")
@@ -119,4 +125,8 @@ def sample_depth_pairs(
     x, y = pair_depths(predicted, context)
     step = max(1, -(-len(x) // MAX_PAIRS))
     x, y = x[::step], y[::step]
-    return DepthPairs(fit_view, x, y, find_affine_inliers(x, y, affine.scale, affine.shift))
+    inlier_mask = find_affine_inliers(x, y, affine.scale, affine.shift)
+    # All tensors of a completion lie on one device.
+    device = predicted.depth.device
+    x, y, inlier_mask = (part.to(device, non_blocking=True) for part in (x, y, inlier_mask))
+    return DepthPairs(fit_view, x, y, inlier_mask)

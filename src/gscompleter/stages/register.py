@@ -17,7 +17,7 @@ from gscompleter.numerics.adam import Adam
 from gscompleter.numerics.geometry import compute_z_depths, move_to_depths, slide
 from gscompleter.numerics.image_ops import fill_smoothly
 from gscompleter.numerics.sky import mask_out_sky
-from gscompleter.render.protocols import Renderer
+from gscompleter.render.protocols import JointScene, Renderer
 from gscompleter.stages.extrapolate_registration import extrapolate_into_holes, extrapolate_sky
 from gscompleter.stages.target_view import TargetView
 from gscompleter.system.progress import track
@@ -46,8 +46,8 @@ OCCLUSION_TOLERANCE = 0.05
 IN_FRONT = 0.98
 """Depth of what fills a forced hole, relative to what is left in it."""
 
-RenderAlone = Callable[[Gaussians], Render]
-"""Renders moved Gaussians at the target without the scene."""
+RenderAlone = Callable[[Gaussians], tuple[Render, Render]]
+"""Renders moved Gaussians at target and anchor, without the scene."""
 
 
 @timed_stage("register")
@@ -128,7 +128,7 @@ def optimize_distances(
     renderer = view.scenes.renderer
     anchor = view.anchor_view.camera
     objective = Objective.from_renders(view.render, view.anchor_render, reference, anchor, config)
-    alone = make_renderer_alone(coarse, reference.camera, renderer, config)
+    alone = make_renderer_alone(coarse, reference.camera, anchor, renderer, config)
     parameters = torch.zeros(
         (len(coarse), config.degrees_of_freedom), device=coarse.means.device, requires_grad=True
     )
@@ -139,7 +139,7 @@ def optimize_distances(
         # (decision 003).
         remaining = 1 - iteration / config.iterations
         moved = move_along_rays(coarse, parameters, reference.camera, config.degrees_of_freedom)
-        loss = objective(alone(moved), renderer.render(moved, anchor))
+        loss = objective(*alone(moved))
         optimizer.step(loss, remaining)
         losses.append(loss.detach())
     with torch.no_grad():
@@ -168,17 +168,27 @@ def move_along_rays(
 
 
 def make_renderer_alone(
-    coarse: Gaussians, camera: Camera, renderer: Renderer, config: RegistrationConfig
+    coarse: Gaussians,
+    target: Camera,
+    anchor: Camera,
+    renderer: Renderer,
+    config: RegistrationConfig,
 ) -> RenderAlone:
     """Return a renderer of moved Gaussians alone.
 
-    With a constant footprint their image does not change along rays, so only depth is rendered
-    again.
+    With a constant footprint their image at the target does not change along rays, so only depth is
+    rendered again there. A GPU gains nothing by that, but by drawing for both cameras at once.
     """
+    nothing = renderer.freeze(coarse[:0], target)
+    if isinstance(nothing, JointScene):
+        return lambda moved: nothing.composite_beside(moved, anchor)
     if config.degrees_of_freedom == 3:
-        return lambda moved: renderer.render(moved, camera)
-    plan = renderer.freeze(coarse[:0], camera).vary_depths(coarse)
-    return lambda moved: plan(compute_z_depths(moved.means, camera))
+        return lambda moved: (renderer.render(moved, target), renderer.render(moved, anchor))
+    plan = nothing.vary_depths(coarse)
+    return lambda moved: (
+        plan(compute_z_depths(moved.means, target)),
+        renderer.render(moved, anchor),
+    )
 
 
 @dataclass(frozen=True)
@@ -190,7 +200,7 @@ class Objective:
 
     target_depth: DepthMap
     anchor_depth: DepthMap
-    unit: float
+    unit: Float[Tensor, ""]
     """Divisor of depth residuals, in scene units."""
     config: RegistrationConfig
 
@@ -209,9 +219,10 @@ class Objective:
         """
         target_depth = mask_out_sky(at_target, reference.camera)
         anchor_depth = mask_out_sky(at_anchor, anchor)
-        seen = anchor_depth.depth[anchor_depth.valid]
         # Residuals are relative to the median depth, so that the unit of the scene does not matter.
-        unit = seen.median().item() if len(seen) > 0 else 1.0
+        # Without any depth they are 0 anyway.
+        seen = anchor_depth.depth.where(anchor_depth.valid, torch.nan)
+        unit = seen.nanmedian().nan_to_num(1.0)
         return Objective(target_depth, anchor_depth, unit, config)
 
     def __call__(self, at_target: Render, at_anchor: Render) -> Float[Tensor, ""]:

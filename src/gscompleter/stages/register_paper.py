@@ -16,6 +16,7 @@ from torch import Tensor
 from gscompleter.config import PaperRegistrationConfig
 from gscompleter.numerics.adam import Adam
 from gscompleter.numerics.geometry import compute_z_depths, slide
+from gscompleter.render.redraw import composite_beside
 from gscompleter.stages.target_view import TargetView
 from gscompleter.system.progress import track
 from gscompleter.system.threads import use_one_torch_thread
@@ -84,10 +85,11 @@ def optimize_paper_distances(
     for _ in track(range(config.iterations), "Registering"):
         moved = move(initial, offsets, target)
 
-        # \hat{D}_tgt and \hat{I}_tgt are of the composite scene, G_ctx with G_tgt, ...
-        composite = view.frozen.composite(moved)
-        # ... and \hat{D}_anc is of the target Gaussians G_tgt alone.
-        alone_at_anchor = view.scenes.renderer.render(moved, anchor)
+        # \hat{D}_tgt and \hat{I}_tgt are of the composite scene, G_ctx with G_tgt, and \hat{D}_anc
+        # is of the target Gaussians G_tgt alone.
+        composite, alone_at_anchor = composite_beside(
+            view.frozen, moved, view.scenes.renderer, anchor
+        )
 
         l_depth = compute_depth_error(composite.depth_map(), context_at_target)
         l_stereo = compute_depth_error(alone_at_anchor.depth_map(), context_at_anchor)

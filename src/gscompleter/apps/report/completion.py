@@ -220,7 +220,11 @@ def score_targets(
     renderer: Renderer,
 ) -> list[TargetRow]:
     """Make the rows of the targets."""
-    views = [t.view and hide_removed(t.view, completion.source, renderer) for t in targets]
+    # Photographs of targets are read for their scores alone, and so stayed on the CPU.
+    device = completion.context.means.device
+    views = [
+        t.view and hide_removed(t.view.to(device), completion.source, renderer) for t in targets
+    ]
     scores = map_in_parallel(compute_scores, pairs, views)
     rows = zip(targets, completion.targets, scores, strict=True)
     return [make_target_row(completion, *row) for row in rows]

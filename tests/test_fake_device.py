@@ -1,0 +1,265 @@
+"""What a GPU is asked to do, on a CUDA device that is none: see `support/fake_cuda.py`.
+
+No tensors of two devices meet, gsplat is given float32 alone, nothing reads memory that its kernels
+leave unset, and no stage makes the host wait more often than it has to.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from command import run
+from fake_cuda import CUDA, Counts, FakeCudaTensor
+from fake_gsplat import WHEEL, fake_gsplat, find_gsplat
+from gscompleter import CompleterConfig, GSCompleter, load_renderer
+from gscompleter.apps.batch import engine
+from gscompleter.render.device import Devices, choose_devices
+from gscompleter.render.gsplat import TILE_SIZE, CudaRenderer
+from gscompleter.splats.ply import load_ply, save_ply
+from gscompleter.system.jobs.jobs import Pool, Share
+from gscompleter.system.timing import STAGES
+from gscompleter.types import View, merge
+from parity import assert_close
+from render_scenes import CAMERA, REFERENCE, SCENES, compute_gradients, in_dtype
+from scenes import Room, camera_at, gaussians_of, photographed, view_of
+
+pytestmark = [
+    pytest.mark.skipif(
+        find_gsplat() is None,
+        reason=f"needs {WHEEL} in .whl: pip download --no-deps gsplat==1.5.3 -d .whl",
+    ),
+    pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU"),
+]
+
+CONFIGS = {"default": CompleterConfig(), "paper": CompleterConfig.paper()}
+SIZE = 24
+"""Sides of the photographs in pixels. The counts hardly depend on them."""
+MOST_WAITS = {
+    "default": {"context": 127, "generate": 40, "lift": 41, "register": 15, "integrate": 30},
+    "paper": {"context": 72, "generate": 42, "lift": 54, "register": 60, "integrate": 10},
+}
+"""Waits of the host in each stage of a completion of two photographs (docs/performance.md)."""
+
+
+@pytest.fixture
+def device() -> Iterator[Counts]:
+    with fake_gsplat() as counts:
+        yield counts
+
+
+def make_views(places: tuple[float, ...] = (-0.3, 0.1)) -> list[View]:
+    return [view_of(Room(), camera_at(x, size=SIZE), i) for i, x in enumerate(places)]
+
+
+def test_tensors_of_two_devices_do_not_meet(device):
+    there = torch.ones(2, 3).to("cuda")
+    assert there.device == CUDA
+    assert torch.zeros(2, device=there.device).is_cuda
+    assert there[:1].new_tensor([1.0, 2.0]).is_cuda
+    # A single number may be of the host; several, or a position to copy it to, may not.
+    assert (there * torch.tensor(2.0)).tolist() == [[2.0] * 3] * 2
+    for mix in (
+        lambda: there + torch.ones(2, 3),
+        lambda: torch.ones(2, 3) @ there.T,
+        lambda: torch.cat([there[0], torch.ones(3)]),
+        lambda: torch.stack([there.mean(), torch.tensor(1.0)]),
+        lambda: torch.ones(2)[there[0].long()],
+    ):
+        with pytest.raises(RuntimeError, match="same device"):
+            mix()
+    with pytest.raises(RuntimeError, match="generator"):
+        torch.rand(3, device="cuda", generator=torch.Generator())
+    for read in (there.numpy, lambda: np.asarray(there)):
+        with pytest.raises(TypeError, match="numpy"):
+            read()
+
+
+def test_gradients_cross_between_devices(device):
+    here = torch.ones(3, requires_grad=True)
+    loss = (here.to("cuda") ** 2).cpu().sum()
+    (gradient,) = torch.autograd.grad(loss, here)
+    assert gradient.device.type == "cpu"
+    assert gradient.tolist() == [2.0] * 3
+
+
+def test_waits_are_counted_where_the_host_reads_or_copies(device):
+    values = torch.arange(4.0).to("cuda")
+    assert device.waits.total() == 1
+    values[values > 2] = 0.0  # one number for all of them needs no positions
+    assert torch.where(values > 0, values, 1.0).sum().is_cuda
+    assert device.waits.total() == 1
+    for wait in (
+        lambda: values.sum().item(),
+        lambda: values[values > 0],
+        lambda: values.nonzero(),
+        lambda: values.cpu(),
+        lambda: values.tolist(),
+        lambda: values.new_tensor([1.0, 2.0]),
+        lambda: torch.linalg.inv(torch.eye(2, device="cuda")),
+        lambda: bool(values.any()),
+    ):
+        before = device.waits.total()
+        wait()
+        assert device.waits.total() == before + 1
+
+
+@pytest.mark.parametrize("name", ["strange-harmonics", "antialiased-random"])
+def test_gsplat_draws_what_the_reference_draws(device, name):
+    scene, exact = SCENES[name], in_dtype(SCENES[name], torch.float64)
+    drawn = CudaRenderer().render(scene.to("cuda"), CAMERA.to("cuda"))
+    truth = REFERENCE.render(exact, CAMERA)
+    for part in ("image", "alpha"):
+        assert_close(getattr(drawn, part).cpu(), getattr(truth, part), part, 1e-5)
+    covered = truth.alpha > 0.05
+    assert_close(drawn.depth.cpu() * covered, truth.depth * covered, "depth", 1e-5)
+    ours = compute_gradients(
+        CudaRenderer(), scene.to("cuda"), covered.to("cuda"), CAMERA.to("cuda")
+    )
+    for parameter, expected in compute_gradients(REFERENCE, exact, covered).items():
+        assert_close(ours[parameter].cpu(), expected, f"gradient of {parameter}", 1e-4)
+
+
+def test_what_kernels_leave_unset_is_nan_and_is_not_read(device):
+    scene = SCENES["strange"].to("cuda")
+    binned = CudaRenderer().bin_gaussians(scene, CAMERA.to("cuda"))
+    shown = CudaRenderer().find_visible(scene, CAMERA.to("cuda")).cpu()
+    assert 0 < shown.sum() < len(shown)
+    assert torch.equal(binned.means2d[0].cpu().isfinite().all(dim=-1), shown)
+    weights = binned.backproject(torch.zeros_like(scene.means), torch.ones(48, 48, 3).to("cuda"))
+    assert torch.equal((weights.cpu() > 0).all(dim=-1) & ~shown, torch.zeros_like(shown))
+    assert weights.cpu().isfinite().all()
+
+
+def test_the_compiled_module_is_given_float32_alone(device):
+    from gsplat import rasterize_to_pixels
+
+    scene = in_dtype(SCENES["harmonics"], torch.float64).to("cuda")
+    render = CudaRenderer().render(scene, CAMERA.to("cuda"))
+    assert render.image.dtype == torch.float32
+    # What the cast at the boundary prevents:
+    binned = CudaRenderer().bin_gaussians(scene, CAMERA.to("cuda"))
+    with pytest.raises(RuntimeError, match="Float but found torch.float64"):
+        rasterize_to_pixels(
+            binned.means2d,
+            binned.conics,
+            scene.means[None],
+            binned.opacities,
+            CAMERA.width,
+            CAMERA.height,
+            TILE_SIZE,
+            binned.tile_offsets,
+            binned.rows,
+        )
+
+
+@pytest.mark.parametrize("name", ["harmonics", "antialiased-strange"])
+def test_two_cameras_are_drawn_with_one_wait(device, name):
+    """Images of two sizes, of which the second shows new Gaussians alone."""
+    context, new = SCENES[name][::2].to("cuda"), SCENES[name][1::2].to("cuda")
+    other = camera_at(0.2, yaw=5, size=40).to("cuda")
+    frozen = CudaRenderer().freeze(context, CAMERA.to("cuda"))
+    assert len(frozen.visible_rows) > 0
+    means = new.means.requires_grad_()
+    before = device.waits.total()
+    together = frozen.composite_beside(new, other)
+    assert device.waits.total() == before + 1
+    alone = frozen.composite(new), CudaRenderer().render(new, other)
+    gradients = []
+    for here, there in (together, alone):
+        assert here.image.shape == (48, 48, 3)
+        assert there.alpha.shape == (40, 40)
+        loss = here.image.square().sum() + there.image.square().sum() + there.alpha.sum()
+        gradients.append(torch.autograd.grad(loss, means)[0].cpu())
+    for ours, truth in zip(together, alone, strict=True):
+        assert_close(ours.image.cpu(), truth.image.cpu(), "image", 1e-5)
+        assert_close(ours.depth.cpu(), truth.depth.cpu(), "depth", 1e-5)
+    assert_close(*gradients, "gradient", 1e-4)
+
+
+def test_auto_chooses_a_gpu_that_draws(device):
+    assert choose_devices("auto") == Devices("cuda", "cuda")
+
+
+@pytest.mark.parametrize("name", CONFIGS)
+def test_a_completion_stays_on_the_device_and_waits_no_more_than_it_has_to(device, name):
+    views = make_views()
+    target = camera_at(0.5, yaw=10, size=SIZE)
+    complete = GSCompleter(renderer=load_renderer("cuda"), config=CONFIGS[name])
+    there = [view.to("cuda") for view in views]
+    target_there = target.to("cuda")
+    done = complete(there, target_there)
+    assert isinstance(done.scene.means, FakeCudaTensor)
+    assert done.scene.means.cpu().isfinite().all()
+    plain = replace(complete, renderer=load_renderer("cpu"))(views, target)
+    assert len(done.added) == len(plain.added) > 100
+    # Rounding grows in the optimisation, so that only what hardly moves is compared.
+    difference = (done.added.means.cpu() - plain.added.means).norm(dim=1)
+    assert difference.median() < 0.01
+    for stage in STAGES:
+        found = device.count_waits(stage)
+        assert found <= MOST_WAITS[name][stage], f"{stage}:\n{device.list_waits(stage)}"
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Path:
+    """Write photographs of the room, and a splat of what the first two show."""
+    cameras = [camera_at(x, yaw=yaw, size=32) for x, yaw in ((-0.4, 4), (0.0, 0), (0.4, -4))]
+    folder = photographed(tmp_path_factory.mktemp("fake") / "room", cameras)
+    seen = [gaussians_of(view_of(Room(), camera)) for camera in cameras[:2]]
+    save_ply(folder / "splat.ply", merge(seen))
+    return folder
+
+
+def test_a_given_splat_is_completed_with_photographs_that_check_it(device):
+    views = [view.to("cuda") for view in make_views((-0.3, 0.1, 0.2))]
+    scene = merge([gaussians_of(view.to("cpu")) for view in views[:2]]).to("cuda")
+    complete = GSCompleter(renderer=load_renderer("cuda"))
+    target = camera_at(0.5, yaw=10, size=SIZE).to("cuda")
+    done = complete(views[:2], target, scene, check_views=views)
+    assert isinstance(done.scene.means, FakeCudaTensor)
+    assert len(done.added) > 30
+
+
+def test_something_is_removed_and_a_splat_cleaned(device, room, tmp_path, monkeypatch):
+    common = ("--scene", room / "splat.ply", "--device", "cuda", "--resolution", 32, 32, "--quiet")
+    box = ("--box", -0.6, 0.2, 2.1, 0.4, 1.47, 3.1)
+    words = ("remove", room, *box, "--target", 1, "--near", 0.5, "--far", 20)
+    assert run(monkeypatch, *words, *common, "--out", tmp_path / "cut") == 0
+    assert json.loads((tmp_path / "cut" / "summary.json").read_text())["device"] == "cuda"
+    assert len(load_ply(tmp_path / "cut" / "removed.ply")) > 50
+
+    assert run(monkeypatch, "clean", room, *common, "--out", tmp_path / "cleaned") == 0
+    assert (tmp_path / "cleaned" / "completed.ply").is_file()
+
+
+@contextmanager
+def open_here(workers: int) -> Iterator[Pool]:
+    """Open a pool whose shares run in this process, which alone has the device."""
+
+    def start(share: Share) -> Future[Exception | None]:
+        future: Future[Exception | None] = Future()
+        future.set_result(share())
+        return future
+
+    yield Pool(workers, start)
+
+
+def test_a_batch_completes_on_the_device(device, room, tmp_path, monkeypatch):
+    row = {"folder": str(room), "context": [0, 1], "target": [2], "near": 0.5, "far": 20}
+    manifest = tmp_path / "manifest.jsonl"
+    manifest.write_text(json.dumps(row | {"resolution": SIZE, "device": "cuda"}) + "\n")
+    monkeypatch.setattr(engine, "open_local", open_here)
+    out = tmp_path / "out"
+    words = ("batch", manifest, "--out", out, "--workers", 1, "--quiet")
+    assert run(monkeypatch, *words) == 0
+    (summary,) = out.rglob("summary.json")
+    assert json.loads(summary.read_text())["device"] == "cuda"
