@@ -145,7 +145,7 @@ $(VENV)/installed-test: pyproject.toml | $(VENV)/torch
 	touch $@ $(VENV)/installed
 
 $(GSPLAT_WHEEL): | $(VENV)/bin/python
-	$(BIN)/python -m pip download --quiet --disable-pip-version-check --no-deps -d $(@D) gsplat==1.5.3
+	-$(BIN)/python -m pip download --quiet --disable-pip-version-check --no-deps -d $(@D) gsplat==1.5.3
 
 $(VENV)/installed-dev: pyproject.toml | $(VENV)/torch
 	$(PIP) -e '.[test,dev]'

@@ -86,6 +86,8 @@ def few_steps(config: CompleterConfig) -> CompleterConfig:
     return replace(config, **{name: registration}, refine=refine)
 
 
+# tests/test_fake_device.py has the same, where the wheel of gsplat is at hand.
+@pytest.mark.slow
 @pytest.mark.parametrize("config", [CompleterConfig(), CompleterConfig.paper()])
 def test_a_completion_stays_on_the_device_of_its_views_and_is_that_of_the_cpu(views, config):
     complete = GSCompleter(renderer=REFERENCE, config=few_steps(config))
@@ -121,6 +123,7 @@ def test_a_session_in_the_browser_stays_on_the_device_of_its_views(views):
     assert [chunk["name"] for chunk in chunks][:2] == ["observed", "added-1"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ψ", ["mvsplat", "depthsplat", "volsplat"])
 def test_networks_reconstruct_where_the_views_lie_and_run_where_they_lie_themselves(elsewhere, ψ):
     torch.manual_seed(0)
