@@ -13,8 +13,9 @@ GPU := $(and $(NVIDIA),$(NVCC))
 TORCH_INDEX := $(if $(GPU),,--extra-index-url $(TORCH_CPU_INDEX))
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
-# Not installed, as most tests are about machines without it: tests of the GPU's code read the wheel.
-GSPLAT_WHEEL := $(VENV)/wheels/gsplat-1.5.3-py3-none-any.whl
+# Not installed, as most tests are about machines without them: tests of the code for GPUs read the
+# wheels.
+GPU_WHEELS := $(VENV)/wheels/fetched
 
 .PHONY: demo test test-slow golden check-golden lint format types docs dist release-check fuzz evaluate reproduce held-out results-pages bench gpu clean
 
@@ -27,10 +28,10 @@ endif
 	$(BIN)/gscompleter demo --out demo --overwrite
 
 # A process for each core, up to four: most tests wait for one core, and files share what they set up.
-test: $(VENV)/installed-test $(GSPLAT_WHEEL)
+test: $(VENV)/installed-test $(GPU_WHEELS)
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
 
-test-slow: $(VENV)/installed-test $(GSPLAT_WHEEL)
+test-slow: $(VENV)/installed-test $(GPU_WHEELS)
 	$(BIN)/python -m pytest -m slow
 
 # The net under a restructuring: `make golden` before it, `make check-golden` after it. ONLY=scenes|room|texts.
@@ -144,8 +145,9 @@ $(VENV)/installed-test: pyproject.toml | $(VENV)/torch
 	$(PIP) -e '.[test]'
 	touch $@ $(VENV)/installed
 
-$(GSPLAT_WHEEL): | $(VENV)/bin/python
-	-$(BIN)/python -m pip download --quiet --disable-pip-version-check --no-deps -d $(@D) gsplat==1.5.3
+$(GPU_WHEELS): | $(VENV)/bin/python
+	-$(BIN)/python -m pip download --quiet --disable-pip-version-check --no-deps -d $(@D) \
+		gsplat==1.5.3 metal-gauss==0.2.1 && touch $@
 
 $(VENV)/installed-dev: pyproject.toml | $(VENV)/torch
 	$(PIP) -e '.[test,dev]'

@@ -24,6 +24,7 @@ from gscompleter.types import Camera, Gaussians, make_observed, sh_from_rgb
 
 PURPOSES = {
     "cuda": "rendering on an NVIDIA GPU",
+    "metal": "rendering on the GPU of a Mac, from Python",
     "evaluation": "the plots of evaluate and tables, FLIP, LPIPS and FID",
     "models": "downloading published weights from the Hugging Face hub",
     "diffusion": "--generator pe-field and diffusers-inpaint",
@@ -69,7 +70,7 @@ def inspect_installation() -> Iterator[Found]:
     for extra, purpose in PURPOSES.items():
         yield inspect_extra(extra, purpose)
 
-    for name in ("cpu", "cuda", "reference"):
+    for name in ("cpu", "cuda", "metal", "reference"):
         yield inspect_renderer(name)
     compiled = all(is_compiled(part) for part in PARTS)
     remedy = "compiled by the first completion, or in advance by `gscompleter warmup`"
