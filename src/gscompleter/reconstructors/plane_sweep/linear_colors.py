@@ -33,9 +33,9 @@ ANGLE = 0.1
 """Angle in radians, from the middle to the ray of a photograph, at which that cost is doubled. It
 is wide, as cheap changes between rays that lie close together lose up to two decibels in cameras
 that stand far off all photographs."""
-RELAXATIONS = (2.0, 2.0), (2.5, 1.0, 2.5, 1.0)
-"""Step sizes of the rounds on the photographs alone, then on all. Half as many suffice for dearer
-changes; with cheap ones they lose up to 0.5 dB."""
+RELAXATIONS = (2.0,), (2.5, 1.0)
+"""Step sizes of the rounds on the photographs alone, then on all. Twice as many take a sixth of the
+time of the context, and gain 0.2 dB beside the photographs."""
 
 
 @dataclass(frozen=True)
