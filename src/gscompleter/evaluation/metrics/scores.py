@@ -99,8 +99,8 @@ class Scores:
     thin_gaps: Change
     """Share of thin gaps at the target (`thin_gaps.measure_thin_gaps`)."""
     neighbours_thin_gaps: tuple[Change, ...]
-    flight_thin_gaps: Change
-    """The same on the way from the nearest photograph to the target."""
+    flight_thin_gaps: Change | None
+    """The same on the way from the nearest photograph to the target; None without photographs."""
 
 
 @dataclass(frozen=True)
@@ -153,8 +153,13 @@ def score(
     if added:
         seam_step = measure_seam_step(added, was, camera, renderer)
         agreement = measure_alignment(added, before, camera, renderer)
-    photographs = [view.camera for view in truth.views]
-    flights = [measure_flight(scene, photographs, camera, renderer) for scene in (before, after)]
+    # Where cracks open as the camera leaves the photographs.
+    flight = None
+    if truth.views:
+        photographs = [view.camera for view in truth.views]
+        gaps = [measure_flight(scene, photographs, camera, renderer) for scene in (before, after)]
+        flight = Change(*gaps)
+
     lifted = None
     if registered:
         lifted = measure_primitive_alignment(registered, before, camera, renderer)
@@ -176,7 +181,7 @@ def score(
         neighbours_thin_gaps=tuple(
             Change(*(measure_thin_gaps(render.alpha) for render in pair)) for pair in beside
         ),
-        flight_thin_gaps=Change(*flights),
+        flight_thin_gaps=flight,
     )
     return scores, TargetRenders(was, now, holes)
 
