@@ -34,8 +34,8 @@ ANGLE = 0.1
 is wide, as cheap changes between rays that lie close together lose up to two decibels in cameras
 that stand far off all photographs."""
 RELAXATIONS = (2.0,), (2.5, 1.0)
-"""Step sizes of the rounds on the photographs alone, then on all. Twice as many take a sixth of the
-time of the context, and gain 0.2 dB beside the photographs."""
+"""Step sizes of the rounds on the photographs alone, then on all. Twice as many take 1.18 times the
+time of the context of five photographs, and gain 0.03 dB beside them."""
 
 
 @dataclass(frozen=True)
