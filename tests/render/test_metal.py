@@ -1,12 +1,11 @@
 """The renderer of a Mac's GPU: its twin in PyTorch draws here what our renderers draw."""
 
-import importlib
 import importlib.util
 
 import pytest
 import torch
 
-from fake_gsplat import FOLDERS
+from fake_gsplat import find_package
 from gscompleter import GSCompleter, InputError, load_renderer
 from gscompleter.render.metal import MetalRenderer, explain_missing_metal
 from parity import assert_close
@@ -31,12 +30,10 @@ ORDERED = [name for name in SCENES if UNORDERED not in name]
 @pytest.fixture
 def twin(monkeypatch) -> MetalRenderer:
     """Return the adapter on the CPU, with the twin in place of the kernels."""
-    if importlib.util.find_spec("metal_gauss") is None:
-        wheels = [folder / WHEEL for folder in FOLDERS if (folder / WHEEL).is_file()]
-        if not wheels:
-            pytest.skip(f"needs {WHEEL} in .whl: pip download --no-deps metal-gauss -d .whl")
-        # A wheel of Python alone is a zip file that can be imported from.
-        monkeypatch.syspath_prepend(str(wheels[0]))
+    place = find_package("metal_gauss", WHEEL)
+    if place is None:
+        pytest.skip(f"needs {WHEEL} in .whl: pip download --no-deps metal-gauss -d .whl")
+    monkeypatch.syspath_prepend(str(place))
     return MetalRenderer("torch_ref", "cpu")
 
 

@@ -40,10 +40,15 @@ MAX_SIGMA = 3.33
 
 def find_gsplat() -> Path | None:
     """Find the folder or wheel to import gsplat from, or None."""
-    installed = importlib.util.find_spec("gsplat")
+    return find_package("gsplat", WHEEL)
+
+
+def find_package(name: str, wheel: str) -> Path | None:
+    """Find the folder or wheel to import a package of Python alone from, or None."""
+    installed = importlib.util.find_spec(name)
     if installed is not None and installed.origin is not None:
         return Path(installed.origin).parents[1]
-    return next((folder / WHEEL for folder in FOLDERS if (folder / WHEEL).is_file()), None)
+    return next((folder / wheel for folder in FOLDERS if (folder / wheel).is_file()), None)
 
 
 @contextmanager

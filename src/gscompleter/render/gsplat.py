@@ -17,7 +17,7 @@ from torch import Tensor
 
 from gscompleter.render.device import choose_device
 from gscompleter.render.protocols import ColorErrors, ColorSums, OpacityRender
-from gscompleter.render.redraw import RedrawnScene, set_colors
+from gscompleter.render.redraw import RedrawnScene, make_empty_render, set_colors
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.types import Camera, Gaussians, Render, merge
 
@@ -88,12 +88,6 @@ class CudaRenderer:
             return found
 
         return render
-
-
-def make_empty_render(camera: Camera, device: torch.device) -> Render:
-    """Render nothing."""
-    empty = torch.zeros(camera.height, camera.width, device=device)
-    return Render(empty[..., None].expand(-1, -1, 3), empty, empty)
 
 
 def project_gaussians(

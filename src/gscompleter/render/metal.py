@@ -15,7 +15,8 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.render.redraw import RedrawnScene
+from gscompleter.numerics.geometry import compute_z_depths
+from gscompleter.render.redraw import RedrawnScene, make_empty_render
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, Gaussians, Render
@@ -44,8 +45,7 @@ class MetalRenderer:
         """Render `gaussians` from `camera`."""
         home = gaussians.means.device
         if len(gaussians) == 0:
-            empty = torch.zeros(camera.height, camera.width, device=home)
-            return Render(empty[..., None].expand(-1, -1, 3), empty, empty)
+            return make_empty_render(camera, home)
         there = gaussians.to(self.device)
         viewer = camera.to(self.device)
         colors = evaluate_colors(there.sh.float(), there.means.float(), viewer.center.float())
@@ -53,7 +53,7 @@ class MetalRenderer:
 
         # Depths are composited like colours, and divided by alpha. The inner `where` keeps the
         # gradient of a division by 0 out of the graph.
-        depths = (there.means.float() - viewer.center.float()) @ viewer.forward.float()
+        depths = compute_z_depths(there.means.float(), viewer)
         sums, _ = self._composite(there, viewer, depths[:, None].expand(-1, 3))
         is_seen = alpha > 0
         depth = torch.where(is_seen, sums[..., 0] / torch.where(is_seen, alpha, 1.0), 0.0)

@@ -96,6 +96,12 @@ def composite_beside(
     return frozen.composite(new), renderer.render(new, other)
 
 
+def make_empty_render(camera: Camera, device: torch.device) -> Render:
+    """Render nothing."""
+    empty = torch.zeros(camera.height, camera.width, device=device)
+    return Render(empty[..., None].expand(-1, -1, 3), empty, empty)
+
+
 def set_colors(gaussians: Gaussians, colors: Float[Tensor, "n 3"]) -> Gaussians:
     """Give Gaussians colours that are the same from every direction."""
     return replace(gaussians, sh=sh_from_rgb(colors), encoded=None)

@@ -1,4 +1,4 @@
-"""Where the live page is served, and who may ask for it."""
+"""Resolve the address that serves the live page, and check who asks for it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a page has to change to show a completion: only Gaussians that it has not got are sent.
+"""Describe the difference of a completion to what a page has got, and send new Gaussians only.
 
 A page holds chunks of Gaussians, which never change: the scene as it was given, in the layers of
 the viewer, then one chunk of whatever is new after a step. A completion is told by what is hidden
@@ -27,7 +27,7 @@ MAX_SH = 16
 
 
 class PageScene:
-    """What the pages of a session hold; it grows with each step that brings new Gaussians."""
+    """Keep what the pages of a session hold, which grows with each step that adds Gaussians."""
 
     def __init__(self, given: Gaussians) -> None:
         """Begin with the scene as it was given, in the layers in which the viewer's page has it."""

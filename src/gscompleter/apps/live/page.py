@@ -50,7 +50,7 @@ FOUND_HOLE = "The scene has a hole here; press “Complete here”."
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a request."""
+    """Tell what a request did."""
 
     text: str
     camera: Camera | None = None

@@ -15,7 +15,7 @@ from gscompleter.apps.completing.printing import print_completion
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.live.serving import LIVE_RESULTS, begin_session, prepare, write_session
 from gscompleter.apps.live.session import Session, Step, apply_step
-from gscompleter.apps.live.strokes import STROKES_FILE, read_steps, read_strokes
+from gscompleter.apps.live.strokes import STROKES_FILE, StrokesFile, read_steps, read_strokes
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.progress import show_progress, track
@@ -24,8 +24,9 @@ from gscompleter.system.progress import show_progress, track
 def replay_strokes(options: RepairOptions, strokes: Path) -> int:
     """Do the steps of a `strokes.json` again, write the result, and return the exit code."""
     path = strokes / STROKES_FILE if os.path.isdir(strokes) else strokes
-    steps = read_steps(path)
-    options = add_saved_options(options, path)
+    saved = read_strokes(path)
+    steps = read_steps(saved, path.parent)
+    options = add_saved_options(options, saved)
     console = Console(stderr=True, quiet=options.quiet)
     with (
         show_progress(console),
@@ -56,9 +57,8 @@ def replay_step(session: Session, step: Step, number: int, console: Console) -> 
     return changed
 
 
-def add_saved_options(options: RepairOptions, path: Path) -> RepairOptions:
+def add_saved_options(options: RepairOptions, saved: StrokesFile) -> RepairOptions:
     """Return the options with those of the session where they are not given."""
-    saved = read_strokes(path)
     given = {name: getattr(options, name) for name in ("resolution", "near", "far", "context")}
     missing = {name: getattr(saved, name) for name, value in given.items() if value is None}
     return replace(options, **missing)

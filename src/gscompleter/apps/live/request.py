@@ -1,4 +1,4 @@
-"""What a page asks for, as it arrives: JSON that is validated before anything is done."""
+"""Parse the requests of a page: JSON that is validated before anything is done."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class PageRequest:
     client: str = ""
     """The page that asks, among all that are open."""
     camera: dict[str, Any] | None = None
-    """Where it stands: `transforms.json` with one frame, in the frame of the result."""
+    """Camera of the page, as a `transforms.json` with one frame, in the frame of the result."""
     mask: str | None = None
     """PNG of the marks in base64; None without any."""
     box: tuple[float, float, float, float, float, float] | None = None

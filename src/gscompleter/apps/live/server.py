@@ -105,13 +105,16 @@ class LiveHandler(PageHandler):
             self._submit(self.rfile.read(int(length)))
 
     def _submit(self, body: bytes) -> None:
+        answer: dict[str, str] = {}
+        status = 202
         try:
             self.server.page.submit(body)
-            answer, status = {}, 202
         except InputError as error:
-            answer, status = {"text": str(error)}, 400
+            answer["text"] = str(error)
+            status = 400
         except BusyError as error:
-            answer, status = {"text": str(error)}, 409
+            answer["text"] = str(error)
+            status = 409
         self.send_content(json.dumps(answer).encode(), JSON, status)
 
     def _is_allowed(self) -> bool:

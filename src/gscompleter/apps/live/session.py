@@ -171,7 +171,7 @@ PERFORM: dict[Action, Callable[[Session, Step, Camera], tuple[Completion, str]]]
     "remove": remove_step,
     "repair": repair_step,
 }
-"""What each action does to the latest completion, and the sentence about it."""
+"""Function of each action: latest completion to the next one, with a sentence about it."""
 
 
 def keep_change(session: Session, completion: Completion) -> tuple[Completion, str]:

@@ -1,4 +1,4 @@
-"""What can be done to a scene at a camera: complete, remove, fill and repair.
+"""Complete, remove, fill and repair a scene at a camera.
 
 Every function takes a completion and returns a new one, so that the one before serves as undo.
 Cameras and marks are in the frame of the result.

@@ -33,7 +33,6 @@ STROKES = (STROKES_FILE, f"{MASK_FOLDER}/stroke*.png")
 """Globs of the files that are written."""
 ADVICE = "save the session again"
 
-
 Row = tuple[float, float, float, float]
 
 
@@ -128,17 +127,17 @@ def read_strokes(path: Path) -> StrokesFile:
     return strokes
 
 
-def read_steps(path: Path) -> list[Step]:
-    """Read the steps of a `strokes.json`, with their cameras in its frame and their masks."""
+def read_steps(strokes: StrokesFile, folder: Path) -> list[Step]:
+    """Make the steps of a `strokes.json`, with cameras in its frame; read masks from `folder`."""
     return [
         Step(
             row.action,
             row.make_camera(),
-            None if row.mask_path is None else read_bytes(path.parent / row.mask_path),
+            None if row.mask_path is None else read_bytes(folder / row.mask_path),
             row.box,
             row.box_rotation,
         )
-        for row in read_strokes(path).frames
+        for row in strokes.frames
     ]
 
 
