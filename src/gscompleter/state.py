@@ -181,7 +181,8 @@ class Completion:
     config: CompleterConfig
     source: ContextScene
     parts: tuple[Gaussians, ...]
-    """Gaussians to render: the context, recoloured in part, then one part per target."""
+    """Gaussians to render: the context, recoloured in part, then what each target added: for the
+    hole, and for thin gaps. Frozen scenes are extended part by part."""
     photos: tuple[Photo, ...]
     """Context photographs, then check photographs."""
     num_context: int
@@ -266,9 +267,14 @@ class Completion:
         known = self.photos[0].view.camera  # all photographs share one depth range
         return replace(camera, near=known.near, far=known.far)
 
-    def extended(self, result: TargetResult, seconds: Mapping[str, float]) -> Completion:
-        """Append the result of one more target, and what it added."""
-        parts = (*self.parts, result.added) if len(result.added) else self.parts
+    def extended(
+        self,
+        result: TargetResult,
+        seconds: Mapping[str, float],
+        added: Sequence[Gaussians] = (),
+    ) -> Completion:
+        """Append the result of one more target, and what it `added`, in the order of addition."""
+        parts = (*self.parts, *(part for part in added if len(part)))
         targets = (*self.targets, result)
         return replace(self, parts=parts, targets=targets).plus_seconds(seconds)
 

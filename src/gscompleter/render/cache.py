@@ -10,7 +10,7 @@ from gscompleter.render.view_map import get_view_map
 from gscompleter.types import Camera, Gaussians
 
 Parts = tuple[Gaussians, ...]
-"""Gaussians to render: the context, then one part per target."""
+"""Gaussians to render: the context, then what was added, part by part."""
 
 
 class SceneRenderer:

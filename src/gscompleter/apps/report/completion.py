@@ -32,7 +32,7 @@ from gscompleter.config.settings import COVERED
 from gscompleter.editing.removal import hide_removed
 from gscompleter.evaluation.metrics.coverage import RenderPair, compute_coverage
 from gscompleter.evaluation.metrics.image import compute_masked_psnr, ssim
-from gscompleter.evaluation.metrics.thin_gaps import measure_thin_gaps
+from gscompleter.evaluation.metrics.thin_gaps import measure_flight, measure_thin_gaps
 from gscompleter.evaluation.verdict.held_out import HeldOut, render_before_after, score_held_out
 from gscompleter.evaluation.verdict.outcome import judge_completion
 from gscompleter.evaluation.verdict.rows import ScoreRow
@@ -226,14 +226,25 @@ def score_targets(
         t.view and hide_removed(t.view.to(device), completion.source, renderer) for t in targets
     ]
     scores = map_in_parallel(compute_scores, pairs, views)
-    rows = zip(targets, completion.targets, scores, strict=True)
+    flights = measure_flights(completion, renderer)
+    rows = zip(targets, completion.targets, scores, flights, strict=True)
     return [make_target_row(completion, *row) for row in rows]
 
 
+def measure_flights(completion: Completion, renderer: Renderer) -> list[float]:
+    """Compute the share of thin gaps on the way from a photograph to each target."""
+    # As stages see it: of a large scene its proxy, which shows the same gaps.
+    scene = merge(completion.parts)
+    photographs = [view.camera for view in completion.views]
+    return [
+        measure_flight(scene, photographs, result.target, renderer) for result in completion.targets
+    ]
+
+
 def make_target_row(
-    completion: Completion, target: Target, result: TargetResult, scores: Scores
+    completion: Completion, target: Target, result: TargetResult, scores: Scores, flight: float
 ) -> TargetRow:
-    """Make the row of a target."""
+    """Make the row of a target; `flight` is the share of thin gaps on the way to it."""
     fit = result.affine
     added = result.added
     return TargetRow(
@@ -252,6 +263,7 @@ def make_target_row(
         refused=result.refusal,
         offset=target.offset,
         thin_gaps=measure_thin_gaps(result.after.alpha),
+        flight_thin_gaps=flight,
         painter=result.painter or None,
     )
 
