@@ -12,8 +12,8 @@ import numpy as np
 from PIL import Image
 
 import gscompleter as gsc
-from gscompleter.apps.completing.demo import write_motorcycle_scene
 from gscompleter.apps.report.film import draw_corner_label
+from gscompleter.data.demo_scene import write_motorcycle_scene
 from gscompleter.system.files.image import convert_to_pixels
 
 RESOLUTION = (500, 740)

@@ -11,11 +11,13 @@ if TYPE_CHECKING:
     from gscompleter.completer import GSCompleter as GSCompleter
     from gscompleter.config import CompleterConfig as CompleterConfig
     from gscompleter.config import load_config as load_config
+    from gscompleter.data.demo_scene import write_demo_scene as write_demo_scene
     from gscompleter.data.scene import load_camera as load_camera
     from gscompleter.data.scene import load_cameras as load_cameras
     from gscompleter.data.scene import load_views as load_views
     from gscompleter.evaluation.verdict.judge import judge as judge
     from gscompleter.generators import load_generator as load_generator
+    from gscompleter.planning.remove import remove as remove
     from gscompleter.reconstructors import load_reconstructor as load_reconstructor
     from gscompleter.render.loading import load_renderer as load_renderer
     from gscompleter.splats import load_splat as load_splat
@@ -45,6 +47,7 @@ _HOMES = {
     "load_camera": "data.scene",
     "load_cameras": "data.scene",
     "load_views": "data.scene",
+    "remove": "planning.remove",
     "load_reconstructor": "reconstructors",
     "load_renderer": "render.loading",
     "load_splat": "splats",
@@ -55,6 +58,7 @@ _HOMES = {
     "Render": "types",
     "View": "types",
     "merge": "types",
+    "write_demo_scene": "data.demo_scene",
     "render_views": "virtual_capture.render_views",
 }
 
