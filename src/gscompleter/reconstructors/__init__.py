@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import is_dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool
@@ -204,14 +205,28 @@ def list_reconstructors() -> dict[str, Callable[[Path | None, str], Reconstructo
     return RECONSTRUCTORS | load_plugins(PLUGINS)
 
 
+def find_loader(name: str) -> Callable[[Path | None, str], Reconstructor] | None:
+    """Find the loader of a reconstructor; None if there is none.
+
+    A name such as `ffgs:FAMILY/VARIANT` in the table stands for all that begin with `ffgs:`; its
+    loader takes the rest as `variant`.
+    """
+    if name in RECONSTRUCTORS:
+        return RECONSTRUCTORS[name]
+    loaders: dict[str, Any] = dict(list_reconstructors())
+    family, colon, variant = name.partition(":")
+    for known, load in loaders.items():
+        if colon and variant and known.startswith(f"{family}:"):
+            return partial(load, variant=variant)
+    return loaders.get(name)
+
+
 def check_reconstructor(name: str) -> None:
     """Raise InputError if no reconstructor has this name, or a named file has none."""
     if is_in_file(name):
         load_own(name, None)
         return
-    if not isinstance(name, str) or (
-        name not in RECONSTRUCTORS and name not in list_reconstructors()
-    ):
+    if not isinstance(name, str) or find_loader(name) is None:
         raise InputError(
             f"There is no reconstructor '{quote_value(name)}'; choose one of "
             f"{', '.join(list_reconstructors())}, or name a function as file.py:function."
@@ -253,7 +268,8 @@ def load_reconstructor(
         reconstructor = load_own(name, weights)
     else:
         check_reconstructor(name)
-        load = RECONSTRUCTORS.get(name) or list_reconstructors()[name]
+        load = find_loader(name)
+        assert load is not None
         reconstructor = load(None if weights is None else Path(weights), device)
     if depth == "none":
         return reconstructor
