@@ -97,7 +97,7 @@ def test_other_files_are_refused_with_one_sentence(tmp_path):
     with pytest.raises(InputError):
         load(tmp_path / "page.onnx")
     with pytest.raises(
-        InputError, match="There is no depth 'nobody'; choose one of none, .*moge-2, "
+        InputError, match="There is no depth 'nobody'; choose one of none, .*moge-2,"
     ):
         load_reconstructor("plane-sweep", depth="nobody")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import runpy
 from pathlib import Path
 
 import pytest
@@ -80,6 +81,19 @@ def test_it_writes_scenes_and_the_report(executed):
 
 def find_names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
+
+
+def test_the_site_has_a_badge_of_colab_once_the_repository_has_an_address():
+    pytest.importorskip("mkdocs", reason="needs gscompleter[docs]")
+    site = runpy.run_path(str(ROOT / "mkdocs_hooks.py"))
+    plain = site["of_notebook"](None)
+    assert plain.startswith("# gscompleter: quick start")
+    assert plain.count("```python") == sum(c.cell_type == "code" for c in read_notebook().cells)
+    assert "colab.research" not in plain
+    page = site["of_notebook"]("https://github.com/some/place/")
+    address = "/github/some/place/blob/main/examples/quickstart.ipynb)"
+    assert address in page
+    assert "colab-badge.svg" in page
 
 
 def test_its_progress_leaves_nothing_behind(executed):
