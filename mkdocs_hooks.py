@@ -1,6 +1,7 @@
-"""Pages of the site that are generated: from README, scripts, options and public names.
+"""Pages of the site that are generated: from README, scripts, notebook, options and public names.
 
-Links are written for the repository, and converted to the same file on the site.
+The demo is completed for the page that embeds the viewer. Links are written for the repository, and
+converted to the same file on the site.
 """
 
 from __future__ import annotations
@@ -9,8 +10,11 @@ import ast
 import contextlib
 import importlib
 import io
+import json
 import os
 import re
+import shutil
+import tempfile
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -45,6 +49,14 @@ STAGES = (
     "new_photos",
 )
 """Modules of `stages/` in the paper's order; those that do not exist are left out."""
+NOTEBOOK = ROOT / "examples" / "quickstart.ipynb"
+NOTEBOOK_PAGE = "tutorials/notebook.md"
+DEMO_PAGE = "demo.md"
+DEMO = "demo-viewer.html"
+"""File of the site with the viewer and the completed demo in it."""
+DEMO_RESOLUTION = 192
+"""Longer side of the demo's photographs, in pixels: a file of some megabytes."""
+COLAB = "https://colab.research.google.com"
 LINK = re.compile(r"(?<=\]\()[^)\s]+(?=\))")
 
 
@@ -59,7 +71,8 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
     pages = sorted(path.relative_to(ROOT / "docs").as_posix() for path in find_pages())
     others = [page for page in pages if page not in named]
     decisions = [page for page in others if page.startswith("decisions/")]
-    config.nav.insert(2, {"Tutorials": list(tutorials())})
+    config.nav.insert(1, {"Demo": DEMO_PAGE})
+    config.nav.insert(3, {"Tutorials": [{"Notebook": NOTEBOOK_PAGE}, *tutorials()]})
     add_pages(config.nav, "decisions/index.md", decisions)
     if more := [page for page in others if page not in decisions]:
         config.nav.append({"More": more})
@@ -87,6 +100,8 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     made = {page: (ROOT / name).read_text() for name, page in TEXTS.items()}
     made |= {page: of_script(path) for page, path in tutorials().items()}
     made |= {
+        NOTEBOOK_PAGE: of_notebook(config.repo_url),
+        DEMO_PAGE: of_demo(),
         "reference/commands.md": of_commands(),
         "reference/python.md": of_names(),
         "reference/stages.md": of_stages(),
@@ -94,7 +109,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     made |= {name: (ROOT / name).read_text() for name in FILES}
     for page, text in made.items():
         files.append(File.generated(config, page, content=text))
+    files.append(File.generated(config, NOTEBOOK.name, content=NOTEBOOK.read_text()))
     return files
+
+
+def on_post_build(config: MkDocsConfig) -> None:
+    """Write the viewer with the completed demo beside the pages."""
+    write_demo(Path(config.site_dir) / DEMO)
 
 
 def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
@@ -111,6 +132,7 @@ def site_link(link: str, place: str, page: str) -> str:
         return link
     path = os.path.normpath(os.path.join(os.path.dirname(place), target))
     scripts = {f"examples/{script.name}": made for made, script in tutorials().items()}
+    scripts[f"examples/{NOTEBOOK.name}"] = NOTEBOOK_PAGE
     uri = (TEXTS | scripts).get(path, path.removeprefix("docs/"))
     return os.path.relpath(uri, os.path.dirname(page) or ".") + mark + anchor
 
@@ -120,6 +142,54 @@ def of_script(path: Path) -> str:
     text = path.read_text()
     title, _, text_below = (ast.get_docstring(ast.parse(text)) or path.stem).partition("\n")
     return f"# {title.rstrip('.')}\n\n{text_below}\n\n```python\n{text}```\n"
+
+
+def of_notebook(repository: str | None) -> str:
+    """Make the page of the notebook: its text and code, as it is stored without output.
+
+    With the address of the repository on GitHub (`repo_url` of mkdocs.yml), Colab opens it by a
+    badge.
+    """
+    parts = []
+    for cell in json.loads(NOTEBOOK.read_text())["cells"]:
+        text = "".join(cell["source"])
+        parts.append(text if cell["cell_type"] == "markdown" else f"```python\n{text}\n```")
+    links = [f"[Download the notebook](../{NOTEBOOK.name})"]
+    if repository and "github.com/" in repository:
+        place = repository.rstrip("/").partition("github.com/")[2]
+        address = f"{COLAB}/github/{place}/blob/main/examples/{NOTEBOOK.name}"
+        links.insert(0, f"[![Open in Colab]({COLAB}/assets/colab-badge.svg)]({address})")
+    title, *others = parts
+    return "\n\n".join([title, " · ".join(links), *others]) + "\n"
+
+
+def of_demo() -> str:
+    """Make the page that embeds the viewer."""
+    return f"""# Demo
+
+Two photographs of a motorcycle (Middlebury 2014, part of scikit-image), completed for a camera on
+either side, as `gscompleter demo` does it. Drag to look around; `1` to `4` show before, after or
+both, `P` plays the cameras, `?` lists the keys. The viewer needs WebGL 2, and loads nothing from
+elsewhere; `gscompleter view OUT --save page.html` writes such a file.
+
+<iframe src="../{DEMO}" title="The demo before and after" width="100%" height="560"
+style="border:0" loading="lazy"></iframe>
+"""
+
+
+def write_demo(path: Path) -> None:
+    """Complete the demo at a small size, and write its viewer into one file."""
+    import gscompleter as gsc
+    from gscompleter.apps.commands.view import ViewOptions, run_view
+
+    with tempfile.TemporaryDirectory() as place:
+        folder = gsc.write_demo_scene(Path(place) / "motorcycle")
+        views = gsc.load_views(folder, resolution=DEMO_RESOLUTION)
+        targets = gsc.load_cameras(folder / "targets.json", resolution=DEMO_RESOLUTION)
+        out = gsc.GSCompleter()(views, targets).save(Path(place) / "demo")
+        page = Path(place) / DEMO
+        run_view(ViewOptions(scene=out, save=page, quiet=True))
+        shutil.move(page, path)
 
 
 def of_commands() -> str:

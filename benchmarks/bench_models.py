@@ -19,7 +19,7 @@ from rich.console import Console
 from rich.table import Table
 
 from bench_render import measure_median_seconds
-from gscompleter.apps.completing.demo import write_motorcycle_scene
+from gscompleter.data.demo_scene import write_motorcycle_scene
 from gscompleter.data.scene import load_views
 from gscompleter.evaluation.memory import measure_peak_memory
 from gscompleter.models.weights.published import PUBLISHED

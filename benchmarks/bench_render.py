@@ -16,7 +16,7 @@ import torch
 import tyro
 
 from gscompleter import Gaussians, View, load_renderer, merge
-from gscompleter.apps.completing.demo import get_motorcycle_cameras, move_right
+from gscompleter.data.demo_scene import get_motorcycle_cameras, move_right
 from gscompleter.numerics.geometry import pad_camera
 from gscompleter.types import make_observed, sh_from_rgb
 

@@ -18,7 +18,7 @@ from skimage.data import stereo_motorcycle
 from skimage.restoration import denoise_tv_chambolle
 
 from gscompleter import View
-from gscompleter.apps.completing.demo import (
+from gscompleter.data.demo_scene import (
     BASELINE_M,
     FOCAL_PX,
     PRINCIPAL_POINT_DX_PX,

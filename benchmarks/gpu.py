@@ -38,7 +38,7 @@ from gscompleter import CompleterConfig, Gaussians, GSCompleter, View, load_rend
 from gscompleter.evaluation.baselines.optimization import OptimizationConfig, optimize
 from gscompleter.evaluation.baselines.reggs import RegGSConfig, register_by_similarity
 from gscompleter.generators import GeneratorRequest, load_generator
-from gscompleter.models.diffusion.inpaint import DiffusersInpaint, Painter, get_size_rules
+from gscompleter.models.diffusion.inpaint import DiffusersInpaint, Editor, get_size_rules
 from gscompleter.models.diffusion.pe_field import PEField
 from gscompleter.models.diffusion.placing import select_dtype
 from gscompleter.models.tables import DEPTH_PREDICTORS
@@ -439,7 +439,7 @@ def measure_free_models(bench: Bench, klein: Callable[[str], Any] | None = None)
 
     def painted() -> Iterator[Row]:
         pipeline = (klein or build_random_klein)(bench.device)
-        generator = DiffusersInpaint(Painter(pipeline, *get_size_rules(pipeline)), steps=4)
+        generator = DiffusersInpaint(Editor(pipeline, *get_size_rules(pipeline)), steps=4)
         seconds = measure_median_seconds(lambda: generator.synthesize(requests), bench.repetitions)
         yield Row("flux2-klein, 4 steps", seconds, "s")
 
@@ -460,7 +460,7 @@ def measure_free_models(bench: Bench, klein: Callable[[str], Any] | None = None)
             )
 
     yield from try_rows("flux2-klein", painted)
-    for name in ("migan", "lama", *DEPTH_PREDICTORS):
+    for name in ("migan", "lama", *(depth for depth in DEPTH_PREDICTORS if depth in PUBLISHED)):
         yield from try_rows(name, lambda name=name: ran(name))
 
 
@@ -492,7 +492,7 @@ def build_random_klein(device: str) -> Any:
             vae, encoder = diffusers.AutoencoderKLFlux2(), Qwen3ForCausalLM(language)
     finally:
         torch.set_default_dtype(before)
-    return diffusers.Flux2KleinInpaintPipeline(
+    return diffusers.Flux2KleinPipeline(
         scheduler=diffusers.FlowMatchEulerDiscreteScheduler(),
         vae=vae.eval(),
         text_encoder=encoder.eval(),

@@ -36,7 +36,7 @@ from gscompleter.stages.synthesize import GeneratedView, synthesize
 from gscompleter.stages.target_view import TargetView, render_target
 from gscompleter.state import NEW_PHOTO_ID, Completion, Photo, Step, find_last_target_id
 from gscompleter.system.errors import InputError
-from gscompleter.system.progress import track
+from gscompleter.system.progress import show_in_notebook, track
 from gscompleter.system.tensor_checks import describe, is_whole
 from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.trust import Trust
@@ -101,6 +101,7 @@ class GSCompleter:
         """The renderer, with scenes frozen at the cameras that are visited again."""
         return SceneRenderer(self.renderer)
 
+    @show_in_notebook()
     def __call__(
         self,
         views: Sequence[View],
@@ -129,6 +130,7 @@ class GSCompleter:
             check_target_ids(scene, len(targets))
         return self.complete(self.begin(views, scene, check_views, targets), targets)
 
+    @show_in_notebook()
     def complete(self, state: Completion, targets: Sequence[Camera]) -> Completion:
         """Complete a begun scene for targets, one group after the other.
 
@@ -141,6 +143,7 @@ class GSCompleter:
         check_any_completed(state)
         return state
 
+    @show_in_notebook()
     def begin(
         self,
         views: Sequence[View],
@@ -169,6 +172,7 @@ class GSCompleter:
                 len(views),
                 Trust(),
                 is_given=scene is not None,
+                seed=self.seed,
             )
             # Guards measure the scene as it was given, so before anything changes.
             state = prepare_guards(state, self.scenes)
@@ -190,6 +194,7 @@ class GSCompleter:
             state = recolor_to_photos(state, [context.views[i] for i in new], self.scenes)
         return replace(state, exposure_gains=context.exposure_gains, seconds=seconds)
 
+    @show_in_notebook()
     def advance(
         self, state: Completion, target: Camera, reference: GeneratedView | None = None
     ) -> Completion:

@@ -5,13 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar
+from pathlib import Path
+from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import CompleterConfig
+from gscompleter.system.files.display import Displayed
+from gscompleter.system.plugins import load_function
 from gscompleter.system.timing import add_seconds
 from gscompleter.trust import Trust
 from gscompleter.types import (
@@ -27,6 +30,10 @@ from gscompleter.types import (
 
 NEW_PHOTO_ID = 255
 """Value of `generated` for Gaussians that were recoloured to a new photograph, or cut."""
+MAX_SHOWN_TARGETS = 4
+"""Most targets whose pictures a notebook shows."""
+RESULTS = "gscompleter.apps.report.results"
+"""Module of the files and scores of a completion, which is above this one."""
 AFFINE_NOTES = {
     "ransac": "",
     "median": "RANSAC finds no reliable depth correction; the median depth ratio replaces it.",
@@ -109,8 +116,8 @@ class Unfilled:
         )
 
 
-@dataclass(frozen=True)
-class TargetResult:
+@dataclass(frozen=True, repr=False)
+class TargetResult(Displayed):
     """Result of one target camera. No stage reads it."""
 
     target: Camera
@@ -149,6 +156,17 @@ class TargetResult:
     skip_reason: str = ""
     """Sentence why there was nothing to complete; empty if there was."""
 
+    def summarize(self) -> str:
+        """Describe the hole, and what was done about it."""
+        parts = [f"hole {self.hole_fraction:.1%}", f"{len(self.added):,} Gaussians added"]
+        if self.num_recolored:
+            parts.append(f"{self.num_recolored:,} recoloured")
+        return ", ".join([*parts, f"{len(self.notes)} notes"] if self.notes else parts)
+
+    def list_pictures(self) -> dict[str, Tensor]:
+        """List the scene at the target before and after."""
+        return {"before": self.before.image, "after": self.after.image}
+
     @property
     def hole_fraction(self) -> float:
         """Fraction of the image in holes."""
@@ -174,8 +192,8 @@ class TargetResult:
         return tuple(filter(None, notes))
 
 
-@dataclass(frozen=True)
-class Completion:
+@dataclass(frozen=True, repr=False)
+class Completion(Displayed):
     """A scene during completion; steps return a new value, and the old one serves as undo."""
 
     config: CompleterConfig
@@ -201,6 +219,71 @@ class Completion:
     """Number of Gaussians that were added from photographs, before any target."""
     is_given: bool = False
     """True if the context is a scene that was given, and Ψ did not reconstruct it."""
+    seed: int = 0
+    """Seed of all random numbers."""
+
+    def summarize(self) -> str:
+        """Describe the targets and the Gaussians."""
+        count = len(self.targets)
+        holes = ", ".join(f"{result.hole_fraction:.1%}" for result in self.targets)
+        targets = f"{count} target{'' if count == 1 else 's'}"
+        if holes:
+            targets += f" with holes of {holes}"
+        return f"{targets}; {len(self.added):,} Gaussians added to {len(self.context):,}"
+
+    def list_pictures(self) -> dict[str, Tensor]:
+        """List the scene at its first targets, before and after."""
+        shown = enumerate(self.targets[:MAX_SHOWN_TARGETS], start=1)
+        return {
+            f"target {number}, {when}": image
+            for number, result in shown
+            for when, image in result.list_pictures().items()
+        }
+
+    @cached_property
+    def scores(self) -> dict[str, Any]:
+        """The verdict, coverage, and scores of photographs and targets, as in `summary.json`.
+
+        Photographs that were not used are missing in them; `score` takes some.
+        """
+        return self.score()
+
+    def score(self, unused_views: Sequence[View] = ()) -> dict[str, Any]:
+        """Score as `scores`, with photographs that were not used, in the frame of the cameras.
+
+        One at the camera of a target scores that target; the others count as held out.
+        """
+        scores: dict[str, Any] = load_function(RESULTS, "score_result")(self, unused_views)
+        return scores
+
+    def save(
+        self,
+        out: Path | str,
+        unused_views: Sequence[View] = (),
+        splat: Path | str | None = None,
+        overwrite: bool = False,
+    ) -> Path:
+        """Write what the command `complete` writes to a folder, and return the folder.
+
+        Args:
+            out: New or empty folder; with `overwrite`, also one of an earlier run.
+            unused_views: As in `score`.
+            splat: File that the scene was loaded from, in whose layout and order `completed.ply`
+                is then written, so that `strip` takes back recolouring and removal, too.
+            overwrite: True to replace the files of an earlier run.
+
+        Raises:
+            InputError: The folder is not empty, or the file holds another scene.
+        """
+        folder: Path = load_function(RESULTS, "save_result")(
+            self, out, unused_views, splat, overwrite
+        )
+        return folder
+
+    def report(self, file: Path | str, unused_views: Sequence[View] = ()) -> Path:
+        """Write the page `report.html` of the command alone, under any name; return its path."""
+        path: Path = load_function(RESULTS, "write_result_page")(self, file, unused_views)
+        return path
 
     @property
     def views(self) -> tuple[View, ...]:

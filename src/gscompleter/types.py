@@ -24,6 +24,7 @@ from torch import Tensor
 
 from gscompleter.config.settings import COVERED
 from gscompleter.system.errors import InputError
+from gscompleter.system.files.display import Displayed
 from gscompleter.system.tensor_checks import (
     BOOLS,
     BYTES,
@@ -96,8 +97,8 @@ class TensorDataclass:
         }
 
 
-@dataclass(frozen=True)
-class Camera(TensorDataclass):
+@dataclass(frozen=True, repr=False)
+class Camera(Displayed, TensorDataclass):
     """A pinhole camera with OpenCV axes: x right, y down, z forward."""
 
     c2w: Float[Tensor, "4 4"]
@@ -131,6 +132,15 @@ class Camera(TensorDataclass):
             number = getattr(self, name)
             if number is not None and type(number) is not convert:
                 object.__setattr__(self, name, convert(number))
+
+    def summarize(self) -> str:
+        """Describe size, focal length, place and depth range."""
+        place = ", ".join(f"{x:.4g}" for x in self.center.tolist())
+        parts = [f"{self.width} x {self.height} pixels", f"focal length {self.K[0, 0]:.4g}"]
+        parts.append(f"centre ({place})")
+        if self.near is not None and self.far is not None:
+            parts.append(f"depths {self.near:.4g} to {self.far:.4g}")
+        return ", ".join(parts)
 
     @property
     def center(self) -> Float[Tensor, "3"]:
@@ -256,8 +266,8 @@ class PaddedCamera:
         return image[rows, self.left : self.left + self.target.width]
 
 
-@dataclass(frozen=True)
-class View(TensorDataclass):
+@dataclass(frozen=True, repr=False)
+class View(Displayed, TensorDataclass):
     """A photograph (or a synthesized image) and its camera."""
 
     image: Float[Tensor, "h w 3"]
@@ -320,6 +330,19 @@ class View(TensorDataclass):
         ):
             raise InputError("A depth both constrains and scores a view; leave one of them out.")
 
+    def summarize(self) -> str:
+        """Describe the frame, the size, and the depths and masks that there are."""
+        parts = [] if self.frame is None else [f"frame {self.frame}"]
+        parts.append(f"{self.camera.width} x {self.camera.height} pixels")
+        maps = [name for name in self.forms if name != "image" and getattr(self, name) is not None]
+        parts += [f"with {name.replace('_', ' ')}" for name in maps]
+        return ", ".join(parts)
+
+    def list_pictures(self) -> dict[str, Tensor]:
+        """List the image."""
+        caption = "image" if self.frame is None else f"frame {self.frame}"
+        return {caption: self.image}
+
     @property
     def known_depths(self) -> Float[Tensor, "n"]:
         """Given depths of the pixels that have one."""
@@ -356,8 +379,8 @@ class View(TensorDataclass):
         return replace(self, image=(self.image / gain).clamp(0, 1))
 
 
-@dataclass(frozen=True)
-class Gaussians(TensorDataclass):
+@dataclass(frozen=True, repr=False)
+class Gaussians(Displayed, TensorDataclass):
     """A set of n 3D Gaussians in world coordinates, with their provenance."""
 
     means: Float[Tensor, "n 3"]
@@ -409,6 +432,19 @@ class Gaussians(TensorDataclass):
                 "is_antialiased of Gaussians has to be True or False, and is "
                 f"{describe(self.is_antialiased)}."
             )
+
+    def summarize(self) -> str:
+        """Describe the number, the generated ones, the extent and the degree of harmonics."""
+        num_generated = int((self.generated > 0).sum())
+        parts = [f"{len(self):,} Gaussians"]
+        if num_generated:
+            parts.append(f"{num_generated:,} of them generated")
+        if len(self):
+            low, high = self.means.aminmax(dim=0)
+            corners = [", ".join(f"{x:.4g}" for x in corner.tolist()) for corner in (low, high)]
+            parts.append(f"from ({corners[0]}) to ({corners[1]})")
+        parts.append(f"harmonics of degree {self.sh_degree}")
+        return ", ".join([*parts, "antialiased"] if self.is_antialiased else parts)
 
     def __len__(self) -> int:
         return self.means.shape[0]
@@ -484,8 +520,8 @@ def sh_from_rgb(rgb: Float[Tensor, "n 3"]) -> Float[Tensor, "n 1 3"]:
     return ((rgb - 0.5) / SH_C0)[:, None]
 
 
-@dataclass(frozen=True)
-class Render:
+@dataclass(frozen=True, repr=False)
+class Render(Displayed):
     """A rendering of Gaussians over black."""
 
     image: Float[Tensor, "h w 3"]
@@ -493,6 +529,16 @@ class Render:
     """z-depth in scene units, sum(w z) / sum(w) over the compositing weights w; 0 if alpha is 0."""
     alpha: Float[Tensor, "h w"]
     """Accumulated opacity, sum(w)."""
+
+    def summarize(self) -> str:
+        """Describe the size and how much of the image is covered."""
+        height, width = self.alpha.shape
+        covered = (self.alpha >= COVERED).float().mean().item()
+        return f"{width} x {height} pixels, {covered:.1%} covered"
+
+    def list_pictures(self) -> dict[str, Tensor]:
+        """List the colours."""
+        return {"render": self.image}
 
     def crop(self, camera: PaddedCamera) -> Render:
         """Cut the padding off a render of the padded camera."""
@@ -503,8 +549,8 @@ class Render:
         return DepthMap(self.depth, self.alpha >= min_alpha)
 
 
-@dataclass(frozen=True)
-class DepthMap(TensorDataclass):
+@dataclass(frozen=True, repr=False)
+class DepthMap(Displayed, TensorDataclass):
     """z-depth per pixel, in scene units, with a validity mask."""
 
     depth: Float[Tensor, "h w"]
@@ -529,6 +575,20 @@ class DepthMap(TensorDataclass):
                 f"The parts of a depth map have to be of one size, and have the shapes "
                 f"{' and '.join(str(list(shape)) for shape in sorted(shapes))}."
             )
+
+    def summarize(self) -> str:
+        """Describe the size, the valid share and the range of depths."""
+        height, width = self.depth.shape
+        parts = [f"{width} x {height} pixels", f"{self.valid.float().mean().item():.1%} valid"]
+        if self.valid.any():
+            low, high = self.depth[self.valid].aminmax()
+            parts.append(f"depths {low:.4g} to {high:.4g}")
+        return ", ".join(parts)
+
+    def list_pictures(self) -> dict[str, Tensor]:
+        """List inverse depth, brighter where nearer and black where it is invalid."""
+        inverse = torch.where(self.valid, 1 / self.depth, torch.zeros_like(self.depth))
+        return {"inverse depth": inverse / inverse.max().clamp_min(1e-12)}
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,11 @@ generators with the protocol.
 
 from __future__ import annotations
 
-import inspect
 import json
 import shutil
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -27,8 +27,13 @@ from gscompleter.config import SynthesisConfig
 from gscompleter.config.generators import get_settings_class
 from gscompleter.generators import GeneratorRequest
 from gscompleter.models.diffusion import pe_field
-from gscompleter.models.diffusion.inpaint import DiffusersInpaint, complete_warp, load_painter
-from gscompleter.models.diffusion.kontext import SIZES, find_nearest_size
+from gscompleter.models.diffusion.inpaint import (
+    DiffusersInpaint,
+    Editor,
+    complete_warp,
+    load_painter,
+)
+from gscompleter.models.diffusion.kontext import SIZES, find_nearest_size, resize_antialiased
 from gscompleter.models.diffusion.loading import PROMPT, load_kontext
 from gscompleter.models.diffusion.pe_field import PEField, group_by_size
 from gscompleter.models.diffusion.source_depth import (
@@ -37,6 +42,7 @@ from gscompleter.models.diffusion.source_depth import (
     load_monocular,
 )
 from gscompleter.models.settings import DiffusersInpaintSettings, PEFieldSettings
+from gscompleter.system.files.image import convert_to_pixels
 from gscompleter.types import Gaussians, GeneratorInput, merge
 from known_room import TARGET, known_room
 from parity import assert_close
@@ -260,30 +266,41 @@ def test_inpainting_keeps_what_was_warped_and_fills_the_rest(name, tmp_path):
     assert not torch.equal(image, other)
 
 
-def test_flux2_klein_sees_the_nearest_photograph(tmp_path):
+def test_flux2_klein_edits_what_is_painted_over_and_gets_no_mask(tmp_path):
     folder = tiny_diffusion.saved(tiny_diffusion.flux2_klein(), tmp_path)
     kind = get_settings_class("flux2-klein")
     assert (kind().steps, kind().weights.partition("@")[0]) == (
         4,
         "black-forest-labs/FLUX.2-klein-4B",
     )
-    generator = load_generator("flux2-klein", settings=kind(weights=str(folder)))
+    settings = kind(weights=str(folder), prompt="a red room")
+    generator = load_generator("flux2-klein", settings=settings)
+    assert type(generator.painter) is Editor
     painter = replace(generator.painter, side=128)
-    assert type(painter.pipeline).__name__ == "Flux2KleinInpaintPipeline"
+    assert type(painter.pipeline).__name__ == "Flux2KleinPipeline"
     context, seen = known_room(), {}
     call = type(painter.pipeline).__call__
 
     class Watched(type(painter.pipeline)):
-        def __call__(self, *values, image_reference=None, **others):
-            seen.update(image_reference=image_reference, **others)
-            return call(self, *values, image_reference=image_reference, **others)
-
-        __call__.__signature__ = inspect.signature(call)
+        def __call__(self, **given):
+            seen.update(given)
+            return call(self, **given)
 
     painter.pipeline.__class__ = Watched
-    answer(replace(generator, painter=painter), context.views[1], TARGET, context)
-    assert torch.equal(seen["image_reference"][0].permute(1, 2, 0), context.views[1].image)
-    assert (seen["num_inference_steps"], seen["strength"]) == (4, 1.0)
+    nearest = context.views[1]
+    answer(replace(generator, painter=painter), nearest, TARGET, context)
+    assert {"mask_image", "strength"}.isdisjoint(seen)
+    assert seen["num_inference_steps"] == 4
+    assert seen["prompt"].endswith("Change nothing else: a red room.")
+
+    # The hole is green in the first image; the second is the nearest photograph.
+    over, reference = (np.array(image) for image in seen["image"])
+    assert np.array_equal(reference, convert_to_pixels(nearest.image))
+    hole = ~complete_warp(nearest, TARGET, context).known
+    shown = resize_antialiased(hole[..., None].float(), over.shape[:2])[..., 0].numpy() > 0.999
+    assert shown.any()
+    assert (over[shown] == (0, 255, 0)).all()
+    assert not (over == (0, 255, 0)).all(axis=-1).all()
 
 
 def test_the_size_follows_the_pipeline_and_the_aspect(inpaint_folder):

@@ -8,7 +8,7 @@ import torch
 from skimage.data import stereo_motorcycle
 
 from gscompleter import InputError, View
-from gscompleter.apps.completing.demo import (
+from gscompleter.data.demo_scene import (
     BASELINE_M,
     FOCAL_PX,
     PRINCIPAL_POINT_DX_PX,

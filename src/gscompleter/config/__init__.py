@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from annotated_types import Interval
+from annotated_types import Interval, Predicate
 
 from gscompleter.config.settings import (
     COVERED,
@@ -17,6 +17,7 @@ from gscompleter.config.settings import (
     read_yaml,
 )
 from gscompleter.system.errors import InputError, quote_value, require_path
+from gscompleter.system.plugins import is_in_file
 
 Pixels = Annotated[int, Interval(ge=0, le=4096)]
 Step = Annotated[float, Interval(gt=0, le=10)]
@@ -313,6 +314,10 @@ else:
     GuardName = Literal[tuple(GUARDS)]
 
 
+FileName = Annotated[str, Predicate(is_in_file)]
+"""A guard in a file, as in `my_guard.py:KeepOpaque`."""
+
+
 @dataclass(frozen=True)
 class CompleterConfig(Settings):
     """Settings of a completion; `paper()`, the defaults, `splat()` and `bare()` are values of it.
@@ -323,8 +328,9 @@ class CompleterConfig(Settings):
     trust: Literal["full", "photometric"] = "full"
     """Trust in the scene: `full` takes it as it is (paper), `photometric` counts a Gaussian as far
     as photographs confirm it."""
-    guards: tuple[GuardName, ...] = USUAL_GUARDS
-    """Safeguards beyond the paper, in the order in which they are asked (paper: none)."""
+    guards: tuple[GuardName | FileName, ...] = USUAL_GUARDS
+    """Safeguards beyond the paper, in the order in which they are asked (paper: none); one of yours
+    as file.py:Class."""
     add_observed: bool = True
     """Add what the photographs of a given scene show and the scene lacks, before Φ invents
     anything (paper: False)."""

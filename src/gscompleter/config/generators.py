@@ -9,7 +9,7 @@ from annotated_types import Len
 
 from gscompleter.config.settings import Settings
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.plugins import load_plugins
+from gscompleter.system.plugins import is_in_file, load_plugins
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,12 @@ A loader that takes settings has their class as its attribute `settings`.
 
 
 def get_settings_class(name: str) -> type[GeneratorSettings]:
-    """Return the class of a generator's settings, or raise InputError for an unknown name."""
+    """Return the class of a generator's settings, or raise InputError for an unknown name.
+
+    A generator of a file, `file.py:function`, has no settings here.
+    """
+    if is_in_file(name):
+        return GeneratorSettings
     if isinstance(name, str) and name in BUILT_IN:
         return BUILT_IN[name]
     others = load_plugins(PLUGINS)
@@ -50,7 +55,7 @@ def get_settings_class(name: str) -> type[GeneratorSettings]:
         return getattr(others[name], "settings", GeneratorSettings)
     raise InputError(
         f"There is no generator '{quote_value(name)}'; choose one of "
-        f"{', '.join([*BUILT_IN, *others])}.",
+        f"{', '.join([*BUILT_IN, *others])}, or name a function as file.py:function.",
         "generator",
     )
 
@@ -62,7 +67,8 @@ class GeneratorOptions(Settings):
     generator: str = "warp-inpaint"
     """Model that synthesizes the image at a target: warp-inpaint (warped photographs, holes filled
     by patches), oracle (the real photograph), painted (by --images), pe-field (the paper's),
-    diffusers-inpaint, or one of the other models that docs/generators.md lists."""
+    diffusers-inpaint, one of the other models that docs/generators.md lists, or a function of yours
+    as file.py:function."""
     generator_weights: str | None = None
     """Weights, by default those published: a folder saved by diffusers, USER/NAME or
     USER/NAME@COMMIT on the Hugging Face hub for pe-field and diffusers-inpaint (which has no

@@ -71,9 +71,9 @@ def translate_errors(settings: object, where: str = "", prefix: str = "") -> Ite
         yield
     except ValidationError as error:
         # A sentence names one setting: that of the first error. Parts of its place that are no
-        # text are indices.
+        # text are indices, and those with a bracket kinds of a value that may be of several.
         wrong = error.errors(include_url=False)[0]
-        name = ".".join(part for part in wrong["loc"] if isinstance(part, str))
+        name = ".".join(p for p in wrong["loc"] if isinstance(p, str) and "[" not in p)
         raise InputError(where + describe_invalid(wrong, name, settings), prefix + name) from None
 
 

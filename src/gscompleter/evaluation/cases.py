@@ -1,10 +1,7 @@
 """Completion cases: which frames are context, target and neighbours.
 
 A case has two or more context frames, a target frame whose photograph no stage sees, and frames
-beside the target ("neighbours"), which a flat billboard in front of the target cannot satisfy. A
-file of cases is JSON: `{"resolution": [h, w], "cases": [{"scene", "context", "target", "near",
-"far", "neighbours"}, ...]}`. Scene folders are relative to the file, and may name variables of the
-environment (`$GSCOMPLETER_DATA/data/fox`).
+beside the target ("neighbours"), which a flat billboard in front of the target cannot satisfy.
 """
 
 from __future__ import annotations
@@ -13,16 +10,14 @@ import os
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from gscompleter.data.ego_vehicle import attach_vehicle_detector
 from gscompleter.data.formats import SCENE_FORMATS, detect_format, find_format, open_photographs
 from gscompleter.data.frame import describe_moved
 from gscompleter.data.masks import attach_masks
 from gscompleter.data.photographs import MAX_TRANSLATION, Photographs, Resolution
-from gscompleter.system.errors import InputError, quote_value
+from gscompleter.evaluation.case_file import read_case_file
 from gscompleter.system.files.output_folder import holds_results
-from gscompleter.system.files.reading import read_json
 from gscompleter.types import View
 
 
@@ -61,41 +56,20 @@ class Case:
 
 
 def read_cases(path: Path) -> list[Case]:
-    """Read the cases of a file."""
-    content = read_json(path, "name a file of cases")
-    try:
-        height, width = (_check_whole(side) for side in content["resolution"])
-        return [_parse_case(row, (height, width), path) for row in content["cases"]]
-    except (ValueError, KeyError, TypeError, OverflowError) as error:
-        raise InputError(
-            f"{path} is no file of cases ({type(error).__name__}: {quote_value(str(error))}); it "
-            "needs resolution and cases, each with scene, context and target."
-        ) from error
-
-
-def _parse_case(row: Any, resolution: tuple[int, int], path: Path) -> Case:
-    def get_plane(key: str) -> float | None:
-        return None if row.get(key) is None else float(row[key])
-
-    return Case(
-        path.parent / os.path.expandvars(row["scene"]),
-        _check_whole_numbers(row["context"]),
-        _check_whole(row["target"]),
-        _check_whole_numbers(row.get("neighbours", ())),
-        resolution,
-        get_plane("near"),
-        get_plane("far"),
-    )
-
-
-def _check_whole_numbers(values: Any) -> tuple[int, ...]:
-    return tuple(_check_whole(value) for value in values)
-
-
-def _check_whole(value: Any) -> int:
-    if type(value) is not int:
-        raise TypeError(f"{quote_value(value)} is no whole number")
-    return value
+    """Read the cases of a file; raises as `read_case_file`."""
+    content = read_case_file(path)
+    return [
+        Case(
+            path.parent / os.path.expandvars(row.scene),
+            row.context,
+            row.target,
+            row.neighbours,
+            content.resolution,
+            row.near,
+            row.far,
+        )
+        for row in content.rows
+    ]
 
 
 @dataclass(frozen=True)

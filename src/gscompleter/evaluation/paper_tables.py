@@ -101,6 +101,8 @@ class PaperTable:
     """Number of cases that all methods finished, by model and protocol."""
     notes: Sequence[str]
     """Failed cases, and the reason why there is no FID."""
+    compared: str = "Ψ"
+    """Title of the column of the models."""
 
     @property
     def columns(self) -> list[Column]:
@@ -161,6 +163,34 @@ def fill_table(spec: TableSpec, runs: Mapping[tuple[str, str], Path]) -> PaperTa
     return PaperTable(spec, rows, counts, list(dict.fromkeys(notes)))
 
 
+def fill_depth_table(
+    methods: Sequence[str], columns: Sequence[str], runs: Mapping[str, Path]
+) -> PaperTable:
+    """Fill a table that compares depths, from runs of `evaluate` with one depth each.
+
+    Differences are those of a method to itself with the first depth, over the cases that both
+    finished.
+    """
+    first = next(iter(runs))
+    spec = TableSpec(
+        "Depths compared", columns=tuple(columns), methods=tuple(methods), baseline=first
+    )
+    summaries = {depth: summarize_run(read_run_rows(folder)) for depth, folder in runs.items()}
+    rows = []
+    for depth, summary in summaries.items():
+        for method in methods:
+            values = collect_values(summary, method, columns)
+            others: dict[str, dict[str, float]] = {key: {} for key in columns}
+            if depth != first:
+                others = collect_values(summaries[first], method, columns)
+            cells = {key: fill_cell(BY_KEY[key], values[key], others[key]) for key in columns}
+            rows.append(TableRow(depth, "", method, cells))
+    counts = {depth: len(summary.common_tasks) for depth, summary in summaries.items()}
+    failures = [failure for summary in summaries.values() for failure in summary.failures]
+    notes = [f"Failed: {' '.join(failure)}" for failure in failures]
+    return PaperTable(spec, rows, counts, list(dict.fromkeys(notes)), compared="depth")
+
+
 def fill_cells(spec: TableSpec, summary: RunSummary, method: str) -> dict[str, Cell]:
     """Fill the cells of a method, by the key of their column."""
     values = collect_values(summary, method, spec.columns)
@@ -216,7 +246,7 @@ def format_rows(
 ) -> tuple[list[str], list[list[str]]]:
     """Return the titles and the cells of a table; columns with a single name are left out."""
     names: dict[str, Callable[[TableRow], str]] = {
-        "Ψ": lambda row: row.model,
+        table.compared: lambda row: row.model,
         "protocol": lambda row: row.protocol,
         "method": lambda row: row.method,
     }

@@ -19,7 +19,7 @@ from gscompleter.config.generators import (
 from gscompleter.config.settings import validate
 from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.system.errors import InputError
-from gscompleter.system.plugins import load_plugins
+from gscompleter.system.plugins import is_in_file, load_from_file, load_plugins
 from gscompleter.system.tensor_checks import describe, is_whole
 from gscompleter.types import Camera, GeneratorInput, View
 
@@ -118,8 +118,9 @@ def load_generator(
     device: str = "cpu",
     settings: GeneratorSettings | None = None,
 ) -> Generator:
-    """Load a generator by name; only `oracle` and `painted` use `photographs`.
+    """Load a generator by name or from `file.py:function`.
 
+    Only `oracle` and `painted` use `photographs`.
     They are the images of the targets: true ones, or those that were painted.
     """
     kind = get_settings_class(name)
@@ -136,6 +137,8 @@ def load_generator(
             "out, or choose the device cuda.",
             "generator_offload",
         )
+    if is_in_file(name):
+        return as_generator(load_from_file(name, "generator"))
     load = GENERATORS.get(name) or load_plugins(PLUGINS)[name]
     return load(settings, seed, photographs, device)
 

@@ -38,7 +38,7 @@ MIN_OPEN = 0.005
 """Share of the hole without paint from which on it is said."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Painting(View):
     """An image that was painted for a target, at the size of its camera.
 

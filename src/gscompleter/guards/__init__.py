@@ -15,6 +15,9 @@ from gscompleter.stages.refine import Refined
 from gscompleter.stages.synthesize import GeneratedView
 from gscompleter.stages.target_view import TargetView
 from gscompleter.state import Completion, Rejection, Step
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.plugins import is_in_file, load_from_file
+from gscompleter.system.tensor_checks import describe
 from gscompleter.system.timing import timed_stage
 from gscompleter.types import DepthAffine, Gaussians
 
@@ -98,6 +101,21 @@ def load_guards(config: CompleterConfig) -> list[Guard]:
     guards = []
     # Imported by name, since the modules of guards import this one.
     for name in config.guards:
+        if is_in_file(name):
+            guards.append(load_own_guard(name))
+            continue
         module, _, class_name = GUARDS[name].partition(":")
         guards.append(getattr(import_module(module), class_name)())
     return guards
+
+
+def load_own_guard(name: str) -> Guard:
+    """Load a guard from `file.py:Class`; raise InputError for anything else there."""
+    guard = load_from_file(name, "config.guards")
+    if not isinstance(guard, Guard) or not isinstance(getattr(guard, "name", None), str):
+        raise InputError(
+            f"'{quote_value(name)}' has to be a subclass of gsc.Guard with a name, and is "
+            f"{describe(guard)}.",
+            "config.guards",
+        )
+    return guard

@@ -47,7 +47,7 @@ class DiffusersInpaintSettings(DiffusionSettings):
 
 @dataclass(frozen=True)
 class Flux2KleinSettings(DiffusersInpaintSettings):
-    """FLUX.2 [klein], which also sees the nearest photograph."""
+    """FLUX.2 [klein], which edits the painted-over image beside the nearest photograph."""
 
     weights: str | None = (
         "black-forest-labs/FLUX.2-klein-4B@e7b7dc27f91deacad38e78976d1f2b499d76a294"

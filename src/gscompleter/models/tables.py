@@ -21,6 +21,9 @@ from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.types import View
 
+FFGS_VARIANT = "FAMILY/VARIANT"
+"""What stands for a model of ffgs in the list of names."""
+
 
 # Imports are local, so that naming a model imports neither torch nor the packages of the others.
 def load_learned_reconstructor(name: str, weights: Path | None, device: str) -> Reconstructor:
@@ -35,6 +38,13 @@ def _load_map_anything(weights: Path | None, device: str) -> Reconstructor:
     from gscompleter.models.map_anything import load_map_anything
 
     return load_map_anything(weights, device)
+
+
+def _load_ffgs(weights: Path | None, device: str, variant: str = FFGS_VARIANT) -> Reconstructor:
+    """Load a model of the package ffgs."""
+    from gscompleter.models.ffgs import load_ffgs
+
+    return load_ffgs(variant, weights, device)
 
 
 @dataclass(frozen=True)
@@ -83,7 +93,7 @@ RECONSTRUCTORS: dict[str, Callable[[Path | None, str], Reconstructor]] = {
     name: partial(load_learned_reconstructor, name)
     for name, weights in PUBLISHED.items()
     if weights.is_reconstructor
-} | {"mapanything": _load_map_anything}
+} | {"mapanything": _load_map_anything, f"ffgs:{FFGS_VARIANT}": _load_ffgs}
 """Loaders of the learned reconstructors, called with the path of the weights and a device."""
 
 GENERATORS = {

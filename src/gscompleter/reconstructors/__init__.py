@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from dataclasses import is_dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from jaxtyping import Bool
@@ -14,7 +15,7 @@ from torch import Tensor
 from gscompleter.numerics.value_checks import check_gaussians
 from gscompleter.reconstructors.depth_predictors import DepthPredictor, load_depth_predictor
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.plugins import load_plugins
+from gscompleter.system.plugins import is_in_file, load_from_file, load_plugins
 from gscompleter.system.tensor_checks import describe, iterate_tensors, name_dtype
 from gscompleter.types import Reconstruction, View
 
@@ -204,15 +205,49 @@ def list_reconstructors() -> dict[str, Callable[[Path | None, str], Reconstructo
     return RECONSTRUCTORS | load_plugins(PLUGINS)
 
 
+def find_loader(name: str) -> Callable[[Path | None, str], Reconstructor] | None:
+    """Find the loader of a reconstructor; None if there is none.
+
+    A name such as `ffgs:FAMILY/VARIANT` in the table stands for all that begin with `ffgs:`; its
+    loader takes the rest as `variant`.
+    """
+    if name in RECONSTRUCTORS:
+        return RECONSTRUCTORS[name]
+    loaders: dict[str, Any] = dict(list_reconstructors())
+    family, colon, variant = name.partition(":")
+    for known, load in loaders.items():
+        if colon and variant and known.startswith(f"{family}:"):
+            return partial(load, variant=variant)
+    return loaders.get(name)
+
+
 def check_reconstructor(name: str) -> None:
-    """Raise InputError if no reconstructor has this name."""
-    if not isinstance(name, str) or (
-        name not in RECONSTRUCTORS and name not in list_reconstructors()
-    ):
+    """Raise InputError if no reconstructor has this name, or a named file has none."""
+    if is_in_file(name):
+        load_own(name, None)
+        return
+    if not isinstance(name, str) or find_loader(name) is None:
         raise InputError(
             f"There is no reconstructor '{quote_value(name)}'; choose one of "
-            f"{', '.join(list_reconstructors())}."
+            f"{', '.join(list_reconstructors())}, or name a function as file.py:function."
         )
+
+
+def load_own(name: str, weights: Path | str | None) -> Reconstructor:
+    """Load a reconstructor from `file.py:function`; raise InputError for anything else there."""
+    if weights is not None:
+        raise InputError(
+            "A reconstructor of a file opens its own weights; leave the file of weights out.",
+            "weights",
+        )
+    reconstructor = load_from_file(name, "reconstructor")
+    if not callable(reconstructor):
+        raise InputError(
+            f"'{quote_value(name)}' has to be a function from views to a Reconstruction, and is "
+            f"{describe(reconstructor)}.",
+            "reconstructor",
+        )
+    return reconstructor
 
 
 def load_reconstructor(
@@ -222,17 +257,23 @@ def load_reconstructor(
     depth: str = "none",
     depth_weights: Path | str | None = None,
 ) -> Reconstructor:
-    """Load a reconstructor by name, with published weights unless others are given.
+    """Load a reconstructor by name or from `file.py:function`.
+
+    The named ones have published weights unless others are given.
 
     Published weights are downloaded if needed. `device` is that of the networks; `plane-sweep`
     itself runs on the CPU. `depth` names the monocular depth that supports it.
     """
-    check_reconstructor(name)
-    load = RECONSTRUCTORS.get(name) or list_reconstructors()[name]
-    reconstructor = load(None if weights is None else Path(weights), device)
+    if is_in_file(name):
+        reconstructor = load_own(name, weights)
+    else:
+        check_reconstructor(name)
+        load = find_loader(name)
+        assert load is not None
+        reconstructor = load(None if weights is None else Path(weights), device)
     if depth == "none":
         return reconstructor
-    if not isinstance(reconstructor, DepthAware):
+    if not isinstance(reconstructor, DepthAware) or not is_dataclass(reconstructor):
         raise InputError(
             f"The reconstructor '{name}' uses no monocular depth; leave it out.", "depth"
         )
@@ -240,4 +281,4 @@ def load_reconstructor(
         depth, None if depth_weights is None else Path(depth_weights), device
     )
     # Loaders return frozen dataclasses.
-    return replace(reconstructor, predict_depth=predictor)  # type: ignore[type-var]
+    return replace(reconstructor, predict_depth=predictor)

@@ -10,7 +10,8 @@ import torch
 
 from gscompleter.numerics.value_checks import check_depth
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.plugins import load_plugins
+from gscompleter.system.plugins import is_in_file, load_from_file, load_plugins
+from gscompleter.system.tensor_checks import describe
 from gscompleter.types import DepthMap, View
 
 DepthPredictor = Callable[[View], DepthMap]
@@ -53,10 +54,26 @@ PLUGINS = "gscompleter.depth_predictors"
 def load_depth_predictor(
     name: str, weights: Path | None = None, device: str = "cpu"
 ) -> DepthPredictor:
-    """Load a predictor by name; raise InputError if no predictor has it."""
+    """Load a predictor by name or from `file.py:function`; raise InputError if there is none."""
+    if is_in_file(name):
+        if weights is not None:
+            raise InputError(
+                "A depth of a file opens its own weights; leave the file of weights out.",
+                "depth-weights",
+            )
+        predictor = load_from_file(name, "depth")
+        if not callable(predictor):
+            raise InputError(
+                f"'{quote_value(name)}' has to be a function from a View to a DepthMap, and is "
+                f"{describe(predictor)}.",
+                "depth",
+            )
+        return predictor
     loaders = DEPTH_PREDICTORS | load_plugins(PLUGINS)
     if name not in loaders:
         raise InputError(
-            f"There is no depth '{quote_value(name)}'; choose one of {', '.join(loaders)}.", "depth"
+            f"There is no depth '{quote_value(name)}'; choose one of {', '.join(loaders)}, or name "
+            "a function as file.py:function.",
+            "depth",
         )
     return loaders[name](weights, device)

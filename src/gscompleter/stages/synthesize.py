@@ -23,7 +23,7 @@ from gscompleter.system.tensor_checks import describe, iterate_tensors
 from gscompleter.types import Camera, GeneratorInput, PaddedCamera, View
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class GeneratedView(View):
     """The image synthesized at the target, with the notes of its generator."""
 

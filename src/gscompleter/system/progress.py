@@ -1,12 +1,14 @@
-"""Progress on stderr: live lines on a terminal, otherwise log lines."""
+"""Progress: live lines on a terminal or in a notebook, otherwise log lines; on stderr."""
 
 from __future__ import annotations
 
+import io
+import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -16,6 +18,10 @@ T = TypeVar("T")
 
 LOG_SECONDS = 10.0
 """Seconds between log lines of counted steps."""
+NOTEBOOK_SECONDS = 0.25
+"""Fewest seconds between two pictures of the bars in a notebook."""
+NOTEBOOK_WIDTH = 90
+"""Width of the bars in a notebook, in characters."""
 
 
 class Display:
@@ -81,6 +87,52 @@ class Display:
             self._console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
+class NotebookDisplay(Display):
+    """The running activities below a cell of a notebook, in one place that is emptied at the end.
+
+    rich draws them. Its own live display needs ipywidgets, which few kernels have.
+    """
+
+    def __init__(self, console: Console) -> None:
+        super().__init__(console)
+        self._place: Any = None
+        self._drawn = float("-inf")
+
+    def advance(self, task: TaskID) -> None:
+        """Count a step; it is drawn `NOTEBOOK_SECONDS` after the last picture at the earliest."""
+        self._running.advance(task)
+        if time.monotonic() >= self._drawn + NOTEBOOK_SECONDS:
+            self._log()
+
+    def stop(self) -> None:
+        """Empty the place of the bars."""
+        if self._place is not None:
+            self._place.update({"text/html": "", "text/plain": ""}, raw=True)
+
+    def _log(self) -> None:
+        """Draw the bars anew."""
+        from IPython.display import display
+
+        self._drawn = time.monotonic()
+        bars = draw_bars(self._running)
+        if self._place is None:
+            self._place = display(bars, raw=True, display_id=True)
+        else:
+            self._place.update(bars, raw=True)
+
+
+def draw_bars(running: Progress) -> dict[str, str]:
+    """Draw the bars as HTML, and as text for notebooks that show none."""
+    from rich.console import Console
+
+    drawing = Console(record=True, file=io.StringIO(), width=NOTEBOOK_WIDTH, force_jupyter=False)
+    drawing.print(running.get_renderable())
+    html = drawing.export_html(
+        inline_styles=True, clear=False, code_format='<pre style="margin:0">{code}</pre>'
+    )
+    return {"text/html": html, "text/plain": drawing.export_text()}
+
+
 def make_bars(console: Console) -> Progress:
     """Make live lines that disappear at the end."""
     # Imported by commands that show progress; a library call does without.
@@ -138,6 +190,36 @@ def notify_of_stages(listener: Callable[[str], None]) -> Iterator[None]:
         yield
     finally:
         _listener.reset(token)
+
+
+@contextmanager
+def show_in_notebook() -> Iterator[None]:
+    """Show activities of the block below the cell of a notebook that runs it.
+
+    Elsewhere, and inside of a call that shows its progress already, this does nothing.
+    """
+    if _display.get() is not None or not is_notebook():
+        yield
+        return
+    from rich.console import Console
+
+    display = NotebookDisplay(Console(file=io.StringIO(), force_jupyter=False))
+    token = _display.set(display)
+    try:
+        yield
+    finally:
+        _display.reset(token)
+        display.stop()
+
+
+def is_notebook() -> bool:
+    """Check whether the kernel of a notebook runs this process, as rich does."""
+    # A process that has not imported IPython is none, and need not import rich to ask.
+    if "IPython" not in sys.modules:
+        return False
+    from rich.console import Console
+
+    return Console().is_jupyter
 
 
 def stage(name: str) -> AbstractContextManager[object]:

@@ -32,7 +32,7 @@ from gscompleter.apps.bench.measure import (
 )
 from gscompleter.apps.bench.report import Measured, Report, describe_machine, format_report
 from gscompleter.apps.commands.bench import BenchOptions
-from gscompleter.apps.completing.demo import (
+from gscompleter.data.demo_scene import (
     BASELINE_M,
     get_motorcycle_cameras,
     move_right,

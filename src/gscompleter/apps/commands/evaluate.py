@@ -40,7 +40,7 @@ class EvaluateOptions(SynthesisOptions, EngineOptions):
 
     Run the same command again to continue. `gscompleter tables OUT` writes the tables at any time.
     With a preset, a table, a figure or several reconstructors it writes tables and figures of the
-    paper instead.
+    paper instead, with several depths one table that compares them.
     """
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
@@ -75,7 +75,12 @@ class EvaluateOptions(SynthesisOptions, EngineOptions):
     """Show the widest hole of each case in figures magnified."""
     reconstructor: tuple[str, ...] = ()
     """Models that turn photographs into Gaussians: plane-sweep (the default), or one or several of
-    `gscompleter models`."""
+    `gscompleter models`, or functions of yours as file.py:function."""
+    depth: tuple[str, ...] = ("none",)  # type: ignore[assignment]
+    """Monocular depths that help plane-sweep where stereo measures nothing: none, moge-2, or
+    functions of yours as file.py:function. Several are compared in one table."""
+    depth_weights: tuple[Path, ...] = ()  # type: ignore[assignment]
+    """Weights file of each depth, or NAME=FILE for some of them; others are downloaded."""
     weights: tuple[Path, ...] = ()
     """Weights file of each reconstructor, or NAME=FILE for some of them, as in
     mvsplat-re10k=re10k.ckpt; others are downloaded."""

@@ -78,7 +78,8 @@ class DepthOptions(RunOptions):
     """Options of every command with a choice of monocular depth."""
 
     depth: str = "none"
-    """Monocular depth that helps plane-sweep where stereo measures nothing: none, or moge-2."""
+    """Monocular depth that helps plane-sweep where stereo measures nothing: none, moge-2, another
+    of docs/models.md, or a function of yours as file.py:function."""
     depth_weights: Path | None = None
     """Weights file of that depth; downloaded if not given."""
     renderer_device: Literal["cpu", "cuda"] | None = None
@@ -100,7 +101,8 @@ class ReconstructorOptions(DepthOptions):
     """Options of every command with a choice of one reconstructor."""
 
     reconstructor: str = "plane-sweep"
-    """Model that turns photographs into Gaussians: plane-sweep, or one of `gscompleter models`."""
+    """Model that turns photographs into Gaussians: plane-sweep, one of `gscompleter models`, or a
+    function of yours as file.py:function."""
     weights: Path | None = None
     """Weights file of the reconstructor; downloaded if not given."""
 

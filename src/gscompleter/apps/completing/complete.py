@@ -21,14 +21,14 @@ from gscompleter.apps.completing.run_info import describe_run, read_held_out, re
 from gscompleter.apps.inputs.describing import describe_task, print_lines
 from gscompleter.apps.inputs.task import CompletionTask
 from gscompleter.apps.report.completion import (
-    GENERATED_FILE,
     IMAGES,
     write_images,
     write_report,
 )
-from gscompleter.apps.report.film import VIDEO_FILE, write_comparison_video
-from gscompleter.apps.report.page import REPORT_FILE, write_completion_page
-from gscompleter.apps.report.schema import RECORD_FILE, read_summary
+from gscompleter.apps.report.film import write_comparison_video
+from gscompleter.apps.report.page import write_completion_page
+from gscompleter.apps.report.results import COMMAND, RESULTS
+from gscompleter.apps.report.schema import read_summary
 from gscompleter.completer import check_target_ids
 from gscompleter.data.scene import write_cameras
 from gscompleter.editing.removal import restore_surroundings
@@ -39,26 +39,10 @@ from gscompleter.state import Completion
 from gscompleter.system.errors import print_error, quote_value
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.files.video import find_ffmpeg
-from gscompleter.system.files.writing import (
-    COMPLETED_FILE,
-    CONTEXT_FILE,
-    REMOVED_FILE,
-    RENDERS_FILE,
-    SUMMARY_FILE,
-    TARGETS_FILE,
-)
+from gscompleter.system.files.writing import RENDERS_FILE, TARGETS_FILE
 from gscompleter.system.progress import show_progress, stage
 from gscompleter.system.timing import add_seconds
 from gscompleter.types import Camera
-
-COMMAND = "complete"
-RESULTS = (
-    *(COMPLETED_FILE, CONTEXT_FILE, GENERATED_FILE, REMOVED_FILE, TARGETS_FILE),
-    RENDERS_FILE,
-    *(REPORT_FILE, RECORD_FILE, SUMMARY_FILE, VIDEO_FILE, "images/target*.png"),
-    *("images/photograph*.png", "images/context*.png"),
-)
-"""Globs of the files that a completion may write."""
 
 Prepare = Callable[[Any, Console], Prepared]
 """Opens the input of a command, whose options it takes, and loads the models."""

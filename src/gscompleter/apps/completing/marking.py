@@ -6,16 +6,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import torch
-from jaxtyping import Bool, Float
 from rich.console import Console
-from torch import Tensor
 
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.completing.preparation import Prepared, prepare_completion
 from gscompleter.apps.inputs.hole_kinds import pair_masks, read_marks
 from gscompleter.editing.marking import find_marked
 from gscompleter.editing.removal import remove_gaussians
+from gscompleter.planning.remove import contain_nothing
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.progress import stage
@@ -79,8 +77,3 @@ def refuse_completed(ready: Prepared, path: Path | None) -> None:
             f"{quote_value(path or ready.options.scene)} was completed before, and removed.ply "
             "keeps what one run removed; strip it first, and remove everything at once."
         )
-
-
-def contain_nothing(points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-    """Return False for all points: what is marked goes as a whole, and nothing is cut."""
-    return torch.zeros(len(points), dtype=torch.bool, device=points.device)

@@ -17,6 +17,7 @@ from gscompleter.apps.evaluating.scoring import Scored, run_methods, score_metho
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.evaluation.claims import HEAD, tabulate_claims
 from gscompleter.evaluation.figures import draw_figure
+from gscompleter.evaluation.methods import expand_methods
 from gscompleter.evaluation.paper import (
     FigureSpec,
     Requirements,
@@ -25,7 +26,12 @@ from gscompleter.evaluation.paper import (
     load_paper,
     select_names,
 )
-from gscompleter.evaluation.paper_tables import fill_table, write_paper_table
+from gscompleter.evaluation.paper_tables import (
+    fill_depth_table,
+    fill_table,
+    format_paper_markdown,
+    write_paper_table,
+)
 from gscompleter.evaluation.protocols import list_indices
 from gscompleter.evaluation.store import make_file_name
 from gscompleter.evaluation.tables import format_markdown, write_tables
@@ -42,6 +48,13 @@ FIGURES = "figures"
 """Folder of the figures in OUT."""
 RUNS = "runs"
 """Folder in OUT with the scores of each run, as `evaluate` writes them."""
+DEPTHS = "depths"
+"""Name of the table that compares depths."""
+DEPTH_COLUMNS = (
+    *("psnr", "hole_psnr", "neighbours", "context_change"),
+    *("depth_observed", "depth_hole", "depth_hole_median"),
+)
+"""Columns of that table."""
 RESULTS = "results.md"
 """Page in OUT with all tables, claims and figures."""
 
@@ -56,16 +69,60 @@ def run_evaluation(options: EvaluateOptions) -> int:
     models = options.reconstructor
     if len(set(models)) < len(models):
         raise InputError("A reconstructor is named twice; change --reconstructor.")
+    if not options.depth or len(set(options.depth)) < len(options.depth):
+        raise InputError("A depth is named twice, or none is; change --depth.", "depth")
     weights = assign_weights(models, options.weights)
+    depth_weights = assign_weights(options.depth, options.depth_weights, "depth", "depth-weights")
+    if len(options.depth) > 1:
+        if is_reproduction or len(models) > 1:
+            raise InputError(
+                "Several depths are compared with one reconstructor in a table of their own; leave "
+                "--preset, --table and --figure out, and name one reconstructor.",
+                "depth",
+            )
+        return compare_depths(replace(options, weights=tuple(weights.values())), depth_weights)
+    options = replace(options, depth_weights=tuple(depth_weights.values()))
     if is_reproduction or len(models) > 1:
         return reproduce(options)
     return run_methods(replace(options, weights=tuple(weights.values())))
 
 
-def assign_weights(models: Sequence[str], weights: Sequence[Path]) -> dict[str, Path]:
-    """Assign files of weights to reconstructors: one for each in their order, or by `NAME=FILE`.
+def compare_depths(options: EvaluateOptions, weights: Mapping[str, Path]) -> int:
+    """Run the methods with each depth, and write one table of all; return the exit code."""
+    console = Console(stderr=True, quiet=options.quiet, highlight=False)
+    methods = expand_methods(options.methods)
+    runs = {}
+    scored = []
+    for depth in options.depth:
+        console.print(f"depth {depth}", markup=False)
+        own = weights.get(depth)
+        run = replace(
+            options,
+            out=options.out / RUNS / make_file_name(f"depth {depth}"),
+            depth=(depth,),
+            depth_weights=() if own is None else (own,),
+        )
+        scored.append(score_methods(run))
+        write_tables(run.out)
+        runs[depth] = run.out
+    table = fill_depth_table(methods, DEPTH_COLUMNS, runs)
+    make_folder(options.out / TABLES)
+    write_paper_table(options.out / TABLES / DEPTHS, table)
+    if not options.quiet:
+        print(format_paper_markdown(table))
+    failed = sum(len(run.failures) for run in scored)
+    return choose_exit_code(failed, sum(run.num_own_rows for run in scored))
 
-    Those without a file take the published one. Raise InputError if a file has no reconstructor.
+
+def assign_weights(
+    models: Sequence[str],
+    weights: Sequence[Path],
+    kind: str = "reconstructor",
+    option: str = "weights",
+) -> dict[str, Path]:
+    """Assign files of weights to models: one for each in their order, or by `NAME=FILE`.
+
+    Those without a file take the published one. Raise InputError if a file has no model.
     """
     named: dict[str, Path] = {}
     plain: list[Path] = []
@@ -78,7 +135,7 @@ def assign_weights(models: Sequence[str], weights: Sequence[Path]) -> dict[str, 
             plain.append(word)
     if plain and (named or len(plain) != len(models)):
         raise InputError(
-            f"{quote_value(plain[0])} belongs to no reconstructor; give --weights one file for "
+            f"{quote_value(plain[0])} belongs to no {kind}; give --{option} one file for "
             f"each of {', '.join(models)} in this order, or {models[0]}=FILE for some of them."
         )
     return named or dict(zip(models, plain, strict=False))

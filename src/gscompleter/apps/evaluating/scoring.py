@@ -74,8 +74,8 @@ def score_methods(options: EvaluateOptions) -> Scored:
     config = RunConfig(
         reconstructor=options.reconstructor[0],
         weights=str(options.weights[0]) if options.weights else None,
-        depth=options.depth,
-        depth_weights=str(options.depth_weights) if options.depth_weights else None,
+        depth=options.depth[0],
+        depth_weights=str(options.depth_weights[0]) if options.depth_weights else None,
         generator=options.synthesis.generator,
         generator_settings=options.synthesis.make_settings(),
         device=devices.renderer,

@@ -10,12 +10,12 @@ from rich.console import Console
 
 from gscompleter.apps.command_line.exit_codes import DONE
 from gscompleter.apps.commands.repair import RepairOptions
-from gscompleter.apps.completing.complete import COMMAND
 from gscompleter.apps.completing.printing import print_completion
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.live.serving import LIVE_RESULTS, begin_session, prepare, write_session
 from gscompleter.apps.live.session import Session, Step, apply_step
 from gscompleter.apps.live.strokes import STROKES_FILE, StrokesFile, read_steps, read_strokes
+from gscompleter.apps.report.results import COMMAND
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.progress import show_progress, track

@@ -14,7 +14,7 @@ from rich.console import Console
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.commands.live import LiveOptions
 from gscompleter.apps.commands.shared_options import DEFAULT_NUM_TARGETS, CompletingOptions
-from gscompleter.apps.completing.complete import COMMAND, RESULTS, write_done
+from gscompleter.apps.completing.complete import write_done
 from gscompleter.apps.completing.preparation import Prepared, prepare_completion
 from gscompleter.apps.inputs.describing import describe_opening, print_lines
 from gscompleter.apps.inputs.task import Target
@@ -24,6 +24,7 @@ from gscompleter.apps.live.page import LivePage
 from gscompleter.apps.live.server import LiveServer
 from gscompleter.apps.live.session import Session
 from gscompleter.apps.live.strokes import STROKES, write_strokes
+from gscompleter.apps.report.results import COMMAND, RESULTS
 from gscompleter.apps.viewer import packages
 from gscompleter.apps.viewer.exhibit import ViewerCamera, ViewerContent, shrink_image
 from gscompleter.apps.viewer.packages import Libraries

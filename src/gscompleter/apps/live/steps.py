@@ -14,7 +14,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.apps.completing.marking import contain_nothing
 from gscompleter.apps.inputs.removal import Selection, find_in_region, widen_regions
 from gscompleter.completer import GSCompleter
 from gscompleter.config import CompleterConfig
@@ -23,6 +22,7 @@ from gscompleter.editing.marking import find_marked
 from gscompleter.editing.removal import remove_gaussians
 from gscompleter.numerics.geometry import look_up
 from gscompleter.numerics.image_ops import dilate, label_regions
+from gscompleter.planning.remove import contain_nothing
 from gscompleter.render.removed import mask_removed
 from gscompleter.state import Completion, Unfilled
 from gscompleter.system.errors import InputError

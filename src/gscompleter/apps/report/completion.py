@@ -107,6 +107,48 @@ def write_report(
     at_targets = [
         render_before_after(completion, result.target, renderer) for result in completion.targets
     ]
+    scores = make_score_rows(
+        completion, targets, at_targets, renderer, held_out, files, has_searched
+    )
+    # Without targets, the photographs are what there is to look at.
+    shown: list[View] = []
+    if not completion.targets:
+        photos = [photo.view for photo in completion.photos]
+        shown = [*photos, *(photograph.view for photograph in held_out)]
+    write_scenes(folder, completion, input_splat)
+    around = render_around()
+    name_view = "ignored" if run_info.get("scene", {}).get("renders_from") is None else "render"
+    write_pictures(folder / IMAGES, completion, targets, at_targets, name_view)
+    write_photographs(folder / IMAGES, completion, shown, renderer)
+    record = make_record(completion, thin_evenly(photographs, MAX_PHOTOGRAPHS))
+    (folder / RECORD_FILE).write_bytes(json.dumps(asdict(record)).encode() + b"\n")
+    coverage = {"coverage": asdict(compute_coverage(around))} if around else {}
+    counts = {**count_changes(completion), "seconds": dict(completion.seconds)}
+    summary = {
+        "version": __version__,
+        "outcome": scores.pop("outcome"),
+        **run_info,
+        **coverage,
+        **scores,
+        **counts,
+    }
+    (folder / SUMMARY_FILE).write_bytes(json.dumps(summary, indent=2).encode() + b"\n")
+    return summary
+
+
+def make_score_rows(
+    completion: Completion,
+    targets: Sequence[Target],
+    at_targets: Sequence[RenderPair],
+    renderer: Renderer,
+    held_out: Sequence[HeldOut] = (),
+    files: Mapping[int | None, str] = MappingProxyType({}),
+    has_searched: bool = True,
+) -> dict[str, Any]:
+    """Return the verdict and the rows of all photographs and targets, as in `summary.json`.
+
+    `at_targets` are the renders at the targets; the rest is as in `write_report`.
+    """
     held_out_rows = score_held_out(completion, held_out, renderer)
     gains = completion.exposure_gains
     gain_rows = [None] * len(completion.views) if gains is None else gains.tolist()
@@ -124,39 +166,16 @@ def write_report(
             for row in score_targets(completion, targets, at_targets, renderer)
         ],
     }
-    # Without targets, the photographs are what there is to look at.
-    shown: list[View] = []
     if not completion.targets:
-        photos = [photo.view for photo in completion.photos]
-        shown = [*photos, *(photograph.view for photograph in held_out)]
-        checks = photos[completion.num_context :]
+        checks = [photo.view for photo in completion.photos[completion.num_context :]]
         rows["checks"] = score_photographs(completion, checks, [None] * len(checks), renderer)
     scores = {
         key: [asdict(replace(row, file=files.get(row.frame))) for row in group]
         for key, group in rows.items()
     }
-
     # The verdict comes from the rows, so that the page and the terminal agree with them.
-    outcome = asdict(judge_completion(completion, held_out_rows, has_searched=has_searched))
-    write_scenes(folder, completion, input_splat)
-    around = render_around()
-    name_view = "ignored" if run_info.get("scene", {}).get("renders_from") is None else "render"
-    write_pictures(folder / IMAGES, completion, targets, at_targets, name_view)
-    write_photographs(folder / IMAGES, completion, shown, renderer)
-    record = make_record(completion, thin_evenly(photographs, MAX_PHOTOGRAPHS))
-    (folder / RECORD_FILE).write_bytes(json.dumps(asdict(record)).encode() + b"\n")
-    coverage = {"coverage": asdict(compute_coverage(around))} if around else {}
-    counts = {**count_changes(completion), "seconds": dict(completion.seconds)}
-    summary = {
-        "version": __version__,
-        "outcome": outcome,
-        **run_info,
-        **coverage,
-        **scores,
-        **counts,
-    }
-    (folder / SUMMARY_FILE).write_bytes(json.dumps(summary, indent=2).encode() + b"\n")
-    return summary
+    outcome = judge_completion(completion, held_out_rows, has_searched=has_searched)
+    return {"outcome": asdict(outcome), **scores}
 
 
 def compute_scores(pair: RenderPair, photograph: View | None) -> Scores:

@@ -103,6 +103,10 @@ def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:
     # The poses of photographs that had none lie in the folder; others stay where the user has them.
     if summary.scene.renders_from is not None:
         return replace(content, cameras=(*targets, *load_render_cameras(folder, summary, content)))
+    if summary.settings.get("folder") is None:
+        # `Completion.save` got its photographs as values, which have no file.
+        note = "The context photographs are not shown, because no folder of them is known."
+        return replace(content, cameras=targets, notes=(*content.notes, note))
     source = Path(str(summary.settings.get("folder")))
     if summary.scene.format == "photographs":
         source = folder / POSES

@@ -30,6 +30,13 @@ def judge(completion: Completion, unused_views: Sequence[View] = ()) -> OutcomeR
     Raises:
         InputError: An unused view is none, or is a part of the context.
     """
+    held_out = hold_out(completion, unused_views)
+    renderer = load_renderer(completion.views[0].image.device.type)
+    return judge_completion(completion, score_held_out(completion, held_out, renderer))
+
+
+def hold_out(completion: Completion, unused_views: Sequence[View]) -> list[HeldOut]:
+    """Check photographs that score a completion, and give them its depth range; as in `judge`."""
     check_views(unused_views, "unused")
     device = completion.views[0].image.device
     used = {view.frame for view in completion.views if view.frame is not None}
@@ -43,5 +50,4 @@ def judge(completion: Completion, unused_views: Sequence[View] = ()) -> OutcomeR
         camera = completion.with_depth_range(view.camera)
         plain = View(view.image, camera, view.frame, ignore_mask=view.ignore_mask)
         held_out.append(HeldOut(plain.to(device)))
-    renderer = load_renderer(device.type)
-    return judge_completion(completion, score_held_out(completion, held_out, renderer))
+    return held_out

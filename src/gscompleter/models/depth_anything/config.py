@@ -80,6 +80,8 @@ VARIANTS: Mapping[str, DepthAnythingConfig | MetricDepthConfig | NestedConfig] =
     "da3-large": DepthAnythingConfig(VitConfig(1024, 16, 24, (11, 15, 19, 23), 8), 256, WIDE),
     "da3-giant": GIANT,
     "da3-metric-large": MetricDepthConfig(),
+    # Its published configuration is the same; it was trained for relative depth.
+    "da3-mono-large": MetricDepthConfig(),
     "da3-nested-giant-large": NestedConfig(GIANT),
 }
 """Published variants by name."""

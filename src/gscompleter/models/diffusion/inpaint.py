@@ -1,4 +1,4 @@
-"""Inpainting pipelines of diffusers, applied to photographs warped to the target."""
+"""Inpainting and editing pipelines of diffusers, applied to photographs warped to the target."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import torch
 from jaxtyping import Bool, Float
+from PIL import Image
 from torch import Tensor
 
 from gscompleter.generators import GeneratorOutput, GeneratorRequest
@@ -28,11 +29,19 @@ from gscompleter.models.diffusion.published import (
 from gscompleter.models.settings import DiffusersInpaintSettings
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.system.errors import InputError
+from gscompleter.system.files.image import convert_to_pixels
 
 DEFAULT_SIDE = 512
 """Default side length of the square image, in pixels."""
-UNMAPPED = {"Flux2KleinPipeline": "Flux2KleinInpaintPipeline"}
-"""Inpainting pipelines by the class of the published one, which diffusers' own mapping lacks."""
+EDITORS = ("Flux2KleinPipeline",)
+"""Pipelines of models that edit images by a prompt and were trained without masks."""
+PAINTED_OVER = (0.0, 1.0, 0.0)
+"""Colour of the hole for them, which no scene has."""
+INSTRUCTION = (
+    "Replace the plain green areas of the first image by what stands there, so that it becomes one "
+    "photograph of the place that the second image shows. Change nothing else: {prompt}."
+)
+"""Prompt for them, with the user's own in it."""
 
 
 @dataclass(frozen=True)
@@ -89,6 +98,42 @@ class Painter:
         painted = self.pipeline(**{k: v for k, v in wanted.items() if k in known}).images[0]
 
         back = resize_antialiased(painted.float().permute(1, 2, 0), (hole.shape[0], hole.shape[1]))
+        return back.clamp(0, 1).to(image.device)
+
+
+@dataclass(frozen=True)
+class Editor(Painter):
+    """A loaded pipeline that edits images by a prompt, such as FLUX.2 [klein].
+
+    It takes no mask: the hole is painted over, and the prompt says what to do with it.
+    """
+
+    def fill_hole(
+        self,
+        image: Float[Tensor, "h w 3"],
+        hole: Bool[Tensor, "h w"],
+        reference: Float[Tensor, "_ _ 3"],
+        prompt: str,
+        seed: int,
+        steps: int | None,
+    ) -> Float[Tensor, "h w 3"]:
+        """Edit the painted-over image, beside the nearest photograph; all pixels may change."""
+        size = self.compute_size(*hole.shape)
+        color = image.new_tensor(PAINTED_OVER)
+        over = resize_antialiased(torch.where(hole[..., None], color, image), size)
+        shown = [Image.fromarray(convert_to_pixels(picture)) for picture in (over, reference)]
+        arguments: dict[str, Any] = {} if steps is None else {"num_inference_steps": steps}
+        edited = self.pipeline(
+            image=shown,
+            prompt=INSTRUCTION.format(prompt=prompt),
+            height=size[0],
+            width=size[1],
+            guidance_scale=1.0,  # which distilled models do not use
+            generator=torch.Generator().manual_seed(seed),
+            output_type="pt",
+            **arguments,
+        ).images[0]
+        back = resize_antialiased(edited.float().permute(1, 2, 0), (hole.shape[0], hole.shape[1]))
         return back.clamp(0, 1).to(image.device)
 
 
@@ -166,11 +211,12 @@ def load_painter(path: str | None, device: str = "cpu", offload: bool = False) -
     with convert_load_errors(source):
         pipeline = load_inpainting_pipeline(source, select_dtype(device))
     move_to_device(pipeline, device, offload)
-    return Painter(pipeline, *get_size_rules(pipeline))
+    kind = Editor if type(pipeline).__name__ in EDITORS else Painter
+    return kind(pipeline, *get_size_rules(pipeline))
 
 
 def load_inpainting_pipeline(source: Source, dtype: torch.dtype) -> Any:
-    """Load the pipeline of a folder or repository as an inpainting pipeline."""
+    """Load the pipeline of a folder or repository as one that inpaints, or that edits."""
     import diffusers
 
     pipeline = diffusers.DiffusionPipeline.from_pretrained(
@@ -179,9 +225,9 @@ def load_inpainting_pipeline(source: Source, dtype: torch.dtype) -> Any:
     check_parts(pipeline)
     if {"image", "mask_image"} <= set(inspect.signature(pipeline.__call__).parameters):
         return pipeline
-    unmapped = UNMAPPED.get(type(pipeline).__name__)
-    kind = getattr(diffusers, unmapped) if unmapped else diffusers.AutoPipelineForInpainting
-    return kind.from_pipe(pipeline)
+    if type(pipeline).__name__ in EDITORS:
+        return pipeline
+    return diffusers.AutoPipelineForInpainting.from_pipe(pipeline)
 
 
 def get_size_rules(pipeline: Any) -> tuple[int, int]:

@@ -115,7 +115,8 @@ VOLSPLAT = PublishedWeights(
     views=(6, 6),
     near_far=(0.5, 100.0),
     code="https://github.com/ziplab/VolSplat",
-    caution=f"{UNLICENSED}; {FROM_BASE}",
+    weights_licence="MIT",
+    caution=FROM_BASE,
     source="https://huggingface.co/lhmd/VolSplat",
 )
 
@@ -189,10 +190,9 @@ def _create_retrained(weights: PublishedWeights, **others: Any) -> PublishedWeig
         megabytes=None,
         views=VOLSPLAT.views,
         near_far=None,
-        weights_licence=UNSTATED,
-        caution=UNLICENSED,
+        weights_licence=VOLSPLAT.weights_licence,
         source=VOLSPLAT.source,
-        **others,
+        **{"caution": "", **others},
     )
 
 
@@ -304,6 +304,7 @@ _FILES = (
         network=None,
         file="depthsplat-re10k-baseline-256x256.ckpt",
         parameters=None,
+        caution=f"if its size is Base, {FROM_BASE}",
     ),
     # Its upsampling is not published.
     replace(
@@ -342,6 +343,14 @@ _FILES = (
         "",
         views=(1, 1),
         gives="scene depth",
+    ),
+    _create_depth_anything(
+        "da3-mono-large",
+        "DA3MONO-LARGE",
+        334_171_394,
+        "",
+        views=(1, 1),
+        gives="monocular depth",
     ),
     _create_depth_anything("da3-nested-giant-large", "DA3NESTED-GIANT-LARGE-1.1", 1_689_845_519),
     MIGAN,

@@ -1,0 +1,218 @@
+"""Files and scores of a completion that was made in Python, as the command `complete` writes them.
+
+`Completion.save`, `report` and `score` find these functions by their names.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from gscompleter.apps.inputs.splat import locate_splat
+from gscompleter.apps.inputs.task import InputSplatFile, Target
+from gscompleter.apps.report.completion import GENERATED_FILE, make_score_rows, write_report
+from gscompleter.apps.report.film import VIDEO_FILE
+from gscompleter.apps.report.page import REPORT_FILE, write_completion_page
+from gscompleter.apps.report.schema import RECORD_FILE
+from gscompleter.data.scene import write_cameras
+from gscompleter.editing.removal import restore_surroundings
+from gscompleter.evaluation.metrics.coverage import (
+    compute_coverage,
+    render_pairs,
+    sample_held_out_cameras,
+)
+from gscompleter.evaluation.verdict.held_out import HeldOut, render_before_after
+from gscompleter.evaluation.verdict.judge import hold_out
+from gscompleter.numerics.geometry import is_same_camera
+from gscompleter.render.loading import load_renderer
+from gscompleter.render.protocols import Renderer
+from gscompleter.splats.formats import load_splat
+from gscompleter.state import Completion
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.output_folder import open_output_folder
+from gscompleter.system.files.writing import (
+    COMPLETED_FILE,
+    CONTEXT_FILE,
+    REMOVED_FILE,
+    RENDERS_FILE,
+    SUMMARY_FILE,
+    TARGETS_FILE,
+    replace_file,
+)
+from gscompleter.system.progress import show_in_notebook, stage
+from gscompleter.types import Camera, View
+
+COMMAND = "complete"
+RESULTS = (
+    *(COMPLETED_FILE, CONTEXT_FILE, GENERATED_FILE, REMOVED_FILE, TARGETS_FILE),
+    RENDERS_FILE,
+    *(REPORT_FILE, RECORD_FILE, SUMMARY_FILE, VIDEO_FILE, "images/target*.png"),
+    *("images/photograph*.png", "images/context*.png"),
+)
+"""Globs of the files that a completion may write."""
+FORMAT = "python"
+"""Format of a scene whose photographs were given as values."""
+
+
+@dataclass(frozen=True)
+class Judged:
+    """A finished completion with the photographs that score it."""
+
+    completion: Completion
+    targets: Sequence[Target]
+    held_out: Sequence[HeldOut]
+    renderer: Renderer
+
+    @property
+    def cameras(self) -> tuple[Camera, ...]:
+        """Cameras of all photographs."""
+        photos = [photo.view.camera for photo in self.completion.photos]
+        return (*photos, *(photograph.view.camera for photograph in self.held_out))
+
+
+def prepare_judged(completion: Completion, unused_views: Sequence[View]) -> Judged:
+    """Finish a removal, and tell photographs of targets from others; raises as `judge`."""
+    held_out = hold_out(completion, unused_views)
+    renderer = load_renderer(completion.context.means.device.type)
+    # After a removal, photographs must look as before where they do not show what was removed.
+    # Without one this returns the completion as it is.
+    completion = restore_surroundings(completion, renderer)
+
+    targets = []
+    others = list(held_out)
+    for result in completion.targets:
+        is_here = [is_same_camera(photo.view.camera, result.target) for photo in others]
+        target = Target(result.target)
+        if any(is_here):
+            view = others.pop(is_here.index(True)).view
+            target = replace(
+                target, frame=view.frame, photograph=view.image, ignore_mask=view.ignore_mask
+            )
+        targets.append(target)
+    return Judged(completion, targets, others, renderer)
+
+
+def score_result(completion: Completion, unused_views: Sequence[View]) -> dict[str, Any]:
+    """Score a completion: the verdict, coverage, photographs and targets; see `Completion`."""
+    judged = prepare_judged(completion, unused_views)
+    completion = judged.completion
+    at_targets = [
+        render_before_after(completion, result.target, judged.renderer)
+        for result in completion.targets
+    ]
+    rows = make_score_rows(completion, judged.targets, at_targets, judged.renderer, judged.held_out)
+    aside = sample_held_out_cameras(judged.cameras, completion.seed)
+    coverage = compute_coverage(render_pairs(completion, aside, judged.renderer))
+    return {"outcome": rows.pop("outcome"), "coverage": asdict(coverage), **rows}
+
+
+@show_in_notebook()
+def save_result(
+    completion: Completion,
+    out: Path | str,
+    unused_views: Sequence[View],
+    splat: Path | str | None,
+    overwrite: bool,
+) -> Path:
+    """Write all files of a completion to a folder; see `Completion.save`."""
+    splat_file = None if splat is None else find_splat_file(Path(splat), completion)
+    judged = prepare_judged(completion, unused_views)
+    with stage("report"), open_output_folder(out, overwrite, COMMAND) as folder:
+        write_result(folder, judged, splat_file)
+    return Path(out)
+
+
+@show_in_notebook()
+def write_result_page(
+    completion: Completion, file: Path | str, unused_views: Sequence[View]
+) -> Path:
+    """Write the page of a completion alone; see `Completion.report`."""
+    judged = prepare_judged(completion, unused_views)
+    with stage("report"), tempfile.TemporaryDirectory(prefix="gscompleter-") as place:
+        folder = Path(place)
+        write_result(folder, judged, None)
+        page = (folder / REPORT_FILE).read_bytes()
+        with replace_file(file) as output:
+            output.write(page)
+    return Path(file)
+
+
+def write_result(folder: Path, judged: Judged, splat_file: InputSplatFile | None) -> None:
+    """Write scenes, pictures, scores, targets and the page."""
+    completion = judged.completion
+    aside = sample_held_out_cameras(judged.cameras, completion.seed)
+    write_report(
+        folder,
+        completion,
+        judged.targets,
+        judged.renderer,
+        describe_values(judged, splat_file),
+        splat_file,
+        judged.cameras,
+        partial(render_pairs, completion, aside, judged.renderer),
+        judged.held_out,
+    )
+    if completion.targets:
+        write_cameras(folder / TARGETS_FILE, [result.target for result in completion.targets])
+    write_completion_page(folder)
+
+
+def describe_values(judged: Judged, splat_file: InputSplatFile | None) -> Mapping[str, Any]:
+    """Describe the input and the settings for `summary.json`, as `describe_run` does."""
+    completion = judged.completion
+    camera = completion.views[0].camera
+    splat = None if splat_file is None else str(splat_file.path)
+    return {
+        "settings": {
+            "folder": None,
+            "scene": splat,
+            "resolution": [camera.height, camera.width],
+            "near": camera.near,
+            "far": camera.far,
+            "config": asdict(completion.config),
+        },
+        "device": completion.context.means.device.type,
+        "scene": {
+            "format": FORMAT,
+            "photographs": len(judged.cameras),
+            "used": len(completion.views),
+            "splat": splat,
+            "renders_from": None,
+            "notes": [],
+        },
+        # Values are in one frame, that of the result.
+        "frame": {
+            "method": "given",
+            "transform": torch.eye(4).tolist(),
+            "origin": [0.0, 0.0, 0.0],
+        },
+        "depth_range": {"near": camera.near, "far": camera.far, "from": {}},
+        "seed": completion.seed,
+    }
+
+
+def find_splat_file(path: Path, completion: Completion) -> InputSplatFile:
+    """Describe the file of a given scene; raise InputError if it holds another one."""
+    if not os.path.isfile(path):
+        raise InputError(f"There is no splat {quote_value(path)}; name the file of the scene.")
+    context = completion.context
+    loaded = load_splat(path)
+    if len(loaded) != len(context) or not torch.equal(loaded.means, context.means.cpu()):
+        raise InputError(
+            f"{quote_value(path)} holds another scene than the one that was completed; name its "
+            "own file, or none."
+        )
+    # As the command `remove`: `strip` cannot undo two runs of which one removes.
+    if bool(completion.source.gone_mask.any()) and bool((context.generated > 0).any()):
+        raise InputError(
+            f"{quote_value(path)} was completed before, and {REMOVED_FILE} keeps what one run "
+            "removed; strip it first, or save without naming it."
+        )
+    return locate_splat(path, drop_nonfinite=False)

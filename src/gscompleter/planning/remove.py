@@ -1,0 +1,76 @@
+"""Removal of something from a splat, and completion of its place, as the command `remove` does."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.completer import GSCompleter
+from gscompleter.editing.cutting import Region
+from gscompleter.editing.removal import remove_gaussians, restore_surroundings
+from gscompleter.numerics.value_checks import check_gaussians
+from gscompleter.planning.photographs import PhotographPlanner
+from gscompleter.state import Completion
+from gscompleter.system.errors import InputError
+from gscompleter.system.progress import show_in_notebook, stage
+from gscompleter.system.tensor_checks import describe
+from gscompleter.types import Camera, Gaussians, View
+
+NUM_TARGETS = 4
+"""Most photographs for which the place is completed if no targets are named."""
+
+
+@show_in_notebook()
+def remove(
+    scene: Gaussians,
+    chosen: Bool[Tensor, "n"],
+    views: Sequence[View],
+    targets: Sequence[Camera] = (),
+    completer: GSCompleter | None = None,
+    contains: Region | None = None,
+) -> Completion:
+    """Remove Gaussians from a scene, and complete the hole that they leave.
+
+    Args:
+        scene: Gaussians in the frame and unit of the cameras.
+        chosen: True for those to remove.
+        views: Posed photographs or renders of the scene; they still show what goes.
+        targets: Cameras to complete the place for. If there are none, up to four cameras of the
+            photographs that show it best.
+        completer: Models and settings; the default ones if None.
+        contains: Function from points [n, 3] to True for those in a region. Gaussians that reach
+            out of it are cut at its border; if None, they go as a whole.
+
+    Returns:
+        The completion. Its `source.removed` has what went, and `save(splat=...)` keeps it.
+
+    Raises:
+        InputError: Nothing or everything is chosen, or as in `GSCompleter`.
+    """
+    completer = completer or GSCompleter()
+    check_gaussians(scene, "The scene")
+    is_mask = isinstance(chosen, Tensor) and chosen.dtype == torch.bool
+    if not is_mask or chosen.shape != (len(scene),):
+        raise InputError(
+            f"What is chosen has to be a mask of the {len(scene)} Gaussians, of bool, and is "
+            f"{describe(chosen)}."
+        )
+    if not chosen.any():
+        raise InputError("No Gaussian is chosen; set the mask for those that have to go.")
+    begun = completer.begin(views, scene, targets=targets)
+    with stage("removing"):
+        begun = remove_gaussians(begun, chosen, contains or contain_nothing, completer.scenes)
+    if targets:
+        done = completer.complete(begun, targets)
+    else:
+        cameras = [view.camera for view in views]
+        done, _ = PhotographPlanner(completer).explore(begun, cameras, NUM_TARGETS)
+    return restore_surroundings(done, completer.renderer)
+
+
+def contain_nothing(points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
+    """Return False for all points: what is chosen goes as a whole, and nothing is cut."""
+    return torch.zeros(len(points), dtype=torch.bool, device=points.device)

@@ -1,0 +1,107 @@
+"""Models of a user on the command line: the examples, and what is no model."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+import gscompleter as gsc
+from command import run
+from paths import ROOT
+
+EXAMPLES = ROOT / "examples"
+SMALL = ("--context", 0, 1, "--target", 2, "--resolution", 32, "--near", 0.5, "--far", 20)
+DEPTH = f"{EXAMPLES / '06_own_depth.py'}:predict_depth"
+
+
+def complete(monkeypatch, room: Path, out: Path, *words: object) -> dict:
+    assert run(monkeypatch, "complete", room, *SMALL, "--out", out, "--quiet", *words) in (0, 1)
+    return json.loads((out / "summary.json").read_text())
+
+
+def refuse(monkeypatch, capsys, *words: object) -> str:
+    assert run(monkeypatch, *words) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    return line
+
+
+@pytest.mark.parametrize(
+    ("option", "word"),
+    [
+        ("--depth", DEPTH),
+        ("--reconstructor", f"{EXAMPLES / '06_own_depth.py'}:reconstruct"),
+        ("--reconstructor", f"{EXAMPLES / '07_own_reconstructor.py'}:Billboards"),
+        ("--generator", f"{EXAMPLES / '08_own_generator.py'}:paint"),
+    ],
+)
+def test_an_example_takes_the_place_of_a_model(option, word, room, tmp_path, monkeypatch):
+    summary = complete(monkeypatch, room, tmp_path / "out", option, word)
+    assert summary["settings"][option.removeprefix("--")] == word
+    assert summary["gaussians"]["context"] > 0
+    if option == "--generator":
+        assert "The holes have the mean colour of the scene." in summary["targets"][0]["notes"]
+
+
+def test_the_guard_of_the_example_drops_what_is_faint(room, tmp_path, monkeypatch):
+    guard = f"{EXAMPLES / '09_own_guard.py'}:DropFaint"
+    usual = ("image-agreement", "psnr")
+    summary = complete(monkeypatch, room, tmp_path / "out", "--config.guards", *usual, guard)
+    assert summary["settings"]["config"]["guards"] == [*usual, guard]
+    # `psnr` fades what makes a photograph worse.
+    complete(monkeypatch, room, tmp_path / "usual", "--config.guards", *usual)
+    added, faded = (gsc.load_ply(tmp_path / out / "generated.ply") for out in ("out", "usual"))
+    assert faded.opacities.min() < 0.19
+    assert len(added) == int((faded.opacities >= 0.2).sum()) > 0
+
+
+@pytest.mark.parametrize("option", ["--depth", "--reconstructor", "--generator"])
+def test_what_is_no_function_is_refused(option, room, tmp_path, monkeypatch, capsys):
+    (tmp_path / "models.py").write_text("number = 3\n")
+    word = f"{tmp_path / 'models.py'}:number"
+    line = refuse(
+        monkeypatch, capsys, "complete", room, *SMALL, "--out", tmp_path / "o", option, word
+    )
+    assert "has to be a function" in line
+
+
+def test_what_is_no_guard_is_refused(room, tmp_path, monkeypatch, capsys):
+    (tmp_path / "models.py").write_text("class Other: pass\n")
+    word = f"{tmp_path / 'models.py'}:Other"
+    words = ("complete", room, *SMALL, "--out", tmp_path / "o", "--quiet", "--config.guards", word)
+    assert "has to be a subclass of gsc.Guard" in refuse(monkeypatch, capsys, *words)
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--depth", DEPTH, "--depth-weights", "w.onnx"),
+        ("--reconstructor", f"{EXAMPLES / '06_own_depth.py'}:reconstruct", "--weights", "w.pth"),
+    ],
+)
+def test_weights_of_a_file_are_its_own(words, room, tmp_path, monkeypatch, capsys):
+    line = refuse(monkeypatch, capsys, "complete", room, *SMALL, "--out", tmp_path / "o", *words)
+    assert "opens its own weights" in line
+
+
+def test_depths_are_compared_in_one_table(room, tmp_path, monkeypatch, capsys):
+    case = {"scene": str(room), "context": [0, 1], "target": 2, "near": 0.5, "far": 20}
+    cases = tmp_path / "cases.json"
+    cases.write_text(json.dumps({"resolution": [32, 32], "cases": [case]}))
+    out = tmp_path / "out"
+    words = ("evaluate", cases, "--methods", "context", "full", "--out", out, "--device", "cpu")
+    assert run(monkeypatch, *words, "--depth", "none", DEPTH) == 0
+    table = json.loads((out / "tables" / "depths.json").read_text())
+    rows = [(row["model"], row["method"]) for row in table["rows"]]
+    assert rows == [(d, m) for d in ("none", DEPTH) for m in ("context", "full")]
+    assert table["rows"][0]["cells"]["psnr"]["difference"] is None
+    assert table["rows"][2]["cells"]["psnr"]["difference"]["num_scenes"] == 1
+    assert "| depth | method |" in capsys.readouterr().out
+
+    # The rows of an earlier run are read, not computed again.
+    assert run(monkeypatch, *words, "--depth", "none", DEPTH) == 0
+    assert "Scored 0, failed 0, done earlier 2" in capsys.readouterr().err
+    assert "named twice" in refuse(monkeypatch, capsys, *words, "--depth", "none", "none")
+    line = refuse(monkeypatch, capsys, *words, "--depth", "none", DEPTH, "--table", "models")
+    assert "table of their own" in line

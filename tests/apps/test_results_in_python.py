@@ -1,0 +1,114 @@
+"""Files and scores of a completion in Python, beside those of the command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+import torch
+
+import gscompleter as gsc
+from command import run
+from gscompleter.apps.report.schema import read_summary
+from gscompleter.system.errors import InputError
+
+NEAR_FAR = {"near": 0.5, "far": 20.0}
+
+
+@pytest.fixture(scope="module")
+def completion(room) -> gsc.Completion:
+    """Complete the room in Python for the same camera as `completed_room`."""
+    views = gsc.load_views(room, frames=[0, 1], **NEAR_FAR)
+    return gsc.GSCompleter()(views, gsc.load_camera(room, frame=2, **NEAR_FAR))
+
+
+@pytest.fixture(scope="module")
+def saved(completion, room, tmp_path_factory) -> Path:
+    photograph = gsc.load_views(room, frames=[2], **NEAR_FAR)
+    return completion.save(tmp_path_factory.mktemp("python") / "out", photograph)
+
+
+def test_scenes_are_those_of_the_command(saved, completed_room):
+    for name in ("completed.ply", "context.ply", "generated.ply"):
+        assert (saved / name).read_bytes() == (completed_room / name).read_bytes()
+    for path in (completed_room / "images").iterdir():
+        assert (saved / "images" / path.name).read_bytes() == path.read_bytes()
+
+
+def test_scores_are_those_of_the_command(saved, completed_room):
+    ours, theirs = (
+        json.loads((out / "summary.json").read_text()) for out in (saved, completed_room)
+    )
+    assert ours["outcome"] == theirs["outcome"]
+    for row in (*ours["targets"], *theirs["targets"], *ours["context"], *theirs["context"]):
+        for name in ("file", "anchor_file", "derived_file"):
+            row.pop(name, None)
+    assert ours["targets"] == theirs["targets"]
+    assert ours["context"] == theirs["context"]
+    assert ours["gaussians"] == theirs["gaussians"]
+    assert ours["coverage"]["cameras"] == theirs["coverage"]["cameras"]
+
+
+def test_other_commands_read_the_folder(saved, monkeypatch, tmp_path):
+    assert read_summary(saved).scene.format == "python"
+    assert run(monkeypatch, "report", saved, "--quiet") == 0
+    observed = tmp_path / "observed.ply"
+    assert run(monkeypatch, "strip", saved / "completed.ply", "--out", observed) == 0
+    assert observed.read_bytes() == (saved / "context.ply").read_bytes()
+
+
+def test_scores_are_on_the_result(completion, room):
+    plain = completion.scores
+    assert plain["targets"][0]["psnr_after"] is None
+    assert plain["coverage"]["after"] > plain["coverage"]["before"]
+    assert plain["context"][0]["psnr_before"] > 20
+    scored = completion.score(gsc.load_views(room, frames=[2], **NEAR_FAR))
+    assert scored["held_out"] == []
+    (target,) = scored["targets"]
+    assert target["psnr_after"] > target["psnr_before"]
+
+
+def test_the_page_alone(completion, tmp_path):
+    page = completion.report(tmp_path / "page.html")
+    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
+    assert "<html" in page.read_text()
+
+
+def test_a_folder_is_replaced_on_request_only(completion, saved):
+    with pytest.raises(InputError, match="is not empty"):
+        completion.save(saved)
+    with pytest.raises(InputError, match="part of the context"):
+        completion.save(saved, completion.views, overwrite=True)
+
+
+def test_a_removal_is_undone_by_strip(completion, room, saved, monkeypatch, tmp_path):
+    file = saved / "context.ply"
+    splat = gsc.load_splat(file)
+    views = gsc.load_views(room, frames=[0, 1], **NEAR_FAR)
+    chosen = ((splat.means - torch.tensor([-0.1, 0.9, 2.6])).abs() < 0.7).all(dim=1)
+    without = gsc.remove(splat, chosen, views, [views[0].camera])
+    assert not set(map(tuple, splat.means[chosen].tolist())) & set(
+        map(tuple, without.scene.means.tolist())
+    )
+    assert len(without.added) > 0
+    out = without.save(tmp_path / "out", splat=file)
+    back = tmp_path / "back.ply"
+    assert run(monkeypatch, "strip", out / "completed.ply", "--out", back) == 0
+    assert back.read_bytes() == file.read_bytes()
+
+
+def test_another_file_is_refused(completion, saved):
+    with pytest.raises(InputError, match="holds another scene"):
+        completion.save(saved.parent / "other", splat=saved / "completed.ply")
+    with pytest.raises(InputError, match="There is no splat"):
+        completion.save(saved.parent / "other", splat=saved / "none.ply")
+
+
+def test_an_impossible_removal_is_refused(room, saved):
+    splat = gsc.load_splat(saved / "context.ply")
+    views = gsc.load_views(room, frames=[0, 1], **NEAR_FAR)
+    with pytest.raises(InputError, match="No Gaussian is chosen"):
+        gsc.remove(splat, torch.zeros(len(splat), dtype=torch.bool), views)
+    with pytest.raises(InputError, match="has to be a mask"):
+        gsc.remove(splat, torch.zeros(3, dtype=torch.bool), views)
