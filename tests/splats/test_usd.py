@@ -136,13 +136,15 @@ def test_usd_is_recognised_and_not_read(pxr, tmp_path, name):
         load_splat(tmp_path / "unnamed")
 
 
-def test_labels_lie_beside_a_file_of_usd(pxr, tmp_path, monkeypatch, capsys):
+def test_labels_are_in_a_file_of_usd(pxr, tmp_path, monkeypatch, capsys):
     gaussians = plausible(9, 0)
     gaussians.generated[4] = 1
     save_splat(tmp_path / "a.ply", gaussians)
     assert run(monkeypatch, "convert", tmp_path / "a.ply", tmp_path / "B.USDZ") == 0
     assert "9 Gaussians, 1 of them generated" in capsys.readouterr().out.replace("\n", " ")
-    assert get_labels_path(tmp_path / "B.USDZ").exists()
+    assert not get_labels_path(tmp_path / "B.USDZ").exists()
+    _, splat = read_stage(tmp_path / "B.USDZ")
+    assert list(splat.GetPrim().GetAttribute("generated").Get()) == [0] * 4 + [1] + [0] * 4
 
 
 def test_without_usd_core_nothing_is_written(tmp_path, monkeypatch):

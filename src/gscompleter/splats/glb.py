@@ -21,7 +21,8 @@ from numpy import ndarray
 from torch import Tensor
 
 from gscompleter.numerics.geometry import quats_to_rotations
-from gscompleter.splats.packing import UnsupportedError, build_gaussians
+from gscompleter.splats.packing import UnsupportedError, build_gaussians, with_labels
+from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
 from gscompleter.splats.transform import HALF_TURN_Z, rotate_half_turn, transform_gaussians
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_bytes
@@ -36,6 +37,8 @@ BINARY = 0x004E4942
 """Type of the binary chunk: "BIN" in ASCII."""
 EXTENSION = "KHR_gaussian_splatting"
 SH_NAMES = [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}" for d in range(4) for i in range(2 * d + 1)]
+LABELS = "_GENERATED"
+"""Attribute of the labels, if anything was generated; names of applications begin with `_`."""
 COLOR_SPACE = "srgb_rec709_display"
 """The colour space in which all splat trainers work."""
 COMPONENT_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
@@ -73,6 +76,12 @@ def read_glb(path: Path) -> Gaussians:
         for primitive, place in placed
     ]
     return rotate_half_turn(merge(parts), HALF_TURN_Z)
+
+
+def read_glb_remarks(path: Path) -> object:
+    """Read the record in the `extras` of the asset, or None if there is none."""
+    table = _parse_document(read_bytes(path)).table
+    return table.get("asset", {}).get("extras", {}).get(KEY)
 
 
 def _describe_other_content(table: dict[str, Any]) -> str:
@@ -158,13 +167,16 @@ def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gauss
         return _read_accessor(document, accessor)
 
     sh = [read_attribute(name) for name in SH_NAMES if name in primitive["attributes"]]
-    return build_gaussians(
+    gaussians = build_gaussians(
         read_attribute("POSITION"),
         np.roll(read_attribute(f"{EXTENSION}:ROTATION", "VEC4"), 1, axis=1),
         read_attribute(f"{EXTENSION}:SCALE"),
         read_attribute(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0],
         np.stack(sh, axis=1),
     )
+    if LABELS not in primitive["attributes"]:
+        return gaussians
+    return with_labels(gaussians, read_attribute(LABELS, "SCALAR")[:, 0])
 
 
 def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[ndarray, "n k"]:
@@ -188,10 +200,13 @@ def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[nda
     return np.maximum(values.astype(np.float32) / largest, -1 if largest > 1 else -np.inf)
 
 
-def write_glb(path: Path, gaussians: Gaussians) -> None:
+def write_glb(path: Path, gaussians: Gaussians, made_by: Provenance = NOTHING_KNOWN) -> None:
     """Write a .glb whose scene is one primitive of Gaussians, with all SH."""
     columns = _make_columns(rotate_half_turn(gaussians, HALF_TURN_Z))
-    text = json.dumps(_describe_scene(columns)).encode()
+    scene = _describe_scene(columns)
+    if made_by.runs:
+        scene["asset"]["extras"] = {KEY: made_by.to_json()}
+    text = json.dumps(scene).encode()
     # Chunks are aligned to four bytes, JSON with spaces.
     text += b" " * (-len(text) % 4)
     size = sum(column.nbytes for column in columns.values())
@@ -220,6 +235,8 @@ def _make_columns(gaussians: Gaussians) -> dict[str, Float[ndarray, "n k"]]:
         f"{EXTENSION}:OPACITY": opacities,
         **dict(zip(SH_NAMES, gaussians.sh.unbind(1), strict=False)),
     }
+    if gaussians.generated.any():
+        columns[LABELS] = gaussians.generated[:, None].float()
     return {name: np.require(tensor.numpy(), "<f4", ["C"]) for name, tensor in columns.items()}
 
 

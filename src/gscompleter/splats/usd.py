@@ -7,6 +7,7 @@ one .usdc.
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import time
@@ -19,6 +20,7 @@ import numpy as np
 import torch
 
 from gscompleter.splats.glb import COLOR_SPACE
+from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
 from gscompleter.splats.transform import HALF_TURN_X, rotate_half_turn
 from gscompleter.system.errors import InputError, OutputError, quote_value
 from gscompleter.system.files.unfinished import make_unfinished_name
@@ -30,6 +32,8 @@ if TYPE_CHECKING:
 
 KIND = "ParticleField3DGaussianSplat"
 SH_NAME = "radiance:sphericalHarmonics"
+LABELS = "generated"
+"""Attribute of the labels, if anything was generated; ours alone."""
 PROBE_BYTES = 2**20
 """Bytes that are written to find out why OpenUSD could not."""
 EXTENT = 3
@@ -38,12 +42,15 @@ PACKAGED = (2000, 1, 1, 0, 0, 0, 0, 0, -1)
 """Time of the .usdc in a .usdz, so that the same Gaussians give the same bytes."""
 
 
-def write_usd(path: Path, gaussians: Gaussians) -> None:
+def write_usd(path: Path, gaussians: Gaussians, made_by: Provenance = NOTHING_KNOWN) -> None:
     """Write a .usda, .usdc or .usdz, by the name of `path`."""
     _require_usd()
     from pxr import UsdUtils
 
     stage = _make_stage(rotate_half_turn(gaussians, HALF_TURN_X))
+    if made_by.runs:
+        # OpenUSD has no lists of dictionaries there, so that the record is a text.
+        stage.GetRootLayer().customLayerData = {KEY: json.dumps(made_by.to_json())}
     ending = path.suffix.lower()
     with _make_folder_beside(path) as folder:
         # A .usdz is made of a .usdc.
@@ -93,7 +100,7 @@ def _convert_usd_errors(path: Path, folder: Path) -> Iterator[None]:
 
 def _make_stage(gaussians: Gaussians) -> Usd.Stage:
     """Make a stage of one prim, from Gaussians in its axes."""
-    from pxr import Usd, UsdGeom
+    from pxr import Sdf, Usd, UsdGeom, Vt
 
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -114,6 +121,9 @@ def _make_stage(gaussians: Gaussians) -> Usd.Stage:
     for name, value in values.items():
         prim.GetAttribute(name).Set(np.ascontiguousarray(value.numpy()))
     prim.GetAttribute(f"{SH_NAME}Degree").Set(gaussians.sh_degree)
+    if gaussians.generated.any():
+        labels = prim.CreateAttribute(LABELS, Sdf.ValueTypeNames.UCharArray, custom=True)
+        labels.Set(Vt.UCharArray.FromNumpy(gaussians.generated.numpy()))
     return stage
 
 

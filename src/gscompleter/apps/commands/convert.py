@@ -28,8 +28,8 @@ class ConvertOptions(WritingOptions):
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
     plain: bool = False
-    """Write no labels of generated Gaussians, which some programs misread: no property `generated`
-    in a .ply, no file beside other formats."""
+    """Write neither labels of generated Gaussians, which some programs misread (no property
+    `generated` in a .ply, no file beside other formats), nor who made them."""
 
     def check_overlap(self) -> None:
         """Refuse to write over the input."""
@@ -46,8 +46,10 @@ def run_convert(options: ConvertOptions) -> None:
             describe_mode_loss,
             get_writer,
             load_splat,
+            read_provenance,
             save_splat,
         )
+        from gscompleter.splats.provenance import NOTHING_KNOWN
         from gscompleter.system.files.output_file import reserve_file
         from gscompleter.system.progress import show_preparation, show_progress
 
@@ -58,13 +60,14 @@ def run_convert(options: ConvertOptions) -> None:
     ):
         with show_preparation("reading"):
             gaussians = load_splat(options.source, options.drop_nonfinite)
+            made_by = NOTHING_KNOWN if options.plain else read_provenance(options.source)
         generated = gaussians.generated
         written = gaussians
         if options.plain:
             # Without generated Gaussians a writer leaves the labels out altogether.
             written = replace(gaussians, generated=generated.new_zeros(len(gaussians)))
         with show_preparation("writing"):
-            save_splat(options.out, written)
+            save_splat(options.out, written, made_by)
     if not options.quiet:
         # Some formats cannot say that a scene is antialiased.
         if note := describe_mode_loss(options.out, gaussians):

@@ -14,6 +14,7 @@ from rich.console import Console
 from gscompleter.apps.command_line.exit_codes import DONE, ERROR
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.completing.holes import EXPORTED, refuse_painted, write_holes
+from gscompleter.apps.completing.maker import describe_maker
 from gscompleter.apps.completing.marking import prepare_marked
 from gscompleter.apps.completing.preparation import Prepared
 from gscompleter.apps.completing.printing import print_completion, print_export, print_plan
@@ -235,6 +236,7 @@ def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[st
             read_held_out(ready.opened, task, ready.cameras),
             ready.opened.files,
             has_searched=not options.from_photographs_only,
+            run=describe_maker(options, task, completion),
         )
     write_render_cameras(folder, ready)
     write_completion_page(folder)
