@@ -49,7 +49,7 @@ from gscompleter.splats.provenance import (
 from gscompleter.splats.sog import META, read_sog, read_sog_remarks, write_sog
 from gscompleter.splats.splat import read_splat_rows, write_splat
 from gscompleter.splats.spz import read_spz, write_spz
-from gscompleter.splats.usd import refuse_usd, write_usd
+from gscompleter.splats.usd import read_usd, read_usd_remarks, write_usd
 from gscompleter.system.errors import InputError, quote_value, refuse_pointer, require_path
 from gscompleter.system.files.ply import read_header
 from gscompleter.system.files.reading import hash_file, open_file, read_json
@@ -98,8 +98,16 @@ SPLAT_FORMATS = {
     ),
     "ply": SplatFormat((".ply",), (b"ply",), load_ply, save_ply),
     "spz": SplatFormat((".spz",), (b"NGSP", b"\x1f\x8b"), read_spz, write_spz),
-    "usdz": SplatFormat((".usdz",), (ZIP_MAGIC,), refuse_usd, write_usd, contains=b".usd"),
-    "usd": SplatFormat((".usdc", ".usda", ".usd"), (b"PXR-USDC", b"#usda"), refuse_usd, write_usd),
+    "usdz": SplatFormat(
+        (".usdz",), (ZIP_MAGIC,), read_usd, write_usd, b".usd", read_remarks=read_usd_remarks
+    ),
+    "usd": SplatFormat(
+        (".usdc", ".usda", ".usd"),
+        (b"PXR-USDC", b"#usda"),
+        read_usd,
+        write_usd,
+        read_remarks=read_usd_remarks,
+    ),
     "sog": SplatFormat((".sog",), (ZIP_MAGIC,), read_sog, write_sog, read_remarks=read_sog_remarks),
     "sog-folder": SplatFormat((META,), (b"{",), read_sog, read_remarks=read_sog_remarks),
     "glb": SplatFormat((".glb",), (b"glTF",), read_glb, write_glb, read_remarks=read_glb_remarks),
@@ -135,7 +143,7 @@ def decode_splat(path: Path) -> Gaussians:
     name = detect_splat_format(path)
     if name == "ply":
         return decode_gaussians(read_scene(path))
-    has_json = name in ("sog", "sog-folder", "glb")
+    has_json = name in ("sog", "sog-folder", "glb", "usd", "usdz")
     errors = DECODING_ERRORS + JSON_ERRORS if has_json else DECODING_ERRORS
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # infinite values are refused below

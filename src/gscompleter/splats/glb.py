@@ -3,7 +3,8 @@
 A primitive of points has one attribute per property: linear scales, opacities in [0, 1], xyzw
 rotations, and a `SH_DEGREE_d_COEF_i` of three channels for each SH coefficient. Nodes give its
 transform to the scene. Axes are x left, y up, z forward. All numbers are written as float32, with
-linear colours for viewers that show points only.
+linear colours for viewers that show points only. KHR_gaussian_splatting_compression_spz, whose
+buffer holds a .spz in place of the attributes, is read.
 """
 
 from __future__ import annotations
@@ -21,9 +22,20 @@ from numpy import ndarray
 from torch import Tensor
 
 from gscompleter.numerics.geometry import quats_to_rotations
-from gscompleter.splats.packing import UnsupportedError, build_gaussians, with_labels
+from gscompleter.splats.packing import (
+    UnsupportedError,
+    build_gaussians,
+    check_growth,
+    with_labels,
+)
 from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
-from gscompleter.splats.transform import HALF_TURN_Z, rotate_half_turn, transform_gaussians
+from gscompleter.splats.spz import decode_spz
+from gscompleter.splats.transform import (
+    HALF_TURN_Z,
+    require_similarity,
+    rotate_half_turn,
+    transform_gaussians,
+)
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_bytes
 from gscompleter.system.files.writing import replace_file
@@ -36,6 +48,8 @@ JSON = 0x4E4F534A
 BINARY = 0x004E4942
 """Type of the binary chunk: "BIN" in ASCII."""
 EXTENSION = "KHR_gaussian_splatting"
+COMPRESSIONS = tuple(f"{EXTENSION}_compression_spz{version}" for version in ("", "_2"))
+"""Extensions whose buffer holds a .spz: the name, and that of its later drafts."""
 SH_NAMES = [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}" for d in range(4) for i in range(2 * d + 1)]
 LABELS = "_GENERATED"
 """Attribute of the labels, if anything was generated; names of applications begin with `_`."""
@@ -68,9 +82,13 @@ def read_glb(path: Path) -> Gaussians:
     if not placed:
         raise UnsupportedError(_describe_other_content(document.table))
     # Accessors may share bytes, so that a small file can claim any number.
-    counts = [_get_accessor(document, p, "POSITION")["count"] for p, _ in placed]
-    if sum(counts) * MIN_GAUSSIAN_BYTES > len(document.binary):
+    counts = {True: 0, False: 0}
+    for primitive, _ in placed:
+        is_packed = _find_compression(primitive) is not None
+        counts[is_packed] += _get_accessor(document, primitive, "POSITION")["count"]
+    if counts[False] * MIN_GAUSSIAN_BYTES > len(document.binary):
         raise ValueError("it claims more Gaussians than fit into it")
+    check_growth(counts[True] * MIN_GAUSSIAN_BYTES, len(document.binary))
     parts = [
         transform_gaussians(_decode_primitive(document, primitive), place)
         for primitive, place in placed
@@ -137,12 +155,7 @@ def _read_transform(node: dict[str, Any]) -> Float[Tensor, "4 4"]:
         place[:3, :3] = quats_to_rotations(torch.tensor([w, x, y, z], dtype=torch.float64))
         place[:3, :3] *= torch.tensor(node.get("scale", (1, 1, 1)), dtype=torch.float64)
         place[:3, 3] = torch.tensor(node.get("translation", (0, 0, 0)), dtype=torch.float64)
-    # For s R, with s > 0, the determinant is s³ and the product with the transpose s² I.
-    linear = place[:3, :3]
-    volume = float(torch.linalg.det(linear))
-    shape = linear @ linear.T / max(volume, 1e-30) ** (2 / 3)
-    if not volume > 0 or not torch.allclose(shape, torch.eye(3).double(), atol=1e-3):
-        raise UnsupportedError("has a node that mirrors Gaussians or stretches them unevenly")
+    require_similarity(place, "node")
     return place
 
 
@@ -150,8 +163,32 @@ def _get_accessor(document: GlbDocument, primitive: dict[str, Any], name: str) -
     return document.table["accessors"][primitive["attributes"][name]]
 
 
+def _find_compression(primitive: dict[str, Any]) -> dict[str, Any] | None:
+    """Find the extension of a primitive whose buffer holds a .spz; None if there is none."""
+    extensions = primitive["extensions"][EXTENSION].get("extensions", {})
+    return next((extensions[name] for name in COMPRESSIONS if name in extensions), None)
+
+
+def _decode_packed(
+    document: GlbDocument, primitive: dict[str, Any], compression: dict[str, Any]
+) -> Gaussians:
+    """Decode the .spz of a primitive, in the frame of its node."""
+    view = document.table["bufferViews"][compression["bufferView"]]
+    if view.get("buffer") != 0:
+        raise UnsupportedError("holds its Gaussians in another file")
+    start = int(view.get("byteOffset", 0))
+    # Its own axes are converted to those of glTF, as the extension demands.
+    gaussians = decode_spz(document.binary[start : start + int(view["byteLength"])])
+    if len(gaussians) != _get_accessor(document, primitive, "POSITION")["count"]:
+        raise ValueError("its .spz has another number of Gaussians than its accessors")
+    return rotate_half_turn(gaussians, HALF_TURN_Z)
+
+
 def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gaussians:
     """Decode the Gaussians of a primitive, in the frame of its node."""
+    compression = _find_compression(primitive)
+    if compression is not None:
+        return _decode_packed(document, primitive, compression)
     extension = primitive["extensions"][EXTENSION]
     packed = ", ".join({**extension.get("extensions", {}), **primitive["extensions"]})
     stored = (packed, extension.get("kernel", "ellipse"), extension.get("colorSpace", COLOR_SPACE))

@@ -18,7 +18,8 @@ class ConvertOptions(WritingOptions):
     """Convert a file of Gaussians to another format, by the name of B.
 
     Formats are .ply, .compressed.ply, .spz, .splat, .sog, .glb (KHR_gaussian_splatting), and
-    .usda, .usdc and .usdz (OpenUSD, with usd-core). It also reads .ksplat and the folder of a .sog.
+    .usda, .usdc and .usdz (OpenUSD, with usd-core). It also reads .ksplat, the folder of a .sog,
+    and .glb with a .spz inside.
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="A")]
