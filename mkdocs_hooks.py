@@ -21,7 +21,7 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parent
 TEXTS = {
-    "README.md": "index.md",
+    "README.md": "overview.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
     "benchmarks/history.md": "history.md",
@@ -29,6 +29,8 @@ TEXTS = {
 """Files of the repository that are pages of the site."""
 FILES = ("LICENSE", "CITATION.cff")
 """Files of the repository that pages link to and that are copied as they are."""
+LLMS = "llms.txt"
+"""What assistants read first; its links are converted to pages of the site."""
 STAGES = (
     "context",
     "target_view",
@@ -59,7 +61,7 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
     pages = sorted(path.relative_to(ROOT / "docs").as_posix() for path in find_pages())
     others = [page for page in pages if page not in named]
     decisions = [page for page in others if page.startswith("decisions/")]
-    config.nav.insert(2, {"Tutorials": list(tutorials())})
+    config.nav.insert(3, {"Tutorials": list(tutorials())})
     add_pages(config.nav, "decisions/index.md", decisions)
     if more := [page for page in others if page not in decisions]:
         config.nav.append({"More": more})
@@ -92,6 +94,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "reference/stages.md": of_stages(),
     }
     made |= {name: (ROOT / name).read_text() for name in FILES}
+    made[LLMS] = link_pages((ROOT / LLMS).read_text())
     for page, text in made.items():
         files.append(File.generated(config, page, content=text))
     return files
@@ -102,6 +105,15 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     by_page = {made: name for name, made in TEXTS.items()}
     place = by_page.get(page.file.src_uri, f"docs/{page.file.src_uri}")
     return LINK.sub(lambda link: site_link(link[0], place, page.file.src_uri), markdown)
+
+
+def link_pages(text: str) -> str:
+    """Convert links to files of `docs/` to the folders of their pages, as mkdocs makes them."""
+    folders = {
+        path: f"{path.removeprefix('docs/').removesuffix('.md')}/" for path in LINK.findall(text)
+    }
+    folders["docs/index.md"] = "./"
+    return LINK.sub(lambda link: folders[link[0]], text)
 
 
 def site_link(link: str, place: str, page: str) -> str:

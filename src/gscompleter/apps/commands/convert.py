@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from gscompleter.apps.command_line.answers import print_answer
 from gscompleter.apps.commands.shared_options import WritingOptions, list_inputs
 from gscompleter.system.files.overlap import refuse_input_file
 from gscompleter.system.process import import_without_collection
@@ -69,9 +70,15 @@ def run_convert(options: ConvertOptions) -> None:
             written = replace(gaussians, generated=generated.new_zeros(len(gaussians)))
         with show_preparation("writing"):
             save_splat(options.out, written, made_by)
-    if not options.quiet:
-        # Some formats cannot say that a scene is antialiased.
-        if note := describe_mode_loss(options.out, gaussians):
-            print(note)
-        count = int((generated > 0).sum())
-        print(f"{len(gaussians):,} Gaussians, {count:,} of them generated: {options.out}")
+    # Some formats cannot say that a scene is antialiased.
+    note = describe_mode_loss(options.out, gaussians)
+    notes = [] if note is None else [note]
+    count = int((generated > 0).sum())
+    content = {
+        "out": str(options.out),
+        "gaussians": len(gaussians),
+        "generated": count,
+        "notes": notes,
+    }
+    sentence = f"{len(gaussians):,} Gaussians, {count:,} of them generated: {options.out}"
+    print_answer(options, content, [*notes, sentence])
