@@ -21,7 +21,13 @@ from numpy.lib.recfunctions import require_fields
 from torch import Tensor
 
 from gscompleter.splats.foreign import resolve_splat
-from gscompleter.splats.formats import detect_splat_format, get_writer, load_splat, save_splat
+from gscompleter.splats.formats import (
+    detect_splat_format,
+    get_writer,
+    load_splat,
+    read_provenance,
+    save_splat,
+)
 from gscompleter.splats.ply import (
     MEANS,
     count_rest,
@@ -35,13 +41,17 @@ from gscompleter.splats.ply import (
     require_finite,
     save_ply,
 )
+from gscompleter.splats.provenance import RunRecord, make_comment_lines
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.ply import PlyFile, write_ply_file
 from gscompleter.system.files.writing import REMOVED_FILE
 from gscompleter.types import Gaussians, merge
 
 LABEL_COLUMN = "generated"
-_LABEL_LINE = re.compile(rb"^property\s+\w+\s+generated\s*?\n", re.M)
+_LABEL_LINES = re.compile(
+    rb"^property\s+\w+\s+generated\s*?\n(?:comment gscompleter-provenance/[^\n]*\n)*", re.M
+)
+"""The line of the labels, with the comments of runs that follow it."""
 _ELEMENT_LINE = re.compile(rb"^(?:element|end_header)", re.M)
 
 
@@ -60,12 +70,12 @@ def split_header(header: bytes) -> tuple[bytes, bytes, bytes]:
 
 
 def drop_generated(layout: PlyFile) -> PlyFile:
-    """Remove the generated rows and the column `generated`."""
+    """Remove the generated rows, the column `generated`, and who made them."""
     if LABEL_COLUMN not in (layout.rows.dtype.names or ()):
         return layout
     dtype = [column for column in layout.rows.dtype.descr if column[0] != LABEL_COLUMN]
     rows = require_fields(layout.rows[layout.rows[LABEL_COLUMN] == 0], dtype)
-    return replace(layout, header=_LABEL_LINE.sub(b"", layout.header), rows=rows)
+    return replace(layout, header=_LABEL_LINES.sub(b"", layout.header), rows=rows)
 
 
 def save_like(
@@ -74,8 +84,9 @@ def save_like(
     added: Gaussians,
     given: Path,
     kept: Bool[Tensor, "n"] | None = None,
+    run: RunRecord | None = None,
 ) -> None:
-    """Write a completed scene in the layout of the input file `given`.
+    """Write a completed scene in the layout of the input file `given`; `run` made it.
 
     The standard layout is used if `given` is ASCII or no .ply, has surfels (two scales cannot hold
     `added`), a column `generated` of another type, fewer SH coefficients than `added`, or rows that
@@ -86,14 +97,18 @@ def save_like(
     added = merge([context[:0], added.to("cpu")])
     numbers = None if layout is None else _match_rows(layout, context, added, kept)
     if layout is None or numbers is None:
-        save_ply(path, merge([context, added]), provenance=True)
+        made_by = read_provenance(given)
+        made_by = made_by if run is None else made_by.plus(run)
+        save_ply(path, merge([context, added]), provenance=True, made_by=made_by)
         return
     # The file's own columns stay as they are; only `generated` is added, or written anew.
-    header = _add_label_line(layout.header)
-    label = [(LABEL_COLUMN, "u1")]
-    if LABEL_COLUMN in (layout.rows.dtype.names or ()):
-        header = layout.header
-        label = []
+    header = layout.header
+    label = []
+    if LABEL_COLUMN not in (layout.rows.dtype.names or ()):
+        header = _add_label_line(header)
+        label = [(LABEL_COLUMN, "u1")]
+    if run is not None:
+        header = _add_run(header, run)
     dtype = np.dtype([*layout.rows.dtype.descr, *label])
 
     def write_labels(values: ndarray, labels: UInt8[Tensor, "m"]) -> ndarray:
@@ -129,6 +144,14 @@ def _add_label_line(header: bytes) -> bytes:
     first, others, end = split_header(header)
     ending = b"\r\n" if end.endswith(b"\r\n") else b"\n"
     return b"".join([first, b"property uchar generated", ending, others, end])
+
+
+def _add_run(header: bytes, run: RunRecord) -> bytes:
+    """Add the comment of a run after the line of the labels and the comments of earlier runs."""
+    lines = _LABEL_LINES.search(header)
+    assert lines is not None
+    ending = b"\r\n" if lines[0].endswith(b"\r\n") else b"\n"
+    return header[: lines.end()] + make_comment_lines([run], ending) + header[lines.end() :]
 
 
 def strip(path: Path, out: Path) -> tuple[int, int]:

@@ -27,6 +27,7 @@ from torch import Tensor
 
 from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.numerics.value_checks import LARGEST, check_gaussians, find_finite
+from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, add_comments
 from gscompleter.system.errors import InputError, quote_value, require_path
 from gscompleter.system.files.ply import (
     Element,
@@ -238,11 +239,17 @@ def encode(gaussians: Gaussians) -> Float[Tensor, "n 4"]:
     return torch.where(same & from_file.isfinite(), from_file, anew)
 
 
-def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = None) -> None:
+def save_ply(
+    path: Path | str,
+    gaussians: Gaussians,
+    provenance: bool | None = None,
+    made_by: Provenance = NOTHING_KNOWN,
+) -> None:
     """Write a standard 3DGS .ply, with `uchar generated` after the standard properties.
 
     `provenance` decides if `generated` is written; the default is yes if anything was generated.
     Some readers (such as gsply 0.4) misread rows that end in a byte; False writes the plain layout.
+    `made_by` becomes comments.
     """
     path = require_path(path)
     check_gaussians(gaussians, "The scene to write")
@@ -250,7 +257,7 @@ def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = N
         provenance = bool((gaussians.generated > 0).any())
     gaussians = gaussians.detach().to("cpu")
     blocks = (make_rows(gaussians[block], provenance) for block in iterate_blocks(len(gaussians)))
-    header = make_scene_header(gaussians, provenance)
+    header = add_comments(make_scene_header(gaussians, provenance), made_by)
     write_ply_file(path, header, len(gaussians), blocks)
 
 

@@ -76,7 +76,11 @@ class SpzHeader(NamedTuple):
 
 def read_spz(path: Path) -> Gaussians:
     """Read a .spz of SH degree 0 to 3, in the axes of a .ply."""
-    data = read_bytes(path)
+    return decode_spz(read_bytes(path))
+
+
+def decode_spz(data: bytes) -> Gaussians:
+    """Decode the bytes of a .spz, in the axes of a .ply."""
     if data.startswith(GZIP):
         data = _unpack_gzip(data)
     header = _parse_header(data)

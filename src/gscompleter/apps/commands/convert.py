@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from gscompleter.apps.command_line.answers import print_answer
 from gscompleter.apps.commands.shared_options import WritingOptions, list_inputs
 from gscompleter.system.files.overlap import refuse_input_file
 from gscompleter.system.process import import_without_collection
@@ -18,7 +19,8 @@ class ConvertOptions(WritingOptions):
     """Convert a file of Gaussians to another format, by the name of B.
 
     Formats are .ply, .compressed.ply, .spz, .splat, .sog, .glb (KHR_gaussian_splatting), and
-    .usda, .usdc and .usdz (OpenUSD, with usd-core). It also reads .ksplat and the folder of a .sog.
+    .usda, .usdc and .usdz (OpenUSD, with usd-core). It also reads .ksplat, the folder of a .sog,
+    and .glb with a .spz inside.
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="A")]
@@ -28,8 +30,8 @@ class ConvertOptions(WritingOptions):
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
     plain: bool = False
-    """Write no labels of generated Gaussians, which some programs misread: no property `generated`
-    in a .ply, no file beside other formats."""
+    """Write neither labels of generated Gaussians, which some programs misread (no property
+    `generated` in a .ply, no file beside other formats), nor who made them."""
 
     def check_overlap(self) -> None:
         """Refuse to write over the input."""
@@ -46,8 +48,10 @@ def run_convert(options: ConvertOptions) -> None:
             describe_mode_loss,
             get_writer,
             load_splat,
+            read_provenance,
             save_splat,
         )
+        from gscompleter.splats.provenance import NOTHING_KNOWN
         from gscompleter.system.files.output_file import reserve_file
         from gscompleter.system.progress import show_preparation, show_progress
 
@@ -58,16 +62,23 @@ def run_convert(options: ConvertOptions) -> None:
     ):
         with show_preparation("reading"):
             gaussians = load_splat(options.source, options.drop_nonfinite)
+            made_by = NOTHING_KNOWN if options.plain else read_provenance(options.source)
         generated = gaussians.generated
         written = gaussians
         if options.plain:
             # Without generated Gaussians a writer leaves the labels out altogether.
             written = replace(gaussians, generated=generated.new_zeros(len(gaussians)))
         with show_preparation("writing"):
-            save_splat(options.out, written)
-    if not options.quiet:
-        # Some formats cannot say that a scene is antialiased.
-        if note := describe_mode_loss(options.out, gaussians):
-            print(note)
-        count = int((generated > 0).sum())
-        print(f"{len(gaussians):,} Gaussians, {count:,} of them generated: {options.out}")
+            save_splat(options.out, written, made_by)
+    # Some formats cannot say that a scene is antialiased.
+    note = describe_mode_loss(options.out, gaussians)
+    notes = [] if note is None else [note]
+    count = int((generated > 0).sum())
+    content = {
+        "out": str(options.out),
+        "gaussians": len(gaussians),
+        "generated": count,
+        "notes": notes,
+    }
+    sentence = f"{len(gaussians):,} Gaussians, {count:,} of them generated: {options.out}"
+    print_answer(options, content, [*notes, sentence])

@@ -37,7 +37,9 @@ class Options(Settings):
     """Options of every command that writes something."""
 
     quiet: bool = False
-    """Print errors only."""
+    """Print errors only, and what --json asks for."""
+    json: bool = False
+    """Print the result as one JSON object."""
 
     def check_overlap(self) -> None:
         """Raise an InputError if the output of the command is, holds or lies in an input."""

@@ -44,6 +44,7 @@ from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
 from gscompleter.splats.layout import save_like, save_removed
 from gscompleter.splats.ply import save_ply
+from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, RunRecord
 from gscompleter.state import Completion, TargetResult
 from gscompleter.system.files.image import write_image
 from gscompleter.system.files.writing import (
@@ -97,12 +98,14 @@ def write_report(
     held_out: Sequence[HeldOut] = (),
     files: Mapping[int | None, str] = MappingProxyType({}),
     has_searched: bool = True,
+    run: RunRecord | None = None,
 ) -> dict[str, Any]:
     """Write the scenes, `images/`, `report.json` and `summary.json`; return the summary.
 
     `photographs` are the cameras of all, in the frame of the result. `render_around` renders the
     views whose coverage is measured. `files` are those of the photographs by frame. `has_searched`
-    is False if targets were neither named nor searched for.
+    is False if targets were neither named nor searched for. `run` is what the files say about who
+    made them.
     """
     at_targets = [
         render_before_after(completion, result.target, renderer) for result in completion.targets
@@ -115,7 +118,7 @@ def write_report(
     if not completion.targets:
         photos = [photo.view for photo in completion.photos]
         shown = [*photos, *(photograph.view for photograph in held_out)]
-    write_scenes(folder, completion, input_splat)
+    write_scenes(folder, completion, input_splat, run)
     around = render_around()
     name_view = "ignored" if run_info.get("scene", {}).get("renders_from") is None else "render"
     write_pictures(folder / IMAGES, completion, targets, at_targets, name_view)
@@ -306,22 +309,35 @@ def thin_evenly(items: Sequence[Camera], most: int) -> Sequence[Camera]:
     return items[:: max(1, -(-len(items) // most))]
 
 
-def write_scenes(folder: Path, completion: Completion, input_splat: InputSplatFile | None) -> None:
-    """Write the three scenes, and the originals of recoloured Gaussians of an input splat."""
+def write_scenes(
+    folder: Path,
+    completion: Completion,
+    input_splat: InputSplatFile | None,
+    run: RunRecord | None = None,
+) -> None:
+    """Write the three scenes, and the originals of recoloured Gaussians of an input splat.
+
+    `run` is what the completed scene and the additions say about who made them.
+    """
+    made_by = NOTHING_KNOWN if run is None else Provenance((run,))
     added = completion.added
     context = completion.context
     if input_splat is None:
-        completed = partial(save_ply, folder / COMPLETED_FILE, completion.scene, provenance=True)
+        completed = partial(
+            save_ply, folder / COMPLETED_FILE, completion.scene, provenance=True, made_by=made_by
+        )
     else:
         # In the layout and the order of the user's file, so that what was kept is kept bit by bit.
         context, changed = restore_file_order(completion, input_splat)
         recolored = completion.recolored_context[completion.recolored_mask]
         generated = merge([recolored, added])
-        completed = partial(save_completed_splat, folder, context, changed, generated, input_splat)
+        completed = partial(
+            save_completed_splat, folder, context, changed, generated, input_splat, run
+        )
     writing = [
         completed,
         partial(save_ply, folder / CONTEXT_FILE, context),
-        partial(save_ply, folder / GENERATED_FILE, added, provenance=True),
+        partial(save_ply, folder / GENERATED_FILE, added, provenance=True, made_by=made_by),
     ]
     map_in_parallel(lambda write: write(), writing)
 
@@ -348,6 +364,7 @@ def save_completed_splat(
     changed: Bool[Tensor, "n"],
     generated: Gaussians,
     input_splat: InputSplatFile,
+    run: RunRecord | None = None,
 ) -> None:
     """Write `completed.ply` in the layout of the input splat, and the originals of the changed.
 
@@ -360,14 +377,14 @@ def save_completed_splat(
     if not changed.any():
         if bool((context.generated > 0).any()) and earlier.is_file():
             shutil.copyfile(earlier, folder / REMOVED_FILE)
-        save_like(folder / COMPLETED_FILE, context, generated, input_splat.path, kept)
+        save_like(folder / COMPLETED_FILE, context, generated, input_splat.path, kept, run)
         return
     save_changed(folder, context, changed, input_splat)
     stays = ~changed.cpu()
     if kept is not None:
         # From a mask over the context to one over all Gaussians of the file.
         stays = torch.zeros_like(kept).masked_scatter(kept, stays)
-    save_like(folder / COMPLETED_FILE, context[~changed], generated, input_splat.path, stays)
+    save_like(folder / COMPLETED_FILE, context[~changed], generated, input_splat.path, stays, run)
 
 
 def save_changed(

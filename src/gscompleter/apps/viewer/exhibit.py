@@ -99,14 +99,23 @@ def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:
         transform=np.array(summary.frame.transform),
         origin=np.array(summary.frame.origin),
     )
+    cameras, notes = load_known_cameras(folder, summary, content)
+    return replace(content, cameras=cameras, notes=notes)
+
+
+def load_known_cameras(
+    folder: Path, summary: CompletionSummary, content: ViewerContent
+) -> tuple[tuple[ViewerCamera, ...], tuple[str, ...]]:
+    """Load the targets and the photographs of a completion, with notes on what is missing."""
     targets = load_target_cameras(folder, summary, content)
     # The poses of photographs that had none lie in the folder; others stay where the user has them.
     if summary.scene.renders_from is not None:
-        return replace(content, cameras=(*targets, *load_render_cameras(folder, summary, content)))
+        return (*targets, *load_render_cameras(folder, summary, content)), ()
     if summary.settings.get("folder") is None:
         # `Completion.save` got its photographs as values, which have no file.
-        note = "The context photographs are not shown, because no folder of them is known."
-        return replace(content, cameras=targets, notes=(*content.notes, note))
+        return targets, (
+            "The context photographs are not shown, because no folder of them is known.",
+        )
     source = Path(str(summary.settings.get("folder")))
     if summary.scene.format == "photographs":
         source = folder / POSES
@@ -114,8 +123,8 @@ def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:
         photographs = load_context_cameras(source, summary, content)
     except InputError:
         note = f"The context photographs are not shown, because {quote_value(source)} was moved."
-        return replace(content, cameras=targets, notes=(note,))
-    return replace(content, cameras=(*targets, *photographs))
+        return targets, (note,)
+    return (*targets, *photographs), ()
 
 
 def load_target_cameras(
