@@ -30,7 +30,7 @@ from gscompleter.splats.glb import read_glb, write_glb
 from gscompleter.splats.ksplat import read_ksplat
 from gscompleter.splats.morton import sort_along_morton
 from gscompleter.splats.packing import ZIP_MAGIC, UnsupportedError
-from gscompleter.splats.ply import load_ply, make_memory_error, require_finite, save_ply
+from gscompleter.splats.ply import copy_ply, load_ply, make_memory_error, require_finite, save_ply
 from gscompleter.splats.sog import META, read_sog, write_sog
 from gscompleter.splats.splat import read_splat_rows, write_splat
 from gscompleter.splats.spz import read_spz, write_spz
@@ -157,6 +157,26 @@ def save_splat(path: Path | str, gaussians: Gaussians) -> None:
         gaussians = sort_along_morton(gaussians)
     write(path, gaussians)
     save_labels(path, gaussians.generated)
+
+
+def convert_splat(
+    source: Path, out: Path, drop_nonfinite: bool = False, keep_labels: bool = True
+) -> tuple[int, int, str | None]:
+    """Convert a file of Gaussians to the format given by the extension of `out`.
+
+    Returns the numbers of Gaussians and of generated ones, and a sentence on what the format cannot
+    say or None. From .ply to .ply, some Gaussians are in memory at a time.
+    """
+    source = resolve_splat(source)
+    if get_writer(out) is save_ply and detect_splat_format(source) == "ply":
+        return (*copy_ply(source, out, drop_nonfinite, keep_labels), None)
+    gaussians = load_splat(source, drop_nonfinite)
+    generated = gaussians.generated
+    # Without generated Gaussians a writer leaves the labels out altogether.
+    written = generated if keep_labels else torch.zeros_like(generated)
+    save_splat(out, replace(gaussians, generated=written))
+    note = describe_mode_loss(out, gaussians)
+    return len(gaussians), int((generated > 0).sum()), note
 
 
 def describe_mode_loss(path: Path, gaussians: Gaussians) -> str | None:

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int, UInt8
+from jaxtyping import Bool, Int, Int64, UInt8
 from numpy import ndarray
 from numpy.lib.recfunctions import require_fields
 from torch import Tensor
@@ -23,7 +23,9 @@ from torch import Tensor
 from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import detect_splat_format, get_writer, load_splat, save_splat
 from gscompleter.splats.ply import (
+    LABEL_COLUMN,
     MEANS,
+    append_labels,
     count_rest,
     decode_gaussians,
     has_surfels,
@@ -33,14 +35,14 @@ from gscompleter.splats.ply import (
     read_columns,
     read_scene,
     require_finite,
+    save_parts,
     save_ply,
 )
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.ply import PlyFile, write_ply_file
+from gscompleter.system.files.ply import PlyFile, release_pages, write_ply_file
 from gscompleter.system.files.writing import REMOVED_FILE
 from gscompleter.types import Gaussians, merge
 
-LABEL_COLUMN = "generated"
 _LABEL_LINE = re.compile(rb"^property\s+\w+\s+generated\s*?\n", re.M)
 _ELEMENT_LINE = re.compile(rb"^(?:element|end_header)", re.M)
 
@@ -74,19 +76,24 @@ def save_like(
     added: Gaussians,
     given: Path,
     kept: Bool[Tensor, "n"] | None = None,
+    order: Int64[Tensor, "m"] | None = None,
 ) -> None:
     """Write a completed scene in the layout of the input file `given`.
 
     The standard layout is used if `given` is ASCII or no .ply, has surfels (two scales cannot hold
     `added`), a column `generated` of another type, fewer SH coefficients than `added`, or rows that
-    do not match `context`. `kept` marks the rows of `given` that the context has; None for all.
+    do not match `context`. `kept` marks the rows of `given` that are written; None for all. `order`
+    are the Gaussians of the context that they belong to; None for all in their order. Rows go from
+    file to file, some at a time.
     """
-    context = context.to("cpu")
     layout = find_layout(given)
-    added = merge([context[:0], added.to("cpu")])
-    numbers = None if layout is None else _match_rows(layout, context, added, kept)
-    if layout is None or numbers is None:
-        save_ply(path, merge([context, added]), provenance=True)
+    added = merge([context[:0].to("cpu"), added.to("cpu")])
+    order = torch.arange(len(context)) if order is None else order.to("cpu")
+    numbers = None
+    if layout is not None and _can_hold(layout, added):
+        numbers = np.arange(len(layout.rows)) if kept is None else np.flatnonzero(kept.numpy())
+    if layout is None or numbers is None or not _is_read_from(layout, numbers, context, order):
+        save_parts(path, [(context, order), (added, torch.arange(len(added)))], provenance=True)
         return
     # The file's own columns stay as they are; only `generated` is added, or written anew.
     header = _add_label_line(layout.header)
@@ -96,32 +103,46 @@ def save_like(
         label = []
     dtype = np.dtype([*layout.rows.dtype.descr, *label])
 
-    def write_labels(values: ndarray, labels: UInt8[Tensor, "m"]) -> ndarray:
+    def write_labels(values: ndarray, labels: UInt8[Tensor, "k"]) -> ndarray:
+        if values.dtype.descr == dtype.descr[:-1]:
+            return append_labels(values, dtype, labels.numpy())
         rows = require_fields(values, dtype)
         rows[LABEL_COLUMN] = labels.numpy()
         return rows
 
     def generate_blocks() -> Iterator[ndarray]:
-        for block in iterate_blocks(len(context)):
-            yield write_labels(layout.rows[numbers[block]], context.generated[block])
-        yield write_labels(make_rows(added, provenance=False), added.generated)
+        for block, rows in iterate_rows(layout, numbers):
+            yield write_labels(rows, context.generated[order[block]].cpu())
+        for block in iterate_blocks(len(added)):
+            yield write_labels(make_rows(added, False, block), added.generated[block])
 
-    write_ply_file(path, header, len(context) + len(added), generate_blocks(), layout.trailer)
+    write_ply_file(path, header, len(order) + len(added), generate_blocks(), layout.trailer)
 
 
-def _match_rows(
-    layout: PlyFile, context: Gaussians, added: Gaussians, kept: Bool[Tensor, "n"] | None
-) -> Int[ndarray, "m"] | None:
-    """Find the rows of a file that its context was read from, or None if `added` do not fit in."""
-    # Rows are copied only if their positions are those of the context, one by one.
+def iterate_rows(layout: PlyFile, numbers: Int[ndarray, "m"]) -> Iterator[tuple[slice, ndarray]]:
+    """Yield copies of rows by ascending numbers, some at a time, with their places among these."""
+    for block in iterate_blocks(len(numbers)):
+        chosen = numbers[block]
+        yield block, layout.rows[chosen]
+        release_pages(layout.rows[chosen[0] : chosen[-1] + 1])
+
+
+def _can_hold(layout: PlyFile, added: Gaussians) -> bool:
+    """Return True if rows of a file can hold `added`, and their labels."""
     names = layout.rows.dtype.names or ()
     has_other_labels = LABEL_COLUMN in names and layout.rows.dtype[LABEL_COLUMN] != np.uint8
-    if has_surfels(layout) or has_other_labels:
-        return None
-    numbers = np.arange(len(layout.rows)) if kept is None else np.flatnonzero(kept.numpy())
-    means = read_columns(layout.rows, MEANS)[numbers]
-    fits = count_rest(layout) == 3 * (added.sh.shape[1] - 1)
-    return numbers if fits and np.array_equal(means, context.means.numpy()) else None
+    has_all_sh = count_rest(layout) == 3 * (added.sh.shape[1] - 1)
+    return has_all_sh and not has_surfels(layout) and not has_other_labels
+
+
+def _is_read_from(
+    layout: PlyFile, numbers: Int[ndarray, "m"], context: Gaussians, order: Int64[Tensor, "k"]
+) -> bool:
+    """Return True if the positions of rows are those of Gaussians of the context, one by one."""
+    return len(numbers) == len(order) and all(
+        np.array_equal(read_columns(rows, MEANS), context.means[order[block]].cpu().numpy())
+        for block, rows in iterate_rows(layout, numbers)
+    )
 
 
 def _add_label_line(header: bytes) -> bytes:
@@ -191,9 +212,9 @@ def save_removed(
         header = make_scene_header(removed, has_labels)
         values = make_rows(removed, has_labels)
     else:
-        scene_rows = layout.rows if kept is None else layout.rows[kept.numpy()]
+        numbers = rows.numpy() if kept is None else np.flatnonzero(kept.numpy())[rows.numpy()]
         header = layout.header
-        values = scene_rows[rows.numpy()]
+        values = layout.rows[numbers]
     first, _, end = split_header(header)
     place = f"element place {len(rows)}\nproperty uint row\n".encode()
     trailer = rows.numpy().astype("<u4")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -42,12 +42,7 @@ def run_convert(options: ConvertOptions) -> None:
     with import_without_collection():
         from rich.console import Console
 
-        from gscompleter.splats.formats import (
-            describe_mode_loss,
-            get_writer,
-            load_splat,
-            save_splat,
-        )
+        from gscompleter.splats.formats import convert_splat, get_writer
         from gscompleter.system.files.output_file import reserve_file
         from gscompleter.system.progress import show_preparation, show_progress
 
@@ -55,19 +50,13 @@ def run_convert(options: ConvertOptions) -> None:
     with (
         reserve_file(options.out, options.overwrite),
         show_progress(Console(stderr=True, quiet=options.quiet)),
+        show_preparation("converting"),
     ):
-        with show_preparation("reading"):
-            gaussians = load_splat(options.source, options.drop_nonfinite)
-        generated = gaussians.generated
-        written = gaussians
-        if options.plain:
-            # Without generated Gaussians a writer leaves the labels out altogether.
-            written = replace(gaussians, generated=generated.new_zeros(len(gaussians)))
-        with show_preparation("writing"):
-            save_splat(options.out, written)
+        count, num_generated, note = convert_splat(
+            options.source, options.out, options.drop_nonfinite, not options.plain
+        )
     if not options.quiet:
         # Some formats cannot say that a scene is antialiased.
-        if note := describe_mode_loss(options.out, gaussians):
+        if note is not None:
             print(note)
-        count = int((generated > 0).sum())
-        print(f"{len(gaussians):,} Gaussians, {count:,} of them generated: {options.out}")
+        print(f"{count:,} Gaussians, {num_generated:,} of them generated: {options.out}")
