@@ -262,7 +262,7 @@ class Completion:
     @cached_property
     def has_changed_context(self) -> bool:
         """True if Gaussians of the context were recoloured or removed."""
-        return len(self.recolored) > 0 or bool(self.source.gone_mask.any())
+        return bool(self.recolored_mask.any()) or bool(self.source.gone_mask.any())
 
     @cached_property
     def kept_context(self) -> Gaussians:

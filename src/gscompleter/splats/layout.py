@@ -20,14 +20,18 @@ from numpy import ndarray
 from numpy.lib.recfunctions import require_fields
 from torch import Tensor
 
+from gscompleter.numerics.value_checks import find_finite
 from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import detect_splat_format, get_writer, load_splat, save_splat
 from gscompleter.splats.ply import (
+    CHUNK_ROWS,
     LABEL_COLUMN,
     MEANS,
     append_labels,
+    check_finite,
     count_rest,
     decode_gaussians,
+    has_mode_comment,
     has_surfels,
     iterate_blocks,
     make_rows,
@@ -41,7 +45,7 @@ from gscompleter.splats.ply import (
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.ply import PlyFile, release_pages, write_ply_file
 from gscompleter.system.files.writing import REMOVED_FILE
-from gscompleter.types import Gaussians, merge
+from gscompleter.types import NUM_SH, Gaussians, merge
 
 _LABEL_LINE = re.compile(rb"^property\s+\w+\s+generated\s*?\n", re.M)
 _ELEMENT_LINE = re.compile(rb"^(?:element|end_header)", re.M)
@@ -159,8 +163,12 @@ def strip(path: Path, out: Path) -> tuple[int, int]:
     left out.
     """
     path = resolve_splat(path)
-    completed = load_splat(path)
     layout = find_layout(path)
+    if layout is not None and get_writer(out) is save_ply:
+        counts = strip_rows(path, layout, out)
+        if counts is not None:
+            return counts
+    completed = load_splat(path)
     scene = drop_sh_padding(completed)
     layout = None if layout is None else drop_generated(layout)
     removed = path.parent / REMOVED_FILE
@@ -178,6 +186,88 @@ def strip(path: Path, out: Path) -> tuple[int, int]:
     else:
         write_ply_file(out, layout.header, len(layout.rows), [layout.rows], layout.trailer)
     return len(scene), int((completed.generated > 0).sum())
+
+
+def strip_rows(path: Path, layout: PlyFile, out: Path) -> tuple[int, int] | None:
+    """Write the input scene from the rows of a completed .ply, some at a time, as `strip` does.
+
+    None if rows cannot be copied: the file has the SH of generated Gaussians of a higher degree, or
+    the originals beside it have other columns. It is refused as `load_splat` refuses it.
+    """
+    labels = np.zeros(len(layout.rows), np.uint8)
+    has_sh = np.zeros(2, np.bool_)
+    count = 0
+    for start in range(0, len(layout.rows), CHUNK_ROWS):
+        chunk = decode_gaussians(replace(layout, rows=layout.rows[start : start + CHUNK_ROWS]))
+        count += int(find_finite(chunk).sum())
+        labels[start : start + CHUNK_ROWS] = chunk.generated.numpy()
+        # The harmonics of the highest degree, of what was given and of what was generated.
+        highest = chunk.sh[:, NUM_SH[max(chunk.sh_degree - 1, 0)] :].flatten(1).any(dim=1).numpy()
+        for index, is_of_kind in enumerate((chunk.generated == 0, chunk.generated > 0)):
+            has_sh[index] |= bool(highest[is_of_kind.numpy()].any())
+    check_finite(count, len(labels), path, drop_nonfinite=False)
+    # A scene of lower degree was padded with zeros, which the generated Gaussians fill.
+    if has_sh[1] and not has_sh[0]:
+        return None
+
+    numbers = np.flatnonzero(labels == 0)
+    header = _LABEL_LINE.sub(b"", layout.header)
+    dtype = np.dtype([c for c in layout.rows.dtype.descr if c[0] != LABEL_COLUMN])
+    originals = np.empty(0, dtype)
+    taken = np.zeros(len(numbers), np.bool_)
+    removed = path.parent / REMOVED_FILE
+    if removed.is_file():
+        source = read_scene(removed)
+        is_antialiased = has_mode_comment(layout.header)
+        rows = find_places(source, removed, len(numbers), is_antialiased)
+        originals = drop_generated(source).rows
+        if originals.dtype != dtype or len(originals) != len(rows):
+            return None
+        taken = np.zeros(len(numbers) + len(rows), np.bool_)
+        taken[rows] = True
+    if len(taken) == 0:
+        return None
+
+    def generate_blocks() -> Iterator[ndarray]:
+        kept = 0
+        restored = 0
+        for block in iterate_blocks(len(taken)):
+            # The originals take their rows, the others the rest, in their order.
+            is_original = taken[block]
+            rows = np.empty(len(is_original), dtype)
+            num_kept = int((~is_original).sum())
+            for _, copied in iterate_rows(layout, numbers[kept : kept + num_kept]):
+                rows[~is_original] = drop_generated(replace(layout, rows=copied)).rows
+            num_restored = len(rows) - num_kept
+            rows[is_original] = originals[restored : restored + num_restored]
+            kept += num_kept
+            restored += num_restored
+            yield rows
+
+    write_ply_file(out, header, len(taken), generate_blocks(), layout.trailer)
+    return len(taken), len(labels) - len(numbers)
+
+
+def find_places(
+    source: PlyFile, path: Path, num_kept: int, is_antialiased: bool
+) -> Int64[ndarray, "n"]:
+    """Find the rows of the originals of the file `path` in a scene of `num_kept` others.
+
+    Raises InputError if they are not finite, or do not say where they belong in that scene.
+    """
+    removed = require_finite(decode_gaussians(source), path, drop_nonfinite=False)
+    total = num_kept + len(removed)
+    rows = np.zeros(0, np.int64)
+    if b"element place " in source.header and len(source.trailer) == 4 * len(removed):
+        rows = source.trailer.view("<u4").astype(np.int64)
+    # Row numbers ascend, and the last one lies within the scene.
+    is_ordered = len(rows) > 0 and bool((np.diff(rows, append=total) > 0).all())
+    if not is_ordered or is_antialiased != removed.is_antialiased:
+        raise InputError(
+            f"{quote_value(path)} does not say where its Gaussians belong in the scene beside it; "
+            "fetch both files again."
+        )
+    return rows
 
 
 def drop_sh_padding(completed: Gaussians) -> Gaussians:
@@ -226,18 +316,9 @@ def reinsert(
 ) -> tuple[Gaussians, PlyFile | None]:
     """Insert the replaced originals of the file `path` at their rows; None if columns differ."""
     source = read_scene(path)
-    removed = require_finite(decode_gaussians(source), path, drop_nonfinite=False)
+    rows = find_places(source, path, len(kept), kept.is_antialiased)
+    removed = decode_gaussians(source)
     total = len(kept) + len(removed)
-    rows = np.zeros(0, np.int64)
-    if b"element place " in source.header and len(source.trailer) == 4 * len(removed):
-        rows = source.trailer.view("<u4").astype(np.int64)
-    # Row numbers ascend, and the last one lies within the scene.
-    is_ordered = len(rows) > 0 and bool((np.diff(rows, append=total) > 0).all())
-    if not is_ordered or kept.is_antialiased != removed.is_antialiased:
-        raise InputError(
-            f"{quote_value(path)} does not say where its Gaussians belong in the scene beside it; "
-            "fetch both files again."
-        )
     # Place of each Gaussian: the originals take their rows, the others the rest, in their order.
     taken = torch.zeros(total, dtype=torch.bool)
     taken[torch.from_numpy(rows)] = True
