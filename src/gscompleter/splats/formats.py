@@ -32,6 +32,7 @@ from gscompleter.splats.ksplat import read_ksplat
 from gscompleter.splats.morton import sort_along_morton
 from gscompleter.splats.packing import ZIP_MAGIC, UnsupportedError
 from gscompleter.splats.ply import (
+    copy_ply,
     decode_gaussians,
     load_ply,
     make_memory_error,
@@ -203,6 +204,27 @@ def save_splat(path: Path | str, gaussians: Gaussians, made_by: Provenance = NOT
     # Labels beside a file that holds its own would be those of an earlier one.
     labels = gaussians.generated
     save_labels(path, torch.zeros_like(labels) if write in LABELLING else labels, made_by)
+
+
+def convert_splat(
+    source: Path, out: Path, drop_nonfinite: bool = False, keep_labels: bool = True
+) -> tuple[int, int, str | None]:
+    """Convert a file of Gaussians to the format given by the extension of `out`.
+
+    Returns the numbers of Gaussians and of generated ones, and a sentence on what the format cannot
+    say or None. From .ply to .ply, some Gaussians are in memory at a time.
+    """
+    source = resolve_splat(source)
+    made_by = read_provenance(source) if keep_labels else NOTHING_KNOWN
+    if get_writer(out) is save_ply and detect_splat_format(source) == "ply":
+        return (*copy_ply(source, out, drop_nonfinite, keep_labels, made_by), None)
+    gaussians = load_splat(source, drop_nonfinite)
+    generated = gaussians.generated
+    # Without generated Gaussians a writer leaves the labels out altogether.
+    written = generated if keep_labels else torch.zeros_like(generated)
+    save_splat(out, replace(gaussians, generated=written), made_by)
+    note = describe_mode_loss(out, gaussians)
+    return len(gaussians), int((generated > 0).sum()), note
 
 
 def describe_mode_loss(path: Path, gaussians: Gaussians) -> str | None:

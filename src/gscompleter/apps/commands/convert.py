@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
@@ -44,14 +44,7 @@ def run_convert(options: ConvertOptions) -> None:
     with import_without_collection():
         from rich.console import Console
 
-        from gscompleter.splats.formats import (
-            describe_mode_loss,
-            get_writer,
-            load_splat,
-            read_provenance,
-            save_splat,
-        )
-        from gscompleter.splats.provenance import NOTHING_KNOWN
+        from gscompleter.splats.formats import convert_splat, get_writer
         from gscompleter.system.files.output_file import reserve_file
         from gscompleter.system.progress import show_preparation, show_progress
 
@@ -59,26 +52,18 @@ def run_convert(options: ConvertOptions) -> None:
     with (
         reserve_file(options.out, options.overwrite),
         show_progress(Console(stderr=True, quiet=options.quiet)),
+        show_preparation("converting"),
     ):
-        with show_preparation("reading"):
-            gaussians = load_splat(options.source, options.drop_nonfinite)
-            made_by = NOTHING_KNOWN if options.plain else read_provenance(options.source)
-        generated = gaussians.generated
-        written = gaussians
-        if options.plain:
-            # Without generated Gaussians a writer leaves the labels out altogether.
-            written = replace(gaussians, generated=generated.new_zeros(len(gaussians)))
-        with show_preparation("writing"):
-            save_splat(options.out, written, made_by)
+        count, num_generated, note = convert_splat(
+            options.source, options.out, options.drop_nonfinite, not options.plain
+        )
     # Some formats cannot say that a scene is antialiased.
-    note = describe_mode_loss(options.out, gaussians)
     notes = [] if note is None else [note]
-    count = int((generated > 0).sum())
     content = {
         "out": str(options.out),
-        "gaussians": len(gaussians),
-        "generated": count,
+        "gaussians": count,
+        "generated": num_generated,
         "notes": notes,
     }
-    sentence = f"{len(gaussians):,} Gaussians, {count:,} of them generated: {options.out}"
+    sentence = f"{count:,} Gaussians, {num_generated:,} of them generated: {options.out}"
     print_answer(options, content, [*notes, sentence])

@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -43,7 +43,7 @@ from gscompleter.reconstructors.features.consistency import measure_pose_errors
 from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
 from gscompleter.splats.layout import save_like, save_removed
-from gscompleter.splats.ply import save_ply
+from gscompleter.splats.ply import save_parts, save_ply
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, RunRecord
 from gscompleter.state import Completion, TargetResult
 from gscompleter.system.files.image import write_image
@@ -321,41 +321,41 @@ def write_scenes(
     """
     made_by = NOTHING_KNOWN if run is None else Provenance((run,))
     added = completion.added
-    context = completion.context
     if input_splat is None:
+        order = torch.arange(len(completion.context))
+        parts = [(part, torch.arange(len(part))) for part in (completion.kept_context, added)]
         completed = partial(
-            save_ply, folder / COMPLETED_FILE, completion.scene, provenance=True, made_by=made_by
+            save_parts, folder / COMPLETED_FILE, parts, provenance=True, made_by=made_by
         )
     else:
         # In the layout and the order of the user's file, so that what was kept is kept bit by bit.
-        context, changed = restore_file_order(completion, input_splat)
-        recolored = completion.recolored_context[completion.recolored_mask]
-        generated = merge([recolored, added])
+        order = find_file_order(completion.context, input_splat)
+        generated = merge([completion.recolored, added])
         completed = partial(
-            save_completed_splat, folder, context, changed, generated, input_splat, run
+            save_completed_splat,
+            folder,
+            completion.context,
+            completion.recolored_mask | completion.source.gone_mask,
+            generated,
+            input_splat,
+            run,
         )
+    # The context has labels if it was completed before.
+    has_labels = bool((completion.context.generated > 0).any())
     writing = [
         completed,
-        partial(save_ply, folder / CONTEXT_FILE, context),
+        partial(save_parts, folder / CONTEXT_FILE, [(completion.context, order)], has_labels),
         partial(save_ply, folder / GENERATED_FILE, added, provenance=True, made_by=made_by),
     ]
     map_in_parallel(lambda write: write(), writing)
 
 
-def restore_file_order(
-    completion: Completion, input_splat: InputSplatFile
-) -> tuple[Gaussians, Bool[Tensor, "n"]]:
-    """Sort the context and the mask of changed Gaussians in the order of the input file.
-
-    Changed are those that were recoloured or removed.
-    """
-    changed = completion.recolored_mask | completion.source.gone_mask
-    context = completion.context
+def find_file_order(context: Gaussians, input_splat: InputSplatFile) -> Int64[Tensor, "n"]:
+    """Find the Gaussians of the context in the order of the input file."""
     if input_splat.file_order is None:
-        return context, changed
+        return torch.arange(len(context))
     # `file_order[i]` is the place in the file of Gaussian i; sorting by it inverts that.
-    places = input_splat.file_order.argsort().to(context.means.device)
-    return context[places], changed[places]
+    return input_splat.file_order.argsort()
 
 
 def save_completed_splat(
@@ -368,32 +368,37 @@ def save_completed_splat(
 ) -> None:
     """Write `completed.ply` in the layout of the input splat, and the originals of the changed.
 
-    Recoloured Gaussians stand among the generated ones, after all that kept its bits. The originals
-    of an earlier run are kept with those that it recoloured.
+    `changed` marks the Gaussians of the context that were recoloured or removed. Recoloured ones
+    stand among the generated ones, after all that kept its bits. The originals of an earlier run
+    are kept with those that it recoloured.
     """
     kept = input_splat.context_mask
+    order = find_file_order(context, input_splat)
     # A splat that was completed before has its originals beside it; they stay valid with it.
     earlier = input_splat.path.with_name(REMOVED_FILE)
     if not changed.any():
         if bool((context.generated > 0).any()) and earlier.is_file():
             shutil.copyfile(earlier, folder / REMOVED_FILE)
-        save_like(folder / COMPLETED_FILE, context, generated, input_splat.path, kept, run)
+        save_like(folder / COMPLETED_FILE, context, generated, input_splat.path, kept, order, run)
         return
     save_changed(folder, context, changed, input_splat)
-    stays = ~changed.cpu()
+    # The mask in the order of the file, over the Gaussians of the context and over all of the file.
+    stays = ~changed.cpu()[order]
+    order = order[stays]
     if kept is not None:
-        # From a mask over the context to one over all Gaussians of the file.
         stays = torch.zeros_like(kept).masked_scatter(kept, stays)
-    save_like(folder / COMPLETED_FILE, context[~changed], generated, input_splat.path, stays, run)
+    save_like(folder / COMPLETED_FILE, context, generated, input_splat.path, stays, order, run)
 
 
 def save_changed(
     folder: Path, context: Gaussians, changed: Bool[Tensor, "n"], input_splat: InputSplatFile
 ) -> None:
     """Write `removed.ply`, the originals of the changed Gaussians."""
-    rows = torch.nonzero(changed.cpu())[:, 0]
+    order = find_file_order(context, input_splat)
+    rows = changed.cpu()[order].nonzero()[:, 0]
+    removed = context[order[rows].to(context.means.device)].to("cpu")
     kept = input_splat.context_mask
-    save_removed(folder / REMOVED_FILE, context[changed].to("cpu"), rows, input_splat.path, kept)
+    save_removed(folder / REMOVED_FILE, removed, rows, input_splat.path, kept)
 
 
 def make_record(completion: Completion, photographs: Sequence[Camera]) -> CompletionRecord:

@@ -83,10 +83,10 @@ def load_viewer_files(after: Path, before: Path | None, drop_nonfinite: bool) ->
     scene = load_splat(after, drop_nonfinite)
     if before is not None:
         return ViewerContent(after.name, scene, load_splat(before, drop_nonfinite))
-    observed = scene[scene.generated == 0]
+    is_observed = scene.generated == 0
     # Without anything generated or anything observed there is only one state to show.
-    shown = observed if 0 < len(observed) < len(scene) else None
-    return ViewerContent(after.name, scene, shown)
+    has_two_states = bool(is_observed.any()) and not bool(is_observed.all())
+    return ViewerContent(after.name, scene, scene[is_observed] if has_two_states else None)
 
 
 def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:

@@ -68,7 +68,10 @@ def encode_text(text: str) -> bytes:
 
     Names of files may hold bytes that are no UTF-8; each becomes the sign for an unknown character.
     """
-    return text.encode("utf-8", "surrogatepass").decode("utf-8", "replace").encode()
+    try:
+        return text.encode()
+    except UnicodeEncodeError:
+        return text.encode("utf-8", "surrogatepass").decode("utf-8", "replace").encode()
 
 
 def refuse_special_file(path: Path) -> None:
