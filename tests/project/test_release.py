@@ -41,17 +41,19 @@ from release_check import (
 )
 
 DEVELOPERS = {"test-core", "test", "dev", "docs"}
-KERNELS = Path("numerics", "kernels")
 """Extras that users do not need."""
+KERNELS = Path("numerics", "kernels")
 
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> Path:
+    pytest.importorskip("hatchling", reason="needs gscompleter[test]")
     return built("wheel", tmp_path_factory.mktemp("wheel"))
 
 
 @pytest.fixture(scope="module")
 def sdist(tmp_path_factory) -> Path:
+    pytest.importorskip("hatchling", reason="needs gscompleter[test]")
     return built("sdist", tmp_path_factory.mktemp("sdist"))
 
 
@@ -99,6 +101,7 @@ def test_the_same_sources_give_the_same_bytes_wherever_they_lie(
     assert built("sdist", tmp_path / "sdist", unpacked).read_bytes() == sdist.read_bytes()
 
 
+@pytest.mark.linux
 def test_the_wheel_runs_by_itself_in_another_folder(wheel, tmp_path):
     """The environment has the wheel, and borrows its requirements from ours."""
     programs = environment(sys.executable, tmp_path / "environment")
@@ -116,6 +119,7 @@ def test_the_wheel_runs_by_itself_in_another_folder(wheel, tmp_path):
     assert summary["version"] == __version__
 
 
+@pytest.mark.linux
 @pytest.mark.slow
 @pytest.mark.parametrize("extra", ["", *sorted(PURPOSES)])
 def test_the_wheel_installs_into_an_empty_environment(wheel, extra, tmp_path):

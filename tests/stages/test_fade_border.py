@@ -11,7 +11,7 @@ from gscompleter.types import Gaussians, View
 from scenes import Room, camera_at, gaussians_of, view_of
 from target_views import begin_with
 
-SIZE = 64
+SIZE = 160
 TARGET = camera_at(0.0, size=SIZE)
 MARGIN = 0.25
 

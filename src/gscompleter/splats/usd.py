@@ -193,7 +193,9 @@ def _open_stage(path: Path) -> Iterator[Usd.Stage]:
     with ExitStack() as stack:
         place = path
         if path.suffix.lower() not in ENDINGS:
-            folder = stack.enter_context(tempfile.TemporaryDirectory())
+            # On Windows, a file that OpenUSD still maps cannot be removed.
+            temporary = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+            folder = stack.enter_context(temporary)
             starts = path.open("rb").read(len(ZIP_MAGIC))
             ending = {b"PXR-": ".usdc", ZIP_MAGIC: ".usdz"}.get(starts, ".usda")
             place = Path(shutil.copyfile(path, Path(folder) / f"splat{ending}"))
