@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
@@ -193,3 +194,13 @@ def test_a_completion_in_python_names_its_models_by_their_classes(room, tmp_path
         assert made.generator.name == expected
         assert made.generator.licence == ("Apache-2.0" if generator is None else None)
     assert generator is not None or len(completion.added)
+
+
+def test_the_folder_of_the_demo_is_that_of_its_completion(
+    completed_room, tmp_path, monkeypatch, capsys
+):
+    shutil.copytree(completed_room, tmp_path / "demo" / "completion")
+    (tmp_path / "demo" / "summary.json").write_text('{"command": "demo"}', encoding="utf-8")
+    found = inspected(monkeypatch, capsys, tmp_path / "demo")
+    assert found["file"] == str(tmp_path / "demo" / "completion" / "completed.ply")
+    assert found["pictures"]
