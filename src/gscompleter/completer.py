@@ -10,7 +10,13 @@ import torch
 
 from gscompleter.config import CompleterConfig
 from gscompleter.config.settings import validate
-from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
+from gscompleter.generators import (
+    FunctionGenerator,
+    Generator,
+    ImageFunction,
+    as_generator,
+    load_generator,
+)
 from gscompleter.guards import Attempt, place, prepare_guards, verify
 from gscompleter.numerics.geometry import pad_camera, pad_like
 from gscompleter.numerics.image_ops import is_enclosed
@@ -173,6 +179,7 @@ class GSCompleter:
                 Trust(),
                 is_given=scene is not None,
                 seed=self.seed,
+                made_with=(name_model(self.reconstructor), name_model(self.generator)),
             )
             # Guards measure the scene as it was given, so before anything changes.
             state = prepare_guards(state, self.scenes)
@@ -353,3 +360,10 @@ def check_any_completed(state: Completion) -> None:
     if all(reasons):
         more = "" if len(reasons) == 1 else f" The same holds for the other {len(reasons) - 1}."
         raise InputError(f"{reasons[0]}{more}", "target")
+
+
+def name_model(model: object) -> str:
+    """Name Ψ or Φ by the module and the name of its function, or else of its class."""
+    inner = model.function if isinstance(model, FunctionGenerator) else model
+    named = inner if hasattr(inner, "__qualname__") else type(inner)
+    return f"{named.__module__}.{named.__qualname__}"

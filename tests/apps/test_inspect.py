@@ -2,12 +2,14 @@
 
 import hashlib
 import json
+import shutil
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
+import gscompleter as gsc
 from command import run
 from gscompleter import load_ply, save_ply, save_splat
 from gscompleter.apps.completing.maker import describe_model
@@ -169,3 +171,36 @@ def test_models_are_named_with_their_licences(tmp_path):
     own = describe_model("lama", tmp_path / "weights")
     assert own == ModelRecord("lama", "weights")
     assert describe_model("my_package:load", None) == ModelRecord("my_package:load")
+
+
+def my_painter(nearest, target, context):
+    """Return the least of generators."""
+    return torch.full((target.height, target.width, 3), 0.5)
+
+
+@pytest.mark.parametrize("generator", [None, my_painter])
+def test_a_completion_in_python_names_its_models_by_their_classes(room, tmp_path, generator):
+    views = [gsc.load_views(room)[number] for number in (0, 1)]
+    target = gsc.load_camera(room, frame=2)
+    named = {} if generator is None else {"generator": generator}
+    completion = gsc.GSCompleter(seed=5, **named)(views, target)
+    completion.save(tmp_path / "out")
+    (made,) = read_provenance(tmp_path / "out" / "completed.ply").runs
+    assert made.reconstructor.name == "PlaneSweep"
+    assert made.reconstructor.licence == "Apache-2.0"
+    assert made.seed == 5
+    if len(completion.added):
+        expected = "WarpInpaint" if generator is None else f"{__name__}.my_painter"
+        assert made.generator.name == expected
+        assert made.generator.licence == ("Apache-2.0" if generator is None else None)
+    assert generator is not None or len(completion.added)
+
+
+def test_the_folder_of_the_demo_is_that_of_its_completion(
+    completed_room, tmp_path, monkeypatch, capsys
+):
+    shutil.copytree(completed_room, tmp_path / "demo" / "completion")
+    (tmp_path / "demo" / "summary.json").write_text('{"command": "demo"}', encoding="utf-8")
+    found = inspected(monkeypatch, capsys, tmp_path / "demo")
+    assert found["file"] == str(tmp_path / "demo" / "completion" / "completed.ply")
+    assert found["pictures"]

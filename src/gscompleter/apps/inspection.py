@@ -130,8 +130,10 @@ def inspect_splat(options: InspectOptions) -> Inspection:
 
 def locate(file: Path) -> tuple[Path, Path | None]:
     """Find the splat, and the folder of the completion that it lies in, or None."""
-    if (file / SUMMARY_FILE).is_file():
-        return file / COMPLETED_FILE, file
+    # The folder of `demo` holds that of its completion.
+    for folder in (file, file / "completion"):
+        if (folder / SUMMARY_FILE).is_file() and (folder / COMPLETED_FILE).is_file():
+            return folder / COMPLETED_FILE, folder
     path = resolve_splat(file)
     beside = path.parent
     is_result = (beside / SUMMARY_FILE).is_file() and (beside / COMPLETED_FILE).is_file()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
+from pathlib import Path
 
 from rich.console import Console
 
@@ -15,13 +17,20 @@ from gscompleter.apps.report.completion import join_images
 from gscompleter.data.demo_scene import write_motorcycle_scene
 from gscompleter.system.files.image import read_image, write_image
 from gscompleter.system.files.output_folder import reserve_output
-from gscompleter.system.files.writing import SUMMARY_FILE
+from gscompleter.system.files.writing import SUMMARY_FILE, TARGETS_FILE
 
 PICTURE_FILE = "before_after.png"
 RESOLUTION = (250, 370)
 COMMAND = "demo"
 RESULTS = ("scene/**/*", "completion/**/*", PICTURE_FILE, SUMMARY_FILE)
 """Globs of the files that it may write."""
+
+
+def name_scene(summary: Path, scene: Path) -> None:
+    """Name the scene in the summary by its final place: the folder that is completed is moved."""
+    content = json.loads(summary.read_bytes())
+    content["settings"] |= {"folder": str(scene), "target": [str(scene / TARGETS_FILE)]}
+    summary.write_bytes(json.dumps(content, indent=2).encode() + b"\n")
 
 
 def complete_demo(options: DemoOptions) -> None:
@@ -44,6 +53,7 @@ def complete_demo(options: DemoOptions) -> None:
             quiet=options.quiet,
         )
         complete_folder(complete_options)
+        name_scene(folder / "completion" / SUMMARY_FILE, options.out / "scene")
 
         # One row of four images: before and after at the first target, then at the second.
         images = folder / "completion" / "images"

@@ -5,18 +5,14 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from gscompleter import __version__
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.inputs.task import CompletionTask
+from gscompleter.apps.report.maker import LICENCE, make_run
 from gscompleter.models.diffusion.published import PE_FIELD, find_usual_licence
 from gscompleter.models.weights.published import PUBLISHED, UNSTATED
 from gscompleter.splats.provenance import ModelRecord, RunRecord, shorten
-from gscompleter.state import NEW_PHOTO_ID, Completion
-from gscompleter.system.files.reading import hash_file
+from gscompleter.state import Completion
 
-TOOL = "gscompleter"
-LICENCE = "Apache-2.0"
-"""Licence of gscompleter, whose own models have no weights."""
 OWN_MODELS = ("plane-sweep", "warp-inpaint")
 PUBLISHED_BY_AUTHORS = {
     "pe-field": ModelRecord("pe-field", PE_FIELD.location, "non-commercial, of FLUX.1-Kontext-dev"),
@@ -28,23 +24,15 @@ def describe_maker(
     options: CompleteOptions, task: CompletionTask, completion: Completion
 ) -> RunRecord:
     """Describe a completion as the run that made its files."""
-    added = completion.added.generated
-    recolored = completion.recolored_context.generated[completion.recolored_mask]
-    labels = [*added.unique().tolist(), *recolored.unique().tolist()]
-    invented = [label for label in labels if label != NEW_PHOTO_ID]
     synthesis = options.synthesis
     weights = getattr(synthesis.make_settings(), "weights", None)
-    painters = [result.painter for result in completion.targets if result.painter]
-    return RunRecord(
-        TOOL,
-        __version__,
-        (min(invented), max(invented)) if invented else None,
+    has_depth = options.depth != "none"
+    return make_run(
+        completion,
+        task.splat_file,
         describe_model(options.reconstructor, options.weights),
-        None if options.depth == "none" else describe_model(options.depth, options.depth_weights),
-        describe_model(synthesis.generator, weights) if invented else None,
-        shorten(painters[0]) if painters and invented else None,
-        options.seed,
-        None if task.splat_file is None else hash_given(task.splat_file.path),
+        describe_model(synthesis.generator, weights),
+        describe_model(options.depth, options.depth_weights) if has_depth else None,
     )
 
 
@@ -64,8 +52,3 @@ def describe_model(name: str, weights: Path | str | None) -> ModelRecord:
         return ModelRecord(shorten(name))
     licence = published.weights_licence
     return ModelRecord(name, published.name, None if licence == UNSTATED else shorten(licence))
-
-
-def hash_given(path: Path) -> str | None:
-    """Compute the SHA-256 of the given splat; None for the folder of a .sog."""
-    return hash_file(path) if path.is_file() else None

@@ -19,6 +19,7 @@ from gscompleter.apps.inputs.splat import locate_splat
 from gscompleter.apps.inputs.task import InputSplatFile, Target
 from gscompleter.apps.report.completion import GENERATED_FILE, make_score_rows, write_report
 from gscompleter.apps.report.film import VIDEO_FILE
+from gscompleter.apps.report.maker import make_run_of_objects
 from gscompleter.apps.report.page import REPORT_FILE, write_completion_page
 from gscompleter.apps.report.schema import RECORD_FILE
 from gscompleter.data.scene import write_cameras
@@ -158,6 +159,7 @@ def write_result(folder: Path, judged: Judged, splat_file: InputSplatFile | None
         judged.cameras,
         partial(render_pairs, completion, aside, judged.renderer),
         judged.held_out,
+        run=make_run_of_objects(completion, splat_file),
     )
     if completion.targets:
         write_cameras(folder / TARGETS_FILE, [result.target for result in completion.targets])
