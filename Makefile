@@ -65,9 +65,11 @@ types: $(VENV)/installed-dev
 docs: $(VENV)/installed-test
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict
 
-# Wheel and sdist, in dist/. The same sources give the same bytes.
-dist: $(VENV)/installed-test
+# Wheel and sdist, in dist/, as they can be uploaded. The same sources give the same bytes.
+dist: $(VENV)/installed-dist
+	rm -rf dist
 	$(BIN)/python -m hatchling build -d dist
+	$(BIN)/python -m twine check --strict dist/*
 
 # The wheel and every extra in an empty environment of each Python; gigabytes and an hour.
 PYTHONS ?= python3.10 python3.11 python3.12 python3.13
@@ -144,6 +146,10 @@ $(VENV)/installed-evaluation: pyproject.toml | $(VENV)/torch
 $(VENV)/installed-test: pyproject.toml | $(VENV)/torch
 	$(PIP) -e '.[test]'
 	touch $@ $(VENV)/installed
+
+$(VENV)/installed-dist: pyproject.toml | $(VENV)/bin/python
+	$(PIP) 'hatchling>=1.26' 'twine>=6'
+	touch $@
 
 $(GPU_WHEELS): | $(VENV)/bin/python
 	-$(BIN)/python -m pip download --quiet --disable-pip-version-check --no-deps -d $(@D) \

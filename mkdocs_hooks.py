@@ -25,7 +25,7 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).resolve().parent
 TEXTS = {
-    "README.md": "index.md",
+    "README.md": "overview.md",
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
     "benchmarks/history.md": "history.md",
@@ -33,6 +33,8 @@ TEXTS = {
 """Files of the repository that are pages of the site."""
 FILES = ("LICENSE", "CITATION.cff")
 """Files of the repository that pages link to and that are copied as they are."""
+LLMS = "llms.txt"
+"""What assistants read first; its links are converted to pages of the site."""
 STAGES = (
     "context",
     "target_view",
@@ -72,7 +74,7 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
     others = [page for page in pages if page not in named]
     decisions = [page for page in others if page.startswith("decisions/")]
     config.nav.insert(1, {"Demo": DEMO_PAGE})
-    config.nav.insert(3, {"Tutorials": [{"Notebook": NOTEBOOK_PAGE}, *tutorials()]})
+    config.nav.insert(4, {"Tutorials": [{"Notebook": NOTEBOOK_PAGE}, *tutorials()]})
     add_pages(config.nav, "decisions/index.md", decisions)
     if more := [page for page in others if page not in decisions]:
         config.nav.append({"More": more})
@@ -107,6 +109,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
         "reference/stages.md": of_stages(),
     }
     made |= {name: (ROOT / name).read_text() for name in FILES}
+    made[LLMS] = link_pages((ROOT / LLMS).read_text())
     for page, text in made.items():
         files.append(File.generated(config, page, content=text))
     files.append(File.generated(config, NOTEBOOK.name, content=NOTEBOOK.read_text()))
@@ -123,6 +126,15 @@ def on_page_markdown(markdown: str, page: Any, **_: Any) -> str:
     by_page = {made: name for name, made in TEXTS.items()}
     place = by_page.get(page.file.src_uri, f"docs/{page.file.src_uri}")
     return LINK.sub(lambda link: site_link(link[0], place, page.file.src_uri), markdown)
+
+
+def link_pages(text: str) -> str:
+    """Convert links to files of `docs/` to the folders of their pages, as mkdocs makes them."""
+    folders = {
+        path: f"{path.removeprefix('docs/').removesuffix('.md')}/" for path in LINK.findall(text)
+    }
+    folders["docs/index.md"] = "./"
+    return LINK.sub(lambda link: folders[link[0]], text)
 
 
 def site_link(link: str, place: str, page: str) -> str:

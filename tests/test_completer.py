@@ -16,6 +16,7 @@ from gscompleter import (
 )
 from gscompleter.apps.inputs.task import Target
 from gscompleter.apps.report.completion import write_report
+from gscompleter.config import GapConfig
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.generators import GeneratorOutput
 from gscompleter.guards.free_space import respect_free_space
@@ -173,7 +174,7 @@ def test_targets_are_synthesized_together_where_the_generator_can():
     So it has the same padding as alone.
     """
     views, (_, target) = photographs(), cameras()
-    others = [camera_at(x, yaw=12, size=SIZE) for x in (1.1, 1.8, 2.5)]
+    others = [camera_at(x, yaw=12, size=SIZE) for x in (1.5, 2.3, 2.8)]
     targets = [target, views[0].camera, *others]
     generator = KnowingTogether()
     together = GSCompleter(KnowingReconstructor(), generator)(views, targets)
@@ -420,7 +421,8 @@ def test_nothing_is_added_before_what_an_earlier_target_sees(monkeypatch):
 
     monkeypatch.setattr("gscompleter.guards.free_space.respect_free_space", told)
     first, second = cameras()[1], camera_at(-0.9, yaw=-12, size=SIZE)
-    knowing()(photographs(), [first, second])
+    without_gaps = replace(CompleterConfig(), gaps=GapConfig(displacement=0.0))
+    knowing(without_gaps)(photographs(), [first, second])
     assert [len(centers) for centers in asked] == [2, 3]
     assert torch.equal(asked[1][2], first.center)
 

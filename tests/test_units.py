@@ -55,6 +55,7 @@ def test_the_reconstructor_alone_draws_small_scenes_too():
     assert (scaled(small, 2.0**13).means - whole.means).abs().max() < 1e-2
 
 
+@pytest.mark.slow
 def test_the_report_of_a_small_scene_shows_it(tmp_path, monkeypatch):
     def scores(unit: float) -> list[float]:
         folder, out = tmp_path / f"room{unit:g}", tmp_path / f"out{unit:g}"

@@ -10,24 +10,33 @@ import torch
 
 from gscompleter.config import CompleterConfig
 from gscompleter.config.settings import validate
-from gscompleter.generators import Generator, ImageFunction, as_generator, load_generator
+from gscompleter.generators import (
+    FunctionGenerator,
+    Generator,
+    ImageFunction,
+    as_generator,
+    load_generator,
+)
 from gscompleter.guards import Attempt, place, prepare_guards, verify
 from gscompleter.numerics.geometry import pad_camera, pad_like
 from gscompleter.numerics.image_ops import is_enclosed
 from gscompleter.numerics.value_checks import check_camera, check_gaussians, check_inputs
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
+from gscompleter.reconstructors.depth_predictors import predict_nothing
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
 from gscompleter.stages.add_observed import add_observed
 from gscompleter.stages.align_depth import align_depth
+from gscompleter.stages.close_gaps import continue_surfaces, find_gaps, view_gaps
 from gscompleter.stages.context import choose_config, init_context
+from gscompleter.stages.fade_border import fade_border
 from gscompleter.stages.filter_holes import filter_holes
 from gscompleter.stages.find_unfilled import find_unfilled
 from gscompleter.stages.lift import lift
 from gscompleter.stages.new_photos import find_new_photos, recolor_to_photos
 from gscompleter.stages.recolor import recolor
-from gscompleter.stages.refine import refine
+from gscompleter.stages.refine import Refined, refine
 from gscompleter.stages.register import register_along_rays
 from gscompleter.stages.register_paper import register_as_paper
 from gscompleter.stages.synthesize import GeneratedView, synthesize
@@ -39,7 +48,7 @@ from gscompleter.system.tensor_checks import describe, is_whole
 from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.trust import Trust
 from gscompleter.trust.photometric import load_trust
-from gscompleter.types import Camera, Gaussians, PaddedCamera, View
+from gscompleter.types import Camera, DepthAffine, Gaussians, PaddedCamera, View, merge
 
 MAX_TARGET_ID = NEW_PHOTO_ID - 1
 """Largest target id: `generated` is one byte per Gaussian, and 0 means observed."""
@@ -171,6 +180,7 @@ class GSCompleter:
                 Trust(),
                 is_given=scene is not None,
                 seed=self.seed,
+                models=self.name_models(),
             )
             # Guards measure the scene as it was given, so before anything changes.
             state = prepare_guards(state, self.scenes)
@@ -191,6 +201,17 @@ class GSCompleter:
             state = replace(state, trust=trust)
             state = recolor_to_photos(state, [context.views[i] for i in new], self.scenes)
         return replace(state, exposure_gains=context.exposure_gains, seconds=seconds)
+
+    def name_models(self) -> dict[str, str]:
+        """Name Ψ, the depth that helps it, and Φ, for the record of what is invented."""
+        depth = getattr(self.reconstructor, "predict_depth", predict_nothing)
+        phi = self.generator
+        models = {
+            "reconstructor": self.reconstructor,
+            "depth": None if depth is predict_nothing else depth,
+            "generator": phi.function if isinstance(phi, FunctionGenerator) else phi,
+        }
+        return {key: name_model(model) for key, model in models.items() if model is not None}
 
     @show_in_notebook()
     def advance(
@@ -223,10 +244,13 @@ class GSCompleter:
             steps.append(Step("refine", refined.gaussians))
             verified, rejection = verify(Attempt(view, image, affine, refined))
             steps += verified
-            added = steps[-1].gaussians
+            filled = fade_border(steps[-1].gaussians, view)
 
-            # Not in the paper: what covers the target without being trusted takes new colours.
+            # Not in the paper: what covers the target without being trusted takes new colours, and
+            # gaps that a camera beside the target would see are closed.
             recolored = recolor(image, view, state.next_target_id)
+            closing = self.close_gaps(recolored.state, view, filled)
+            added = merge([filled, closing])
             after = recolored.frozen.composite(added)
             result = replace(
                 view.make_unchanged_result(),
@@ -242,7 +266,33 @@ class GSCompleter:
                 painter=image.painter,
                 rejection=rejection,
             )
-        return recolored.state.extended(result, seconds)
+        return recolored.state.extended(result, seconds, (filled, closing))
+
+    def close_gaps(self, state: Completion, target: TargetView, added: Gaussians) -> Gaussians:
+        """Return what closes the thin gaps beside a target, for which `added` is added.
+
+        None are closed where nothing was added, or in the paper.
+        """
+        nothing = added[:0]
+        if state.config.gaps.displacement == 0 or len(added) == 0:
+            return nothing
+        # The target is not counted as completed yet: what is added here gets its id, and has to be
+        # content with its budgets.
+        photos = tuple(
+            replace(photo, budgets=budgets)
+            for photo, budgets in zip(state.photos, target.budgets, strict=True)
+        )
+        with_added = replace(state, parts=(*state.parts, added), photos=photos)
+        view = view_gaps(with_added, target.camera.target, self.scenes, state.config.gaps)
+        gaps = find_gaps(view)
+        if not gaps.any():
+            return nothing
+        image, candidates = continue_surfaces(view, gaps)
+        steps = [Step("continue", candidates), *place(candidates, view)]
+        placed = steps[-1].gaussians
+        plans = tuple(frozen.vary_opacities(placed) for frozen in view.frozen_photos)
+        verified, _ = verify(Attempt(view, image, DepthAffine(), Refined(placed, plans, ())))
+        return [*steps, *verified][-1].gaussians
 
     def advance_batch(self, state: Completion, targets: Sequence[Camera]) -> Completion:
         """Complete several targets, whose images Φ synthesizes in one call.
@@ -291,6 +341,12 @@ class GSCompleter:
             return []
         inputs = [(view.camera.padded, view.make_generator_input()) for view in views]
         return synthesize(self.generator, inputs, views[0].state.config.synthesis)
+
+
+def name_model(model: object) -> str:
+    """Name a model by its own `name`, or that of its function or class."""
+    own = getattr(model, "name", None) or getattr(model, "__name__", None)
+    return own if isinstance(own, str) else type(model).__name__
 
 
 def list_targets(target: object) -> list[Camera]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -199,7 +198,8 @@ class Completion(Displayed):
     config: CompleterConfig
     source: ContextScene
     parts: tuple[Gaussians, ...]
-    """Gaussians to render: the context, recoloured in part, then one part per target."""
+    """Gaussians to render: the context, recoloured in part, then what each target added: for the
+    hole, and for thin gaps. Frozen scenes are extended part by part."""
     photos: tuple[Photo, ...]
     """Context photographs, then check photographs."""
     num_context: int
@@ -220,6 +220,8 @@ class Completion(Displayed):
     """True if the context is a scene that was given, and Ψ did not reconstruct it."""
     seed: int = 0
     """Seed of all random numbers."""
+    models: Mapping[str, str] = field(default_factory=dict)
+    """Names of the `reconstructor`, its `depth` and the `generator`, for those who read files."""
 
     def summarize(self) -> str:
         """Describe the targets and the Gaussians."""
@@ -316,28 +318,61 @@ class Completion(Displayed):
         return merge(parts) if len(parts) > 1 else parts[0]
 
     @cached_property
-    def recolored_context(self) -> Gaussians:
-        """The context with the new colours and target ids of recoloured Gaussians."""
+    def recolored(self) -> Gaussians:
+        """The Gaussians of `context` that got new colours, with these and their target ids."""
         before = self.source.rendered
         after = self.rendered_context
-        gaussians = self.source.gaussians
         if after is before:
-            return gaussians
-
+            return self.context[:0]
         # What was recoloured may be an LOD proxy: each Gaussian that it stands for takes its change
-        # (decision 024). The others keep their bits, which adding zero might not.
+        # (decision 024).
         is_changed = self.recolored_mask
-        change = self.source.expand(after.sh - before.sh)
-        sh = torch.where(is_changed[:, None, None], gaussians.sh + change, gaussians.sh)
-        target_ids = self.source.expand(after.generated)
-        generated = torch.where(is_changed, target_ids, gaussians.generated)
-        return replace(gaussians, sh=sh, generated=generated)
+        rows = self.source.stand_ins[is_changed]
+        gaussians = self.context[is_changed]
+        change = after.sh[rows] - before.sh[rows]
+        return replace(gaussians, sh=gaussians.sh + change, generated=after.generated[rows])
+
+    @cached_property
+    def recolored_context(self) -> Gaussians:
+        """The context with the new colours and target ids of recoloured Gaussians."""
+        if len(self.recolored) == 0:
+            return self.context
+        # The others keep their bits.
+        rows = self.recolored_mask.nonzero()[:, 0]
+        return replace(
+            self.context,
+            sh=self.context.sh.index_copy(0, rows, self.recolored.sh),
+            generated=self.context.generated.index_copy(0, rows, self.recolored.generated),
+        )
+
+    @cached_property
+    def has_changed_context(self) -> bool:
+        """True if Gaussians of the context were recoloured or removed."""
+        return bool(self.recolored_mask.any()) or bool(self.source.gone_mask.any())
 
     @cached_property
     def kept_context(self) -> Gaussians:
         """The recoloured context without removed Gaussians."""
         gone = self.source.gone_mask
         return self.recolored_context[~gone] if gone.any() else self.recolored_context
+
+    def iterate_kept(self, count: int) -> Iterator[Gaussians]:
+        """Yield `kept_context` from `count` Gaussians of the context at a time, to save memory."""
+        is_recolored = self.recolored_mask
+        is_gone = self.source.gone_mask
+        first = 0
+        for start in range(0, max(len(self.context), 1), count):
+            block = slice(start, start + count)
+            rows = is_recolored[block].nonzero()[:, 0]
+            new = self.recolored[first : first + len(rows)]
+            first += len(rows)
+            part = self.context[block]
+            part = replace(
+                part,
+                sh=part.sh.index_copy(0, rows, new.sh),
+                generated=part.generated.index_copy(0, rows, new.generated),
+            )
+            yield part[~is_gone[block]]
 
     @property
     def next_target_id(self) -> int:
@@ -349,9 +384,14 @@ class Completion(Displayed):
         known = self.photos[0].view.camera  # all photographs share one depth range
         return replace(camera, near=known.near, far=known.far)
 
-    def extended(self, result: TargetResult, seconds: Mapping[str, float]) -> Completion:
-        """Append the result of one more target, and what it added."""
-        parts = (*self.parts, result.added) if len(result.added) else self.parts
+    def extended(
+        self,
+        result: TargetResult,
+        seconds: Mapping[str, float],
+        added: Sequence[Gaussians] = (),
+    ) -> Completion:
+        """Append the result of one more target, and what it `added`, in the order of addition."""
+        parts = (*self.parts, *(part for part in added if len(part)))
         targets = (*self.targets, result)
         return replace(self, parts=parts, targets=targets).plus_seconds(seconds)
 

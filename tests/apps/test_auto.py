@@ -79,6 +79,7 @@ def test_the_cameras_stand_beside_the_photographs_they_were_derived_from(scene, 
         assert measure_baseline(camera, photographs.camera(row["derived_from"], 48)) < 0.5
 
 
+@pytest.mark.slow
 def test_a_dry_run_writes_the_cameras_and_what_they_see(scene, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     said = [word for word in QUICK if word != "--quiet"]

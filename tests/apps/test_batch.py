@@ -154,6 +154,7 @@ class Deadly:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
+@pytest.mark.slow
 @pytest.mark.linux
 def test_workers_that_cannot_even_list_a_failure_end_the_run():
     with pytest.raises(BrokenProcessPool):
@@ -345,6 +346,7 @@ def test_a_batch_does_what_complete_does_and_tells_of_what_is_broken(
     assert {p: p.stat().st_mtime_ns for p in out.rglob("*.ply")} == before
 
 
+@pytest.mark.slow
 def test_every_scene_failing_is_no_success_and_the_first_are_named(tmp_path, monkeypatch, capsys):
     """A script sees it by the exit code, and a person the reasons."""
     for number in range(7):

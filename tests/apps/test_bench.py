@@ -70,6 +70,7 @@ def sample(seconds: float, yardstick: float = 0.5) -> Sample:
     return Sample({"lift": seconds / 4, PROCESS: seconds}, yardstick, 2**30, counts)
 
 
+@pytest.mark.slow
 def test_a_quick_run_tells_every_stage_of_its_case(quick):
     report = json.loads((quick / "bench.json").read_text())
     (case,) = report["cases"]
@@ -217,6 +218,7 @@ def test_the_cases_of_the_documentation_can_be_read():
     assert len(series["views"][32].context) == 32
 
 
+@pytest.mark.slow
 def test_a_process_that_refuses_its_input_says_why(tmp_path):
     with pytest.raises(InputError, match="nowhere"):
         run_command(["complete", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out")])

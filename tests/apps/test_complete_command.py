@@ -169,6 +169,7 @@ def foreign(given: Path, path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_splat_of_another_program_is_completed_in_its_own_layout(
     scene, chosen, tmp_path, monkeypatch
 ):
@@ -204,6 +205,7 @@ def test_rows_that_were_dropped_stay_out_of_the_users_layout(scene, chosen, tmp_
     assert labels == [n for n in range(len(gaussians)) if n not in (2, 9)]
 
 
+@pytest.mark.slow
 def test_a_splat_with_infinite_logits_keeps_its_bytes(scene, chosen, tmp_path, monkeypatch):
     """Such Gaussians are opaque, and the file keeps its rows."""
     given = foreign(chosen[0] / "context.ply", tmp_path / "given.ply")

@@ -233,6 +233,7 @@ def test_the_same_completion_gives_the_same_bytes(completion, tmp_path):
 SMALL = ("--context", 0, 1, "--target", 2, "--resolution", 32, "--near", 0.5, "--far", 20)
 
 
+@pytest.mark.slow
 def test_a_completion_writes_a_film_where_it_is_asked(room, tmp_path, monkeypatch, capfd):
     out = tmp_path / "out"
     assert run(monkeypatch, "complete", room, *SMALL, "--video", "--out", out) == 0

@@ -158,6 +158,7 @@ def the_same_as_complete(monkeypatch, ready: serving.Prepared, tmp_path: Path, *
     return all((out / name).read_bytes() == (other / name).read_bytes() for name in names)
 
 
+@pytest.mark.slow
 def test_what_is_saved_is_what_complete_writes(ready, begun, tmp_path, monkeypatch):
     with pytest.raises(InputError, match="nothing to save"):
         serving.save_session(ready, begun)

@@ -110,6 +110,7 @@ def test_the_page_shows_what_is_ignored(completed):
     assert (ignored[:HIDDEN_ROWS] == (255, 0, 255)).all()
 
 
+@pytest.mark.slow
 def test_one_line_says_what_was_found(scenes, tmp_path, monkeypatch, capsys):
     words = ("--context", 1, 3, "--target", 5, *SIZE, "--dry-run")
     for kind, said in (("masks", "masks of 3 photographs"), ("alpha", "the alpha channel of 3")):
@@ -179,6 +180,7 @@ def test_cases_read_masks(scenes, tmp_path, monkeypatch, capsys):
     assert read_scores(tmp_path / "out")["context_psnr"][0]["after"] > 30
 
 
+@pytest.mark.slow
 def test_batch_reads_masks(scenes, tmp_path, monkeypatch):
     manifest = tmp_path / "scenes.csv"
     manifest.write_text(f"folder,context,target\n{scenes['masks']},1 photo_003,photo_005.png\n")

@@ -61,6 +61,7 @@ def test_photographs_are_named_by_file_in_options_lines_and_results(tmp_path, mo
         assert text in page
 
 
+@pytest.mark.slow
 def test_photographs_that_are_missing_are_named_also_in_the_report(tmp_path, monkeypatch, capsys):
     scene, out = write_transforms(tmp_path / "scene", CAMERAS), tmp_path / "out"
     (scene / "images" / "photo_002.png").unlink()

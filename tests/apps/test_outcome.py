@@ -88,6 +88,7 @@ def test_a_scene_of_wrong_poses_is_no_success(scene, tmp_path, monkeypatch, caps
     assert said.err == f"gscompleter: {outcome['headline']}\n"
 
 
+@pytest.mark.slow
 def test_python_gets_the_verdict_of_the_command(scene, tmp_path, monkeypatch):
     for folder in (scene, permute_poses(scene, tmp_path / "broken")):
         out = tmp_path / f"out-{folder.name}"

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from command import run
 from gscompleter import load_ply, save_ply
 from gscompleter.apps.inputs.removal import (
+    Selection,
     find_in_boxes,
     find_in_masks,
+    find_in_region,
     find_masks,
     find_same_positions,
+    widen_regions,
 )
 from gscompleter.data.formats import open_photographs
 from gscompleter.numerics.geometry import axis_angle_to_matrix, rotations_to_quats
@@ -48,6 +53,41 @@ def remove(scene: Path, out: Path, *others: object) -> tuple[object, ...]:
     """Return the words of a command."""
     size = ("--resolution", SIZE, SIZE, "--near", 0.5, "--far", 20, "--quiet")
     return ("remove", scene, "--scene", scene / "splat.ply", "--out", out, *size, *others)
+
+
+EXACT = (-0.5, 0.3, 2.2, 0.3, 1.5, 3.0)
+"""The box as it stands in the room."""
+
+
+def test_a_box_drawn_exactly_on_an_object_takes_its_faces(scene):
+    """Half of the Gaussians of a face lie before it, as depths are not exact."""
+    splat = load_ply(scene / "splat.ply")
+    noise = torch.randn(len(splat), generator=torch.Generator().manual_seed(0))
+    noisy = replace(splat, means=splat.means * (1 + 0.002 * noise)[:, None])
+    truly = find_in_boxes(splat.means, EXACT, UPRIGHT, 1e-3)
+    given = Selection(EXACT, UPRIGHT)
+    origin = np.zeros(3)
+    widened = widen_regions(given, noisy, origin)
+    points = noisy.means.double()
+    taken = find_in_region(points, given) & truly
+    taken_wide = find_in_region(points, widened) & truly
+    assert taken.sum() < 0.8 * truly.sum()
+    assert taken_wide.sum() > 0.95 * truly.sum()
+    # One Gaussian, and never much of the region.
+    assert 0.001 < widened.margin < 0.05
+    assert widen_regions(given, replace(noisy, scales=100 * noisy.scales), origin).margin == (
+        pytest.approx(0.05 * 0.8)
+    )
+    # What is selected by masks or a file has no margin.
+    assert widen_regions(Selection(), noisy, origin).margin == 0
+
+
+def test_a_sphere_reaches_as_far(scene):
+    splat = load_ply(scene / "splat.ply")
+    widened = widen_regions(Selection(sphere=(-0.1, 0.9, 2.6, 0.6)), splat, np.zeros(3))
+    beyond = torch.tensor([[-0.1, 0.9, 2.6 - 0.6 - 0.9 * widened.margin]], dtype=torch.float64)
+    assert find_in_region(beyond, widened).all()
+    assert not find_in_region(beyond, replace(widened, margin=0.0)).any()
 
 
 def write_masks(folder: Path) -> Path:
@@ -186,6 +226,7 @@ FOX_BOX = (0.221, -3.331, 1.068, 3.621, 2.619, 4.318, 1.44, -0.987, 3.908, 4.54,
 FOX_ROTATION = (-0.3356, -0.0044, 0.9419, -0.0123)
 
 
+@pytest.mark.slow
 def test_the_fox_is_removed_and_brought_back(fox, tmp_path, monkeypatch):
     out, again, few_photographs = tmp_path / "out", tmp_path / "again.ply", tmp_path / "fox"
     (few_photographs / "images").mkdir(parents=True)
@@ -227,6 +268,7 @@ def test_masks_of_the_fox_choose_the_fox(fox, tmp_path):
     assert both > 0.7 * either
 
 
+@pytest.mark.slow
 def test_the_hole_of_what_was_removed_can_be_painted(scene, tmp_path, monkeypatch):
     """With the same selection both times; `strip` gives the splat back."""
     out, holes = tmp_path / "out", tmp_path / "holes"
@@ -253,6 +295,7 @@ def test_the_hole_of_what_was_removed_can_be_painted(scene, tmp_path, monkeypatc
     assert (tmp_path / "back.ply").read_bytes() == (scene / "splat.ply").read_bytes()
 
 
+@pytest.mark.slow
 def test_without_photographs_renders_around_the_place_take_their_part(
     scene, tmp_path, monkeypatch, capsys
 ):

@@ -101,6 +101,7 @@ def test_the_camera_path_plays_and_named_views_are_jumped_to(tab):
     assert tab.errors == []
 
 
+@pytest.mark.slow
 def test_it_fits_a_phone(browser, completed_room):
     tab = Tab(browser, completed_room / "report.html", 360, 700)
     assert tab.page.evaluate("document.documentElement.scrollWidth") <= 360

@@ -238,6 +238,7 @@ def test_a_case_whose_workers_were_killed_is_given_up(tasks, tmp_path):
     assert all("killed 3 times" in error for error in errors)
 
 
+@pytest.mark.slow
 def test_shards_one_after_the_other_add_up(finished, tasks, tmp_path):
     out = tmp_path / "out"
     for number in (1, 0):

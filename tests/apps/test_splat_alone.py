@@ -215,6 +215,7 @@ def test_a_painted_hole_of_a_splat_alone_is_completed(folder, tmp_path, monkeypa
     assert (red & is_hole).sum() > 0.7 * is_hole.sum()
 
 
+@pytest.mark.slow
 def test_with_nothing_named_the_camera_of_a_pixel_aligned_splat_is_found(
     folder, tmp_path, monkeypatch, capsys
 ):
@@ -252,6 +253,7 @@ def test_a_camera_that_covers_little_is_refused(folder, tmp_path, monkeypatch, c
     assert "at least 101% are needed to trust it" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_what_a_mask_marks_goes_and_is_filled_and_strip_puts_it_back(folder, tmp_path, monkeypatch):
     write_refused(folder)
     write_cameras(tmp_path / "front.json", [make_camera(0.02)])

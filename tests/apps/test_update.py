@@ -96,6 +96,7 @@ def test_photographs_without_cameras_are_placed_and_used(
     assert (out / "colmap" / "images" / "3.png").is_file()
 
 
+@pytest.mark.slow
 def test_a_splat_that_lacks_nothing_stays(room, tmp_path, monkeypatch, capsys):
     known = [camera for number, camera in enumerate(CAMERAS) if number not in NEW]
     whole = merge([gaussians_of(view_of(Room(), camera)) for camera in known])

@@ -236,6 +236,7 @@ def test_keys_and_drags_do_what_the_page_says(bare):
     assert step @ TARGET.forward.double().numpy() > 0.99 * np.linalg.norm(step) > 0
 
 
+@pytest.mark.slow
 def test_the_path_goes_smoothly_through_the_cameras(bare):
     bare.do("gsc.setMode('side')")
     end = bare.do("gsc.goTo('camera-1'), gsc.stats()")["seconds"]
@@ -327,6 +328,7 @@ def test_text_from_outside_stays_text(browser, libraries, tmp_path):
     tab.context.close()
 
 
+@pytest.mark.slow
 def test_what_is_painted_is_saved_with_its_camera_and_repaired(
     browser, saved, exhibit, tmp_path, monkeypatch
 ):

@@ -138,6 +138,7 @@ def complete(monkeypatch, scene: Path, out: Path, *more: object) -> int:
     return run(monkeypatch, "complete", scene, *where, *more)
 
 
+@pytest.mark.slow
 def test_a_chunk_and_a_camera_file_are_completed_like_a_folder(tmp_path, monkeypatch):
     """Every format gives the same photographs, so that the same command gives the same scene."""
     places = {

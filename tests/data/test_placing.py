@@ -107,6 +107,7 @@ def test_a_photograph_of_something_else_is_named_with_the_reason(known, new, tmp
     )
 
 
+@pytest.mark.slow
 def test_photographs_none_of_which_fits_are_refused_and_nothing_is_left(known, tmp_path):
     pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     other = tmp_path / "other"
@@ -149,6 +150,7 @@ def test_a_missing_package_is_told_how_to_install(known, new, tmp_path, monkeypa
         place_photographs(new, known, tmp_path / "colmap")
 
 
+@pytest.mark.slow
 def test_masks_of_new_photographs_are_kept(known, new, tmp_path):
     pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     mask = np.full((160, 160), 255, dtype=np.uint8)

@@ -287,6 +287,7 @@ def test_the_steps_need_the_model_of_the_paper(rooms, tmp_path, monkeypatch, cap
     assert "FLUX.1-Kontext" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_case_that_no_figure_can_show_is_named_once_the_cases_are_there(
     rooms, tmp_path, monkeypatch, capsys
 ):

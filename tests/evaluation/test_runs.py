@@ -319,6 +319,7 @@ def test_peak_memory_sees_what_was_let_go_of():
         assert much.bytes - nothing.bytes > 2**27
 
 
+@pytest.mark.slow
 def test_a_run_goes_on_where_it_was_stopped(finished, tasks, tmp_path, monkeypatch):
     out = tmp_path / "out"
     original = runner.write_json
@@ -515,6 +516,7 @@ def test_scenes_need_a_protocol_and_an_index_is_kept(scenes, tmp_path, monkeypat
     assert run(monkeypatch, "tables", tmp_path) == 2
 
 
+@pytest.mark.slow
 def test_one_case_per_scene_is_the_first(scenes, tmp_path, monkeypatch, capsys):
     def names(out: Path, *words: object) -> set[str]:
         options = ("--methods", "context", "--device", "cpu", "--quiet", "--out", out)

@@ -210,6 +210,7 @@ def test_a_step_counts_every_photograph_that_is_known_by_then(ours):
     assert [len(step.scores.context_psnr) for step in ours.steps] == [2, 3, 4]
 
 
+@pytest.mark.slow
 def test_photographs_that_were_completed_become_anchors(begun, tmp_path):
     nearest = complete_task(begun, "no-sa", tmp_path)
     assert [view.frame for view in nearest.views] == [0, 1, 2, 3, 4]

@@ -21,6 +21,8 @@ from gscompleter.stages.error_budgets import (
     meet_error_budgets,
     select_fewest,
     set_error_budgets,
+    set_total_budgets,
+    share_budgets,
 )
 from gscompleter.stages.refine import Refined
 from gscompleter.stages.synthesize import GeneratedView
@@ -121,6 +123,44 @@ def test_what_is_invisible_may_be_lost_from_a_perfect_photograph():
     dimmed = set_error_budgets(view, 0.9 * view.image, no_holes)[0]
     error = compute_squared_error(0.9 * view.image, view.image).item()
     assert dimmed.limit == pytest.approx(add_psnr_loss(error, 0.018))
+
+
+def test_a_target_uses_at_most_half_of_what_is_left_over_all_targets():
+    view = view_of(ROOM, CAMERA)
+    no_holes = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    image = 0.9 * view.image
+    totals = set_total_budgets(view, image, no_holes)
+    before = [compute_pixel_errors(image, budget).sum().item() for budget in totals]
+    assert totals[0].limit == pytest.approx(add_psnr_loss(before[0], 0.05))
+
+    # The first target has what it always had.
+    first = share_budgets(totals, image)
+    alone = set_error_budgets(view, image, no_holes)
+    assert [b.limit for b in first] == pytest.approx([b.limit for b in alone])
+
+    # After a target that took nearly all, half of the rest is left, and never nothing.
+    worse = image
+    for step in range(1, 200):
+        trial = 0.9 * view.image - step * 2e-5
+        if compute_pixel_errors(trial, totals[0]).sum() > totals[0].limit:
+            break
+        worse = trial
+    error = compute_pixel_errors(worse, totals[0]).sum().item()
+    assert before[0] < error < totals[0].limit
+    limit = share_budgets(totals, worse)[0].limit
+    assert limit == pytest.approx((error + totals[0].limit) / 2)
+
+
+def test_settings_of_one_target_widen_those_of_all():
+    view = view_of(ROOM, CAMERA)
+    no_holes = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    image = 0.9 * view.image
+    settings = PsnrGuardConfig(max_drop=0.5)
+    error = compute_squared_error(image, view.image).item()
+    totals = set_total_budgets(view, image, no_holes, settings)
+    assert totals[0].limit == pytest.approx(add_psnr_loss(error, 1.0))
+    own = share_budgets(totals, image, settings)[0].limit
+    assert own == pytest.approx(add_psnr_loss(error, 0.5))
 
 
 def test_where_halving_does_not_help_only_the_worst_pixels_are_given_up(monkeypatch):

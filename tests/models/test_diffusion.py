@@ -123,6 +123,7 @@ def test_the_text_encoders_leave_memory_and_the_model_is_loaded_once(kontext_fol
     assert load_kontext(str(kontext_folder)) is model
 
 
+@pytest.mark.slow
 def test_pe_field_depends_on_seed_and_depth_and_on_nothing_else(kontext_folder):
     model, context = load_kontext(str(kontext_folder)), known_room()
 
@@ -410,6 +411,7 @@ def test_a_smoke_test_of_an_evaluation_with_random_weights(inpaint_folder, tmp_p
     assert json.loads(row.read_text())["error"] is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["pe-field", "diffusers-inpaint"])
 def test_a_smoke_test_on_photographs_with_random_weights(
     name, kontext_folder, inpaint_folder, shared, tmp_path, monkeypatch

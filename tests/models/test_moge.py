@@ -109,6 +109,7 @@ def test_a_network_that_answers_in_another_shape_is_refused(tmp_path):
         predict(view_of(Room(), replace(camera_at(size=80), height=60)))
 
 
+@pytest.mark.slow
 def test_a_scene_is_completed_with_its_help(tmp_path, monkeypatch, capsys):
     cameras = [camera_at(x, size=64) for x in (-0.3, 0.1, 0.5)]
     scene = photographed(tmp_path / "scene", cameras)

@@ -6,41 +6,54 @@ import json
 import re
 import shutil
 import site
+import subprocess
 import sys
 import tarfile
 from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 
 import gscompleter
+import link_readme
 from command import run
 from gscompleter import __version__
-from gscompleter.apps.installation import PURPOSES, find_installed_version, is_required_by
+from gscompleter.apps.installation import (
+    PURPOSES,
+    describe_build,
+    find_installed_version,
+    is_required_by,
+    make_install_command,
+)
 from gscompleter.apps.warmup import PARTS, compile_kernels
 from gscompleter.numerics.kernels.compiled import get_cache_folder
 from release_check import (
+    IMPORT_EXTRA,
     ROOT,
     built,
     check_answers,
-    check_completion,
+    check_demo,
     environment,
     install,
+    ran,
 )
 
 DEVELOPERS = {"test-core", "test", "dev", "docs"}
-KERNELS = Path("numerics", "kernels")
 """Extras that users do not need."""
+KERNELS = Path("numerics", "kernels")
 
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory) -> Path:
+    pytest.importorskip("hatchling", reason="needs gscompleter[test]")
     return built("wheel", tmp_path_factory.mktemp("wheel"))
 
 
 @pytest.fixture(scope="module")
 def sdist(tmp_path_factory) -> Path:
+    pytest.importorskip("hatchling", reason="needs gscompleter[test]")
     return built("sdist", tmp_path_factory.mktemp("sdist"))
 
 
@@ -88,7 +101,8 @@ def test_the_same_sources_give_the_same_bytes_wherever_they_lie(
     assert built("sdist", tmp_path / "sdist", unpacked).read_bytes() == sdist.read_bytes()
 
 
-def test_the_wheel_runs_by_itself_in_another_folder(wheel, room, tmp_path):
+@pytest.mark.linux
+def test_the_wheel_runs_by_itself_in_another_folder(wheel, tmp_path):
     """The environment has the wheel, and borrows its requirements from ours."""
     programs = environment(sys.executable, tmp_path / "environment")
     install(programs, "--no-deps", str(wheel))
@@ -98,10 +112,30 @@ def test_the_wheel_runs_by_itself_in_another_folder(wheel, room, tmp_path):
     folder = tmp_path / "elsewhere"
     folder.mkdir()
     check_answers(programs, folder)
-    frames = ("--context", 0, 1, "--target", 2, "--near", 0.5, "--far", 20, "--resolution", 32)
-    check_completion(programs, folder, room, *frames)
-    summary = json.loads((folder / "out" / "summary.json").read_text())
+    found = ran(programs, folder, "python", "-c", "import gscompleter as g; print(g.__file__)")
+    assert Path(found.strip()).parent == packages / "gscompleter"
+    check_demo(programs, folder)
+    summary = json.loads((folder / "demo" / "completion" / "summary.json").read_text())
     assert summary["version"] == __version__
+
+
+@pytest.mark.linux
+@pytest.mark.slow
+@pytest.mark.parametrize("extra", ["", *sorted(PURPOSES)])
+def test_the_wheel_installs_into_an_empty_environment(wheel, extra, tmp_path):
+    """With what pip finds for it: the demo for the core, an import for each extra."""
+    programs = environment(sys.executable, tmp_path / "environment")
+    try:
+        install(programs, f"gscompleter{f'[{extra}]' if extra else ''} @ {wheel.as_uri()}")
+    except subprocess.CalledProcessError as error:
+        pytest.skip(f"pip does not find the packages: {error}")
+    folder = tmp_path / "elsewhere"
+    folder.mkdir()
+    if extra:
+        assert ran(programs, folder, "python", "-c", IMPORT_EXTRA, extra).strip()
+    else:
+        check_answers(programs, folder)
+        check_demo(programs, folder)
 
 
 def borrow_kernels(package: Path) -> None:
@@ -146,11 +180,60 @@ def test_doctor_tells_of_what_is_missing_and_for_what(monkeypatch, capsys):
     assert found["packages", "numpy"]["there"]
     assert not found["extras", "film"]["there"]
     assert "--video" in found["extras", "film"]["told"]
-    assert "pip install 'gscompleter[poses]'" in found["extras", "poses"]["told"]
+    poses = found["extras", "poses"]
+    assert poses["told"] == "not-there, for photographs whose cameras are not known"
+    assert re.fullmatch(r"pip install .*\[poses\].*", poses["install"])
+    assert found["packages", "numpy"]["install"] is None
     assert not found["extras", "ray"]["there"]
     assert "older than this extra" in found["extras", "ray"]["told"]
     assert run(monkeypatch, "doctor") == 0
-    assert "missing: not-there, for photographs whose" in capsys.readouterr().out
+    shown = capsys.readouterr().out
+    assert "missing: not-there, for photographs whose" in shown
+    assert poses["install"] in shown
+
+
+@pytest.mark.parametrize(
+    ("source", "command"),
+    [
+        (None, "pip install 'gscompleter[film]'"),
+        ({"url": "https://example.org/a.whl"}, "pip install 'gscompleter[film]'"),
+        (
+            {"url": "file:///d/gscompleter-0.1.0.whl", "archive_info": {}},
+            "pip install 'gscompleter[film] @ file:///d/gscompleter-0.1.0.whl'",
+        ),
+        ({"url": "file:///my%20code", "dir_info": {}}, f"pip install '{Path('/my code')}[film]'"),
+        (
+            {"url": "file:///code", "dir_info": {"editable": True}},
+            f"pip install -e '{Path('/code')}[film]'",
+        ),
+    ],
+)
+def test_the_command_for_an_extra_is_that_of_this_installation(monkeypatch, source, command):
+    class Installed:
+        def read_text(self, name: str) -> str | None:
+            return None if source is None else json.dumps(source)
+
+    monkeypatch.setattr("importlib.metadata.distribution", lambda _: Installed())
+    assert make_install_command("film") == command
+
+
+def test_doctor_ends_with_an_error_where_a_needed_extra_is_missing(monkeypatch, capsys):
+    lines = ["numpy>=1; extra == 'film'", "not-there; extra == 'poses'"]
+    monkeypatch.setattr("importlib.metadata.requires", lambda _: lines)
+    assert run(monkeypatch, "doctor", "--needs", "film") == 0
+    assert run(monkeypatch, "doctor", "--needs", "film", "poses") == 1
+    capsys.readouterr()
+    assert run(monkeypatch, "doctor", "--needs", "poses", "--json") == 1
+    assert json.loads(capsys.readouterr().out)
+    assert run(monkeypatch, "doctor", "--needs", "everything") == 2
+    assert "There is no extra 'everything'" in capsys.readouterr().err
+
+
+def test_torch_for_cuda_without_a_gpu_is_told(monkeypatch):
+    monkeypatch.setattr("torch.version.cuda", "13.0")
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    assert "gigabytes smaller" in describe_build(Requirement("torch"), "2.13.0")
+    assert describe_build(Requirement("numpy"), "2.0") == "2.0"
 
 
 def test_a_version_that_is_too_old_will_not_do():
@@ -164,3 +247,54 @@ def test_an_extra_is_what_it_adds():
     assert [is_required_by("", r) for r in (always, added)] == [True, False]
     assert [is_required_by("cuda", r) for r in (always, added)] == [False, True]
     assert not is_required_by("film", added)
+
+
+# ------------------------------------------------------------------- the workflow of a release
+
+
+def read_workflow() -> dict:
+    return yaml.safe_load((ROOT / ".github" / "workflows" / "release.yml").read_text("utf-8"))
+
+
+def test_only_the_upload_of_a_tag_may_prove_who_it_is():
+    """Trusted publishing: a token of the run in place of a stored password."""
+    workflow = read_workflow()
+    assert workflow[True] == {"push": {"tags": ["v*"]}}  # YAML takes the word `on` for true
+    assert workflow["permissions"] == {"contents": "read"}
+    jobs = workflow["jobs"]
+    allowed = {name for name, job in jobs.items() if "id-token" in job.get("permissions", {})}
+    assert allowed == {"publish"}
+    assert jobs["publish"]["environment"]["name"] == "pypi"
+    assert set(jobs["publish"]["needs"]) == {"build", "try"}
+    assert "secrets." not in str(workflow)
+
+
+def test_every_extra_is_tried_before_the_upload():
+    extras = read_workflow()["jobs"]["try"]["strategy"]["matrix"]["extra"]
+    assert {*extras, "metal"} == {"", *PURPOSES}
+
+
+def test_the_page_on_pypi_links_to_the_repository(tmp_path, monkeypatch):
+    text = (
+        "[![a](https://b.org/c)](LICENSE) ![d](docs/e.jpg) [f](docs/g.md#h) [i](#j) [k](http://l)"
+    )
+    linked = link_readme.make_absolute(text, "me/it", "v1")
+    place = "https://github.com/me/it"
+    assert linked == (
+        f"[![a](https://b.org/c)]({place}/blob/v1/LICENSE) ![d]({place}/raw/v1/docs/e.jpg) "
+        f"[f]({place}/blob/v1/docs/g.md#h) [i](#j) [k](http://l)"
+    )
+    readme = (ROOT / "README.md").read_text("utf-8")
+    left = link_readme.make_absolute(readme, "me/it", "v1")
+    assert not link_readme.LINK.search(left)
+    named = re.findall(rf"{place}/(?:raw|blob)/v1/([^)#]+)", left)
+    assert len(named) > 10
+    assert [name for name in named if not (ROOT / name).exists()] == []
+
+
+def test_a_tag_has_to_be_that_of_the_version():
+    source = (ROOT / "src" / "gscompleter" / "__init__.py").read_text("utf-8")
+    link_readme.check_tag(f"v{__version__}", source)
+    for tag in (__version__, "v99"):
+        with pytest.raises(SystemExit, match="tag that one"):
+            link_readme.check_tag(tag, source)

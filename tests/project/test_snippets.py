@@ -51,7 +51,7 @@ NEEDS_WEIGHTS = ("--reconstructor", "--generator")
 """Options that name published weights, which no machine of ours has."""
 NEEDS_PAINTER = ("--images",)
 """Options that name what somebody painted; test_painters.py does."""
-FAST = ("doctor", "models", "report", "strip", "view", "convert")
+FAST = ("doctor", "models", "report", "strip", "view", "convert", "inspect")
 """Commands that take a second or two."""
 WRITES_OUT = ("complete", "clean")
 """Commands after which OUT is theirs."""

@@ -74,6 +74,15 @@ def test_without_a_gpu_cuda_is_refused_and_auto_is_the_cpu(caplog):
 def test_a_mac_that_is_none_is_refused():
     with pytest.raises(InputError, match="no GPU of a Mac; choose cpu"):
         choose_devices("cpu", networks="mps")
+    with pytest.raises(InputError, match="no GPU of a Mac; choose cpu") as refused:
+        choose_devices("mps")
+    assert refused.value.argument == "device"
+
+
+def test_on_a_mac_networks_run_on_its_gpu_and_the_cpu_draws(monkeypatch):
+    monkeypatch.setattr(torch.backends.mps, "is_available", lambda: True)
+    assert choose_devices("mps") == Devices("cpu", "mps")
+    assert choose_devices("auto", renderer="cpu") == Devices("cpu", "mps")
 
 
 def test_a_gpu_without_gsplat_runs_networks_alone(gpu, monkeypatch, caplog):

@@ -440,6 +440,7 @@ def test_a_frozen_view_tells_what_it_shows_of_each_gaussian(name):
     assert_close(view.splat(values), plain.splat(values), "splat")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["strange-harmonics", "antialiased-harmonics"])
 def test_gsplat_is_called_so_that_frozen_views_draw_what_the_reference_does(name, cuda):
     beside = replace(SCENES[name], means=SCENES[name].means + torch.tensor([9.0, 0, 0]))

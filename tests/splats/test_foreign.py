@@ -66,7 +66,7 @@ DRAFT = GLTF | {
     ],
 }
 PACKED = GLTF | {
-    "extensionsUsed": ["KHR_gaussian_splatting_compression_spz"],
+    "extensionsUsed": ["EXT_gaussian_splatting_of_others"],
     "meshes": [{"primitives": [{"attributes": {}}]}],
 }
 MESH = GLTF | {"meshes": [{"primitives": [{"attributes": {"POSITION": 0}}]}]}
@@ -84,7 +84,7 @@ FOREIGN = {
     "scene.ply.gz": (gzip.compress(b"ply\nformat"), "is packed with gzip; unpack it"),
     "scene.gltf": (json.dumps(GLTF).encode(), "is glTF with its data in other files"),
     "draft.glb": (glb(DRAFT), "stores Gaussians as a draft of KHR_gaussian_splatting did"),
-    "packed.glb": (glb(PACKED), "KHR_gaussian_splatting_compression_spz, a draft or another"),
+    "packed.glb": (glb(PACKED), "EXT_gaussian_splatting_of_others, a draft or another"),
     "mesh.glb": (glb(MESH), "holds a mesh or points, no Gaussians"),
     "points.ply": (vertices(POINTS), "is no 3DGS scene but a point cloud"),
     "mesh.ply": (vertices(POINTS, faces=True), "is no 3DGS scene but a mesh"),

@@ -10,7 +10,7 @@ import torch
 
 from gscompleter import InputError, load_splat, save_splat
 from gscompleter.splats import glb
-from splat_files import covariances, plausible
+from splat_files import covariances, plausible, write_glb, write_spz_2
 
 NAME = "KHR_gaussian_splatting:"
 
@@ -98,3 +98,95 @@ def test_a_file_that_exceeds_the_format_is_refused(tmp_path, monkeypatch):
         save_splat(tmp_path / "scene.glb", plausible(50, 0))
     assert os.listdir(tmp_path) == []
     save_splat(tmp_path / "scene.glb", plausible(30, 0))
+
+
+# ------------------------------------------------------------------------------ SPZ within glTF
+
+
+def pack(path, gaussians, name="KHR_gaussian_splatting_compression_spz", version=3, **changes):
+    """Write a .glb whose buffer holds a .spz, as the extension describes it."""
+    spz = path.with_name("inside.spz")
+    save_splat(spz, gaussians)
+    if version == 2:
+        write_spz_2(spz, spz, gaussians)
+    data = b"\0\0\0\0" + spz.read_bytes()
+    table = {
+        "asset": {"version": "2.0"},
+        "extensionsUsed": ["KHR_gaussian_splatting", name],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, **changes.get("node", {})}],
+        "meshes": [
+            {
+                "primitives": [
+                    {
+                        "attributes": {"POSITION": 0, "COLOR_0": 1},
+                        "mode": 0,
+                        "extensions": {
+                            "KHR_gaussian_splatting": {
+                                "extensions": {name: {"bufferView": 0}},
+                            }
+                        },
+                    }
+                ]
+            }
+        ],
+        # Without buffers: they say what comes out of the .spz.
+        "accessors": [
+            {"componentType": 5126, "count": changes.get("count", len(gaussians)), "type": kind}
+            for kind in ("VEC3", "VEC4")
+        ],
+        "bufferViews": [{"buffer": 0, "byteOffset": 4, "byteLength": len(data) - 4}],
+        "buffers": [{"byteLength": len(data)}],
+    }
+    return write_glb(path, table, data + b"\0" * (-len(data) % 4))
+
+
+@pytest.mark.parametrize("version", [2, 3])
+@pytest.mark.parametrize("name", [f"{NAME[:-1]}_compression_spz", f"{NAME[:-1]}_compression_spz_2"])
+def test_a_spz_within_gltf_is_the_splat_of_the_spz(tmp_path, name, version):
+    """Its own axes become those of glTF by half a turn, and those of a .ply by another."""
+    gaussians = plausible(60, 2)
+    packed = load_splat(pack(tmp_path / "scene.glb", gaussians, name, version))
+    alone = load_splat(tmp_path / "inside.spz")
+    for field in ("means", "scales", "opacities", "sh"):
+        assert torch.allclose(getattr(packed, field), getattr(alone, field), atol=1e-6)
+    assert torch.allclose(covariances(packed), covariances(alone), atol=1e-6)
+
+
+def test_a_node_moves_a_spz_within_gltf(tmp_path):
+    gaussians = plausible(30, 1)
+    node = {"translation": [1, 2, 3], "scale": [2, 2, 2]}
+    moved = load_splat(pack(tmp_path / "scene.glb", gaussians, node=node))
+    alone = load_splat(tmp_path / "inside.spz")
+    # Axes of glTF are x left, y up, z forward.
+    assert torch.allclose(moved.means, 2 * alone.means + torch.tensor([-1.0, -2, 3]), atol=1e-4)
+    assert torch.allclose(moved.scales, 2 * alone.scales)
+
+
+@pytest.mark.parametrize("count", [29, 31, 10**9])
+def test_a_spz_of_another_size_than_its_accessors_is_refused(tmp_path, count):
+    with pytest.raises(InputError, match="cannot be read: its"):
+        load_splat(pack(tmp_path / "scene.glb", plausible(30, 0), count=count))
+
+
+def test_a_damaged_spz_within_gltf_is_one_sentence(tmp_path):
+    path = pack(tmp_path / "scene.glb", plausible(300, 1))
+    table, binary = parse(path.read_bytes())
+    for cut in (0, 10, 200):
+        write_glb(path, table, binary[:cut] + b"\xff" * (len(binary) - cut))
+        with pytest.raises(InputError, match="cannot be read"):
+            load_splat(path)
+    table["bufferViews"][0]["byteLength"] //= 2
+    with pytest.raises(InputError, match="cannot be read"):
+        load_splat(write_glb(path, table, binary))
+
+
+def test_many_primitives_cannot_unpack_one_spz_without_end(tmp_path):
+    """A bomb: a thousand primitives that each name the same megabytes."""
+    path = pack(tmp_path / "scene.glb", plausible(30, 0))
+    table, binary = parse(path.read_bytes())
+    table["meshes"][0]["primitives"] *= 20_000
+    table["accessors"][0]["count"] = 30
+    with pytest.raises(InputError, match="claim to hold"):
+        load_splat(write_glb(path, table, binary))

@@ -1,6 +1,7 @@
 """Splat formats: each reads as the same picture, and other files give a sentence."""
 
 import gzip
+import hashlib
 import json
 import os
 import shutil
@@ -223,7 +224,31 @@ def test_what_was_generated_is_known_after_every_conversion(tmp_path, name):
     loaded = load_splat(tmp_path / name)
     nearest = torch.cdist(loaded.means, gaussians.means).argmin(1)
     assert torch.equal(loaded.generated, labels[nearest])
-    assert get_labels_path(tmp_path / name).exists() == (name != "scene.ply")
+    has_own = name in ("scene.ply", "written.sog", "written.glb")
+    assert get_labels_path(tmp_path / name).exists() != has_own
+
+
+@pytest.mark.parametrize("name", ["written.sog", "written.glb"])
+def test_labels_beside_a_file_of_an_earlier_version_are_read(tmp_path, name):
+    """They lay beside all files but .ply."""
+    save_splat(tmp_path / name, plausible(12, 0))
+    digest = hashlib.sha256((tmp_path / name).read_bytes()).hexdigest()
+    table = {"sha256": digest, "generated": [[0, 5], [2, 7]]}
+    get_labels_path(tmp_path / name).write_text(json.dumps(table))
+    assert load_splat(tmp_path / name).generated.tolist() == [0] * 5 + [2] * 7
+
+
+@pytest.mark.parametrize("values", [[0.5] * 4, [300.0] * 4, [float("nan")] * 4])
+def test_labels_in_a_glb_that_are_no_bytes_are_refused(tmp_path, values):
+    table, binary = glb_table(plausible(4, 0))
+    table["bufferViews"].append({"buffer": 0, "byteOffset": len(binary), "byteLength": 16})
+    accessor = {"bufferView": len(table["bufferViews"]) - 1, "componentType": 5126}
+    table["accessors"].append({**accessor, "count": 4, "type": "SCALAR"})
+    attributes = table["meshes"][0]["primitives"][0]["attributes"]
+    attributes["_GENERATED"] = len(table["accessors"]) - 1
+    binary += struct.pack("<4f", *values)
+    table["buffers"][0]["byteLength"] = len(binary)
+    refused(write_glb(tmp_path / "scene.glb", table, binary), "labels of generated Gaussians")
 
 
 @pytest.mark.parametrize("antialiased", [False, True])

@@ -1,4 +1,4 @@
-"""OpenUSD: what is written is read back by usd-core itself, by its schema."""
+"""OpenUSD: what is written is read back by usd-core itself, by its schema, and by ours."""
 
 import os
 import subprocess
@@ -13,6 +13,7 @@ from command import run
 from gscompleter import Gaussians, InputError, load_splat, save_splat
 from gscompleter.splats.formats import get_labels_path
 from gscompleter.splats.transform import HALF_TURN_X, rotate_half_turn
+from gscompleter.splats.usd import SH_NAME
 from gscompleter.types import make_observed
 from paths import SUPPORT
 from splat_files import covariances, plausible
@@ -128,21 +129,149 @@ def test_a_package_is_aligned_uncompressed_and_the_same_every_time(pxr, tmp_path
     assert data.index(b"PXR-USDC") % 64 == 0
 
 
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("name", NAMES)
-def test_usd_is_recognised_and_not_read(pxr, tmp_path, name):
+def test_usd_is_read_as_it_was_written(pxr, tmp_path, name, degree):
+    gaussians = plausible(40, degree)
+    save_splat(tmp_path / name, gaussians)
+    read = load_splat(tmp_path / name)
+    for field in ("means", "scales", "opacities", "sh"):
+        assert torch.equal(getattr(read, field), getattr(gaussians, field))
+    assert torch.allclose(covariances(read), covariances(gaussians), atol=1e-6)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_usd_is_recognised_without_its_ending(pxr, tmp_path, name):
     save_splat(tmp_path / name, plausible(5, 0))
     os.rename(tmp_path / name, tmp_path / "unnamed")
-    with pytest.raises(InputError, match="is OpenUSD, which is not read"):
-        load_splat(tmp_path / "unnamed")
+    assert len(load_splat(tmp_path / "unnamed")) == 5
 
 
-def test_labels_lie_beside_a_file_of_usd(pxr, tmp_path, monkeypatch, capsys):
+def change_stage(path, change) -> None:
+    """Write a scene of two Gaussians, and let `change` edit its stage and prim."""
+    from pxr import Usd
+
+    save_splat(path, plausible(2, 1))
+    stage = Usd.Stage.Open(str(path))
+    change(stage, stage.GetDefaultPrim())
+    stage.GetRootLayer().Save()
+
+
+def test_prims_are_read_at_their_places_in_the_world(pxr, tmp_path):
+    """A prim that is turned, twice as large and moved, beside one that is not."""
+    from pxr import Gf, Sdf, UsdGeom
+
+    def add_second(stage, prim) -> None:
+        stage.DefinePrim("/World")
+        Sdf.CopySpec(stage.GetRootLayer(), "/Splat", stage.GetRootLayer(), "/World/Second")
+        xform = UsdGeom.Xformable(stage.GetPrimAtPath("/World/Second"))
+        xform.AddTranslateOp().Set(Gf.Vec3d(1, 2, 3))
+        xform.AddRotateYOp().Set(90.0)
+        xform.AddScaleOp().Set(Gf.Vec3f(2, 2, 2))
+
+    path = tmp_path / "scene.usda"
+    change_stage(path, add_second)
+    read = load_splat(path)
+    first = rotate_half_turn(read[:2], HALF_TURN_X)
+    second = rotate_half_turn(read[2:], HALF_TURN_X)
+    # By hand: y up, a quarter turn about it takes z to x and x to -z.
+    x, y, z = first.means.T
+    expected = torch.stack([2 * z + 1, 2 * y + 2, -2 * x + 3], dim=1)
+    assert torch.allclose(second.means, expected, atol=1e-5)
+    assert torch.allclose(second.scales, 2 * first.scales)
+    turn = torch.tensor([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]]).double()
+    turned = 4 * turn @ covariances(first) @ turn.T
+    assert torch.allclose(covariances(second), turned, rtol=1e-4, atol=1e-6)
+
+
+def test_a_stage_with_z_up_is_turned(pxr, tmp_path):
+    from pxr import UsdGeom
+
+    save_splat(tmp_path / "y.usda", plausible(2, 1))
+    change_stage(
+        tmp_path / "z.usda", lambda stage, _: UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.z)
+    )
+    before, after = (load_splat(tmp_path / name).means for name in ("y.usda", "z.usda"))
+    # What was y (up is -y in a .ply) is depth now, and what was back is up.
+    assert torch.allclose(after, torch.stack([before[:, 0], before[:, 2], -before[:, 1]], 1))
+
+
+def test_half_precision_is_read_where_there_is_no_other(pxr, tmp_path):
+    from pxr import Sdf, Vt
+
+    def halve(stage, prim) -> None:
+        for name, kind in (("positions", "Point3hArray"), ("opacities", "HalfArray")):
+            values = np.array(prim.GetAttribute(name).Get())
+            prim.RemoveProperty(name)
+            array = Vt.Vec3hArray if values.ndim == 2 else Vt.HalfArray
+            half = prim.CreateAttribute(f"{name}h", getattr(Sdf.ValueTypeNames, kind))
+            half.Set(array.FromNumpy(values.astype(np.float16)))
+
+    change_stage(tmp_path / "scene.usdc", halve)
+    read, exact = load_splat(tmp_path / "scene.usdc"), plausible(2, 1)
+    assert torch.allclose(read.means, exact.means, rtol=1e-3)
+    assert torch.allclose(read.opacities, exact.opacities, rtol=1e-3)
+    assert torch.equal(read.scales, exact.scales)
+
+
+UNREADABLE = {
+    "prim that mirrors": lambda stage, prim: mirror(prim),
+    "without Gaussians": lambda stage, prim: prim.SetTypeName("Mesh"),
+    "without scales": lambda stage, prim: prim.RemoveProperty("scales"),
+    "SH degree 4": lambda stage, prim: prim.GetAttribute(f"{SH_NAME}Degree").Set(4),
+    "cannot be read": lambda stage, prim: prim.GetAttribute("opacities").Set([0.5]),
+    "opacity outside": lambda stage, prim: prim.GetAttribute("opacities").Set([0.5, 7.0]),
+    "linear space": lambda stage, prim: set_space(prim, "lin_rec709_scene"),
+}
+
+
+def mirror(prim) -> None:
+    from pxr import Gf, UsdGeom
+
+    UsdGeom.Xformable(prim).AddScaleOp().Set(Gf.Vec3f(1, 1, -1))
+
+
+def set_space(prim, name: str) -> None:
+    from pxr import Usd
+
+    Usd.ColorSpaceAPI(prim).GetColorSpaceNameAttr().Set(name)
+
+
+@pytest.mark.parametrize("sentence", UNREADABLE)
+def test_what_is_no_splat_of_ours_is_one_sentence(pxr, tmp_path, sentence, capfd):
+    change_stage(tmp_path / "scene.usda", UNREADABLE[sentence])
+    with pytest.raises(InputError, match=sentence) as caught:
+        load_splat(tmp_path / "scene.usda")
+    assert len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_damaged_file_is_one_sentence(pxr, tmp_path, name):
+    save_splat(tmp_path / name, plausible(20, 0))
+    data = (tmp_path / name).read_bytes()
+    for share in (0.2, 0.6, 0.95):
+        (tmp_path / name).write_bytes(data[: int(len(data) * share)])
+        with pytest.raises(InputError, match="cannot be read|is OpenUSD without"):
+            load_splat(tmp_path / name)
+
+
+def test_openusd_is_not_read_without_usd_core(tmp_path, monkeypatch):
+    (tmp_path / "a.usda").write_text("#usda 1.0\n")
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    with pytest.raises(InputError, match=r"pip install 'gscompleter\[usd\]'"):
+        load_splat(tmp_path / "a.usda")
+
+
+def test_labels_are_in_a_file_of_usd(pxr, tmp_path, monkeypatch, capsys):
     gaussians = plausible(9, 0)
     gaussians.generated[4] = 1
     save_splat(tmp_path / "a.ply", gaussians)
     assert run(monkeypatch, "convert", tmp_path / "a.ply", tmp_path / "B.USDZ") == 0
     assert "9 Gaussians, 1 of them generated" in capsys.readouterr().out.replace("\n", " ")
-    assert get_labels_path(tmp_path / "B.USDZ").exists()
+    assert not get_labels_path(tmp_path / "B.USDZ").exists()
+    _, splat = read_stage(tmp_path / "B.USDZ")
+    assert list(splat.GetPrim().GetAttribute("generated").Get()) == [0] * 4 + [1] + [0] * 4
+    assert load_splat(tmp_path / "B.USDZ").generated.tolist() == [0] * 4 + [1] + [0] * 4
 
 
 def test_without_usd_core_nothing_is_written(tmp_path, monkeypatch):

@@ -82,10 +82,10 @@ def check_answers(programs: Path, folder: Path) -> None:
     assert there["viewer", "libraries"], found
 
 
-def check_completion(programs: Path, folder: Path, scene: Path, *words: object) -> None:
-    """Return a completion, and a page that shows it."""
-    out = folder / "out"
-    ran(programs, folder, "gscompleter", "complete", scene, *words, "--out", out, "--quiet")
+def check_demo(programs: Path, folder: Path) -> None:
+    """Complete the demo, and write a page that shows it."""
+    ran(programs, folder, "gscompleter", "demo", "--out", "demo", "--quiet")
+    out = folder / "demo" / "completion"
     assert json.loads((out / "summary.json").read_text())["gaussians"]["added"] > 0
     ran(programs, folder, "gscompleter", "view", out, "--save", "page.html")
     page = (folder / "page.html").read_text()
@@ -112,11 +112,8 @@ def check(python: str, wheel: Path, with_extras: bool) -> bool:
         install(programs, str(wheel))
         check_answers(programs, folder)
         ran(programs, folder, "python", "-c", IMPORT_ALL)
-        ran(programs, folder, "gscompleter", "demo", "--out", "demo", "--quiet")
-        scene, targets = folder / "demo/scene", folder / "demo/scene/targets.json"
-        frames = ("--context", 0, 1, "--target", targets, "--resolution", 96)
-        check_completion(programs, folder, scene, *frames)
-        print(f"{python}: demo, complete and view ran from the wheel", flush=True)
+        check_demo(programs, folder)
+        print(f"{python}: demo and view ran from the wheel", flush=True)
         lines = check_extras(programs, wheel, folder) if with_extras else iter(())
         return all(told(f"{python}: {line}") for line in lines)
 

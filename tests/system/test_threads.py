@@ -66,6 +66,7 @@ def test_all_threads_allocate_from_one_arena():
     assert life.stdout.count("<heap nr=") == 1
 
 
+@pytest.mark.slow
 def test_what_the_environment_says_gives_way_to_what_is_told_and_to_nothing_else():
     cores = cpu_threads.count_available_cores()
     assert counted() == [cores, cores, cores]

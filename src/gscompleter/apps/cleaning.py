@@ -14,6 +14,7 @@ from rich.console import Console
 from torch import Tensor
 
 from gscompleter import __version__
+from gscompleter.apps.command_line.answers import print_answer
 from gscompleter.apps.commands.clean import CleanOptions
 from gscompleter.apps.completing.preparation import open_input
 from gscompleter.apps.completing.run_info import describe_run, refuse_results
@@ -96,11 +97,10 @@ def clean_splat(options: CleanOptions) -> None:
             elif cleaning.removed.any():
                 save_changed(folder, cleaning.given, cleaning.removed, cleaning.splat_file)
             (folder / SUMMARY_FILE).write_bytes(json.dumps(summary, indent=2).encode() + b"\n")
-    if not options.quiet:
-        if options.dry_run:
-            print(f"Dry run: {describe_cleaning(summary)}: {options.out / REMOVED_FILE}")
-        else:
-            print(f"{describe_cleaning(summary)}: {options.out / COMPLETED_FILE}")
+    line = f"{describe_cleaning(summary)}: {options.out / COMPLETED_FILE}"
+    if options.dry_run:
+        line = f"Dry run: {describe_cleaning(summary)}: {options.out / REMOVED_FILE}"
+    print_answer(options, json.loads((options.out / SUMMARY_FILE).read_bytes()), [line])
 
 
 def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:

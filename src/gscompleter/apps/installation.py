@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Iterator
+import json
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 import torch
 from packaging.requirements import Requirement
@@ -18,7 +21,7 @@ from gscompleter.numerics.kernels.cache import CACHE
 from gscompleter.numerics.kernels.compiled import get_cache_folder, is_compiled
 from gscompleter.render.device import choose_device
 from gscompleter.render.loading import load_renderer
-from gscompleter.system.errors import InputError
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import get_download_folder
 from gscompleter.types import Camera, Gaussians, make_observed, sh_from_rgb
 
@@ -55,7 +58,19 @@ class Found:
     name: str
     there: bool
     told: str
-    """Versions and locations, or the purpose of a missing part and what to do."""
+    """Versions and locations, or the purpose of a missing part."""
+    install: str | None = None
+    """Command that installs a missing part; None if it is there, or if there is no command."""
+
+
+def check_needs(extras: Sequence[str]) -> None:
+    """Refuse names that are no extras."""
+    for extra in extras:
+        if extra not in PURPOSES:
+            raise InputError(
+                f"There is no extra '{quote_value(extra)}'; choose from {', '.join(PURPOSES)}.",
+                "needs",
+            )
 
 
 def inspect_installation() -> Iterator[Found]:
@@ -65,31 +80,48 @@ def inspect_installation() -> Iterator[Found]:
 
     for requirement in list_requirements():
         version = find_installed_version(requirement)
-        remedy = f"every command needs it; pip install '{requirement}'"
-        yield Found("packages", requirement.name, version is not None, version or remedy)
+        if version is None:
+            told = "every command needs it"
+            yield Found("packages", requirement.name, False, told, f"pip install '{requirement}'")
+        else:
+            yield Found("packages", requirement.name, True, describe_build(requirement, version))
     for extra, purpose in PURPOSES.items():
         yield inspect_extra(extra, purpose)
 
     for name in ("cpu", "cuda", "metal", "reference"):
         yield inspect_renderer(name)
     compiled = all(is_compiled(part) for part in PARTS)
-    remedy = "compiled by the first completion, or in advance by `gscompleter warmup`"
-    yield Found("renderers", "kernels", compiled, "compiled" if compiled else remedy)
+    yield Found(
+        "renderers",
+        "kernels",
+        compiled,
+        "compiled" if compiled else "compiled by the first completion, or in advance",
+        None if compiled else "gscompleter warmup",
+    )
 
     # One file of weights is enough to count as there: nobody needs all of them.
     here = [name for name, published in PUBLISHED.items() if find_cached(published)]
     weights = ", ".join(here) or f"all {len(PUBLISHED)} that `gscompleter models` lists"
-    yield Found("weights", "reconstructors", bool(here), f"{weights}, for --reconstructor")
+    command = None if here else "gscompleter models --download NAME"
+    yield Found("weights", "reconstructors", bool(here), f"{weights}, for --reconstructor", command)
 
     # A wheel contains the libraries in one file; a checkout downloads an archive of each.
     archives = [get_archive_path(package) for package in read_lock(LOCK_FILE)]
     there = BUILT_LIBRARIES.is_file() or all(path.is_file() for path in archives)
-    remedy = "fetched with npm's registry when `gscompleter view` first runs"
-    yield Found("viewer", "libraries", there, "here" if there else remedy)
+    told = "here" if there else "fetched from npm's registry when a page is first made"
+    command = None if there else "gscompleter view OUT"
+    yield Found("viewer", "libraries", there, told, command)
 
     yield Found("caches", "downloads", True, f"{get_download_folder()} (GSCOMPLETER_HOME)")
     yield inspect_kernel_cache()
     yield Found("caches", "torch.hub", True, f"{torch.hub.get_dir()} (TORCH_HOME)")
+
+
+def describe_build(requirement: Requirement, version: str) -> str:
+    """Describe an installed package; torch with the libraries of CUDA says so where no GPU is."""
+    if requirement.name != "torch" or not torch.version.cuda or torch.cuda.is_available():
+        return version
+    return f"{version} (built for CUDA, and there is no GPU: its CPU build is gigabytes smaller)"
 
 
 def inspect_renderer(name: str) -> Found:
@@ -146,11 +178,32 @@ def inspect_extra(extra: str, purpose: str) -> Found:
     if not versions:
         detail = f"the installed version or this Python is older than this extra; for {purpose}"
     elif missing:
-        detail = f"{', '.join(missing)}, for {purpose}; pip install 'gscompleter[{extra}]'"
+        detail = f"{', '.join(missing)}, for {purpose}"
+        return Found("extras", extra, False, detail, make_install_command(extra))
     else:
         names = ", ".join(f"{name} {version}" for name, version in versions.items())
         detail = f"{names}, for {purpose}"
-    return Found("extras", extra, bool(versions) and not missing, detail)
+    return Found("extras", extra, bool(versions), detail)
+
+
+def make_install_command(extra: str) -> str:
+    """Make the command that adds an extra to the package as it was installed.
+
+    A checkout or a wheel was named by its place, and the package index need not have this version.
+    """
+    try:
+        text = importlib.metadata.distribution("gscompleter").read_text("direct_url.json")
+    except importlib.metadata.PackageNotFoundError:
+        text = None
+    source = json.loads(text) if text else {}
+    url = source.get("url", "")
+    if not url.startswith("file:"):
+        return f"pip install 'gscompleter[{extra}]'"
+    if "dir_info" not in source:
+        return f"pip install 'gscompleter[{extra}] @ {url}'"
+    editable = "-e " if source["dir_info"].get("editable") else ""
+    folder = url2pathname(urlsplit(url).path)
+    return f"pip install {editable}'{folder}[{extra}]'"
 
 
 def list_requirements(extra: str = "") -> list[Requirement]:

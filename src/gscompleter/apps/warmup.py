@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import torch
 
@@ -17,6 +19,8 @@ from gscompleter.numerics.kernels.compiled import get_cache_folder, is_compiled,
 from gscompleter.render.gsplat_kernels import explain_missing_gpu, explain_missing_renderer
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import simplify_scene
+from gscompleter.splats.morton import sort_nearby
+from gscompleter.splats.ply import load_ply, save_ply
 from gscompleter.system.progress import show_progress, stage
 from gscompleter.types import Camera, View
 
@@ -68,6 +72,11 @@ def rehearse(with_splat: bool) -> None:
     views = make_photographs()
     target = make_wall_camera(2)
     completion = completer(views, target)
+    # Results are written, and splats are read, by kernels as well.
+    with TemporaryDirectory() as folder:
+        save_ply(Path(folder, "wall.ply"), completion.scene)
+        wall = load_ply(Path(folder, "wall.ply"))
+    sort_nearby(wall)
     if with_splat:
         # The reconstructed context stands for a splat, which comes with check views.
         completer(views, target, completion.context, views)

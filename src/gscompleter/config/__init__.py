@@ -192,16 +192,35 @@ class RecolorConfig(Settings):
 
 @dataclass(frozen=True)
 class PsnrGuardConfig(Settings):
-    """Guard `psnr`: the error budget of the photographs, within which additions must stay."""
+    """Guard `psnr`: the error budget of the photographs, within which additions must stay.
+
+    A target uses at most half of what the targets before it left of the loss over all targets, so
+    that none finds it spent. That loss is at least twice what one target may cause.
+    """
 
     max_drop: Annotated[float, Interval(ge=0, le=100)] = 0.018
-    """Largest loss of PSNR of any photograph, in dB over the whole image."""
+    """Largest loss of PSNR of any photograph by one target, in dB over the whole image."""
+    max_total_drop: Annotated[float, Interval(ge=0, le=100)] = 0.05
+    """Largest loss of PSNR of any photograph by all targets together, in dB."""
     max_ssim_drop: Share = 0.0009
-    """Largest loss of SSIM of any photograph."""
+    """Largest loss of SSIM of any photograph by one target."""
+    max_total_ssim_drop: Share = 0.0025
+    """Largest loss of SSIM of any photograph by all targets together."""
     invisible_psnr: Annotated[float, Interval(ge=0, le=200)] = 45.0
     """PSNR in dB from which on an error is invisible, so that any loss down to it is allowed."""
     max_opacity_loss: Share = 0.75
     """Drop a connected part of the hole if its Gaussians lose more than this share of opacity."""
+
+
+@dataclass(frozen=True)
+class GapConfig(Settings):
+    """Closing of thin gaps, which open where the camera moves on from a target."""
+
+    displacement: Annotated[float, Interval(ge=0, le=2)] = 0.35
+    """Move of the camera that looks for gaps, away from the photograph nearest to the target and
+    relative to their baseline; 0 closes none (paper)."""
+    max_alpha: Annotated[float, Interval(gt=0, le=1)] = 0.85
+    """Accumulated opacity below which a thin structure is a gap."""
 
 
 @dataclass(frozen=True)
@@ -285,6 +304,8 @@ REMOVAL_ALPHA = 0.85
 """`holes.max_alpha` after a removal."""
 REMOVAL_RADIUS = 0.05
 """`next_best_view.border_radius` after a removal."""
+REMOVAL_GAIN = 0.002
+"""`next_best_view.min_gain` after a removal, whose hole is all that is to be filled."""
 
 # A type checker cannot read a Literal that is computed from a table; pydantic and tyro can.
 if TYPE_CHECKING:
@@ -334,6 +355,7 @@ class CompleterConfig(Settings):
     depth_agreement: DepthAgreementConfig = DepthAgreementConfig()
     free_space: FreeSpaceConfig = FreeSpaceConfig()
     psnr_guard: PsnrGuardConfig = PsnrGuardConfig()
+    gaps: GapConfig = GapConfig()
     next_best_view: NextBestViewConfig = NextBestViewConfig()
 
     def __post_init__(self) -> None:
@@ -398,6 +420,7 @@ class CompleterConfig(Settings):
             registration_method="paper",
             refine=RefineConfig(color_rounds=0, iterations=30, rel_tol=None, learning_rate=0.08),
             holes=HoleConfig(dilation=0, candidate_radius=None),
+            gaps=GapConfig(displacement=0.0),
         )
 
     def for_removal(self) -> CompleterConfig:
@@ -415,7 +438,9 @@ class CompleterConfig(Settings):
             # Its photographs still show what was removed.
             add_observed=False,
             holes=replace(self.holes, max_alpha=REMOVAL_ALPHA),
-            next_best_view=replace(self.next_best_view, border_radius=REMOVAL_RADIUS),
+            next_best_view=replace(
+                self.next_best_view, border_radius=REMOVAL_RADIUS, min_gain=REMOVAL_GAIN
+            ),
         )
 
     def for_marks(self) -> CompleterConfig:

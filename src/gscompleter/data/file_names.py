@@ -1,7 +1,7 @@
 r"""Files by the names that other programs and machines wrote.
 
-Programs and users vary the case of folders and endings, Windows separates folders by `\`, and
-absolute paths stay behind when a scene is copied to another machine.
+Programs and users vary the case of folders and endings, macOS splits letters with accents, Windows
+separates folders by `\`, and absolute paths stay behind when a scene is copied to another machine.
 """
 
 from __future__ import annotations
@@ -11,6 +11,8 @@ import re
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path, PurePosixPath, PureWindowsPath
+
+from gscompleter.system.files.names import fold_name
 
 
 class FolderListings:
@@ -34,7 +36,7 @@ class FolderListings:
                 continue
             names = self._list(path)
             # Names as they are come under their own key, others under the folded one.
-            name = names.get(part) or names.get(part.casefold())
+            name = names.get(part) or names.get(fold_name(part))
             if name is None:
                 # A folder may be entered but not listed.
                 return folder / relative if not names and _exists(folder / relative) else None
@@ -49,7 +51,7 @@ class FolderListings:
                 # In reverse order, so that the first name of those that fold alike is written last
                 # and stays.
                 names = sorted(os.listdir(folder), reverse=True)
-            folded = {name.casefold(): name for name in names}
+            folded = {fold_name(name): name for name in names}
             self._names[folder] = {**folded, **{name: name for name in names}}
         return self._names[folder]
 

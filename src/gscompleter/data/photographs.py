@@ -28,6 +28,7 @@ from gscompleter.data.moving_boxes import mask_moving
 from gscompleter.numerics.geometry import compute_sparse_depth
 from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.image import composite_over_black, convert_to_image, has_alpha
+from gscompleter.system.files.names import fold_name
 from gscompleter.types import MAX_SIDE, Camera, View
 
 
@@ -212,7 +213,7 @@ class Photographs:
 
     def _match_names(self, word: str) -> list[int]:
         """List the frames whose photograph a word names, those that it names exactly if any."""
-        wanted = PurePosixPath(word.replace("\\", "/").casefold()).parts
+        wanted = PurePosixPath(fold_name(word.replace("\\", "/"))).parts
         exact = []
         similar = []
         for number, frame in enumerate(self.frames):
@@ -220,7 +221,7 @@ class Photographs:
             if word in (frame.name, frame.file_name, PurePosixPath(path).name):
                 exact.append(number)
             # The word may lack folders, and so may the name: either may be the end of the other.
-            names = path.casefold(), os.path.splitext(path.casefold())[0]
+            names = fold_name(path), os.path.splitext(fold_name(path))[0]
             if any(_ends_alike(PurePosixPath(name).parts, wanted) for name in names):
                 similar.append(number)
         return exact or similar

@@ -87,7 +87,8 @@ def remove_gaussians(
     shown = scenes.freeze_at(parts, [view.camera for view in views])
     photos = tuple(
         # So that no model copies from ignored pixels.
-        replace(photo, view=view.paint_ignored(scene.render.image.clamp(0, 1)))
+        # Budgets of the photographs with the object would forbid what fills its place.
+        replace(photo, view=view.paint_ignored(scene.render.image.clamp(0, 1)), budgets=())
         for photo, view, scene in zip(state.photos, views, shown, strict=True)
     )
     return prepare_guards(replace(changed, photos=photos), scenes)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from gscompleter.guards import Guard
 from gscompleter.numerics.geometry import project_mask
-from gscompleter.render.removed import mask_removed
 from gscompleter.stages.target_view import TargetView
 from gscompleter.types import Gaussians
 
@@ -16,6 +15,6 @@ class Removal(Guard):
 
     def place(self, candidates: Gaussians, view: TargetView) -> Gaussians:
         """Keep candidates in pixels that showed something removed."""
-        camera = view.camera.padded
-        shown = mask_removed(view.state.source, camera, view.scenes.renderer)
-        return candidates[project_mask(shown, candidates, camera)]
+        if view.opened is None:
+            return candidates
+        return candidates[project_mask(view.opened, candidates, view.camera.padded)]

@@ -14,7 +14,6 @@ tasks/TASK/METHOD/holes-001.png     mask of the holes before completion
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,6 +27,7 @@ from torch import Tensor
 from gscompleter.evaluation.methods import Prediction
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files import reading
+from gscompleter.system.files.names import make_valid_name
 from gscompleter.system.files.writing import replace_file
 from gscompleter.system.jobs.jobs import claim_folder, make_folder
 from gscompleter.types import Gaussians, merge
@@ -46,7 +46,7 @@ GAUSSIANS = ("gaussians", "scene", "added", "registered")
 
 def make_file_name(name: str) -> str:
     """Turn a name into a valid file name."""
-    return re.sub(r"[^\w.+-]+", "-", name.replace(">", "-to-"))
+    return make_valid_name(name.replace(">", "-to-"))
 
 
 def get_task_folder(out: Path, task: str) -> Path:

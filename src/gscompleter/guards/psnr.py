@@ -12,7 +12,7 @@ from gscompleter.render.fit_colors import RELAXATION, fit_colors
 from gscompleter.stages.error_budgets import (
     find_exceeding,
     meet_error_budgets,
-    set_error_budgets,
+    set_total_budgets,
 )
 from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.state import Completion
@@ -28,11 +28,14 @@ class PsnrGuard(Guard):
     name = "psnr"
 
     def begin(self, state: Completion, scenes: SceneRenderer) -> Completion:
-        """Set the error budgets of all photographs, before any target."""
+        """Set the error budgets of all photographs for all targets, before any of them.
+
+        Budgets that were set earlier hold as well.
+        """
         config = state.config
         frozen = scenes.freeze_at(state.parts, [photo.view.camera for photo in state.photos])
         budgets = [
-            set_error_budgets(
+            set_total_budgets(
                 photo.view,
                 scene.render.image,
                 compute_hole_mask(scene.render.alpha, config.holes),
@@ -41,7 +44,7 @@ class PsnrGuard(Guard):
             for photo, scene in zip(state.photos, frozen, strict=True)
         ]
         photos = tuple(
-            replace(photo, budgets=limits)
+            replace(photo, budgets=(*photo.budgets, *limits))
             for photo, limits in zip(state.photos, budgets, strict=True)
         )
         return replace(state, photos=photos)
@@ -54,7 +57,7 @@ class PsnrGuard(Guard):
         """
         view = attempt.view
         state = view.state
-        budgets = [photo.budgets for photo in state.photos]
+        budgets = view.budgets
 
         # What a photograph sees of the additions takes the colours of the photograph first, so that
         # less of it has to fade. At the target the image counts as much as each photograph.

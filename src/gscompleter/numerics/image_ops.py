@@ -15,6 +15,8 @@ SSIM_RADIUS = 5
 """Radius of the Gaussian window of SSIM, in pixels."""
 SSIM_SIGMA = 1.5
 """Standard deviation of the window, in pixels."""
+THIN_RADIUS = 2
+"""Half the width, in pixels, of a square that fits into nothing thin: 5 pixels."""
 MAX_REGIONS = 3
 """Most regions that are listed, the largest first."""
 
@@ -104,6 +106,14 @@ def dilate(mask: Bool[Tensor, "h w"], radius: int) -> Bool[Tensor, "h w"]:
     for size, padding in (((1, side), (0, radius)), ((side, 1), (radius, 0))):
         grown = max_pool2d(grown, size, stride=1, padding=padding)
     return grown[0, 0] > 0
+
+
+def keep_thin(mask: Bool[Tensor, "h w"], radius: int = THIN_RADIUS) -> Bool[Tensor, "h w"]:
+    """Keep the structures of a mask that no square of 2 radius + 1 pixels fits into."""
+    # A morphological opening leaves what the square fits into. One pixel more, as rims of wide
+    # structures are not straight.
+    shrunk = ~dilate(~mask, radius)
+    return mask & ~dilate(shrunk, radius + 1)
 
 
 def label_regions(mask: Bool[Tensor, "h w"]) -> tuple[Int64[Tensor, "h w"], int]:

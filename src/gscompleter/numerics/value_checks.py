@@ -9,10 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gscompleter.numerics.kernels.parallel import share
+from gscompleter.numerics.kernels.splat_rows import mark_usable
 from gscompleter.system.errors import InputError
 from gscompleter.system.memory import check_images
 from gscompleter.system.tensor_checks import describe, name_dtype
@@ -32,8 +35,18 @@ COLOR_TOLERANCE = 0.01
 
 def find_finite(gaussians: Gaussians) -> Bool[Tensor, "n"]:
     """Mark Gaussians of finite numbers below `LARGEST` whose quaternion is a rotation."""
+    names = ("means", "quats", "scales", "opacities", "sh")
+    values = [getattr(gaussians, name).detach() for name in names]
+    if all(value.dtype == torch.float32 and not value.is_cuda for value in values):
+        # In one pass, without a copy of the harmonics that says which of them are too large.
+        values[-1] = values[-1].flatten(1)
+        arrays = [value.contiguous().numpy() for value in values]
+        usable = np.empty(len(gaussians), np.bool_)
+        bounds = map(np.float32, (LARGEST, LARGEST_SH, MIN_QUAT_LENGTH))
+        share(mark_usable, len(gaussians), *arrays, *bounds, usable)
+        return torch.from_numpy(usable)
     good = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
-    for name in ("means", "quats", "scales", "sh", "opacities"):
+    for name in names:
         good &= ~_find_infinite(getattr(gaussians, name), LARGEST_SH if name == "sh" else LARGEST)
     return good & (gaussians.quats.square().sum(1) >= MIN_QUAT_LENGTH**2)
 

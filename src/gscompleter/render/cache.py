@@ -10,7 +10,7 @@ from gscompleter.render.view_map import get_view_map
 from gscompleter.types import Camera, Gaussians
 
 Parts = tuple[Gaussians, ...]
-"""Gaussians to render: the context, then one part per target."""
+"""Gaussians to render: the context, then what was added, part by part."""
 
 
 class SceneRenderer:
@@ -35,17 +35,17 @@ class SceneRenderer:
 
     def freeze_at(self, parts: Parts, cameras: Sequence[Camera]) -> tuple[FrozenScene, ...]:
         """Freeze a scene at cameras, or reuse and extend what was frozen there before."""
-        keys = [make_camera_key(camera) for camera in cameras]
-        known = [self._views.get(key, ((), None)) for key in keys]
 
-        def update(camera: Camera, before: tuple[Parts, FrozenScene | None]) -> FrozenScene:
-            known_parts, frozen = before
-            return self._update(parts, camera, known_parts, frozen)
+        def update(camera: Camera) -> FrozenScene:
+            # What was frozen before is taken out of the cache, so that each view takes memory once
+            # and not twice until all are done. No thread waits for another: a view that is not
+            # there is frozen anew, with the same result.
+            key = make_camera_key(camera)
+            frozen = self._update(parts, camera, *self._views.pop(key, ((), None)))
+            self._views[key] = (parts, frozen)
+            return frozen
 
-        frozen = tuple(get_view_map(parts[0].means)(update, cameras, known))
-        # Threads only read the cache; it is written when all of them are done.
-        self._views.update((key, (parts, view)) for key, view in zip(keys, frozen, strict=True))
-        return frozen
+        return tuple(get_view_map(parts[0].means)(update, cameras))
 
     def freeze_small(self, parts: Parts, cameras: Sequence[Camera]) -> tuple[FrozenScene, ...]:
         """Freeze a simplified scene at cameras of small images."""

@@ -15,6 +15,8 @@ from gscompleter.system.errors import InputError
 RendererDevice = Literal["cpu", "cuda"]
 NetworkDevice = Literal["cpu", "cuda", "mps"]
 """AMD's GPUs are `cuda` as well (torch for ROCm); `mps` is the GPU of a Mac."""
+Device = Literal["auto", "cpu", "cuda", "mps"]
+"""Choice of one device for both; with `mps` the renderer stays on the CPU."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,7 @@ class Devices:
 
 
 def choose_devices(
-    device: Literal["auto", "cpu", "cuda"] = "auto",
+    device: Device = "auto",
     renderer: RendererDevice | None = None,
     networks: NetworkDevice | None = None,
 ) -> Devices:
@@ -37,16 +39,20 @@ def choose_devices(
     )
 
 
-def choose_device(
-    device: Literal["auto", "cpu", "cuda"] = "auto", option: str = "device"
-) -> RendererDevice:
+def choose_device(device: Device = "auto", option: str = "device") -> RendererDevice:
     """Choose the device of the renderer; `auto` uses a GPU if gsplat can draw on it.
 
     Raises:
-        InputError: `device` is `cuda`, and gsplat cannot draw; it says what is missing.
+        InputError: `device` is `cuda`, and gsplat cannot draw; it says what is missing. Or it is
+            `mps`, and torch sees no GPU of a Mac.
     """
     # The CPU is chosen without asking for a GPU, which takes time and memory on one.
     if device == "cpu":
+        return "cpu"
+    # The GPU of a Mac runs networks. The renderer `metal` draws there from Python only: it draws
+    # the whole scene anew for each step, and no Mac was at hand to compare it with the CPU.
+    if device == "mps":
+        choose_network_device(device, option)
         return "cpu"
     missing = explain_missing_renderer()
     if missing is None:
@@ -67,7 +73,7 @@ def choose_device(
     return "cpu"
 
 
-def choose_network_device(device: Literal["auto", "cpu", "cuda", "mps"]) -> NetworkDevice:
+def choose_network_device(device: Device, option: str = "network-device") -> NetworkDevice:
     """Choose the device of the networks; `auto` uses any GPU that torch sees.
 
     Raises:
@@ -82,9 +88,7 @@ def choose_network_device(device: Literal["auto", "cpu", "cuda", "mps"]) -> Netw
     if device == "auto":
         return "cpu"
     reason = explain_missing_gpu() if device == "cuda" else "torch sees no GPU of a Mac"
-    raise InputError(
-        f"The networks cannot run on {device}: {reason}; choose cpu.", "network-device"
-    )
+    raise InputError(f"The networks cannot run on {device}: {reason}; choose cpu.", option)
 
 
 @cache

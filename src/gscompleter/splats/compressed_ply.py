@@ -26,6 +26,7 @@ from gscompleter.splats.packing import (
     unpack_fractions,
 )
 from gscompleter.splats.ply import MODE_COMMENT, encode, has_mode_comment
+from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, add_comments
 from gscompleter.system.files.ply import make_header, read_header
 from gscompleter.system.files.writing import replace_file
 from gscompleter.types import SH_C0, Gaussians
@@ -108,7 +109,9 @@ def _unpack_sh_rest(table: ndarray) -> Float[ndarray, "n k 3"]:
     return values.reshape(count, 3, num_rest // 3).transpose(0, 2, 1)
 
 
-def write_compressed_ply(path: Path, gaussians: Gaussians) -> None:
+def write_compressed_ply(
+    path: Path, gaussians: Gaussians, made_by: Provenance = NOTHING_KNOWN
+) -> None:
     """Write a compressed .ply; the Gaussians should be sorted with `sort_along_morton`."""
     log_scales = np.clip(encode(gaussians)[:, :3].numpy(), -MAX_LOG_SCALE, MAX_LOG_SCALE)
     rgb = 0.5 + SH_C0 * gaussians.sh[:, 0].numpy()
@@ -138,7 +141,8 @@ def write_compressed_ply(path: Path, gaussians: Gaussians) -> None:
     # The byte of the interval that a value in [-4, 4] lies in.
     rest_bytes = np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8)
     with replace_file(path) as file:
-        file.write(_make_header(gaussians, len(starts), rest.shape[1]))
+        header = _make_header(gaussians, len(starts), rest.shape[1])
+        file.write(add_comments(header, made_by))
         file.write(np.concatenate(bounds, axis=1).astype("<f4").tobytes())
         file.write(np.stack(columns, axis=1).astype("<u4").tobytes())
         file.write(rest_bytes.tobytes())

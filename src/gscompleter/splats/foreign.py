@@ -28,7 +28,7 @@ CHECKPOINTS = (".pt", ".pth", ".ckpt")
 POINT_CLOUDS = (".las", ".laz", ".e57", ".pcd", ".xyz", ".pts")
 POINT_CLOUD_STARTS = (b"LASF", b"ASTM-E57", b"# .PCD")
 MESHES = (".obj", ".stl", ".fbx", ".dae", ".off")
-SPLATS = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb")
+SPLATS = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".usdz", ".usdc", ".usda")
 """Endings of files that are worth naming in an archive or folder."""
 
 # Where trainers write their splats, below the folder of a model; the number is the iteration.

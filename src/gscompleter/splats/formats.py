@@ -1,12 +1,12 @@
 """The table of splat formats: read by the first bytes of a file, written by its extension.
 
-The labels of generated Gaussians are a column of a .ply; other formats have a file beside them.
+The labels of generated Gaussians are a column of a .ply, and in .sog, .glb and OpenUSD an array of
+their own; other formats have a file beside them.
 """
 
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import json
 import lzma
 import struct
@@ -16,6 +16,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -26,17 +27,33 @@ from torch import Tensor
 from gscompleter.numerics.value_checks import check_gaussians
 from gscompleter.splats.compressed_ply import read_compressed_ply, write_compressed_ply
 from gscompleter.splats.foreign import refuse_folder, refuse_foreign, resolve_splat
-from gscompleter.splats.glb import read_glb, write_glb
+from gscompleter.splats.glb import read_glb, read_glb_remarks, write_glb
 from gscompleter.splats.ksplat import read_ksplat
 from gscompleter.splats.morton import sort_along_morton
 from gscompleter.splats.packing import ZIP_MAGIC, UnsupportedError
-from gscompleter.splats.ply import load_ply, make_memory_error, require_finite, save_ply
-from gscompleter.splats.sog import META, read_sog, write_sog
+from gscompleter.splats.ply import (
+    copy_ply,
+    decode_gaussians,
+    load_ply,
+    make_memory_error,
+    read_scene,
+    require_finite,
+    save_ply,
+)
+from gscompleter.splats.provenance import (
+    KEY,
+    NOTHING_KNOWN,
+    Provenance,
+    parse_comments,
+    parse_provenance,
+)
+from gscompleter.splats.sog import META, read_sog, read_sog_remarks, write_sog
 from gscompleter.splats.splat import read_splat_rows, write_splat
 from gscompleter.splats.spz import read_spz, write_spz
-from gscompleter.splats.usd import refuse_usd, write_usd
+from gscompleter.splats.usd import read_usd, read_usd_remarks, write_usd
 from gscompleter.system.errors import InputError, quote_value, refuse_pointer, require_path
-from gscompleter.system.files.reading import open_file, read_json
+from gscompleter.system.files.ply import read_header
+from gscompleter.system.files.reading import hash_file, open_file, read_json
 from gscompleter.system.files.writing import replace_file
 from gscompleter.types import Gaussians
 
@@ -64,9 +81,12 @@ class SplatFormat:
     starts: tuple[bytes, ...]
     """First bytes of a file, white space aside; none if only the extension tells the format."""
     read: Callable[[Path], Gaussians]
-    write: Callable[[Path, Gaussians], None] | None = None
+    write: Callable[..., None] | None = None
+    """Takes path and Gaussians; those of `RECORDING` also who made the file."""
     contains: bytes = b""
     """Text near the start of a file that tells it from others with the same first bytes."""
+    read_remarks: Callable[[Path], object] | None = None
+    """Reads the record of who made the file, as values of JSON; None if it lies beside it."""
 
 
 SPLAT_FORMATS = {
@@ -79,11 +99,19 @@ SPLAT_FORMATS = {
     ),
     "ply": SplatFormat((".ply",), (b"ply",), load_ply, save_ply),
     "spz": SplatFormat((".spz",), (b"NGSP", b"\x1f\x8b"), read_spz, write_spz),
-    "usdz": SplatFormat((".usdz",), (ZIP_MAGIC,), refuse_usd, write_usd, contains=b".usd"),
-    "usd": SplatFormat((".usdc", ".usda", ".usd"), (b"PXR-USDC", b"#usda"), refuse_usd, write_usd),
-    "sog": SplatFormat((".sog",), (ZIP_MAGIC,), read_sog, write_sog),
-    "sog-folder": SplatFormat((META,), (b"{",), read_sog),
-    "glb": SplatFormat((".glb",), (b"glTF",), read_glb, write_glb),
+    "usdz": SplatFormat(
+        (".usdz",), (ZIP_MAGIC,), read_usd, write_usd, b".usd", read_remarks=read_usd_remarks
+    ),
+    "usd": SplatFormat(
+        (".usdc", ".usda", ".usd"),
+        (b"PXR-USDC", b"#usda"),
+        read_usd,
+        write_usd,
+        read_remarks=read_usd_remarks,
+    ),
+    "sog": SplatFormat((".sog",), (ZIP_MAGIC,), read_sog, write_sog, read_remarks=read_sog_remarks),
+    "sog-folder": SplatFormat((META,), (b"{",), read_sog, read_remarks=read_sog_remarks),
+    "glb": SplatFormat((".glb",), (b"glTF",), read_glb, write_glb, read_remarks=read_glb_remarks),
     "splat": SplatFormat((".splat",), (), read_splat_rows, write_splat),
     "ksplat": SplatFormat((".ksplat",), (), read_ksplat),
 }
@@ -92,20 +120,31 @@ SORTED = (write_compressed_ply, write_sog)
 """Writers of formats whose Gaussians lie along a Morton curve."""
 UNMARKED = (write_splat, write_glb, write_usd)
 """Writers of formats that cannot mark Gaussians as antialiased."""
+LABELLING = (write_sog, write_glb, write_usd)
+"""Writers of formats that hold the labels of generated Gaussians, besides .ply."""
+RECORDING = (write_compressed_ply, *LABELLING)
+"""Writers of formats that hold the record of who made the file, besides .ply."""
 
 
 def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     """Load the Gaussians of a file in any format of `FORMATS`, in the axes of a 3DGS .ply.
 
-    Of a trainer's model folder, the newest iteration is loaded. A .ply has the labels of generated
-    Gaussians; other formats have `NAME.generated.json` beside them. `drop_nonfinite` drops
+    Of a trainer's model folder, the newest iteration is loaded. Labels of generated Gaussians are
+    in the file, or in `NAME.generated.json` beside it. `drop_nonfinite` drops
     Gaussians with NaN, infinity or a zero quaternion instead of refusing the file.
     """
     path = resolve_splat(require_path(path))
+    if detect_splat_format(path) == "ply":
+        return load_ply(path, drop_nonfinite)
+    return require_finite(decode_splat(path), path, drop_nonfinite)
+
+
+def decode_splat(path: Path) -> Gaussians:
+    """Decode all Gaussians of a file with their labels, those included that are not finite."""
     name = detect_splat_format(path)
     if name == "ply":
-        return load_ply(path, drop_nonfinite)
-    has_json = name in ("sog", "sog-folder", "glb")
+        return decode_gaussians(read_scene(path))
+    has_json = name in ("sog", "sog-folder", "glb", "usd", "usdz")
     errors = DECODING_ERRORS + JSON_ERRORS if has_json else DECODING_ERRORS
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # infinite values are refused below
@@ -121,8 +160,10 @@ def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
             f"{quote_value(path)} cannot be read: {quote_value(str(error), MAX_DEFECT)}; fetch the "
             "file again, or export it as .ply."
         ) from error
-    labelled = replace(gaussians, generated=load_labels(path, len(gaussians)))
-    return require_finite(validate_ranges(labelled, path), path, drop_nonfinite)
+    # Labels lie in the file, or beside it as an earlier version wrote them for all formats.
+    if not gaussians.generated.any():
+        gaussians = replace(gaussians, generated=load_labels(path, len(gaussians)))
+    return validate_ranges(gaussians, path)
 
 
 def validate_ranges(gaussians: Gaussians, path: Path) -> Gaussians:
@@ -138,11 +179,11 @@ def validate_ranges(gaussians: Gaussians, path: Path) -> Gaussians:
     return replace(gaussians, opacities=opacities.clamp(0, 1))
 
 
-def save_splat(path: Path | str, gaussians: Gaussians) -> None:
+def save_splat(path: Path | str, gaussians: Gaussians, made_by: Provenance = NOTHING_KNOWN) -> None:
     """Write Gaussians in the format given by the extension of `path`.
 
-    A .ply stores everything. Other formats round, and the labels of generated Gaussians go to
-    `NAME.generated.json` beside the file.
+    A .ply stores everything, and other formats round. Where a format has no place for the labels
+    of generated Gaussians or for `made_by`, they go to `NAME.generated.json` beside the file.
     """
     path = require_path(path)
     write = get_writer(path)
@@ -150,13 +191,40 @@ def save_splat(path: Path | str, gaussians: Gaussians) -> None:
     if len(gaussians) == 0:
         raise InputError(f"There is no Gaussian to write to {quote_value(path)}.")
     if write is save_ply:
-        save_ply(path, gaussians)
+        save_ply(path, gaussians, made_by=made_by)
         return
     gaussians = gaussians.detach().to("cpu")
     if write in SORTED:
         gaussians = sort_along_morton(gaussians)
-    write(path, gaussians)
-    save_labels(path, gaussians.generated)
+    if write in RECORDING:
+        write(path, gaussians, made_by)
+        made_by = NOTHING_KNOWN
+    else:
+        write(path, gaussians)
+    # Labels beside a file that holds its own would be those of an earlier one.
+    labels = gaussians.generated
+    save_labels(path, torch.zeros_like(labels) if write in LABELLING else labels, made_by)
+
+
+def convert_splat(
+    source: Path, out: Path, drop_nonfinite: bool = False, keep_labels: bool = True
+) -> tuple[int, int, str | None]:
+    """Convert a file of Gaussians to the format given by the extension of `out`.
+
+    Returns the numbers of Gaussians and of generated ones, and a sentence on what the format cannot
+    say or None. From .ply to .ply, some Gaussians are in memory at a time.
+    """
+    source = resolve_splat(source)
+    made_by = read_provenance(source) if keep_labels else NOTHING_KNOWN
+    if get_writer(out) is save_ply and detect_splat_format(source) == "ply":
+        return (*copy_ply(source, out, drop_nonfinite, keep_labels, made_by), None)
+    gaussians = load_splat(source, drop_nonfinite)
+    generated = gaussians.generated
+    # Without generated Gaussians a writer leaves the labels out altogether.
+    written = generated if keep_labels else torch.zeros_like(generated)
+    save_splat(out, replace(gaussians, generated=written), made_by)
+    note = describe_mode_loss(out, gaussians)
+    return len(gaussians), int((generated > 0).sum()), note
 
 
 def describe_mode_loss(path: Path, gaussians: Gaussians) -> str | None:
@@ -194,7 +262,34 @@ def detect_splat_format(path: Path) -> str:
     return named
 
 
-def get_writer(path: Path) -> Callable[[Path, Gaussians], None]:
+def read_provenance(path: Path) -> Provenance:
+    """Read who made a splat, from the file or from beside it; no runs if nobody says so.
+
+    Raise InputError if the record is damaged.
+    """
+    path = resolve_splat(path)
+    name = detect_splat_format(path)
+    if name in ("ply", "compressed-ply"):
+        with open_file(path) as file:
+            return parse_comments(read_header(file, path)[0], quote_value(path))
+    read_remarks = SPLAT_FORMATS[name].read_remarks
+    beside = get_labels_path(path)
+    try:
+        if read_remarks is not None:
+            table = read_remarks(path)
+        elif beside.is_file():
+            table = read_json(beside, "remove it to go on without labels").get(KEY)
+        else:
+            table = None
+    except (*DECODING_ERRORS, *JSON_ERRORS) as error:
+        raise InputError(
+            f"{quote_value(path)} cannot be read: {quote_value(str(error), MAX_DEFECT)}; fetch the "
+            "file again."
+        ) from error
+    return parse_provenance(table, quote_value(path))
+
+
+def get_writer(path: Path) -> Callable[..., None]:
     """Get the function that writes the format for the extension of `path`."""
     name = _match_extension(path)
     write = None if name is None else SPLAT_FORMATS[name].write
@@ -223,8 +318,13 @@ def get_labels_path(path: Path) -> Path:
     return path.with_name(f"{path.name}.generated.json")
 
 
-def save_labels(path: Path, generated: UInt8[Tensor, "n"]) -> None:
-    """Write the labels of the file at `path` beside it; remove them if nothing was generated."""
+def save_labels(
+    path: Path, generated: UInt8[Tensor, "n"], made_by: Provenance = NOTHING_KNOWN
+) -> None:
+    """Write the labels of the file at `path` beside it, with who made it unless the file says so.
+
+    They are removed if nothing was generated.
+    """
     place = get_labels_path(path)
     if not (generated > 0).any():
         with contextlib.suppress(FileNotFoundError):
@@ -233,7 +333,10 @@ def save_labels(path: Path, generated: UInt8[Tensor, "n"]) -> None:
     # Run lengths, as labels come in long runs; the digest ties them to this very file.
     runs = [[label, len(list(run))] for label, run in groupby(generated.tolist())]
     with replace_file(place) as file:
-        file.write(json.dumps({"sha256": _hash_file(path), "generated": runs}).encode())
+        table: dict[str, Any] = {"sha256": hash_file(path), "generated": runs}
+        if made_by.runs:
+            table[KEY] = made_by.to_json()
+        file.write(json.dumps(table).encode())
 
 
 def load_labels(path: Path, count: int) -> UInt8[Tensor, "n"]:
@@ -245,7 +348,7 @@ def load_labels(path: Path, count: int) -> UInt8[Tensor, "n"]:
     try:
         runs = np.array(table["generated"], dtype=np.int64).reshape(-1, 2)
         in_range = bool(((runs >= 0) & (runs <= [255, count])).all())
-        fits = in_range and runs[:, 1].sum() == count and table["sha256"] == _hash_file(path)
+        fits = in_range and runs[:, 1].sum() == count and table["sha256"] == hash_file(path)
     except (KeyError, TypeError, ValueError, OverflowError):
         fits = False
     if not fits:
@@ -253,7 +356,3 @@ def load_labels(path: Path, count: int) -> UInt8[Tensor, "n"]:
             f"{place} does not hold the labels of {path.name}; remove it to go on without them."
         )
     return torch.from_numpy(np.repeat(runs[:, 0].astype(np.uint8), runs[:, 1]))
-
-
-def _hash_file(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()

@@ -3,7 +3,8 @@
 A primitive of points has one attribute per property: linear scales, opacities in [0, 1], xyzw
 rotations, and a `SH_DEGREE_d_COEF_i` of three channels for each SH coefficient. Nodes give its
 transform to the scene. Axes are x left, y up, z forward. All numbers are written as float32, with
-linear colours for viewers that show points only.
+linear colours for viewers that show points only. KHR_gaussian_splatting_compression_spz, whose
+buffer holds a .spz in place of the attributes, is read.
 """
 
 from __future__ import annotations
@@ -21,8 +22,20 @@ from numpy import ndarray
 from torch import Tensor
 
 from gscompleter.numerics.geometry import quats_to_rotations
-from gscompleter.splats.packing import UnsupportedError, build_gaussians
-from gscompleter.splats.transform import HALF_TURN_Z, rotate_half_turn, transform_gaussians
+from gscompleter.splats.packing import (
+    UnsupportedError,
+    build_gaussians,
+    check_growth,
+    with_labels,
+)
+from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
+from gscompleter.splats.spz import decode_spz
+from gscompleter.splats.transform import (
+    HALF_TURN_Z,
+    require_similarity,
+    rotate_half_turn,
+    transform_gaussians,
+)
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_bytes
 from gscompleter.system.files.writing import replace_file
@@ -35,7 +48,11 @@ JSON = 0x4E4F534A
 BINARY = 0x004E4942
 """Type of the binary chunk: "BIN" in ASCII."""
 EXTENSION = "KHR_gaussian_splatting"
+COMPRESSIONS = tuple(f"{EXTENSION}_compression_spz{version}" for version in ("", "_2"))
+"""Extensions whose buffer holds a .spz: the name, and that of its later drafts."""
 SH_NAMES = [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}" for d in range(4) for i in range(2 * d + 1)]
+LABELS = "_GENERATED"
+"""Attribute of the labels, if anything was generated; names of applications begin with `_`."""
 COLOR_SPACE = "srgb_rec709_display"
 """The colour space in which all splat trainers work."""
 COMPONENT_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
@@ -65,14 +82,24 @@ def read_glb(path: Path) -> Gaussians:
     if not placed:
         raise UnsupportedError(_describe_other_content(document.table))
     # Accessors may share bytes, so that a small file can claim any number.
-    counts = [_get_accessor(document, p, "POSITION")["count"] for p, _ in placed]
-    if sum(counts) * MIN_GAUSSIAN_BYTES > len(document.binary):
+    counts = {True: 0, False: 0}
+    for primitive, _ in placed:
+        is_packed = _find_compression(primitive) is not None
+        counts[is_packed] += _get_accessor(document, primitive, "POSITION")["count"]
+    if counts[False] * MIN_GAUSSIAN_BYTES > len(document.binary):
         raise ValueError("it claims more Gaussians than fit into it")
+    check_growth(counts[True] * MIN_GAUSSIAN_BYTES, len(document.binary))
     parts = [
         transform_gaussians(_decode_primitive(document, primitive), place)
         for primitive, place in placed
     ]
     return rotate_half_turn(merge(parts), HALF_TURN_Z)
+
+
+def read_glb_remarks(path: Path) -> object:
+    """Read the record in the `extras` of the asset, or None if there is none."""
+    table = _parse_document(read_bytes(path)).table
+    return table.get("asset", {}).get("extras", {}).get(KEY)
 
 
 def _describe_other_content(table: dict[str, Any]) -> str:
@@ -128,12 +155,7 @@ def _read_transform(node: dict[str, Any]) -> Float[Tensor, "4 4"]:
         place[:3, :3] = quats_to_rotations(torch.tensor([w, x, y, z], dtype=torch.float64))
         place[:3, :3] *= torch.tensor(node.get("scale", (1, 1, 1)), dtype=torch.float64)
         place[:3, 3] = torch.tensor(node.get("translation", (0, 0, 0)), dtype=torch.float64)
-    # For s R, with s > 0, the determinant is s³ and the product with the transpose s² I.
-    linear = place[:3, :3]
-    volume = float(torch.linalg.det(linear))
-    shape = linear @ linear.T / max(volume, 1e-30) ** (2 / 3)
-    if not volume > 0 or not torch.allclose(shape, torch.eye(3).double(), atol=1e-3):
-        raise UnsupportedError("has a node that mirrors Gaussians or stretches them unevenly")
+    require_similarity(place, "node")
     return place
 
 
@@ -141,8 +163,32 @@ def _get_accessor(document: GlbDocument, primitive: dict[str, Any], name: str) -
     return document.table["accessors"][primitive["attributes"][name]]
 
 
+def _find_compression(primitive: dict[str, Any]) -> dict[str, Any] | None:
+    """Find the extension of a primitive whose buffer holds a .spz; None if there is none."""
+    extensions = primitive["extensions"][EXTENSION].get("extensions", {})
+    return next((extensions[name] for name in COMPRESSIONS if name in extensions), None)
+
+
+def _decode_packed(
+    document: GlbDocument, primitive: dict[str, Any], compression: dict[str, Any]
+) -> Gaussians:
+    """Decode the .spz of a primitive, in the frame of its node."""
+    view = document.table["bufferViews"][compression["bufferView"]]
+    if view.get("buffer") != 0:
+        raise UnsupportedError("holds its Gaussians in another file")
+    start = int(view.get("byteOffset", 0))
+    # Its own axes are converted to those of glTF, as the extension demands.
+    gaussians = decode_spz(document.binary[start : start + int(view["byteLength"])])
+    if len(gaussians) != _get_accessor(document, primitive, "POSITION")["count"]:
+        raise ValueError("its .spz has another number of Gaussians than its accessors")
+    return rotate_half_turn(gaussians, HALF_TURN_Z)
+
+
 def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gaussians:
     """Decode the Gaussians of a primitive, in the frame of its node."""
+    compression = _find_compression(primitive)
+    if compression is not None:
+        return _decode_packed(document, primitive, compression)
     extension = primitive["extensions"][EXTENSION]
     packed = ", ".join({**extension.get("extensions", {}), **primitive["extensions"]})
     stored = (packed, extension.get("kernel", "ellipse"), extension.get("colorSpace", COLOR_SPACE))
@@ -158,13 +204,16 @@ def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gauss
         return _read_accessor(document, accessor)
 
     sh = [read_attribute(name) for name in SH_NAMES if name in primitive["attributes"]]
-    return build_gaussians(
+    gaussians = build_gaussians(
         read_attribute("POSITION"),
         np.roll(read_attribute(f"{EXTENSION}:ROTATION", "VEC4"), 1, axis=1),
         read_attribute(f"{EXTENSION}:SCALE"),
         read_attribute(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0],
         np.stack(sh, axis=1),
     )
+    if LABELS not in primitive["attributes"]:
+        return gaussians
+    return with_labels(gaussians, read_attribute(LABELS, "SCALAR")[:, 0])
 
 
 def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[ndarray, "n k"]:
@@ -188,10 +237,13 @@ def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[nda
     return np.maximum(values.astype(np.float32) / largest, -1 if largest > 1 else -np.inf)
 
 
-def write_glb(path: Path, gaussians: Gaussians) -> None:
+def write_glb(path: Path, gaussians: Gaussians, made_by: Provenance = NOTHING_KNOWN) -> None:
     """Write a .glb whose scene is one primitive of Gaussians, with all SH."""
     columns = _make_columns(rotate_half_turn(gaussians, HALF_TURN_Z))
-    text = json.dumps(_describe_scene(columns)).encode()
+    scene = _describe_scene(columns)
+    if made_by.runs:
+        scene["asset"]["extras"] = {KEY: made_by.to_json()}
+    text = json.dumps(scene).encode()
     # Chunks are aligned to four bytes, JSON with spaces.
     text += b" " * (-len(text) % 4)
     size = sum(column.nbytes for column in columns.values())
@@ -220,6 +272,8 @@ def _make_columns(gaussians: Gaussians) -> dict[str, Float[ndarray, "n k"]]:
         f"{EXTENSION}:OPACITY": opacities,
         **dict(zip(SH_NAMES, gaussians.sh.unbind(1), strict=False)),
     }
+    if gaussians.generated.any():
+        columns[LABELS] = gaussians.generated[:, None].float()
     return {name: np.require(tensor.numpy(), "<f4", ["C"]) for name, tensor in columns.items()}
 
 

@@ -15,17 +15,29 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Int, UInt8
+from jaxtyping import Bool, Int, Int64, UInt8
 from numpy import ndarray
 from numpy.lib.recfunctions import require_fields
 from torch import Tensor
 
+from gscompleter.numerics.value_checks import find_finite
 from gscompleter.splats.foreign import resolve_splat
-from gscompleter.splats.formats import detect_splat_format, get_writer, load_splat, save_splat
+from gscompleter.splats.formats import (
+    detect_splat_format,
+    get_writer,
+    load_splat,
+    read_provenance,
+    save_splat,
+)
 from gscompleter.splats.ply import (
+    CHUNK_ROWS,
+    LABEL_COLUMN,
     MEANS,
+    append_labels,
+    check_finite,
     count_rest,
     decode_gaussians,
+    has_mode_comment,
     has_surfels,
     iterate_blocks,
     make_rows,
@@ -33,15 +45,19 @@ from gscompleter.splats.ply import (
     read_columns,
     read_scene,
     require_finite,
+    save_parts,
     save_ply,
 )
+from gscompleter.splats.provenance import RunRecord, make_comment_lines
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.ply import PlyFile, write_ply_file
+from gscompleter.system.files.ply import PlyFile, release_pages, write_ply_file
 from gscompleter.system.files.writing import REMOVED_FILE
-from gscompleter.types import Gaussians, merge
+from gscompleter.types import NUM_SH, Gaussians, merge
 
-LABEL_COLUMN = "generated"
-_LABEL_LINE = re.compile(rb"^property\s+\w+\s+generated\s*?\n", re.M)
+_LABEL_LINES = re.compile(
+    rb"^property\s+\w+\s+generated\s*?\n(?:comment gscompleter-provenance/[^\n]*\n)*", re.M
+)
+"""The line of the labels, with the comments of runs that follow it."""
 _ELEMENT_LINE = re.compile(rb"^(?:element|end_header)", re.M)
 
 
@@ -60,12 +76,12 @@ def split_header(header: bytes) -> tuple[bytes, bytes, bytes]:
 
 
 def drop_generated(layout: PlyFile) -> PlyFile:
-    """Remove the generated rows and the column `generated`."""
+    """Remove the generated rows, the column `generated`, and who made them."""
     if LABEL_COLUMN not in (layout.rows.dtype.names or ()):
         return layout
     dtype = [column for column in layout.rows.dtype.descr if column[0] != LABEL_COLUMN]
     rows = require_fields(layout.rows[layout.rows[LABEL_COLUMN] == 0], dtype)
-    return replace(layout, header=_LABEL_LINE.sub(b"", layout.header), rows=rows)
+    return replace(layout, header=_LABEL_LINES.sub(b"", layout.header), rows=rows)
 
 
 def save_like(
@@ -74,54 +90,79 @@ def save_like(
     added: Gaussians,
     given: Path,
     kept: Bool[Tensor, "n"] | None = None,
+    order: Int64[Tensor, "m"] | None = None,
+    run: RunRecord | None = None,
 ) -> None:
-    """Write a completed scene in the layout of the input file `given`.
+    """Write a completed scene in the layout of the input file `given`; `run` made it.
 
     The standard layout is used if `given` is ASCII or no .ply, has surfels (two scales cannot hold
     `added`), a column `generated` of another type, fewer SH coefficients than `added`, or rows that
-    do not match `context`. `kept` marks the rows of `given` that the context has; None for all.
+    do not match `context`. `kept` marks the rows of `given` that are written; None for all. `order`
+    are the Gaussians of the context that they belong to; None for all in their order. Rows go from
+    file to file, some at a time.
     """
-    context = context.to("cpu")
     layout = find_layout(given)
-    added = merge([context[:0], added.to("cpu")])
-    numbers = None if layout is None else _match_rows(layout, context, added, kept)
-    if layout is None or numbers is None:
-        save_ply(path, merge([context, added]), provenance=True)
+    added = merge([context[:0].to("cpu"), added.to("cpu")])
+    order = torch.arange(len(context)) if order is None else order.to("cpu")
+    numbers = None
+    if layout is not None and _can_hold(layout, added):
+        numbers = np.arange(len(layout.rows)) if kept is None else np.flatnonzero(kept.numpy())
+    if layout is None or numbers is None or not _is_read_from(layout, numbers, context, order):
+        made_by = read_provenance(given)
+        made_by = made_by if run is None else made_by.plus(run)
+        parts = [(context, order), (added, torch.arange(len(added)))]
+        save_parts(path, parts, provenance=True, made_by=made_by)
         return
     # The file's own columns stay as they are; only `generated` is added, or written anew.
-    header = _add_label_line(layout.header)
-    label = [(LABEL_COLUMN, "u1")]
-    if LABEL_COLUMN in (layout.rows.dtype.names or ()):
-        header = layout.header
-        label = []
+    header = layout.header
+    label = []
+    if LABEL_COLUMN not in (layout.rows.dtype.names or ()):
+        header = _add_label_line(header)
+        label = [(LABEL_COLUMN, "u1")]
+    if run is not None:
+        header = _add_run(header, run)
     dtype = np.dtype([*layout.rows.dtype.descr, *label])
 
-    def write_labels(values: ndarray, labels: UInt8[Tensor, "m"]) -> ndarray:
+    def write_labels(values: ndarray, labels: UInt8[Tensor, "k"]) -> ndarray:
+        if values.dtype.descr == dtype.descr[:-1]:
+            return append_labels(values, dtype, labels.numpy())
         rows = require_fields(values, dtype)
         rows[LABEL_COLUMN] = labels.numpy()
         return rows
 
     def generate_blocks() -> Iterator[ndarray]:
-        for block in iterate_blocks(len(context)):
-            yield write_labels(layout.rows[numbers[block]], context.generated[block])
-        yield write_labels(make_rows(added, provenance=False), added.generated)
+        for block, rows in iterate_rows(layout, numbers):
+            yield write_labels(rows, context.generated[order[block]].cpu())
+        for block in iterate_blocks(len(added)):
+            yield write_labels(make_rows(added, False, block), added.generated[block])
 
-    write_ply_file(path, header, len(context) + len(added), generate_blocks(), layout.trailer)
+    write_ply_file(path, header, len(order) + len(added), generate_blocks(), layout.trailer)
 
 
-def _match_rows(
-    layout: PlyFile, context: Gaussians, added: Gaussians, kept: Bool[Tensor, "n"] | None
-) -> Int[ndarray, "m"] | None:
-    """Find the rows of a file that its context was read from, or None if `added` do not fit in."""
-    # Rows are copied only if their positions are those of the context, one by one.
+def iterate_rows(layout: PlyFile, numbers: Int[ndarray, "m"]) -> Iterator[tuple[slice, ndarray]]:
+    """Yield copies of rows by ascending numbers, some at a time, with their places among these."""
+    for block in iterate_blocks(len(numbers)):
+        chosen = numbers[block]
+        yield block, layout.rows[chosen]
+        release_pages(layout.rows[chosen[0] : chosen[-1] + 1])
+
+
+def _can_hold(layout: PlyFile, added: Gaussians) -> bool:
+    """Return True if rows of a file can hold `added`, and their labels."""
     names = layout.rows.dtype.names or ()
     has_other_labels = LABEL_COLUMN in names and layout.rows.dtype[LABEL_COLUMN] != np.uint8
-    if has_surfels(layout) or has_other_labels:
-        return None
-    numbers = np.arange(len(layout.rows)) if kept is None else np.flatnonzero(kept.numpy())
-    means = read_columns(layout.rows, MEANS)[numbers]
-    fits = count_rest(layout) == 3 * (added.sh.shape[1] - 1)
-    return numbers if fits and np.array_equal(means, context.means.numpy()) else None
+    has_all_sh = count_rest(layout) == 3 * (added.sh.shape[1] - 1)
+    return has_all_sh and not has_surfels(layout) and not has_other_labels
+
+
+def _is_read_from(
+    layout: PlyFile, numbers: Int[ndarray, "m"], context: Gaussians, order: Int64[Tensor, "k"]
+) -> bool:
+    """Return True if the positions of rows are those of Gaussians of the context, one by one."""
+    return len(numbers) == len(order) and all(
+        np.array_equal(read_columns(rows, MEANS), context.means[order[block]].cpu().numpy())
+        for block, rows in iterate_rows(layout, numbers)
+    )
 
 
 def _add_label_line(header: bytes) -> bytes:
@@ -131,6 +172,14 @@ def _add_label_line(header: bytes) -> bytes:
     return b"".join([first, b"property uchar generated", ending, others, end])
 
 
+def _add_run(header: bytes, run: RunRecord) -> bytes:
+    """Add the comment of a run after the line of the labels and the comments of earlier runs."""
+    lines = _LABEL_LINES.search(header)
+    assert lines is not None
+    ending = b"\r\n" if lines[0].endswith(b"\r\n") else b"\n"
+    return header[: lines.end()] + make_comment_lines([run], ending) + header[lines.end() :]
+
+
 def strip(path: Path, out: Path) -> tuple[int, int]:
     """Write the input scene of the completed scene at `path`.
 
@@ -138,8 +187,12 @@ def strip(path: Path, out: Path) -> tuple[int, int]:
     left out.
     """
     path = resolve_splat(path)
-    completed = load_splat(path)
     layout = find_layout(path)
+    if layout is not None and get_writer(out) is save_ply:
+        counts = strip_rows(path, layout, out)
+        if counts is not None:
+            return counts
+    completed = load_splat(path)
     scene = drop_sh_padding(completed)
     layout = None if layout is None else drop_generated(layout)
     removed = path.parent / REMOVED_FILE
@@ -157,6 +210,88 @@ def strip(path: Path, out: Path) -> tuple[int, int]:
     else:
         write_ply_file(out, layout.header, len(layout.rows), [layout.rows], layout.trailer)
     return len(scene), int((completed.generated > 0).sum())
+
+
+def strip_rows(path: Path, layout: PlyFile, out: Path) -> tuple[int, int] | None:
+    """Write the input scene from the rows of a completed .ply, some at a time, as `strip` does.
+
+    None if rows cannot be copied: the file has the SH of generated Gaussians of a higher degree, or
+    the originals beside it have other columns. It is refused as `load_splat` refuses it.
+    """
+    labels = np.zeros(len(layout.rows), np.uint8)
+    has_sh = np.zeros(2, np.bool_)
+    count = 0
+    for start in range(0, len(layout.rows), CHUNK_ROWS):
+        chunk = decode_gaussians(replace(layout, rows=layout.rows[start : start + CHUNK_ROWS]))
+        count += int(find_finite(chunk).sum())
+        labels[start : start + CHUNK_ROWS] = chunk.generated.numpy()
+        # The harmonics of the highest degree, of what was given and of what was generated.
+        highest = chunk.sh[:, NUM_SH[max(chunk.sh_degree - 1, 0)] :].flatten(1).any(dim=1).numpy()
+        for index, is_of_kind in enumerate((chunk.generated == 0, chunk.generated > 0)):
+            has_sh[index] |= bool(highest[is_of_kind.numpy()].any())
+    check_finite(count, len(labels), path, drop_nonfinite=False)
+    # A scene of lower degree was padded with zeros, which the generated Gaussians fill.
+    if has_sh[1] and not has_sh[0]:
+        return None
+
+    numbers = np.flatnonzero(labels == 0)
+    header = _LABEL_LINES.sub(b"", layout.header)
+    dtype = np.dtype([c for c in layout.rows.dtype.descr if c[0] != LABEL_COLUMN])
+    originals = np.empty(0, dtype)
+    taken = np.zeros(len(numbers), np.bool_)
+    removed = path.parent / REMOVED_FILE
+    if removed.is_file():
+        source = read_scene(removed)
+        is_antialiased = has_mode_comment(layout.header)
+        rows = find_places(source, removed, len(numbers), is_antialiased)
+        originals = drop_generated(source).rows
+        if originals.dtype != dtype or len(originals) != len(rows):
+            return None
+        taken = np.zeros(len(numbers) + len(rows), np.bool_)
+        taken[rows] = True
+    if len(taken) == 0:
+        return None
+
+    def generate_blocks() -> Iterator[ndarray]:
+        kept = 0
+        restored = 0
+        for block in iterate_blocks(len(taken)):
+            # The originals take their rows, the others the rest, in their order.
+            is_original = taken[block]
+            rows = np.empty(len(is_original), dtype)
+            num_kept = int((~is_original).sum())
+            for _, copied in iterate_rows(layout, numbers[kept : kept + num_kept]):
+                rows[~is_original] = drop_generated(replace(layout, rows=copied)).rows
+            num_restored = len(rows) - num_kept
+            rows[is_original] = originals[restored : restored + num_restored]
+            kept += num_kept
+            restored += num_restored
+            yield rows
+
+    write_ply_file(out, header, len(taken), generate_blocks(), layout.trailer)
+    return len(taken), len(labels) - len(numbers)
+
+
+def find_places(
+    source: PlyFile, path: Path, num_kept: int, is_antialiased: bool
+) -> Int64[ndarray, "n"]:
+    """Find the rows of the originals of the file `path` in a scene of `num_kept` others.
+
+    Raises InputError if they are not finite, or do not say where they belong in that scene.
+    """
+    removed = require_finite(decode_gaussians(source), path, drop_nonfinite=False)
+    total = num_kept + len(removed)
+    rows = np.zeros(0, np.int64)
+    if b"element place " in source.header and len(source.trailer) == 4 * len(removed):
+        rows = source.trailer.view("<u4").astype(np.int64)
+    # Row numbers ascend, and the last one lies within the scene.
+    is_ordered = len(rows) > 0 and bool((np.diff(rows, append=total) > 0).all())
+    if not is_ordered or is_antialiased != removed.is_antialiased:
+        raise InputError(
+            f"{quote_value(path)} does not say where its Gaussians belong in the scene beside it; "
+            "fetch both files again."
+        )
+    return rows
 
 
 def drop_sh_padding(completed: Gaussians) -> Gaussians:
@@ -191,9 +326,9 @@ def save_removed(
         header = make_scene_header(removed, has_labels)
         values = make_rows(removed, has_labels)
     else:
-        scene_rows = layout.rows if kept is None else layout.rows[kept.numpy()]
+        numbers = rows.numpy() if kept is None else np.flatnonzero(kept.numpy())[rows.numpy()]
         header = layout.header
-        values = scene_rows[rows.numpy()]
+        values = layout.rows[numbers]
     first, _, end = split_header(header)
     place = f"element place {len(rows)}\nproperty uint row\n".encode()
     trailer = rows.numpy().astype("<u4")
@@ -205,18 +340,9 @@ def reinsert(
 ) -> tuple[Gaussians, PlyFile | None]:
     """Insert the replaced originals of the file `path` at their rows; None if columns differ."""
     source = read_scene(path)
-    removed = require_finite(decode_gaussians(source), path, drop_nonfinite=False)
+    rows = find_places(source, path, len(kept), kept.is_antialiased)
+    removed = decode_gaussians(source)
     total = len(kept) + len(removed)
-    rows = np.zeros(0, np.int64)
-    if b"element place " in source.header and len(source.trailer) == 4 * len(removed):
-        rows = source.trailer.view("<u4").astype(np.int64)
-    # Row numbers ascend, and the last one lies within the scene.
-    is_ordered = len(rows) > 0 and bool((np.diff(rows, append=total) > 0).all())
-    if not is_ordered or kept.is_antialiased != removed.is_antialiased:
-        raise InputError(
-            f"{quote_value(path)} does not say where its Gaussians belong in the scene beside it; "
-            "fetch both files again."
-        )
     # Place of each Gaussian: the originals take their rows, the others the rest, in their order.
     taken = torch.zeros(total, dtype=torch.bool)
     taken[torch.from_numpy(rows)] = True

@@ -8,6 +8,7 @@ from jaxtyping import Float, Int64
 from numpy import ndarray
 from torch import Tensor
 
+from gscompleter.numerics.kernels.splat_rows import permute_rows
 from gscompleter.types import Gaussians
 
 BITS_PER_AXIS = 21
@@ -20,6 +21,19 @@ def argsort_nearby(gaussians: Gaussians) -> Int64[Tensor, "n"]:
     means = gaussians.means.detach().cpu().double().numpy()
     low, high = np.quantile(means[:: max(1, len(means) // SAMPLE_SIZE)], (0.01, 0.99), axis=0)
     return argsort_morton(means, low, high).to(gaussians.means.device)
+
+
+def sort_nearby(gaussians: Gaussians) -> Int64[Tensor, "n"]:
+    """Sort Gaussians on the CPU along the curve in their own memory; return the order.
+
+    For what was just read and that nobody else holds: a sorted copy would take as much again.
+    """
+    order = argsort_nearby(gaussians)
+    for values in vars(gaussians).values():
+        if isinstance(values, Tensor):
+            rows = values.numpy().reshape(len(order), -1)
+            permute_rows(order.numpy(), rows, np.zeros(len(order), np.bool_))
+    return order
 
 
 def sort_along_morton(gaussians: Gaussians) -> Gaussians:

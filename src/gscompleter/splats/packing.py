@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import torch
-from jaxtyping import Float, Integer, UInt32
+from jaxtyping import Float, Integer, Shaped, UInt32
 from numpy import ndarray
 
 from gscompleter.system.errors import quote_value
@@ -94,6 +95,14 @@ def build_gaussians(
     return make_observed(
         *[torch.from_numpy(np.require(array, np.float32, ["C", "W"])) for array in arrays]
     )
+
+
+def with_labels(gaussians: Gaussians, labels: Shaped[ndarray, "n"]) -> Gaussians:
+    """Return Gaussians with the labels of a file, whole numbers from 0 to 255."""
+    generated = labels.astype(np.uint8)
+    if len(generated) != len(gaussians) or not np.array_equal(generated, labels):
+        raise ValueError("its labels of generated Gaussians are no bytes, or too few")
+    return replace(gaussians, generated=torch.from_numpy(generated))
 
 
 def assemble_sh(

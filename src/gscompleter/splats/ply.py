@@ -15,27 +15,31 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Bool, Float
-from numpy.lib.recfunctions import require_fields
+from jaxtyping import Bool, Float, Int64, UInt8
+from numpy import ndarray
 from torch import Tensor
 
-from gscompleter.numerics.kernels.parallel import map_in_parallel
+from gscompleter.numerics.kernels import splat_rows as kernels
+from gscompleter.numerics.kernels.parallel import run_calls, share
 from gscompleter.numerics.value_checks import LARGEST, check_gaussians, find_finite
+from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, add_comments
 from gscompleter.system.errors import InputError, quote_value, require_path
 from gscompleter.system.files.ply import (
     Element,
     PlyFile,
     make_header,
     read_ply_file,
+    release_pages,
     write_ply_file,
 )
-from gscompleter.types import Gaussians
+from gscompleter.types import Gaussians, merge
 
 MEANS = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
@@ -43,15 +47,13 @@ _DC = ("f_dc_0", "f_dc_1", "f_dc_2")
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 _NEEDED = (*MEANS, *_DC, "opacity", *_SCALES[:2], *_QUATS)
+LABEL_COLUMN = "generated"
 FILTER = "filter_3D"
 """Standard deviation of the smoothing filter of Mip-Splatting and GOF, in scene units."""
 SURFEL_THICKNESS = 1e-3
 """Thickness of a surfel of 2DGS, relative to its smaller scale."""
 _NUM_REST = (0, 9, 24, 45)
 """Number of properties f_rest_* by SH degree."""
-
-_MAX_LOGIT = 30.0
-"""Opacities of 0 are written as this logit, negated."""
 
 MODE_COMMENT = "SplatRenderMode: mip"
 """Comment that marks antialiased Gaussians."""
@@ -64,6 +66,8 @@ _ANTIALIASED = (b"mip", b"antialiased", b"1", b"true")
 
 BLOCK_ROWS = 8192
 """Rows processed at a time, so that all their columns stay in the cache."""
+CHUNK_ROWS = 16 * BLOCK_ROWS
+"""Rows of a file that are copied at a time."""
 
 
 def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
@@ -122,32 +126,43 @@ def has_mode_comment(header: bytes) -> bool:
 
 
 def decode_gaussians(scene: PlyFile) -> Gaussians:
-    """Decode the Gaussians of a .ply, non-finite ones included."""
+    """Decode the Gaussians of a .ply, non-finite ones included.
+
+    Blocks of rows are decoded one by one, and their pages of a mapped file are released: the memory
+    holds the Gaussians, and not the file as well.
+    """
     rows = scene.rows
-    num_rest = count_rest(scene)
+    count = len(rows)
     names = rows.dtype.names or ()
-    rests = tuple(f"f_rest_{i}" for i in range(num_rest))
-    logs = (*(name for name in _SCALES if name in names), "opacity")
-    rest, means, quats, encoded, dc = map_in_parallel(
-        lambda columns: torch.from_numpy(read_columns(rows, columns)),
-        [rests, MEANS, _QUATS, logs, _DC],
+    arrays = (
+        np.empty((count, 3), np.float32),
+        np.empty((count, 4), np.float32),
+        np.empty((count, 3), np.float32),
+        np.empty(count, np.float32),
+        np.empty((count, 1 + count_rest(scene) // 3, 3), np.float32),
+        np.empty((count, 4), np.float32),
     )
-    # The file has all coefficients of red, then green, then blue.
-    rest = rest.view(len(rows), 3, num_rest // 3).transpose(1, 2)
-    # Logarithms of scales: the third one of a surfel is thinner than the smaller one by a factor.
-    if has_surfels(scene):
-        thin = encoded[:, :2].amin(1) + math.log(SURFEL_THICKNESS)
-        encoded = torch.cat([encoded[:, :2], thin[:, None], encoded[:, 2:]], dim=1)
-    generated = np.zeros(len(rows), np.uint8)
-    if "generated" in names:
-        with np.errstate(invalid="ignore"):
-            generated = rows["generated"].astype(np.uint8)
+    generated = np.zeros(count, np.uint8)
+    columns = find_columns(scene)
+
+    def decode_block(block: slice) -> None:
+        part = rows[block]
+        table = view_as_table(part) if columns is not None else gather_table(scene, part)
+        places = np.arange(table.shape[1]) if columns is None else columns
+        kernels.decode_rows(0, len(part), block.start, table, places, *arrays)
+        if LABEL_COLUMN in names:
+            with np.errstate(invalid="ignore"):
+                generated[block] = part[LABEL_COLUMN].astype(np.uint8)
+        release_pages(part)
+
+    run_calls(decode_block, [(block,) for block in iterate_blocks(count)])
+    means, quats, scales, opacities, sh, encoded = map(torch.from_numpy, arrays)
     gaussians = Gaussians(
         means=means,
         quats=quats,
-        scales=_decode_scales(encoded),
-        opacities=_decode_opacities(encoded),
-        sh=torch.cat([dc[:, None], rest], dim=1).contiguous(),
+        scales=scales,
+        opacities=opacities,
+        sh=sh,
         generated=torch.from_numpy(generated),
         encoded=encoded,
         is_antialiased=has_mode_comment(scene.header),
@@ -155,6 +170,46 @@ def decode_gaussians(scene: PlyFile) -> Gaussians:
     if FILTER not in names:
         return gaussians
     return fuse_filter(gaussians, torch.from_numpy(read_columns(rows, (FILTER,)))[:, 0])
+
+
+def name_columns(scene: PlyFile) -> tuple[str, ...]:
+    """Name the properties of Gaussians in the order in which kernels take them."""
+    rest = (f"f_rest_{i}" for i in range(count_rest(scene)))
+    return (*MEANS, *_DC, *rest, "opacity", *_SCALES, *_QUATS)
+
+
+def find_columns(scene: PlyFile) -> Int64[ndarray, "c"] | None:
+    """Find the properties of Gaussians among the float32 of a row.
+
+    None if some are no little-endian float32 at a multiple of four bytes, or are not there.
+    """
+    fields: Mapping[str, Any] = scene.rows.dtype.fields or {}
+    places = []
+    for name in name_columns(scene):
+        dtype, offset = fields.get(name, (np.dtype(np.uint8), 0))[:2]
+        if dtype != np.dtype("<f4") or offset % 4 != 0:
+            return None
+        places.append(offset // 4)
+    return np.array(places)
+
+
+def view_as_table(part: ndarray) -> Float[ndarray, "n c"]:
+    """Copy rows as they are to a table of the float32 that each begins with."""
+    width = part.dtype.itemsize // 4
+    raw = np.ascontiguousarray(part).view(np.uint8).reshape(len(part), -1)
+    return np.ascontiguousarray(raw[:, : 4 * width]).view("<f4").astype(np.float32, copy=False)
+
+
+def gather_table(scene: PlyFile, part: ndarray) -> Float[ndarray, "n c"]:
+    """Gather the properties of Gaussians, of any type, in the order of `name_columns`."""
+    names = name_columns(scene)
+    if not has_surfels(scene):
+        return read_columns(part, names)
+    table = read_columns(part, tuple(name for name in names if name != _SCALES[2]))
+    # Logarithms of scales: the third one of a surfel is thinner than the smaller one by a factor.
+    place = names.index(_SCALES[2])
+    thin = table[:, place - 2 : place].min(axis=1) + np.float32(math.log(SURFEL_THICKNESS))
+    return np.insert(table, place, thin, axis=1)
 
 
 def has_surfels(scene: PlyFile) -> bool:
@@ -193,17 +248,23 @@ def read_columns(rows: np.ndarray, names: tuple[str, ...]) -> Float[np.ndarray, 
 def require_finite(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Gaussians:
     """Refuse non-finite Gaussians of the file `path`, or drop them if some are finite."""
     good = find_finite(gaussians)
-    bad = int((~good).sum())
-    if bad == len(good) and (bad == 0 or drop_nonfinite):
+    count = int(good.sum())
+    check_finite(count, len(good), path, drop_nonfinite)
+    return gaussians if count == len(good) else gaussians[good]
+
+
+def check_finite(count: int, total: int, path: Path, drop_nonfinite: bool) -> None:
+    """Raise InputError if not all Gaussians of a file are finite, or if none is."""
+    bad = total - count
+    if count == 0 and (bad == 0 or drop_nonfinite):
         raise InputError(f"{quote_value(path)} holds no Gaussian that is finite; write it anew.")
     if bad > 0 and not drop_nonfinite:
         raise InputError(
-            f"{quote_value(path)} has {bad:,} of {len(good):,} Gaussians with NaN, infinity, "
+            f"{quote_value(path)} has {bad:,} of {total:,} Gaussians with NaN, infinity, "
             f"numbers above {LARGEST:g} or a rotation of zeros; repair it, or drop what is not "
             "finite.",
             "drop_nonfinite",
         )
-    return gaussians[good] if bad > 0 else gaussians
 
 
 def iterate_blocks(count: int) -> Iterator[slice]:
@@ -211,76 +272,160 @@ def iterate_blocks(count: int) -> Iterator[slice]:
     return (slice(start, start + BLOCK_ROWS) for start in range(0, count, BLOCK_ROWS))
 
 
-def _decode_scales(encoded: Float[Tensor, "n 4"]) -> Float[Tensor, "n 3"]:
-    return encoded[:, :3].double().exp_().float()
-
-
-def _decode_opacities(encoded: Float[Tensor, "n 4"]) -> Float[Tensor, "n"]:
-    return encoded[:, 3].double().sigmoid_().float()
-
-
 def encode(gaussians: Gaussians) -> Float[Tensor, "n 4"]:
     """Compute log-scales and logit opacities for a file, always finite.
 
     Values read from a file are reused where they still decode to the values in memory.
     """
-    tiny = torch.finfo(torch.float32).tiny
-    scales = gaussians.scales.double().clamp_min(tiny).log()
-    # The largest float32 below 1 has a logit of 16.6; a larger one could not be read back.
-    opacities = gaussians.opacities.double().clamp(0, 1 - 2**-24).logit()
-    anew = torch.cat([scales, opacities.clamp_min(-_MAX_LOGIT)[:, None]], dim=1).float()
-    if gaussians.encoded is None:
-        return anew
-    from_file = gaussians.encoded
-    same_scales = _decode_scales(from_file) == gaussians.scales
-    same_opacities = _decode_opacities(from_file) == gaussians.opacities
-    same = torch.cat([same_scales, same_opacities[:, None]], dim=1)
-    return torch.where(same & from_file.isfinite(), from_file, anew)
+    written = np.empty((len(gaussians), 4), np.float32)
+    values = (gaussians.scales, gaussians.opacities, gaussians.encoded)
+    share(kernels.encode_values, len(gaussians), *map(_to_array, values), written)
+    return torch.from_numpy(written)
 
 
-def save_ply(path: Path | str, gaussians: Gaussians, provenance: bool | None = None) -> None:
+def _to_array(values: Tensor | None) -> Float[ndarray, "n *c"]:
+    """Convert values to a contiguous array; log-scales and logits that are not known are empty."""
+    if values is None:
+        return np.empty((0, 4), np.float32)
+    return values.detach().cpu().float().contiguous().numpy()
+
+
+def save_ply(
+    path: Path | str,
+    gaussians: Gaussians,
+    provenance: bool | None = None,
+    made_by: Provenance = NOTHING_KNOWN,
+) -> None:
     """Write a standard 3DGS .ply, with `uchar generated` after the standard properties.
 
     `provenance` decides if `generated` is written; the default is yes if anything was generated.
     Some readers (such as gsply 0.4) misread rows that end in a byte; False writes the plain layout.
+    `made_by` becomes comments.
     """
     path = require_path(path)
     check_gaussians(gaussians, "The scene to write")
     if provenance is None:
         provenance = bool((gaussians.generated > 0).any())
     gaussians = gaussians.detach().to("cpu")
-    blocks = (make_rows(gaussians[block], provenance) for block in iterate_blocks(len(gaussians)))
-    header = make_scene_header(gaussians, provenance)
+    blocks = (make_rows(gaussians, provenance, block) for block in iterate_blocks(len(gaussians)))
+    header = add_comments(make_scene_header(gaussians, provenance), made_by)
     write_ply_file(path, header, len(gaussians), blocks)
+
+
+def save_parts(
+    path: Path,
+    parts: Sequence[tuple[Gaussians, Int64[Tensor, "_"]]],
+    provenance: bool,
+    made_by: Provenance = NOTHING_KNOWN,
+) -> None:
+    """Write rows of several scenes as one 3DGS .ply, some at a time, without merging the scenes.
+
+    Each part is a scene and the Gaussians of it that are written, in their order.
+    """
+    # Scenes of lower degree are padded to this one, as `merge` does.
+    form = merge([scene[:0].to("cpu") for scene, _ in parts])
+    for scene, _ in parts:
+        check_gaussians(scene, "The scene to write")
+
+    def generate_blocks() -> Iterator[ndarray]:
+        for scene, order in parts:
+            for block in iterate_blocks(len(order)):
+                rows = scene[order[block].to(scene.means.device)].detach().to("cpu")
+                yield make_rows(merge([form, rows]), provenance)
+
+    count = sum(len(order) for _, order in parts)
+    header = add_comments(make_scene_header(form, provenance), made_by)
+    write_ply_file(path, header, count, generate_blocks())
+
+
+def copy_ply(
+    source: Path,
+    path: Path,
+    drop_nonfinite: bool = False,
+    keep_labels: bool = True,
+    made_by: Provenance = NOTHING_KNOWN,
+) -> tuple[int, int]:
+    """Write what `load_ply` and `save_ply` would, some Gaussians at a time.
+
+    Returns the numbers of Gaussians written, and of those of them that the file says were
+    generated, whether or not `keep_labels` writes that.
+    """
+    scene = read_scene(source)
+    total = len(scene.rows)
+
+    def decode_chunks() -> Iterator[Gaussians]:
+        for start in range(0, total, CHUNK_ROWS):
+            chunk = decode_gaussians(replace(scene, rows=scene.rows[start : start + CHUNK_ROWS]))
+            good = find_finite(chunk)
+            yield chunk if good.all() else chunk[good]
+
+    # The header has the number of Gaussians and says if there are labels, so that both are counted
+    # before the first is written. Most files have no labels, and all of them is written.
+    count = total
+    num_generated = 0
+    if drop_nonfinite or total == 0 or LABEL_COLUMN in (scene.rows.dtype.names or ()):
+        chunks = [(len(chunk), int((chunk.generated > 0).sum())) for chunk in decode_chunks()]
+        count = sum(number for number, _ in chunks)
+        num_generated = sum(number for _, number in chunks)
+        check_finite(count, total, source, drop_nonfinite)
+
+    has_labels = keep_labels and num_generated > 0
+    form = decode_gaussians(replace(scene, rows=scene.rows[:0]))
+    written = 0
+
+    def encode_chunks() -> Iterator[ndarray]:
+        nonlocal written
+        for chunk in decode_chunks():
+            written += len(chunk)
+            yield make_rows(chunk, has_labels)
+        # Not before the end is known how many are not finite; the file is then left as it was.
+        check_finite(written, count, source, drop_nonfinite)
+
+    header = add_comments(make_scene_header(form, has_labels), made_by)
+    write_ply_file(path, header, count, encode_chunks())
+    return count, num_generated
 
 
 def make_scene_header(gaussians: Gaussians, provenance: bool) -> bytes:
     """Make the header of the standard layout, with or without `generated`."""
-    dtype = make_rows(gaussians[:0], provenance).dtype
+    dtype = make_row_type(gaussians, provenance)
     comment = MODE_COMMENT if gaussians.is_antialiased else None
     return make_header({"vertex": (len(gaussians), dtype)}, comment)
 
 
-def make_rows(gaussians: Gaussians, provenance: bool) -> np.ndarray:
-    """Make one row per Gaussian in the standard layout, with or without `generated`."""
-    rest = gaussians.sh[:, 1:].transpose(1, 2).flatten(1)
-    encoded = encode(gaussians)
-    columns = {
-        MEANS: gaussians.means,
-        _NORMALS: torch.zeros_like(gaussians.means),
-        _DC: gaussians.sh[:, 0],
-        tuple(f"f_rest_{i}" for i in range(rest.shape[1])): rest,
-        ("opacity",): encoded[:, 3:],
-        _SCALES: encoded[:, :3],
-        _QUATS: gaussians.quats,
-    }
-    dtype = [(name, "<f4") for names in columns for name in names]
-    table = torch.cat(list(columns.values()), dim=1).detach().float().numpy()
-    rows = np.ascontiguousarray(table, "<f4").view(dtype)[:, 0]
-    if provenance:
-        rows = require_fields(rows, [*dtype, ("generated", "u1")])
-        rows["generated"] = gaussians.generated.numpy()
-    return rows
+def make_row_type(gaussians: Gaussians, provenance: bool) -> np.dtype:
+    """Make the type of a row in the standard layout, with or without `generated`."""
+    rest = (f"f_rest_{i}" for i in range(3 * (gaussians.sh.shape[1] - 1)))
+    names = (*MEANS, *_NORMALS, *_DC, *rest, "opacity", *_SCALES, *_QUATS)
+    labels = [(LABEL_COLUMN, "u1")] if provenance else []
+    return np.dtype([*((name, "<f4") for name in names), *labels])
+
+
+def make_rows(gaussians: Gaussians, provenance: bool, block: slice | None = None) -> np.ndarray:
+    """Make one row per Gaussian, or per one of a block, in the standard layout."""
+    block = slice(0, len(gaussians)) if block is None else block
+    start, stop, _ = block.indices(len(gaussians))
+    properties = (
+        *(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities),
+        *(gaussians.sh, gaussians.encoded),
+    )
+    plain = make_row_type(gaussians, provenance=False)
+    table = np.empty((stop - start, len(plain.names or ())), np.float32)
+    kernels.encode_rows(0, len(table), start, *map(_to_array, properties), table)
+    rows = table.astype("<f4", copy=False).view(plain)[:, 0]
+    if not provenance:
+        return rows
+    dtype = make_row_type(gaussians, provenance=True)
+    return append_labels(rows, dtype, gaussians.generated[block].cpu().numpy())
+
+
+def append_labels(rows: ndarray, dtype: np.dtype, labels: UInt8[ndarray, "n"]) -> ndarray:
+    """Append a byte to each row, or replace its last one: `dtype` ends in `generated`."""
+    raw = np.empty((len(rows), dtype.itemsize), np.uint8)
+    width = dtype.itemsize - 1
+    raw[:, :width] = np.ascontiguousarray(rows).view(np.uint8).reshape(len(rows), -1)[:, :width]
+    raw[:, width] = labels
+    return raw.view(dtype)[:, 0]
 
 
 def describe_other_content(elements: Sequence[Element], missing: Sequence[str]) -> str | None:

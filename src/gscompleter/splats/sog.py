@@ -35,14 +35,18 @@ from gscompleter.splats.packing import (
     check_growth,
     drop_largest,
     restore_largest,
+    with_labels,
 )
 from gscompleter.splats.ply import encode
+from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.reading import read_bytes
 from gscompleter.system.files.writing import replace_file
 from gscompleter.types import SH_C0, Gaussians
 
 META = "meta.json"
+LABELS = "generated"
+"""Name in `meta.json` of an image of the labels, if anything was generated; ours alone."""
 PALETTE_WIDTH = 64
 """Entries of the SH palette in each row of its image."""
 MAX_ENTRY_GROWTH = 8
@@ -70,6 +74,17 @@ def read_sog(path: Path) -> Gaussians:
         return _read_files(lambda name: _read_entry(bundle, name))
 
 
+def read_sog_remarks(path: Path) -> object:
+    """Read the record in `meta.json`, or None if there is none."""
+    if path.is_dir():
+        return json.loads(read_bytes(path / META)).get(KEY)
+    data = read_bytes(path)
+    if not data.startswith(ZIP_MAGIC):
+        return json.loads(data).get(KEY)
+    with zipfile.ZipFile(io.BytesIO(data)) as bundle:
+        return json.loads(_read_entry(bundle, META)).get(KEY)
+
+
 def _read_entry(bundle: zipfile.ZipFile, name: str) -> bytes:
     entry = bundle.getinfo(name)
     if entry.flag_bits & 1:
@@ -94,13 +109,17 @@ def _decode_scene(read: FileReader, table: dict[str, Any]) -> Gaussians:
     logs = _decode_values(read, table["scales"], count, 3)
     rgba = _decode_values(read, table["sh0"], count, 4)
     rest = _decode_sh_rest(read, table["shN"], count) if table.get("shN") else None
-    return build_gaussians(
+    gaussians = build_gaussians(
         _decode_means(read, table["means"], count),
         _decode_quats(_read_pixels(read, quats, count)),
         np.exp(logs),
         rgba[:, 3] if is_coded else 1 / (1 + np.exp(-rgba[:, 3])),
         assemble_sh(0.5 + SH_C0 * rgba[:, :3], rest),
     )
+    if LABELS not in table:
+        return gaussians
+    (labels,) = table[LABELS]["files"]
+    return with_labels(gaussians, _read_pixels(read, labels, count)[:, 0])
 
 
 def _read_image(read: FileReader, name: object) -> UInt8[ndarray, "h w 4"]:
@@ -184,12 +203,14 @@ def _decode_sh_rest(read: FileReader, table: dict[str, Any], count: int) -> Floa
     return low + (high - low) * rows[number].astype(np.float32) / 255
 
 
-def write_sog(path: Path, gaussians: Gaussians) -> None:
+def write_sog(path: Path, gaussians: Gaussians, made_by: Provenance = NOTHING_KNOWN) -> None:
     """Write a bundle of version 2; the Gaussians should be sorted with `sort_along_morton`."""
     coded = _encode_scene(gaussians)
     model = "antialiased" if gaussians.is_antialiased else "default"
     table = {"version": 2, "count": len(gaussians), "model": model}
     table |= {name: {**values, "files": list(images)} for name, (values, images) in coded.items()}
+    if made_by.runs:
+        table[KEY] = made_by.to_json()
     files = {META: json.dumps(table).encode()}
     for _, images in coded.values():
         files |= images
@@ -214,6 +235,9 @@ def _encode_scene(gaussians: Gaussians) -> dict[str, Coded]:
     }
     if gaussians.sh_degree:
         coded["shN"] = _encode_sh_rest(gaussians)
+    if gaussians.generated.any():
+        labels = _encode_image(gaussians.generated[:, None].expand(-1, 3).numpy())
+        coded[LABELS] = ({}, {"generated.webp": labels})
     return coded
 
 

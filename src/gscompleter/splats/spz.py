@@ -11,6 +11,8 @@ from __future__ import annotations
 import gzip
 import io
 import struct
+import zlib
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -50,6 +52,10 @@ COLOR_SCALE = 0.15
 SIGN_SIZE_BITS = (1, 9) * 3
 """Bits of sign and size of three components of a rotation."""
 MAX_FRACTIONAL_BITS = 16
+BLOCK = 1 << 16
+"""Gaussians that are encoded at a time."""
+GZIP_HEADER = gzip.compress(b"", compresslevel=6, mtime=0)[:10]
+"""Signature, method, no time and the mark of the system, as the module `gzip` writes them."""
 
 
 class SpzHeader(NamedTuple):
@@ -76,7 +82,11 @@ class SpzHeader(NamedTuple):
 
 def read_spz(path: Path) -> Gaussians:
     """Read a .spz of SH degree 0 to 3, in the axes of a .ply."""
-    data = read_bytes(path)
+    return decode_spz(read_bytes(path))
+
+
+def decode_spz(data: bytes) -> Gaussians:
+    """Decode the bytes of a .spz, in the axes of a .ply."""
     if data.startswith(GZIP):
         data = _unpack_gzip(data)
     header = _parse_header(data)
@@ -184,31 +194,54 @@ def write_spz(path: Path, gaussians: Gaussians) -> None:
 
 def encode_spz(path: Path, gaussians: Gaussians) -> bytes:
     """Encode a .spz of version 3 in the finest possible steps; `path` is for errors."""
+    return encode_spz_blocks(path, lambda: (gaussians[block] for block in _cut(len(gaussians))))
+
+
+def encode_spz_blocks(path: Path, make_blocks: Callable[[], Iterable[Gaussians]]) -> bytes:
+    """Encode a .spz of the blocks of a scene, which are made twice, one after the other."""
+    parts = [(len(block), block.means.abs().amax().item()) for block in make_blocks() if len(block)]
+    bits = _choose_fractional_bits(path, max(farthest for _, farthest in parts))
+    # Each attribute of all Gaussians is one stream.
+    streams: list[list[bytes]] = [[] for _ in range(6)]
+    for block in make_blocks():
+        for stream, content in zip(streams, _encode_streams(block, bits), strict=True):
+            stream.append(content)
+        degree = block.sh_degree
+        flags = ANTIALIASED_FLAG if block.is_antialiased else 0
+    header = HEADER.pack(MAGIC, 3, sum(count for count, _ in parts), degree, bits, flags, 0)
+    # The stream of a .gz with the header that Python writes, whatever its level.
+    packer = zlib.compressobj(6, zlib.DEFLATED, 31)
+    packed = [packer.compress(header)]
+    for stream in streams:
+        packed += [packer.compress(content) for content in stream]
+        stream.clear()
+    content = b"".join([*packed, packer.flush()])
+    return GZIP_HEADER + content[len(GZIP_HEADER) :]
+
+
+def _cut(count: int) -> Iterator[slice]:
+    return (slice(start, start + BLOCK) for start in range(0, count, BLOCK))
+
+
+def _encode_streams(gaussians: Gaussians, bits: int) -> tuple[bytes, ...]:
+    """Encode positions, opacities, colours, scales, rotations and SH, in the axes of a .ply."""
     turned = rotate_half_turn(gaussians, HALF_TURN_X)
-    bits = _choose_fractional_bits(path, turned)
-    flags = ANTIALIASED_FLAG if gaussians.is_antialiased else 0
-    header = HEADER.pack(MAGIC, 3, len(turned), turned.sh_degree, bits, flags, 0)
     constant = 0.5 + COLOR_SCALE * turned.sh[:, 0].numpy()
     rest = turned.sh[:, 1:].reshape(len(turned), -1).numpy()
     log_scales = encode(gaussians)[:, :3].numpy()
-    body = b"".join(
-        (
-            header,
-            _pack_positions(turned.means.numpy(), bits),
-            _quantize_to_bytes(turned.opacities.numpy() * 255),
-            _quantize_to_bytes(constant * 255),
-            _quantize_to_bytes((log_scales + 10) * 16),
-            _pack_rotations(turned.quats.numpy()),
-            _quantize_to_bytes(rest * 128 + 128),
-        )
+    return (
+        _pack_positions(turned.means.numpy(), bits),
+        _quantize_to_bytes(turned.opacities.numpy() * 255),
+        _quantize_to_bytes(constant * 255),
+        _quantize_to_bytes((log_scales + 10) * 16),
+        _pack_rotations(turned.quats.numpy()),
+        _quantize_to_bytes(rest * 128 + 128),
     )
-    return gzip.compress(body, compresslevel=6, mtime=0)
 
 
-def _choose_fractional_bits(path: Path, gaussians: Gaussians) -> int:
+def _choose_fractional_bits(path: Path, farthest: float) -> int:
     """Choose the fractional bits that the farthest coordinate leaves of 23."""
     # Positions are signed numbers of 24 bits: what the whole part leaves of 23 is for the fraction.
-    farthest = gaussians.means.abs().max().item()
     bits = 23 - int(np.ceil(np.log2(farthest + 1)))
     if bits < 0:
         raise InputError(

@@ -14,8 +14,11 @@ from torch import Tensor
 
 from gscompleter.numerics.geometry import multiply_quats, rotations_to_quats
 from gscompleter.render.spherical_harmonics import evaluate_sh_basis
+from gscompleter.splats.packing import UnsupportedError
 from gscompleter.types import Gaussians
 
+MAX_SKEW = 1e-3
+"""Largest relative error of a similarity of a file."""
 HALF_TURN_X = (1.0, -1.0, -1.0)
 """Signs of the axes after half a turn about x."""
 HALF_TURN_Z = (-1.0, -1.0, 1.0)
@@ -36,6 +39,17 @@ def rotate_half_turn(gaussians: Gaussians, signs: tuple[float, float, float]) ->
         quats=gaussians.quats * torch.tensor((1.0, *signs)),
         sh=gaussians.sh * (after / before).round().mT,
     )
+
+
+def require_similarity(place: Float[Tensor, "4 4"], name: str) -> None:
+    """Refuse a transform that mirrors or stretches; sentences call it `name`."""
+    # For s R, with s > 0, the determinant is s³ and the product with the transpose s² I.
+    linear = place[:3, :3]
+    volume = float(torch.linalg.det(linear))
+    shape = linear @ linear.T / max(volume, 1e-30) ** (2 / 3)
+    identity = torch.eye(3, dtype=place.dtype)
+    if not volume > 0 or not torch.allclose(shape, identity, atol=MAX_SKEW):
+        raise UnsupportedError(f"has a {name} that mirrors Gaussians or stretches them unevenly")
 
 
 def transform_gaussians(gaussians: Gaussians, similarity: Float[Tensor, "4 4"]) -> Gaussians:

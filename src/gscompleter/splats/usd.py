@@ -1,49 +1,77 @@
-"""Gaussians in OpenUSD, written through usd-core (the extra `usd`).
+"""Gaussians in OpenUSD, through usd-core (the extra `usd`).
 
 A prim ParticleField3DGaussianSplat has arrays of linear scales, opacities in [0, 1], rotations, and
 SH coefficients, one Gaussian after the other. Axes are x right, y up, z back. A .usdz is a zip of
-one .usdc.
+one .usdc. Read are all such prims of a stage, each with its transform to the world, in single or
+half precision; a stage with z up is turned.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
+import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from numpy import ndarray
 
 from gscompleter.splats.glb import COLOR_SPACE
-from gscompleter.splats.transform import HALF_TURN_X, rotate_half_turn
+from gscompleter.splats.packing import (
+    NUM_SH_REST,
+    ZIP_MAGIC,
+    UnsupportedError,
+    build_gaussians,
+    with_labels,
+)
+from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
+from gscompleter.splats.transform import (
+    HALF_TURN_X,
+    require_similarity,
+    rotate_half_turn,
+    transform_gaussians,
+)
 from gscompleter.system.errors import InputError, OutputError, quote_value
 from gscompleter.system.files.unfinished import make_unfinished_name
 from gscompleter.system.files.writing import convert_write_errors, replace_file
-from gscompleter.types import Gaussians
+from gscompleter.types import Gaussians, merge
 
 if TYPE_CHECKING:
     from pxr import Usd
 
 KIND = "ParticleField3DGaussianSplat"
 SH_NAME = "radiance:sphericalHarmonics"
+LABELS = "generated"
+"""Attribute of the labels, if anything was generated; ours alone."""
 PROBE_BYTES = 2**20
 """Bytes that are written to find out why OpenUSD could not."""
+ENDINGS = (".usda", ".usdc", ".usd", ".usdz")
+LINEAR = "lin_"
+"""Start of the names of linear colour spaces."""
+Y_FROM_Z_UP = ((1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1))
+"""Turn from z up to y up, about x."""
 EXTENT = 3
 """Standard deviations of the Gaussians that lie within the bounds of the prim."""
 PACKAGED = (2000, 1, 1, 0, 0, 0, 0, 0, -1)
 """Time of the .usdc in a .usdz, so that the same Gaussians give the same bytes."""
 
 
-def write_usd(path: Path, gaussians: Gaussians) -> None:
+def write_usd(path: Path, gaussians: Gaussians, made_by: Provenance = NOTHING_KNOWN) -> None:
     """Write a .usda, .usdc or .usdz, by the name of `path`."""
     _require_usd()
     from pxr import UsdUtils
 
     stage = _make_stage(rotate_half_turn(gaussians, HALF_TURN_X))
+    if made_by.runs:
+        # OpenUSD has no lists of dictionaries there, so that the record is a text.
+        stage.GetRootLayer().customLayerData = {KEY: json.dumps(made_by.to_json())}
     ending = path.suffix.lower()
     with _make_folder_beside(path) as folder:
         # A .usdz is made of a .usdc.
@@ -93,7 +121,7 @@ def _convert_usd_errors(path: Path, folder: Path) -> Iterator[None]:
 
 def _make_stage(gaussians: Gaussians) -> Usd.Stage:
     """Make a stage of one prim, from Gaussians in its axes."""
-    from pxr import Usd, UsdGeom
+    from pxr import Sdf, Usd, UsdGeom, Vt
 
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -114,6 +142,9 @@ def _make_stage(gaussians: Gaussians) -> Usd.Stage:
     for name, value in values.items():
         prim.GetAttribute(name).Set(np.ascontiguousarray(value.numpy()))
     prim.GetAttribute(f"{SH_NAME}Degree").Set(gaussians.sh_degree)
+    if gaussians.generated.any():
+        labels = prim.CreateAttribute(LABELS, Sdf.ValueTypeNames.UCharArray, custom=True)
+        labels.Set(Vt.UCharArray.FromNumpy(gaussians.generated.numpy()))
     return stage
 
 
@@ -128,6 +159,107 @@ def _require_usd() -> None:
         raise InputError(sentence) from error
 
 
-def refuse_usd(path: Path) -> Gaussians:
-    """Refuse to read OpenUSD, which is only written."""
-    raise InputError(f"{quote_value(path)} is OpenUSD, which is not read; export it as .ply.")
+def read_usd(path: Path) -> Gaussians:
+    """Read all Gaussians of a stage, in the axes of a .ply and the unit of the stage."""
+    _require_usd()
+    from pxr import Usd, UsdGeom
+
+    with _open_stage(path) as stage:
+        prims = [
+            prim
+            for prim in Usd.PrimRange(stage.GetPseudoRoot(), Usd.TraverseInstanceProxies())
+            if prim.GetTypeName() == KIND
+        ]
+        if not prims:
+            raise UnsupportedError(f"is OpenUSD without Gaussians ({KIND})")
+        has_z_up = UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
+        parts = [_read_prim(prim, has_z_up) for prim in prims]
+    return rotate_half_turn(merge(parts), HALF_TURN_X)
+
+
+def read_usd_remarks(path: Path) -> object:
+    """Read the record in the `customLayerData` of a stage, or None if there is none."""
+    _require_usd()
+    with _open_stage(path) as stage:
+        text = stage.GetRootLayer().customLayerData.get(KEY)
+    return None if text is None else json.loads(text)
+
+
+@contextmanager
+def _open_stage(path: Path) -> Iterator[Usd.Stage]:
+    """Open a stage; OpenUSD knows the format of a file by its ending alone."""
+    from pxr import Usd, UsdUtils
+
+    with ExitStack() as stack:
+        place = path
+        if path.suffix.lower() not in ENDINGS:
+            # On Windows, a file that OpenUSD still maps cannot be removed.
+            temporary = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
+            folder = stack.enter_context(temporary)
+            starts = path.open("rb").read(len(ZIP_MAGIC))
+            ending = {b"PXR-": ".usdc", ZIP_MAGIC: ".usdz"}.get(starts, ".usda")
+            place = Path(shutil.copyfile(path, Path(folder) / f"splat{ending}"))
+        # Its warnings would be lines of their own; what matters raises an error.
+        delegate = UsdUtils.CoalescingDiagnosticDelegate()
+        stack.callback(delegate.TakeUncoalescedDiagnostics)
+        try:
+            yield Usd.Stage.Open(str(place))
+        except RuntimeError as error:  # of OpenUSD, about its own sources
+            raise ValueError("OpenUSD finds it damaged") from error
+
+
+def _read_prim(prim: Usd.Prim, has_z_up: bool) -> Gaussians:
+    """Read the Gaussians of a prim, in the world with y up."""
+    from pxr import Usd, UsdGeom
+
+    space = _find_color_space(prim)
+    if space.startswith(LINEAR):
+        raise UnsupportedError(f"has colours in the linear space {quote_value(space)}")
+    positions = _read_array(prim, "positions", 3)
+    count = len(positions)
+    degree = int(prim.GetAttribute(f"{SH_NAME}Degree").Get(Usd.TimeCode.EarliestTime()))
+    if not 0 <= degree < len(NUM_SH_REST):
+        raise UnsupportedError(f"has SH degree {degree}, and degree 0 to 3 is read")
+    width = 1 + NUM_SH_REST[degree]
+    gaussians = build_gaussians(
+        positions,
+        np.roll(_read_array(prim, "orientations", 4), 1, axis=1),
+        _read_array(prim, "scales", 3),
+        _read_array(prim, "opacities", 1)[:, 0],
+        _read_array(prim, f"{SH_NAME}Coefficients", 3).reshape(count, width, 3),
+    )
+    labels = prim.GetAttribute(LABELS)
+    if labels and labels.HasAuthoredValue():
+        gaussians = with_labels(gaussians, np.asarray(labels.Get(Usd.TimeCode.EarliestTime())))
+
+    # Matrices of OpenUSD act on rows.
+    matrix = UsdGeom.XformCache(Usd.TimeCode.EarliestTime()).GetLocalToWorldTransform(prim)
+    place = torch.tensor(np.array(matrix)).T
+    if has_z_up:
+        place = torch.tensor(Y_FROM_Z_UP, dtype=torch.float64) @ place
+    require_similarity(place, "prim")
+    return transform_gaussians(gaussians, place.float())
+
+
+def _find_color_space(prim: Usd.Prim) -> str:
+    """Find the name of the colour space of a prim or the nearest one above; empty for none."""
+    from pxr import Usd
+
+    # Not by `ComputeColorSpaceName`, which prints a warning about names that it does not know.
+    while prim:
+        attribute = Usd.ColorSpaceAPI(prim).GetColorSpaceNameAttr()
+        if attribute and attribute.HasAuthoredValue():
+            return str(attribute.Get())
+        prim = prim.GetParent()
+    return ""
+
+
+def _read_array(prim: Usd.Prim, name: str, width: int) -> Float[ndarray, "n w"]:
+    """Read an array of a prim, that of single precision if there are both."""
+    from pxr import Usd
+
+    for attribute in (prim.GetAttribute(name), prim.GetAttribute(f"{name}h")):
+        if attribute and attribute.HasAuthoredValue():
+            values = np.asarray(attribute.Get(Usd.TimeCode.EarliestTime()), np.float32)
+            return values.reshape(-1, width)
+    raise UnsupportedError(f"has Gaussians without {name}")

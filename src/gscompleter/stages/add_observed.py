@@ -30,7 +30,7 @@ from gscompleter.render.fit_colors import RELAXATION, fit_colors
 from gscompleter.render.protocols import FrozenScene
 from gscompleter.render.reference import adapt_to_mode
 from gscompleter.stages.align_depth import fit_affine
-from gscompleter.stages.error_budgets import meet_error_budgets
+from gscompleter.stages.error_budgets import meet_error_budgets, share_budgets
 from gscompleter.stages.new_photos import match_exposure
 from gscompleter.stages.refine import refine_opacities
 from gscompleter.stages.register import apply_affine
@@ -297,5 +297,9 @@ def fit_to_photographs(
     plans = [scene.vary_opacities(colored) for scene in frozen]
     settings = replace(state.config.refine, target_weight=1.0)
     refined, _ = refine_opacities(colored, plans[0], views[0], plans[1:], views[1:], settings)
-    budgets = [photo.budgets for photo in state.photos]
-    return meet_error_budgets(refined, frozen, budgets, plans, state.config.psnr_guard)
+    guard = state.config.psnr_guard
+    budgets = [
+        share_budgets(photo.budgets, scene.render.image, guard)
+        for photo, scene in zip(state.photos, frozen, strict=True)
+    ]
+    return meet_error_budgets(refined, frozen, budgets, plans, guard)

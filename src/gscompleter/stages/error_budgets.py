@@ -68,6 +68,55 @@ def set_error_budgets(
     return tuple(budgets)
 
 
+def set_total_budgets(
+    photograph: View,
+    image: Float[Tensor, "h w 3"],
+    holes: Bool[Tensor, "h w"],
+    config: PsnrGuardConfig = PsnrGuardConfig(),
+) -> tuple[ErrorBudget, ...]:
+    """Set the error budgets of a photograph for all targets together, as `set_error_budgets`."""
+    total = replace(
+        config,
+        max_drop=max(config.max_total_drop, 2 * config.max_drop),
+        max_ssim_drop=max(config.max_total_ssim_drop, 2 * config.max_ssim_drop),
+    )
+    return set_error_budgets(photograph, image, holes, total)
+
+
+def share_budgets(
+    budgets: Sequence[ErrorBudget],
+    image: Float[Tensor, "h w 3"],
+    config: PsnrGuardConfig = PsnrGuardConfig(),
+) -> tuple[ErrorBudget, ...]:
+    """Limit what one target may use of the error budgets for all targets.
+
+    `image` is the render of the scene at the photograph, before that target.
+    """
+    if not budgets:
+        return ()
+    clipped = image.clamp(0, 1)
+    sums = [compute_pixel_errors(clipped, budget).sum() for budget in budgets]
+    errors = torch.stack(sums).tolist()  # read from a GPU once for all budgets
+    return tuple(
+        share_budget(budget, error, config) for budget, error in zip(budgets, errors, strict=True)
+    )
+
+
+def share_budget(budget: ErrorBudget, error: float, config: PsnrGuardConfig) -> ErrorBudget:
+    """Limit what one target may add to an `error`, within the budget for all targets."""
+    if budget.metric == "mse":
+        own = add_psnr_loss(error, max(config.max_drop, MIN_PSNR_LOSS))
+        invisible = 10 ** (-config.invisible_psnr / 10)
+    else:
+        own = error + config.max_ssim_drop
+        invisible = 0.0
+    # Half of what is left: a later target is not refused because an earlier one took all. Before
+    # that, the fourth target in a row often was (decision 058).
+    half = error + max(budget.limit - error, 0.0) / 2
+    limit = max(min(own, half), min(invisible, budget.limit))
+    return replace(budget, limit=limit)
+
+
 def compute_pixel_errors(
     image: Float[Tensor, "h w 3"], budget: ErrorBudget
 ) -> Float[Tensor, "h w"]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gscompleter.numerics.image_ops import dilate, find_largest_regions
+from gscompleter.stages.fade_border import find_border
 from gscompleter.stages.target_view import TargetView, compute_hole_mask
 from gscompleter.state import Step, Unfilled
 from gscompleter.types import Render
@@ -17,7 +18,8 @@ def find_unfilled(after: Render, steps: Sequence[Step], view: TargetView) -> Unf
     order. The steps are rendered only if more than `Unfilled.MAX_SHARE` stays empty.
     """
     holes = view.state.config.holes
-    mask = dilate(view.empty, holes.dilation)
+    # Towards the end of the padding additions fade on purpose.
+    mask = dilate(view.empty, holes.dilation) & ~find_border(view)
     empty = mask & compute_hole_mask(after.alpha, holes)
     total = max(int(mask.sum()), 1)
     share = int(empty.sum()) / total

@@ -15,11 +15,12 @@ from gscompleter.numerics.image_ops import blur_gaussian, dilate
 from gscompleter.numerics.sky import mask_out_sky
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.protocols import FrozenScene
-from gscompleter.render.removed import find_removed
+from gscompleter.render.removed import find_removed, mask_removed
 from gscompleter.stages.enclosed_holes import keep_enclosed
+from gscompleter.stages.error_budgets import share_budgets
 from gscompleter.stages.select_anchor import AnchorChoice, compute_overlap, select_anchor
 from gscompleter.state import NEW_PHOTO_ID, Completion, TargetResult
-from gscompleter.types import Camera, GeneratorInput, PaddedCamera, Render, View, merge
+from gscompleter.types import Camera, ErrorBudget, GeneratorInput, PaddedCamera, Render, View, merge
 
 FULL_TRUST = 1.0
 """Mean trust of what a pixel shows from which on it is not recoloured."""
@@ -69,6 +70,9 @@ class TargetView:
         # Beside an object nothing is missing; nor is it where an object was taken away from there.
         if config.kind == "enclosed":
             holes = keep_enclosed(holes, self.render, self.camera.padded, self.render_at)
+        # After a removal nothing else is completed, and counts as no hole.
+        if self.opened is not None:
+            holes = holes & self.opened
         return holes if self.forced is None else holes | self.forced
 
     @cached_property
@@ -84,6 +88,14 @@ class TargetView:
             return forced
         alpha = self.scenes.renderer.render(merge(filled), self.camera.padded).alpha
         return forced & compute_hole_mask(alpha, self.state.config.holes)
+
+    @cached_property
+    def opened(self) -> Bool[Tensor, "h w"] | None:
+        """Pixels in which a removal may have opened a hole; None if all of them may be holes."""
+        state = self.state
+        if "removal" not in state.config.guards or len(state.source.removed) == 0:
+            return None
+        return mask_removed(state.source, self.camera.padded, self.scenes.renderer)
 
     def render_at(self, camera: Camera) -> Render:
         """Render the same scene at another camera."""
@@ -121,6 +133,15 @@ class TargetView:
     def frozen_photos(self) -> tuple[FrozenScene, ...]:
         """The same scene frozen at all photographs."""
         return self.at([photo.view for photo in self.state.photos])
+
+    @cached_property
+    def budgets(self) -> tuple[tuple[ErrorBudget, ...], ...]:
+        """Largest errors of each photograph that additions for this target may cause."""
+        guard = self.state.config.psnr_guard
+        return tuple(
+            share_budgets(photo.budgets, frozen.render.image, guard)
+            for photo, frozen in zip(self.state.photos, self.frozen_photos, strict=True)
+        )
 
     @property
     def anchor_render(self) -> Render:
@@ -177,8 +198,9 @@ class TargetView:
         config = self.state.config.holes
         render = self.render
         alpha = self.alpha
-        # Φ takes as holes what has too little alpha, which is more than the holes of an object.
-        if config.kind == "enclosed":
+        # Φ takes as holes what has too little alpha, which is more than the holes of an object, or
+        # those of a removal.
+        if config.kind == "enclosed" or self.opened is not None:
             alpha = alpha.where(self.holes, 1.0)
         # What stands in a forced hole is wrong, so that Φ must not see it.
         if self.forced is not None:

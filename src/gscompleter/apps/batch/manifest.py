@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.names import fold_name, make_valid_name
 from gscompleter.system.files.output_folder import read_command
 from gscompleter.system.files.reading import list_folders, read_bytes
 from gscompleter.system.jobs.jobs import Job
@@ -53,8 +54,10 @@ def read_manifest(manifest: Path, common: Mapping[str, Any], out: Path | None = 
     if not rows:
         raise InputError("The manifest names no job; give it a row for each scene.")
     names = [make_job_name(row) for row in rows]
-    name, count = Counter(names).most_common(1)[0]
+    # Where case does not count, two of them would be one folder.
+    folded, count = Counter(map(fold_name, names)).most_common(1)[0]
     if count > 1:
+        name = next(name for name in names if fold_name(name) == folded)
         raise InputError(
             f"Two jobs have the name {quote_value(name)}; give each row a name of its own."
         )
@@ -147,4 +150,4 @@ def parse_json_lines(text: str) -> Iterator[Options]:
 def make_job_name(row: Options) -> str:
     """Turn the name of a row, or that of its scene folder, into a valid file name."""
     name = str(row[NAME]) if NAME in row else Path(str(row.get(FOLDER, ""))).name
-    return re.sub(r"[^\w.+-]+", "-", name).strip(".")[:LONGEST_NAME] or "job"
+    return make_valid_name(name.strip(".")[:LONGEST_NAME]) or "job"

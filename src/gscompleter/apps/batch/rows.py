@@ -15,7 +15,7 @@ from gscompleter.config.settings import validate
 from gscompleter.system.errors import InputError, quote_value
 
 COMPLETE = "complete"
-RESERVED = ("out", "overwrite", "quiet", "threads", "dry-run", "help", "help-all")
+RESERVED = ("out", "overwrite", "quiet", "json", "threads", "dry-run", "help", "help-all")
 """Options that a batch sets for all jobs."""
 TRUE = ("true", "yes", "1")
 """Values of a CSV that set a flag."""

@@ -18,6 +18,7 @@ from rich.console import Console
 from gscompleter.apps.batch.engine import make_engine, parse_pairs
 from gscompleter.apps.batch.manifest import PATHS, list_results, read_manifest
 from gscompleter.apps.batch.rows import parse_row
+from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.command_line.exit_codes import choose_exit_code
 from gscompleter.apps.commands.batch import BatchOptions
 from gscompleter.system.errors import InputError, join_names, print_error, quote_value
@@ -88,6 +89,9 @@ def complete_batch(options: BatchOptions) -> int:
     print_failures(console, failures, len(share))
     sentence = f"{summarize_rows(out, share, left)} All results: {options.out}/index.html"
     console.print(sentence, markup=False, soft_wrap=True)
+    if options.json:
+        rows = [row for job in share if (row := read_row(job, out)) is not None]
+        print_json({"out": str(options.out), "failed": len(failures), "rows": rows})
     return choose_exit_code(len(failures), len(share))
 
 

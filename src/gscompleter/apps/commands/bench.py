@@ -36,8 +36,6 @@ class BenchOptions(RunOptions, WritingOptions):
     """Number of repetitions."""
     quick: bool = False
     """Run a quick check: the smallest case once, no growth."""
-    json: bool = False
-    """Print all measurements as JSON instead of tables."""
     out: Path | None = None
     """Folder for bench.json and tables.md."""
 

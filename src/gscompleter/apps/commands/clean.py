@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
-from gscompleter.apps.commands.shared_options import Device, SceneOptions
+from gscompleter.apps.commands.shared_options import SceneOptions
 from gscompleter.config import CleaningConfig
 from gscompleter.system.process import import_without_collection
 
@@ -29,7 +29,7 @@ class CleanOptions(SceneOptions):
     """File of Gaussians to clean."""
     dry_run: bool = False
     """Write only removed.ply, the Gaussians that would go, and summary.json."""
-    device: Device = "auto"
+    device: Literal["auto", "cpu", "cuda"] = "auto"
     """Device to compare photographs on."""
     config: CleaningConfig = CleaningConfig()
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from gscompleter.apps.command_line.answers import print_answer
 from gscompleter.apps.commands.shared_options import WritingOptions, list_inputs
 from gscompleter.system.files.overlap import refuse_input_file
 from gscompleter.system.process import import_without_collection
@@ -18,7 +19,8 @@ class ConvertOptions(WritingOptions):
     """Convert a file of Gaussians to another format, by the name of B.
 
     Formats are .ply, .compressed.ply, .spz, .splat, .sog, .glb (KHR_gaussian_splatting), and
-    .usda, .usdc and .usdz (OpenUSD, with usd-core). It also reads .ksplat and the folder of a .sog.
+    .usda, .usdc and .usdz (OpenUSD, with usd-core). It also reads .ksplat, the folder of a .sog,
+    and .glb with a .spz inside.
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="A")]
@@ -28,8 +30,8 @@ class ConvertOptions(WritingOptions):
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
     plain: bool = False
-    """Write no labels of generated Gaussians, which some programs misread: no property `generated`
-    in a .ply, no file beside other formats."""
+    """Write neither labels of generated Gaussians, which some programs misread (no property
+    `generated` in a .ply, no file beside other formats), nor who made them."""
 
     def check_overlap(self) -> None:
         """Refuse to write over the input."""
@@ -42,12 +44,7 @@ def run_convert(options: ConvertOptions) -> None:
     with import_without_collection():
         from rich.console import Console
 
-        from gscompleter.splats.formats import (
-            describe_mode_loss,
-            get_writer,
-            load_splat,
-            save_splat,
-        )
+        from gscompleter.splats.formats import convert_splat, get_writer
         from gscompleter.system.files.output_file import reserve_file
         from gscompleter.system.progress import show_preparation, show_progress
 
@@ -55,19 +52,18 @@ def run_convert(options: ConvertOptions) -> None:
     with (
         reserve_file(options.out, options.overwrite),
         show_progress(Console(stderr=True, quiet=options.quiet)),
+        show_preparation("converting"),
     ):
-        with show_preparation("reading"):
-            gaussians = load_splat(options.source, options.drop_nonfinite)
-        generated = gaussians.generated
-        written = gaussians
-        if options.plain:
-            # Without generated Gaussians a writer leaves the labels out altogether.
-            written = replace(gaussians, generated=generated.new_zeros(len(gaussians)))
-        with show_preparation("writing"):
-            save_splat(options.out, written)
-    if not options.quiet:
-        # Some formats cannot say that a scene is antialiased.
-        if note := describe_mode_loss(options.out, gaussians):
-            print(note)
-        count = int((generated > 0).sum())
-        print(f"{len(gaussians):,} Gaussians, {count:,} of them generated: {options.out}")
+        count, num_generated, note = convert_splat(
+            options.source, options.out, options.drop_nonfinite, not options.plain
+        )
+    # Some formats cannot say that a scene is antialiased.
+    notes = [] if note is None else [note]
+    content = {
+        "out": str(options.out),
+        "gaussians": count,
+        "generated": num_generated,
+        "notes": notes,
+    }
+    sentence = f"{count:,} Gaussians, {num_generated:,} of them generated: {options.out}"
+    print_answer(options, content, [*notes, sentence])

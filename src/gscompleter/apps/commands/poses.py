@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from gscompleter.apps.command_line.answers import print_answer
 from gscompleter.apps.commands.shared_options import ComputeOptions, NumFrames, WritingOptions
 from gscompleter.system.process import import_without_collection
 
@@ -39,12 +40,18 @@ def run_poses(options: PosesOptions) -> None:
 
     with show_progress(Console(stderr=True, quiet=options.quiet)):
         poses = find_poses(options.photographs, options.out, options.overwrite, options.frames)
-    if options.quiet:
-        return
-    for note in poses.notes:
-        print(note)
-    print(
+    sentence = (
         f"{poses.num_registered} of {poses.photographs} cameras and {poses.points:,} points, "
         f"mean error {poses.error:.2f} px"
         f"{', found by an earlier run' if poses.reused else ''}: {options.out}"
     )
+    content = {
+        "out": str(options.out),
+        "cameras": poses.num_registered,
+        "photographs": poses.photographs,
+        "points": poses.points,
+        "error_px": poses.error,
+        "reused": poses.reused,
+        "notes": list(poses.notes),
+    }
+    print_answer(options, content, [*poses.notes, sentence])

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from gscompleter.apps.command_line.answers import print_answer
 from gscompleter.apps.commands.shared_options import Options
 from gscompleter.system.process import import_without_collection
 
@@ -26,5 +27,5 @@ def run_report(options: ReportOptions) -> None:
     with import_without_collection():
         from gscompleter.apps.report.page import REPORT_FILE, write_completion_page
     write_completion_page(options.out)
-    if not options.quiet:
-        print(options.out / REPORT_FILE)
+    path = options.out / REPORT_FILE
+    print_answer(options, {"report": str(path)}, [path])

@@ -18,11 +18,11 @@ from gscompleter.config.settings import Seed, Settings
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.jobs.engines import EngineName
 
+Device = Literal["auto", "cpu", "cuda", "mps"]
 Words = Annotated[tuple[int | str, ...] | None, tyro.conf.arg(metavar="PHOTO [PHOTO ...]")]
 Threads = Annotated[int, Interval(ge=1, le=1024)]
 Port = Annotated[int, Interval(ge=0, le=65535)]
 NumFrames = Annotated[int, Interval(ge=3, le=1000)]
-Device = Literal["auto", "cpu", "cuda"]
 Size = tuple[int, int] | int | Literal["full"]
 """Height and width, the longest side, or `full` for the photographs' own size."""
 DEFAULT_NUM_TARGETS = 4
@@ -37,7 +37,9 @@ class Options(Settings):
     """Options of every command that writes something."""
 
     quiet: bool = False
-    """Print errors only."""
+    """Print errors only, and what --json asks for."""
+    json: bool = False
+    """Print the result as one JSON object."""
 
     def check_overlap(self) -> None:
         """Raise an InputError if the output of the command is, holds or lies in an input."""
@@ -68,7 +70,7 @@ class RunOptions(ComputeOptions):
 
     device: Device = "auto"
     """Device to compute on. `auto` draws on an NVIDIA GPU if gsplat can, and runs networks on any
-    GPU that torch sees."""
+    GPU that torch sees; `mps` runs networks on the GPU of a Mac and draws on the CPU."""
     seed: Seed = 0
     """Seed of all random numbers. The same seed gives the same files on CPUs of one type."""
 

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from gscompleter.apps.command_line.answers import print_answer
 from gscompleter.apps.commands.shared_options import WritingOptions, list_inputs
 from gscompleter.system.files.overlap import refuse_input_file
 from gscompleter.system.files.writing import REMOVED_FILE
@@ -41,5 +42,6 @@ def run_strip(options: StripOptions) -> None:
     get_writer(options.out)  # refuses a name without a format
     with reserve_file(options.out, options.overwrite):
         num_given, num_generated = strip(options.completed, options.out)
-    if not options.quiet:
-        print(f"{num_given:,} Gaussians, {num_generated:,} generated ones removed: {options.out}")
+    content = {"out": str(options.out), "gaussians": num_given, "generated_removed": num_generated}
+    line = f"{num_given:,} Gaussians, {num_generated:,} generated ones removed: {options.out}"
+    print_answer(options, content, [line])

@@ -31,4 +31,4 @@ def run_tables(options: TablesOptions) -> None:
         from gscompleter.apps.evaluating.tables import write_and_print_tables
         from gscompleter.system.progress import show_progress
     with show_progress(Console(stderr=True, quiet=options.quiet)):
-        write_and_print_tables(options.out, options.quiet, options.fid)
+        write_and_print_tables(options.out, options.quiet, options.fid, as_json=options.json)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from gscompleter.apps.command_line.answers import print_answer
 from gscompleter.apps.commands.shared_options import ComputeOptions
 from gscompleter.system.errors import InputError
 from gscompleter.system.process import import_without_collection
@@ -34,8 +35,8 @@ def run_warmup(options: WarmupOptions) -> None:
     with show_progress(Console(stderr=True, quiet=options.quiet)):
         seconds = compile_kernels(list(PARTS))
         about_gpu = compile_gsplat()
-    if not options.quiet:
-        done = " already" if seconds is None else f", in {seconds:.1f} s"
-        print(f"All kernels are compiled{done}: {get_cache_folder()}")
-        if about_gpu is not None:
-            print(about_gpu)
+    done = " already" if seconds is None else f", in {seconds:.1f} s"
+    lines = [f"All kernels are compiled{done}: {get_cache_folder()}"]
+    lines += [] if about_gpu is None else [about_gpu]
+    content = {"folder": str(get_cache_folder()), "seconds": seconds, "gpu": about_gpu}
+    print_answer(options, content, lines)

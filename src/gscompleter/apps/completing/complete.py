@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
@@ -11,14 +12,22 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
+from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.command_line.exit_codes import DONE, ERROR
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.completing.holes import EXPORTED, refuse_painted, write_holes
+from gscompleter.apps.completing.maker import describe_maker
 from gscompleter.apps.completing.marking import prepare_marked
 from gscompleter.apps.completing.preparation import Prepared
-from gscompleter.apps.completing.printing import print_completion, print_export, print_plan
+from gscompleter.apps.completing.printing import (
+    answer_completion,
+    describe_plan,
+    print_export,
+    print_plan,
+)
 from gscompleter.apps.completing.run_info import describe_run, read_held_out, refuse_results
 from gscompleter.apps.inputs.describing import describe_task, print_lines
+from gscompleter.apps.inputs.holes_file import HOLES_FILE
 from gscompleter.apps.inputs.task import CompletionTask
 from gscompleter.apps.report.completion import (
     IMAGES,
@@ -58,12 +67,11 @@ def complete_scene(options: CompleteOptions, prepare: Prepare = prepare_marked) 
         return DONE
     complete_folder(options, prepare)
     outcome = read_summary(options.out).outcome
-    if not options.quiet:
-        print_completion(options)
+    answer_completion(options)
     if outcome.status != "not-reconstructed":
         return DONE
-    # A quiet run that fails says why.
-    if options.quiet:
+    # A quiet run that fails says why, and so does one whose answer is for a program.
+    if options.quiet or options.json:
         print_error(outcome.headline)
     return ERROR
 
@@ -108,7 +116,9 @@ def plan_folder(options: CompleteOptions, prepare: Prepare) -> None:
         write_render_cameras(folder, ready)
         if ready.task.targets:
             write_plan_pictures(folder / IMAGES, ready, begun)
-    if not options.quiet:
+    if options.json:
+        print_json(describe_plan(options, ready.opened, ready.task.targets, holes))
+    elif not options.quiet:
         print_plan(options, ready.opened, ready.task.targets, holes)
 
 
@@ -123,7 +133,10 @@ def export_folder(options: CompleteOptions, prepare: Prepare) -> None:
             cameras = list(ready.cameras.values())
             ready = ready.with_choices(ready.explorer.plan(begun, cameras, options.max_targets))
         lines = write_holes(folder, ready, begun)
-    if not options.quiet:
+    if options.json:
+        content = json.loads((options.results / HOLES_FILE).read_bytes())
+        print_json({"out": str(options.results), "notes": list(lines), "holes": content})
+    elif not options.quiet:
         print_export(options, lines)
 
 
@@ -219,6 +232,7 @@ def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[st
             read_held_out(ready.opened, task, ready.cameras),
             ready.opened.files,
             has_searched=not options.from_photographs_only,
+            run=describe_maker(options, task, completion),
         )
     write_render_cameras(folder, ready)
     write_completion_page(folder)

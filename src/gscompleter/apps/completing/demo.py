@@ -9,7 +9,7 @@ from rich.console import Console
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.commands.demo import DemoOptions
 from gscompleter.apps.completing.complete import complete_folder
-from gscompleter.apps.completing.printing import print_completion
+from gscompleter.apps.completing.printing import answer_completion
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.report.completion import join_images
 from gscompleter.data.demo_scene import write_motorcycle_scene
@@ -52,6 +52,7 @@ def complete_demo(options: DemoOptions) -> None:
         write_image(folder / PICTURE_FILE, picture)
 
     # `output.write` has moved the results from its temporary folder to OUT by now.
-    if not options.quiet:
-        print_completion(replace(complete_options, out=options.out / "completion"))
+    done = replace(complete_options, out=options.out / "completion", json=options.json)
+    answer_completion(done, {"before_after": str(options.out / PICTURE_FILE)})
+    if not options.quiet and not options.json:
         print(f"Before and after, beyond either camera: {options.out / PICTURE_FILE}")

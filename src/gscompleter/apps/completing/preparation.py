@@ -44,7 +44,7 @@ from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.alignment.similarity import transform_camera
 from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import load_splat
-from gscompleter.splats.morton import argsort_nearby
+from gscompleter.splats.morton import sort_nearby
 from gscompleter.stages.context import prepare_single
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
@@ -291,14 +291,13 @@ def add_splat(
 def sort_splat(
     gaussians: Gaussians, splat_file: InputSplatFile
 ) -> tuple[Gaussians, InputSplatFile]:
-    """Sort a large splat along a Morton curve, and keep the order of its file."""
+    """Sort a large splat along a Morton curve, in place, and keep the order of its file."""
     # Gaussians of a file lie in random order, and each tile of an image would read memory all over
     # (decision 025). Files are written in the order of the given file, which `file_order` leads
     # back to.
     if len(gaussians) < MIN_PROXY_GAUSSIANS:
         return gaussians, splat_file
-    order = argsort_nearby(gaussians)
-    return gaussians[order], replace(splat_file, file_order=order)
+    return gaussians, replace(splat_file, file_order=sort_nearby(gaussians))
 
 
 def read_splat_alone(

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
+from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.inputs.holes_file import read_holes
 from gscompleter.apps.inputs.task import Opened, Target
@@ -18,7 +22,18 @@ from gscompleter.apps.report.schema import CompletionSummary, read_summary
 from gscompleter.evaluation.verdict.numbers import average, format_number, format_percent
 from gscompleter.evaluation.verdict.outcome import name_unused, select_testing
 from gscompleter.system.errors import quote_value
-from gscompleter.system.files.writing import COMPLETED_FILE, TARGETS_FILE
+from gscompleter.system.files.writing import COMPLETED_FILE, SUMMARY_FILE, TARGETS_FILE
+
+
+def answer_completion(
+    options: CompleteOptions, further: Mapping[str, Any] = MappingProxyType({})
+) -> None:
+    """Print a completion for people, or its summary and `further` entries as JSON."""
+    if options.json:
+        summary = json.loads((options.out / SUMMARY_FILE).read_bytes())
+        print_json({"out": str(options.out), **summary, **further})
+    elif not options.quiet:
+        print_completion(options)
 
 
 def print_completion(options: CompleteOptions) -> None:
@@ -87,6 +102,21 @@ def describe_result(summary: CompletionSummary, options: CompleteOptions) -> Ite
     yield f"Report: {options.out / REPORT_FILE}"
     if options.video and summary.targets:
         yield f"Video: {options.out / VIDEO_FILE}"
+
+
+def describe_plan(
+    options: CompleteOptions, opened: Opened, targets: Sequence[Target], holes: Sequence[float]
+) -> dict[str, Any]:
+    """Describe the targets and their holes as JSON."""
+    rows = [
+        {"name": opened.name_target(target), "frame": target.frame, "hole_fraction": hole}
+        for target, hole in zip(targets, holes, strict=True)
+    ]
+    return {
+        "out": str(options.out),
+        "cameras": str(options.out / TARGETS_FILE) if rows else None,
+        "targets": rows,
+    }
 
 
 def print_plan(

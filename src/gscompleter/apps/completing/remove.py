@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -18,6 +19,7 @@ from gscompleter.apps.inputs.removal import (
     check_selection,
     choose_gaussians,
     find_in_region,
+    widen_regions,
 )
 from gscompleter.editing.removal import remove_gaussians
 from gscompleter.planning.photographs import PhotographPlanner
@@ -33,10 +35,11 @@ class PreparedRemoval(Prepared):
 
     options: RemoveOptions
 
-    @property
+    @cached_property
     def selection(self) -> Selection:
-        """The Gaussians to remove, as the options select them."""
-        return make_selection(self.options)
+        """The Gaussians to remove, as the options select them, with the margin of regions."""
+        assert self.task.scene is not None
+        return widen_regions(make_selection(self.options), self.task.scene, self.task.origin)
 
     def begin(self) -> Completion:
         """Initialize the context, and remove the selected Gaussians from it."""
@@ -61,7 +64,8 @@ class PreparedRemoval(Prepared):
         selection = {name: getattr(self.options, name) for name in SELECTIONS}
         # JSON has no paths.
         texts = {name: str(selection[name]) for name in ("mask", "select") if selection[name]}
-        return {**super().describe_settings(), **selection, **texts}
+        margin = {"margin": self.selection.margin}
+        return {**super().describe_settings(), **selection, **texts, **margin}
 
 
 def prepare_removal(options: RemoveOptions, console: Console) -> PreparedRemoval:

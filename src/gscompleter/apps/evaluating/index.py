@@ -6,6 +6,7 @@ from dataclasses import replace
 
 from rich.console import Console
 
+from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.commands.index import IndexOptions
 from gscompleter.apps.evaluating.cases import print_skipped
 from gscompleter.evaluation import protocols
@@ -35,7 +36,7 @@ def write_index(options: IndexOptions) -> None:
                 "with a smaller step, or other data."
             )
         protocols.write_evaluation_index(options.out, index)
-    console = Console(quiet=options.quiet, highlight=False)
+    console = Console(quiet=options.quiet or options.json, highlight=False)
     print_skipped(skipped, console)
 
     # A split is one choice of context frames, and each of its targets is a case.
@@ -46,3 +47,12 @@ def write_index(options: IndexOptions) -> None:
         f"skipped: {options.out}",
         soft_wrap=True,
     )
+    if options.json:
+        print_json(
+            {
+                "out": str(options.out),
+                "cases": sum(targets),
+                "scenes": len(used),
+                "skipped": {clip.name: clip.reason for clip in skipped},
+            }
+        )

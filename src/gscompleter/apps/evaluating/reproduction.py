@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
 from gscompleter.apps.bench.report import describe_machine
+from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.command_line.exit_codes import choose_exit_code
 from gscompleter.apps.commands.evaluate import AUTO, EvaluateOptions
 from gscompleter.apps.evaluating.scoring import Scored, run_methods, score_methods
@@ -188,10 +191,22 @@ def reproduce(options: EvaluateOptions) -> int:
         raise InputError("None of the tables and figures could be begun; the lines above say why.")
 
     text = write_results(options)
-    if not options.quiet:
+    if options.json:
+        print_json(collect_outputs(options.out))
+    elif not options.quiet:
         Console(highlight=False).print(text, markup=False, soft_wrap=True)
     failed = sum(len(run.failures) for run in scored)
     return choose_exit_code(failed, sum(run.num_own_rows for run in scored))
+
+
+def collect_outputs(out: Path) -> dict[str, Any]:
+    """Collect the tables by name, with the paths of the page and of the figures."""
+    tables = sorted((out / TABLES).glob("*.json"))
+    return {
+        "results": str(out / RESULTS),
+        "tables": {path.stem: json.loads(path.read_bytes()) for path in tables},
+        "figures": [str(path) for path in sorted((out / FIGURES).glob("*"))],
+    }
 
 
 def write_output(

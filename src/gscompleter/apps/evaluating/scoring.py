@@ -11,6 +11,7 @@ from rich.console import Console
 
 from gscompleter.apps.batch.engine import make_engine
 from gscompleter.apps.batch.running import print_failures
+from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.command_line.exit_codes import choose_exit_code
 from gscompleter.apps.commands.evaluate import EvaluateOptions
 from gscompleter.apps.commands.shared_options import parse_resolution
@@ -35,7 +36,11 @@ def run_methods(options: EvaluateOptions) -> int:
     # A shard without cases has no tables.
     if list_row_paths(options.out):
         with show_progress(Console(stderr=True, quiet=options.quiet)):
-            write_and_print_tables(options.out, options.quiet, num_rows=scored.num_rows)
+            write_and_print_tables(
+                options.out, options.quiet, num_rows=scored.num_rows, as_json=options.json
+            )
+    elif options.json:
+        print_json({"cases": 0, "methods": {}, "failures": list(scored.failures)})
     return choose_exit_code(len(scored.failures), scored.num_own_rows)
 
 

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 from rich.console import Console
 from rich.table import Table
 
+from gscompleter.apps.command_line.answers import print_json
 from gscompleter.evaluation import tables
 from gscompleter.evaluation.store import list_row_paths
 from gscompleter.evaluation.tables import RunSummary
@@ -14,9 +16,13 @@ from gscompleter.system.progress import show_preparation
 
 
 def write_and_print_tables(
-    out: Path, quiet: bool, with_fid: bool = False, num_rows: int = 0
+    out: Path,
+    quiet: bool,
+    with_fid: bool = False,
+    num_rows: int = 0,
+    as_json: bool = False,
 ) -> None:
-    """Write the tables of an evaluation, and print the tables unless `quiet`.
+    """Write the tables of an evaluation, and print them as JSON, or as tables unless `quiet`.
 
     It repeats this if other shards added rows meanwhile and all `num_rows` are there.
     """
@@ -29,7 +35,9 @@ def write_and_print_tables(
         with show_preparation("tables"):
             summary = tables.write_tables(out, with_fid)
         rows = list_row_times(out)
-    if not quiet:
+    if as_json:
+        print_json(json.loads((out / "tables.json").read_bytes()))
+    elif not quiet:
         print_tables(summary, out)
 
 

@@ -24,6 +24,9 @@ from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.progress import track
 from gscompleter.types import Camera, Gaussians
 
+MAX_MARGIN = 0.05
+"""Largest margin of a region, relative to its smallest side or its radius."""
+
 
 @dataclass(frozen=True)
 class Selection:
@@ -41,6 +44,8 @@ class Selection:
     """File of selected Gaussians."""
     drop_nonfinite: bool = False
     """True to drop Gaussians of that file that contain NaN or infinity."""
+    margin: float = 0.0
+    """Distance by which boxes and the sphere reach farther than given, on every side."""
 
 
 def check_selection(selection: Selection) -> None:
@@ -142,12 +147,32 @@ def refuse_nothing(
     return chosen
 
 
+def widen_regions(
+    selection: Selection, scene: Gaussians, origin: Float[np.ndarray, "3"]
+) -> Selection:
+    """Let boxes and the sphere reach farther by one Gaussian of what they enclose.
+
+    The centres of the Gaussians on a face lie on both sides of it: a region drawn exactly on an
+    object would leave half of each face standing. `scene` is relative to `origin`.
+    """
+    points = scene.means.double() + torch.from_numpy(origin).to(scene.means.device)
+    inside = find_in_region(points, selection)
+    sides = [] if selection.sphere is None else [float(selection.sphere[3])]
+    lows, highs = split_boxes(selection.boxes)
+    sides += (highs - lows).flatten().tolist()
+    if not sides or not inside.any():
+        return selection
+    size = scene.scales[inside].amax(dim=1).median().item()
+    return replace(selection, margin=min(size, MAX_MARGIN * min(sides)))
+
+
 def find_in_region(points: Float[Tensor, "n 3"], selection: Selection) -> Bool[Tensor, "n"]:
     """Find points in the boxes and the sphere of a selection."""
-    inside = find_in_boxes(points, selection.boxes, selection.box_rotation)
+    margin = selection.margin
+    inside = find_in_boxes(points, selection.boxes, selection.box_rotation, margin)
     if selection.sphere:
         center = points.new_tensor(selection.sphere[:3])
-        inside |= (points - center).norm(dim=1) <= selection.sphere[3]
+        inside |= (points - center).norm(dim=1) <= selection.sphere[3] + margin
     return inside
 
 
@@ -159,9 +184,15 @@ def split_boxes(numbers: Sequence[float]) -> tuple[Float[Tensor, "b 3"], Float[T
 
 
 def find_in_boxes(
-    points: Float[Tensor, "n 3"], boxes: Sequence[float], rotation: Sequence[float]
+    points: Float[Tensor, "n 3"],
+    boxes: Sequence[float],
+    rotation: Sequence[float],
+    margin: float = 0.0,
 ) -> Bool[Tensor, "n"]:
-    """Find points inside of boxes that a wxyz quaternion rotates about their centres."""
+    """Find points inside of boxes that a wxyz quaternion rotates about their centres.
+
+    The boxes reach farther by `margin` on every side.
+    """
     # The square of a large number overflows, and a rotation has no length.
     largest = max(abs(part) for part in rotation)
     axes = quats_to_rotations(points.new_tensor([part / largest for part in rotation]))
@@ -172,7 +203,7 @@ def find_in_boxes(
         # Row vectors times the rotation are its inverse: from the world into the box's own axes,
         # in which it is |x| <= half of its size.
         local = (points - (low + high) / 2) @ axes
-        inside |= (local.abs() <= (high - low) / 2).all(dim=1)
+        inside |= (local.abs() <= (high - low) / 2 + margin).all(dim=1)
     return inside
 
 

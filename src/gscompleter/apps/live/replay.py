@@ -10,7 +10,7 @@ from rich.console import Console
 
 from gscompleter.apps.command_line.exit_codes import DONE
 from gscompleter.apps.commands.repair import RepairOptions
-from gscompleter.apps.completing.printing import print_completion
+from gscompleter.apps.completing.printing import answer_completion
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.live.serving import LIVE_RESULTS, begin_session, prepare, write_session
 from gscompleter.apps.live.session import Session, Step, apply_step
@@ -41,8 +41,7 @@ def replay_strokes(options: RepairOptions, strokes: Path) -> int:
             raise InputError("No step of the session changes the scene; nothing is written.")
         with output.write() as folder:
             write_session(folder, ready, session)
-    if not options.quiet:
-        print_completion(ready.options)
+    answer_completion(ready.options)
     return DONE
 
 

@@ -11,6 +11,7 @@ from typing import Any
 from PIL import Image
 from rich.console import Console
 
+from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.commands.live import LiveOptions
 from gscompleter.apps.commands.shared_options import DEFAULT_NUM_TARGETS, CompletingOptions
@@ -92,7 +93,10 @@ def serve(options: LiveOptions, page: LivePage) -> None:
     """Serve a page until Ctrl-C."""
     server = LiveServer(resolve_host(options.host), options.host, options.port, page)
     # Printed once the server listens.
-    print(f"{server.url} (Ctrl-C ends it)", flush=True)
+    if options.json:
+        print_json({"url": server.url})
+    else:
+        print(f"{server.url} (Ctrl-C ends it)", flush=True)
     if not options.no_open:
         webbrowser.open(server.url)
     with suppress(KeyboardInterrupt):

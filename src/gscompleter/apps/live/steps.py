@@ -14,7 +14,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.apps.inputs.removal import find_in_boxes
+from gscompleter.apps.inputs.removal import Selection, find_in_region, widen_regions
 from gscompleter.completer import GSCompleter
 from gscompleter.config import CompleterConfig
 from gscompleter.editing.cutting import Region
@@ -122,13 +122,16 @@ def remove_in_box(
 ) -> tuple[Completion, int]:
     """Remove all Gaussians in a box, as `remove` does, and count them.
 
-    The box is in the coordinates of the splat's file, in which the result begins at `origin`.
+    The box is in the coordinates of the splat's file, in which the result begins at `origin`. It
+    reaches farther by one Gaussian, as that of `remove`.
     """
+    given = Selection(corners, rotation)
+    selection = widen_regions(given, state.context[~state.source.gone_mask], origin)
 
     def contains(points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
         # Coordinates of maps are too large for float32.
         absolute = points.double() + torch.from_numpy(origin).to(points.device)
-        return find_in_boxes(absolute, corners, rotation)
+        return find_in_region(absolute, selection)
 
     with stage("removing"):
         context = contains(state.context.means) & ~state.source.gone_mask

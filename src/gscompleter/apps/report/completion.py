@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -32,7 +32,7 @@ from gscompleter.config.settings import COVERED
 from gscompleter.editing.removal import hide_removed
 from gscompleter.evaluation.metrics.coverage import RenderPair, compute_coverage
 from gscompleter.evaluation.metrics.image import compute_masked_psnr, ssim
-from gscompleter.evaluation.metrics.thin_gaps import measure_thin_gaps
+from gscompleter.evaluation.metrics.thin_gaps import measure_flight, measure_thin_gaps
 from gscompleter.evaluation.verdict.held_out import HeldOut, render_before_after, score_held_out
 from gscompleter.evaluation.verdict.outcome import judge_completion
 from gscompleter.evaluation.verdict.rows import ScoreRow
@@ -43,7 +43,8 @@ from gscompleter.reconstructors.features.consistency import measure_pose_errors
 from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
 from gscompleter.splats.layout import save_like, save_removed
-from gscompleter.splats.ply import save_ply
+from gscompleter.splats.ply import save_parts, save_ply
+from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, RunRecord
 from gscompleter.state import Completion, TargetResult
 from gscompleter.system.files.image import write_image
 from gscompleter.system.files.writing import (
@@ -97,12 +98,14 @@ def write_report(
     held_out: Sequence[HeldOut] = (),
     files: Mapping[int | None, str] = MappingProxyType({}),
     has_searched: bool = True,
+    run: RunRecord | None = None,
 ) -> dict[str, Any]:
     """Write the scenes, `images/`, `report.json` and `summary.json`; return the summary.
 
     `photographs` are the cameras of all, in the frame of the result. `render_around` renders the
     views whose coverage is measured. `files` are those of the photographs by frame. `has_searched`
-    is False if targets were neither named nor searched for.
+    is False if targets were neither named nor searched for. `run` is what the files say about who
+    made them.
     """
     at_targets = [
         render_before_after(completion, result.target, renderer) for result in completion.targets
@@ -115,7 +118,7 @@ def write_report(
     if not completion.targets:
         photos = [photo.view for photo in completion.photos]
         shown = [*photos, *(photograph.view for photograph in held_out)]
-    write_scenes(folder, completion, input_splat)
+    write_scenes(folder, completion, input_splat, run)
     around = render_around()
     name_view = "ignored" if run_info.get("scene", {}).get("renders_from") is None else "render"
     write_pictures(folder / IMAGES, completion, targets, at_targets, name_view)
@@ -245,14 +248,25 @@ def score_targets(
         t.view and hide_removed(t.view.to(device), completion.source, renderer) for t in targets
     ]
     scores = map_in_parallel(compute_scores, pairs, views)
-    rows = zip(targets, completion.targets, scores, strict=True)
+    flights = measure_flights(completion, renderer)
+    rows = zip(targets, completion.targets, scores, flights, strict=True)
     return [make_target_row(completion, *row) for row in rows]
 
 
+def measure_flights(completion: Completion, renderer: Renderer) -> list[float]:
+    """Compute the share of thin gaps on the way from a photograph to each target."""
+    # As stages see it: of a large scene its proxy, which shows the same gaps.
+    scene = merge(completion.parts)
+    photographs = [view.camera for view in completion.views]
+    return [
+        measure_flight(scene, photographs, result.target, renderer) for result in completion.targets
+    ]
+
+
 def make_target_row(
-    completion: Completion, target: Target, result: TargetResult, scores: Scores
+    completion: Completion, target: Target, result: TargetResult, scores: Scores, flight: float
 ) -> TargetRow:
-    """Make the row of a target."""
+    """Make the row of a target; `flight` is the share of thin gaps on the way to it."""
     fit = result.affine
     added = result.added
     return TargetRow(
@@ -271,6 +285,7 @@ def make_target_row(
         refused=result.refusal,
         offset=target.offset,
         thin_gaps=measure_thin_gaps(result.after.alpha),
+        flight_thin_gaps=flight,
         painter=result.painter or None,
     )
 
@@ -294,40 +309,53 @@ def thin_evenly(items: Sequence[Camera], most: int) -> Sequence[Camera]:
     return items[:: max(1, -(-len(items) // most))]
 
 
-def write_scenes(folder: Path, completion: Completion, input_splat: InputSplatFile | None) -> None:
-    """Write the three scenes, and the originals of recoloured Gaussians of an input splat."""
+def write_scenes(
+    folder: Path,
+    completion: Completion,
+    input_splat: InputSplatFile | None,
+    run: RunRecord | None = None,
+) -> None:
+    """Write the three scenes, and the originals of recoloured Gaussians of an input splat.
+
+    `run` is what the completed scene and the additions say about who made them.
+    """
+    made_by = NOTHING_KNOWN if run is None else Provenance((run,))
     added = completion.added
-    context = completion.context
     if input_splat is None:
-        completed = partial(save_ply, folder / COMPLETED_FILE, completion.scene, provenance=True)
+        order = torch.arange(len(completion.context))
+        parts = [(part, torch.arange(len(part))) for part in (completion.kept_context, added)]
+        completed = partial(
+            save_parts, folder / COMPLETED_FILE, parts, provenance=True, made_by=made_by
+        )
     else:
         # In the layout and the order of the user's file, so that what was kept is kept bit by bit.
-        context, changed = restore_file_order(completion, input_splat)
-        recolored = completion.recolored_context[completion.recolored_mask]
-        generated = merge([recolored, added])
-        completed = partial(save_completed_splat, folder, context, changed, generated, input_splat)
+        order = find_file_order(completion.context, input_splat)
+        generated = merge([completion.recolored, added])
+        completed = partial(
+            save_completed_splat,
+            folder,
+            completion.context,
+            completion.recolored_mask | completion.source.gone_mask,
+            generated,
+            input_splat,
+            run,
+        )
+    # The context has labels if it was completed before.
+    has_labels = bool((completion.context.generated > 0).any())
     writing = [
         completed,
-        partial(save_ply, folder / CONTEXT_FILE, context),
-        partial(save_ply, folder / GENERATED_FILE, added, provenance=True),
+        partial(save_parts, folder / CONTEXT_FILE, [(completion.context, order)], has_labels),
+        partial(save_ply, folder / GENERATED_FILE, added, provenance=True, made_by=made_by),
     ]
     map_in_parallel(lambda write: write(), writing)
 
 
-def restore_file_order(
-    completion: Completion, input_splat: InputSplatFile
-) -> tuple[Gaussians, Bool[Tensor, "n"]]:
-    """Sort the context and the mask of changed Gaussians in the order of the input file.
-
-    Changed are those that were recoloured or removed.
-    """
-    changed = completion.recolored_mask | completion.source.gone_mask
-    context = completion.context
+def find_file_order(context: Gaussians, input_splat: InputSplatFile) -> Int64[Tensor, "n"]:
+    """Find the Gaussians of the context in the order of the input file."""
     if input_splat.file_order is None:
-        return context, changed
+        return torch.arange(len(context))
     # `file_order[i]` is the place in the file of Gaussian i; sorting by it inverts that.
-    places = input_splat.file_order.argsort().to(context.means.device)
-    return context[places], changed[places]
+    return input_splat.file_order.argsort()
 
 
 def save_completed_splat(
@@ -336,35 +364,41 @@ def save_completed_splat(
     changed: Bool[Tensor, "n"],
     generated: Gaussians,
     input_splat: InputSplatFile,
+    run: RunRecord | None = None,
 ) -> None:
     """Write `completed.ply` in the layout of the input splat, and the originals of the changed.
 
-    Recoloured Gaussians stand among the generated ones, after all that kept its bits. The originals
-    of an earlier run are kept with those that it recoloured.
+    `changed` marks the Gaussians of the context that were recoloured or removed. Recoloured ones
+    stand among the generated ones, after all that kept its bits. The originals of an earlier run
+    are kept with those that it recoloured.
     """
     kept = input_splat.context_mask
+    order = find_file_order(context, input_splat)
     # A splat that was completed before has its originals beside it; they stay valid with it.
     earlier = input_splat.path.with_name(REMOVED_FILE)
     if not changed.any():
         if bool((context.generated > 0).any()) and earlier.is_file():
             shutil.copyfile(earlier, folder / REMOVED_FILE)
-        save_like(folder / COMPLETED_FILE, context, generated, input_splat.path, kept)
+        save_like(folder / COMPLETED_FILE, context, generated, input_splat.path, kept, order, run)
         return
     save_changed(folder, context, changed, input_splat)
-    stays = ~changed.cpu()
+    # The mask in the order of the file, over the Gaussians of the context and over all of the file.
+    stays = ~changed.cpu()[order]
+    order = order[stays]
     if kept is not None:
-        # From a mask over the context to one over all Gaussians of the file.
         stays = torch.zeros_like(kept).masked_scatter(kept, stays)
-    save_like(folder / COMPLETED_FILE, context[~changed], generated, input_splat.path, stays)
+    save_like(folder / COMPLETED_FILE, context, generated, input_splat.path, stays, order, run)
 
 
 def save_changed(
     folder: Path, context: Gaussians, changed: Bool[Tensor, "n"], input_splat: InputSplatFile
 ) -> None:
     """Write `removed.ply`, the originals of the changed Gaussians."""
-    rows = torch.nonzero(changed.cpu())[:, 0]
+    order = find_file_order(context, input_splat)
+    rows = changed.cpu()[order].nonzero()[:, 0]
+    removed = context[order[rows].to(context.means.device)].to("cpu")
     kept = input_splat.context_mask
-    save_removed(folder / REMOVED_FILE, context[changed].to("cpu"), rows, input_splat.path, kept)
+    save_removed(folder / REMOVED_FILE, removed, rows, input_splat.path, kept)
 
 
 def make_record(completion: Completion, photographs: Sequence[Camera]) -> CompletionRecord:

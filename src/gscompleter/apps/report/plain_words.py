@@ -195,6 +195,12 @@ def list_splat_notes(summary: CompletionSummary) -> Iterator[str]:
     num_removed = summary.gaussians.get("removed")
     if num_removed:
         yield f"{num_removed:,} {REMOVED_NOTE}"
+    margin = summary.settings.get("margin")
+    if isinstance(margin, float) and margin > 0:
+        yield (
+            f"The region of the removal reaches {margin:.3g} farther than given on every side, "
+            "which is the size of one Gaussian, so that faces go as a whole."
+        )
     num_recolored = summary.gaussians.get("recolored")
     if num_recolored:
         yield f"{num_recolored:,} {RECOLORED_NOTE}"

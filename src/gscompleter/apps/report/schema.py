@@ -91,6 +91,8 @@ class TargetRow(ScoreRow):
     """File of the anchor's photograph."""
     thin_gaps: float = 0.0
     """Share of the image that is cracks thinner than 5 pixels, afterwards."""
+    flight_thin_gaps: float = 0.0
+    """The same at four cameras between the nearest photograph and the target, on average."""
     painter: str | None = None
     """Who painted the image from which Gaussians were added; None if a generator made it."""
 

@@ -83,10 +83,10 @@ def load_viewer_files(after: Path, before: Path | None, drop_nonfinite: bool) ->
     scene = load_splat(after, drop_nonfinite)
     if before is not None:
         return ViewerContent(after.name, scene, load_splat(before, drop_nonfinite))
-    observed = scene[scene.generated == 0]
+    is_observed = scene.generated == 0
     # Without anything generated or anything observed there is only one state to show.
-    shown = observed if 0 < len(observed) < len(scene) else None
-    return ViewerContent(after.name, scene, shown)
+    has_two_states = bool(is_observed.any()) and not bool(is_observed.all())
+    return ViewerContent(after.name, scene, scene[is_observed] if has_two_states else None)
 
 
 def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:
@@ -99,14 +99,23 @@ def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:
         transform=np.array(summary.frame.transform),
         origin=np.array(summary.frame.origin),
     )
+    cameras, notes = load_known_cameras(folder, summary, content)
+    return replace(content, cameras=cameras, notes=notes)
+
+
+def load_known_cameras(
+    folder: Path, summary: CompletionSummary, content: ViewerContent
+) -> tuple[tuple[ViewerCamera, ...], tuple[str, ...]]:
+    """Load the targets and the photographs of a completion, with notes on what is missing."""
     targets = load_target_cameras(folder, summary, content)
     # The poses of photographs that had none lie in the folder; others stay where the user has them.
     if summary.scene.renders_from is not None:
-        return replace(content, cameras=(*targets, *load_render_cameras(folder, summary, content)))
+        return (*targets, *load_render_cameras(folder, summary, content)), ()
     if summary.settings.get("folder") is None:
         # `Completion.save` got its photographs as values, which have no file.
-        note = "The context photographs are not shown, because no folder of them is known."
-        return replace(content, cameras=targets, notes=(*content.notes, note))
+        return targets, (
+            "The context photographs are not shown, because no folder of them is known.",
+        )
     source = Path(str(summary.settings.get("folder")))
     if summary.scene.format == "photographs":
         source = folder / POSES
@@ -114,8 +123,8 @@ def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:
         photographs = load_context_cameras(source, summary, content)
     except InputError:
         note = f"The context photographs are not shown, because {quote_value(source)} was moved."
-        return replace(content, cameras=targets, notes=(note,))
-    return replace(content, cameras=(*targets, *photographs))
+        return targets, (note,)
+    return (*targets, *photographs), ()
 
 
 def load_target_cameras(

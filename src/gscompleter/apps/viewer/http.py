@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
@@ -28,6 +29,9 @@ class PageHandler(BaseHTTPRequestHandler):
 
 class PageServer(ThreadingHTTPServer):
     """A server of pages, whose threads end with the process."""
+
+    # Windows would let two servers share a port, and elsewhere a port is free again at once.
+    allow_reuse_address = os.name == "posix"
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Ignore a browser that leaves while it is answered; report any other error."""

@@ -11,19 +11,19 @@ import html
 import json
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gscompleter.apps.viewer.exhibit import ViewerCamera, ViewerContent
 from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.numerics.geometry import embed_cameras, is_inside, project
-from gscompleter.splats.spz import encode_spz
+from gscompleter.splats.spz import BLOCK, encode_spz_blocks
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import encode_text
 from gscompleter.types import Camera, Gaussians
@@ -40,6 +40,8 @@ MAX_DISTANCE = 4096.0
 """Largest distance of a Gaussian from the centre, in page units; leaves ten fractional bits."""
 PART = 48_000_000
 """Bytes of Gaussians per script element, below the longest string of any browser."""
+SOURCES_MARK = "\0"
+"""Character that stands in the page for its sources, and that no text of it can have."""
 THREE_FROM_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
 """Half a turn about x, for the axes of the world and of a camera."""
 MAX_LANDMARKS = 100_000
@@ -98,15 +100,20 @@ def make_page(
     """
     frame = compute_page_frame(viewer_content.after)
     after = viewer_content.after
-    parts = {} if viewer_content.before is None else {"before": viewer_content.before}
-    parts |= {
-        "observed": after[after.generated == 0],
-        "generated": after[after.generated > 0],
+    # The Gaussians of each layer by number: a copy of a layer would take as much as its scene.
+    scenes = {} if viewer_content.before is None else {"before": viewer_content.before}
+    scenes |= {"observed": after, "generated": after}
+    layers = {name: torch.arange(len(scene)) for name, scene in scenes.items()}
+    layers["observed"] = (after.generated == 0).nonzero()[:, 0].cpu()
+    layers["generated"] = (after.generated > 0).nonzero()[:, 0].cpu()
+    shown = {
+        name: rows[is_within_page(scenes[name], frame).cpu()[rows]] for name, rows in layers.items()
     }
-    parts = {name: part.to("cpu") for name, part in parts.items()}
-    layers = {name: frame.normalize(part) for name, part in parts.items()}
-    shown = {name: part[is_within_page(parts[name], frame)] for name, part in layers.items()}
-    sources = {name: encode_spz(Path(name), part) for name, part in shown.items() if len(part) > 0}
+    sources = {
+        name: encode_layer(name, scenes[name], rows, frame)
+        for name, rows in shown.items()
+        if len(rows) > 0
+    }
     if not sources.keys() - {"before"}:
         raise InputError(f"{quote_value(viewer_content.title)} has nothing that a page can show.")
 
@@ -116,15 +123,16 @@ def make_page(
         del sources["before"]
         layer_sources["before"] = "observed"
 
-    means = torch.cat([layers["observed"].means, layers["generated"].means]).double()
-    landmarks = means[:: max(1, len(means) // MAX_LANDMARKS)]
+    order = torch.cat([layers["observed"], layers["generated"]])
+    order = order[:: max(1, len(order) // MAX_LANDMARKS)].to(after.means.device)
+    landmarks = frame.normalize(after[order]).means.double().cpu()
     cameras = viewer_content.cameras or (make_overview(viewer_content.after),)
     content = {
         "title": viewer_content.title,
         "frame": {"centre": frame.centre.tolist(), "unit": frame.unit},
         "counts": {name: len(part) for name, part in shown.items()},
         "layers": layer_sources,
-        "antialiased": {name: part.is_antialiased for name, part in layers.items()},
+        "antialiased": {name: scene.is_antialiased for name, scene in scenes.items()},
         "path": plan_path([camera.camera for camera in cameras]),
         "live": is_live,
         "shots": [describe_camera(camera, frame, landmarks) for camera in cameras],
@@ -132,17 +140,35 @@ def make_page(
     }
     omitted = sum(len(layers[name]) - len(shown[name]) for name in ("observed", "generated"))
     notes = (f"{omitted:,} Gaussians are too far away to be shown.",) if omitted else ()
-    page = fill_template(content, make_scripts(sources))
-    return encode_text(page), (*viewer_content.notes, *notes)
+    # Most bytes of the page are those of its sources, which are joined to it once.
+    head, tail = fill_template(content, SOURCES_MARK).split(SOURCES_MARK)
+    page = [encode_text(head), *make_scripts(sources), encode_text(tail)]
+    return b"".join(page), (*viewer_content.notes, *notes)
 
 
-def make_scripts(sources: Mapping[str, bytes]) -> list[str]:
-    """Make the script elements that hold the bytes of each source in base64, in parts."""
-    return [
-        f'<script>gscPart("{name}", "{base64.b64encode(part).decode()}");</script>'
-        for name, content in sorted(sources.items())
-        for part in (content[start : start + PART] for start in range(0, len(content), PART))
-    ]
+def encode_layer(name: str, scene: Gaussians, rows: Int64[Tensor, "m"], frame: PageFrame) -> bytes:
+    """Encode rows of a scene as a .spz in the frame of the page, some at a time."""
+
+    def make_blocks() -> Iterator[Gaussians]:
+        for block in rows.split(BLOCK):
+            yield frame.normalize(scene[block.to(scene.means.device)]).to("cpu")
+
+    return encode_spz_blocks(Path(name), make_blocks)
+
+
+def make_scripts(sources: dict[str, bytes]) -> Iterator[bytes]:
+    """Make the script elements that hold the bytes of each source in base64, piece by piece.
+
+    The sources are taken out of the table one by one. Each element but the first begins a line.
+    """
+    separator = b""
+    for name in sorted(sources):
+        content = sources.pop(name)
+        for start in range(0, len(content), PART):
+            yield separator + b'<script>gscPart("%s", "' % name.encode()
+            yield base64.b64encode(content[start : start + PART])
+            yield b'");</script>'
+            separator = b"\n"
 
 
 def make_overview(scene: Gaussians) -> ViewerCamera:
@@ -194,8 +220,8 @@ def plan_path(cameras: Sequence[Camera]) -> list[tuple[int, float]]:
     return list(zip(stops, [0.0, *times.tolist()], strict=True))
 
 
-def fill_template(content: Mapping[str, Any], scripts: Sequence[str]) -> str:
-    """Fill the template `viewer.html`.
+def fill_template(content: Mapping[str, Any], scripts: str) -> str:
+    """Fill the template `viewer.html`, with `scripts` in the place of the elements of its sources.
 
     External text is inserted as JSON without `<`, which no HTML parser can misread.
     """
@@ -204,7 +230,7 @@ def fill_template(content: Mapping[str, Any], scripts: Sequence[str]) -> str:
         "origins": "'self' data: blob:" if content["live"] else "data: blob:",
         "style": read_asset("viewer.css"),
         "program": read_program(),
-        "parts": "\n".join(scripts),
+        "parts": scripts,
         # `</script>` in a text would end the element.
         "data": json.dumps(content, sort_keys=True).replace("<", "\\u003c"),
     }

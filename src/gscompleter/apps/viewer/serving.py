@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import os
 import webbrowser
+from collections.abc import Sequence
 from contextlib import suppress
 from http.server import ThreadingHTTPServer
 
+from gscompleter.apps.command_line.answers import print_answer, print_json
 from gscompleter.apps.commands.view import ViewOptions
 from gscompleter.apps.viewer import packages
 from gscompleter.apps.viewer.exhibit import (
@@ -36,33 +38,37 @@ def show_scenes(options: ViewOptions) -> None:
             raise InputError(f"{name} is no .html file; name it *.html.", "save")
         # Reserved first: a file that may not be replaced ends the command before scenes are read.
         with reserve_file(options.save, options.overwrite):
-            page = load_page(options)
+            page, notes = load_page(options)
             with replace_file(options.save) as file:
                 file.write(page)
-        if not options.quiet:
-            print(options.save)
+        content = {"page": str(options.save), "notes": list(notes)}
+        print_answer(options, content, [*notes, options.save])
         return
 
-    page = load_page(options)
+    page, notes = load_page(options)
     with make_page_server(page, options.port) as server, suppress(KeyboardInterrupt):
         address = f"http://{ADDRESS}:{server.server_address[1]}/"
         # Printed once the server listens.
-        print(f"{address} (Ctrl-C ends it)", flush=True)
+        if options.json:
+            print_json({"url": address, "notes": list(notes)})
+        else:
+            print(
+                *(() if options.quiet else notes),
+                f"{address} (Ctrl-C ends it)",
+                sep="\n",
+                flush=True,
+            )
         if not options.no_open:
             webbrowser.open(address)
         server.serve_forever()
 
 
-def load_page(options: ViewOptions) -> bytes:
-    """Make the page of the scenes and cameras of the options, and print its notes."""
+def load_page(options: ViewOptions) -> tuple[bytes, Sequence[str]]:
+    """Make the page of the scenes and cameras of the options, with notes on it."""
     # Libraries first: they may have to be downloaded, and a lack of network is said before large
     # scenes are read.
     libraries = packages.load_libraries()
-    page, notes = make_page(load_content(options), libraries)
-    if not options.quiet:
-        for note in notes:
-            print(note)
-    return page
+    return make_page(load_content(options), libraries)
 
 
 def load_content(options: ViewOptions) -> ViewerContent:

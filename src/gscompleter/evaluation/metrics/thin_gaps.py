@@ -13,27 +13,20 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.numerics.geometry import measure_baseline
-from gscompleter.numerics.image_ops import dilate
+from gscompleter.numerics.image_ops import keep_thin
 from gscompleter.planning.candidates import interpolate_camera
 from gscompleter.render.protocols import Renderer
 from gscompleter.types import Camera, Gaussians
 
 OPAQUE = 0.85
 """Alpha below which black is seen through a surface."""
-RADIUS = 2
-"""Half the width, in pixels, of the square that fits into a gap that is not thin: 5 pixels."""
 FLIGHT_SHARES = (0.2, 0.4, 0.6, 0.8)
 """Places of the cameras of a flight, as shares of the way to the target."""
 
 
 def find_thin_gaps(alpha: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
     """Find the pixels below `OPAQUE` in structures thinner than 5 pixels."""
-    is_open = alpha < OPAQUE
-    # A morphological opening leaves what a square of 5 pixels fits into. One pixel more, as rims
-    # of wide gaps are not straight.
-    shrunk = ~dilate(~is_open, RADIUS)
-    wide = dilate(shrunk, RADIUS + 1)
-    return is_open & ~wide
+    return keep_thin(alpha < OPAQUE)
 
 
 def measure_thin_gaps(alpha: Float[Tensor, "h w"]) -> float:

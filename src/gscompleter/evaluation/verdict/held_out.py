@@ -18,6 +18,9 @@ from gscompleter.render.view_map import get_view_map
 from gscompleter.state import Completion
 from gscompleter.types import Camera, View
 
+BLOCK = 1_000_000
+"""Gaussians of a changed context that are copied at a time."""
+
 
 @dataclass(frozen=True)
 class HeldOut:
@@ -34,8 +37,10 @@ def render_before_after(completion: Completion, camera: Camera, renderer: Render
         before = renderer.freeze(completion.context, camera)
         # Without recolouring and removal the context is the same, and is projected once.
         after = before
-        if completion.kept_context is not completion.context:
-            after = renderer.freeze(completion.kept_context, camera)
+        if completion.has_changed_context:
+            after = renderer.freeze(completion.context[:0], camera)
+            for part in completion.iterate_kept(BLOCK):
+                after = after.extend(part)
         return RenderPair(before.render, after.composite(completion.added))
 
 

@@ -118,7 +118,7 @@ def parse_source(path: str, library: str = "diffusers") -> Source:
             f"There is no folder {path}, and it is no repository of the Hugging Face hub either; "
             f"give a folder that {library} saved, or USER/NAME or USER/NAME@COMMIT."
         )
-    usual = next((terms for part, terms in LICENCES.items() if part in name.lower()), None)
+    usual = find_usual_licence(name)
     terms = "the licence that its page states" + (f" (usually {usual})" if usual else "")
     return Source(location=name, revision=revision or "main", terms=terms)
 
@@ -142,6 +142,11 @@ def check_packages(name: str) -> None:
             f"The generator {name!r} needs {', '.join(missing)}; run `{INSTALL}`, or choose "
             "'warp-inpaint', which needs no weights."
         )
+
+
+def find_usual_licence(name: str) -> str | None:
+    """Find the usual licence of the family that a repository id names, or None."""
+    return next((terms for part, terms in LICENCES.items() if part in name.lower()), None)
 
 
 @contextmanager

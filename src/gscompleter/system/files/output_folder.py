@@ -20,6 +20,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
 from gscompleter.system.errors import InputError, join_names, quote_value
+from gscompleter.system.files.renaming import rename, replace
 from gscompleter.system.files.unfinished import (
     REPLACED_SUFFIX,
     UNFINISHED_PREFIX,
@@ -330,7 +331,7 @@ def _list_in_summary(draft: Path, command: str) -> None:
 def _publish(draft: Path, target: Path) -> None:
     """Give everything its final name, or nothing; replaced files are lost."""
     if not os.path.lexists(target):
-        os.rename(draft, target)
+        rename(draft, target)
         return
     replaced = target / f"{draft.name}{REPLACED_SUFFIX}"
     listed = read_listing(target)
@@ -382,11 +383,11 @@ def _rename_all(moves: list[tuple[Path, Path]]) -> None:
     """Do all renames, or none of them."""
     for number, move in enumerate(moves):
         try:
-            os.rename(*move)
+            rename(*move)
         except OSError:
             # In the reverse order, so that the summary, which left first, comes back last.
             for source, destination in reversed(moves[:number]):
-                os.rename(destination, source)
+                rename(destination, source)
             raise
 
 
@@ -431,7 +432,7 @@ def _finish_moves(draft: Path, target: Path, replaced: Path, listed: frozenset[s
     left = [n for n in listed - published if not os.path.lexists(replaced / n)]
     _make_folders(draft, target)
     for source, destination in _list_old_moves(target, replaced, left):
-        os.rename(source, destination)
+        rename(source, destination)
     for source, destination in _list_new_moves(draft, target):
-        os.replace(source, destination)
+        replace(source, destination)
     _remove_replaced(target, replaced, listed)

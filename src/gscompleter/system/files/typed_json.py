@@ -17,7 +17,7 @@ def read_typed_json(kind: type[T], path: Path, advice: str) -> T:
 
     Keys that the dataclass does not have are ignored.
     """
-    return _validate(kind, read_json(path, advice), quote_value(path), advice)
+    return validate_typed(kind, read_json(path, advice), quote_value(path), advice)
 
 
 def parse_typed_json(kind: type[T], content: bytes, name: str, advice: str) -> T:
@@ -26,10 +26,11 @@ def parse_typed_json(kind: type[T], content: bytes, name: str, advice: str) -> T
         parsed = json.loads(content)
     except (ValueError, RecursionError):
         raise InputError(f"{name} is no JSON; {advice}.") from None
-    return _validate(kind, parsed, name, advice)
+    return validate_typed(kind, parsed, name, advice)
 
 
-def _validate(kind: type[T], content: object, name: str, advice: str) -> T:
+def validate_typed(kind: type[T], content: object, name: str, advice: str) -> T:
+    """Validate values of JSON as a dataclass; sentences call them `name`, and end with `advice`."""
     from pydantic import TypeAdapter, ValidationError  # no help page waits for it
 
     try:

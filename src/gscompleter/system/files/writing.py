@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from gscompleter.system.errors import FullDiskError, OutputError, quote_value
+from gscompleter.system.files.renaming import replace
 from gscompleter.system.files.unfinished import make_unfinished_name
 
 SUMMARY_FILE = "summary.json"
@@ -57,7 +58,7 @@ def replace_file(path: Path | str, keep_existing: bool = False) -> Iterator[Bina
                 with suppress(OSError):
                     os.link(temporary, target)
             if not (keep_existing and target.exists()):
-                os.replace(temporary, target)
+                replace(temporary, target)
         finally:
             with suppress(OSError):
                 temporary.unlink()
@@ -68,7 +69,10 @@ def encode_text(text: str) -> bytes:
 
     Names of files may hold bytes that are no UTF-8; each becomes the sign for an unknown character.
     """
-    return text.encode("utf-8", "surrogatepass").decode("utf-8", "replace").encode()
+    try:
+        return text.encode()
+    except UnicodeEncodeError:
+        return text.encode("utf-8", "surrogatepass").decode("utf-8", "replace").encode()
 
 
 def refuse_special_file(path: Path) -> None:

@@ -1,0 +1,43 @@
+"""The command `inspect`: what is in a splat, and what of it is invented."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from gscompleter.apps.commands.shared_options import Device
+from gscompleter.config.settings import Settings
+from gscompleter.system.process import import_without_collection
+
+
+@dataclass(frozen=True, kw_only=True)
+class InspectOptions(Settings):
+    """Print what is in a splat, what of it is invented, by what, and how much of pictures that is.
+
+    Cameras are those of `--cameras`, or of the completion in whose folder FILE lies.
+    """
+
+    file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+    """File of Gaussians in any format that `convert` reads, or output folder of `complete`."""
+    cameras: Path | None = None
+    """Cameras whose pictures are measured: a file as in `complete --target`, or a folder with a
+    transforms.json or a COLMAP model; in the coordinates of the photographs if FILE lies in an
+    output folder, else of FILE."""
+    resolution: tuple[int, int] | None = None
+    """Image size (height and width) of cameras whose file has none."""
+    device: Device = "auto"
+    """Device that draws the pictures."""
+    json: bool = False
+    """Print the result as JSON."""
+
+
+def run_inspect(options: InspectOptions) -> None:
+    """Inspect the splat and print the result."""
+    # Imported here, so that help pages do not wait for torch.
+    with import_without_collection():
+        from gscompleter.apps.inspection import inspect_splat, print_inspection
+
+    print_inspection(inspect_splat(options), options.json)

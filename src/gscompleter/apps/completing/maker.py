@@ -1,0 +1,52 @@
+"""The record of a completion for the files that it writes: with which models, from what."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+from gscompleter.apps.commands.complete import CompleteOptions
+from gscompleter.apps.inputs.task import CompletionTask
+from gscompleter.apps.report.run_record import LICENCE, OWN_MODELS, make_run_record
+from gscompleter.models.diffusion.published import PE_FIELD, find_usual_licence
+from gscompleter.models.weights.published import PUBLISHED, UNSTATED
+from gscompleter.splats.provenance import ModelRecord, RunRecord, shorten
+from gscompleter.state import Completion
+
+PUBLISHED_BY_AUTHORS = {
+    "pe-field": ModelRecord("pe-field", PE_FIELD.location, "non-commercial, of FLUX.1-Kontext-dev"),
+}
+"""Generators whose default weights are not in the table of published weights."""
+
+
+def describe_maker(
+    options: CompleteOptions, task: CompletionTask, completion: Completion
+) -> RunRecord:
+    """Describe a completion as the run that made its files."""
+    synthesis = options.synthesis
+    weights = getattr(synthesis.make_settings(), "weights", None)
+    return make_run_record(
+        completion,
+        describe_model(options.reconstructor, options.weights),
+        None if options.depth == "none" else describe_model(options.depth, options.depth_weights),
+        describe_model(synthesis.generator, weights),
+        None if task.splat_file is None else task.splat_file.path,
+    )
+
+
+def describe_model(name: str, weights: Path | str | None) -> ModelRecord:
+    """Describe Ψ or Φ by its name on the command line, with weights that the user named."""
+    if weights is not None:
+        # The path of a file or folder tells about the machine, and its name no licence.
+        if os.path.exists(weights):
+            return ModelRecord(shorten(name), shorten(Path(weights).name))
+        return ModelRecord(shorten(name), shorten(str(weights)), find_usual_licence(str(weights)))
+    if name in OWN_MODELS:
+        return ModelRecord(name, None, LICENCE)
+    if name in PUBLISHED_BY_AUTHORS:
+        return PUBLISHED_BY_AUTHORS[name]
+    published = PUBLISHED.get(name)
+    if published is None:
+        return ModelRecord(shorten(name))
+    licence = published.weights_licence
+    return ModelRecord(name, published.name, None if licence == UNSTATED else shorten(licence))

@@ -1,0 +1,303 @@
+"""What is in a splat, and what of it is invented."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float, UInt8
+from rich.console import Console
+from rich.table import Table
+from torch import Tensor
+
+from gscompleter.apps.commands.inspect import InspectOptions
+from gscompleter.apps.commands.shared_options import Device
+from gscompleter.apps.report.schema import read_summary
+from gscompleter.apps.viewer.exhibit import (
+    ViewerContent,
+    load_known_cameras,
+    load_scene_cameras,
+)
+from gscompleter.apps.warmup import compile_kernels
+from gscompleter.evaluation.verdict.numbers import format_percent
+from gscompleter.numerics.value_checks import find_finite
+from gscompleter.render.device import choose_device
+from gscompleter.render.loading import load_renderer
+from gscompleter.render.protocols import Renderer
+from gscompleter.splats.foreign import resolve_splat
+from gscompleter.splats.formats import decode_splat, detect_splat_format, read_provenance
+from gscompleter.splats.provenance import ModelRecord, RunRecord
+from gscompleter.state import NEW_PHOTO_ID
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.writing import COMPLETED_FILE, SUMMARY_FILE
+from gscompleter.types import Camera, Gaussians, sh_from_rgb
+
+MIDDLE = (0.01, 0.99)
+"""Quantiles of the coordinates that floaters leave alone."""
+
+Bounds = tuple[tuple[float, float], ...]
+"""Smallest and largest x, y and z."""
+
+
+@dataclass(frozen=True)
+class RunRow:
+    """What one run added, or what has no run that says so."""
+
+    gaussians: int
+    """Gaussians with its labels."""
+    labels: tuple[int, int] | None
+    made_by: RunRecord | None
+    """None if the file does not say who added them."""
+
+
+@dataclass(frozen=True)
+class PictureRow:
+    """What a picture shows, in shares of its area that add up to 1."""
+
+    camera: str
+    invented: float
+    from_photographs: float
+    """Added or recoloured as photographs show."""
+    given: float
+    """Of the scene before the completion."""
+    empty: float
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What is in a splat."""
+
+    file: str
+    format: str
+    bytes: int | None
+    """Size of the file; None for a folder."""
+    gaussians: int
+    nonfinite: int
+    """Gaussians with NaN, infinity or no rotation, which nothing below counts."""
+    sh_degree: int
+    antialiased: bool
+    extent: Bounds
+    extent_of_98_percent: Bounds
+    """Without the hundredth at either end."""
+    invented: int
+    from_photographs: int
+    runs: tuple[RunRow, ...]
+    record_defect: str | None
+    """Why the record of the runs cannot be read; None if it can, or if there is none."""
+    pictures: tuple[PictureRow, ...]
+    notes: tuple[str, ...] = ()
+
+
+def inspect_splat(options: InspectOptions) -> Inspection:
+    """Inspect a file, and the pictures of it at the cameras that are known."""
+    path, folder = locate(options.file)
+    decoded = decode_splat(path)
+    finite = find_finite(decoded)
+    if not finite.any():
+        raise InputError(f"{quote_value(path)} holds no Gaussian that is finite; write it anew.")
+    gaussians = decoded[finite]
+    defect = None
+    runs: tuple[RunRecord, ...] = ()
+    try:
+        runs = read_provenance(path).runs
+    except InputError as error:
+        defect = str(error)
+    labels = gaussians.generated
+    cameras, notes = list_cameras(options, folder, gaussians)
+    low, high = gaussians.means.amin(0), gaussians.means.amax(0)
+    return Inspection(
+        str(path),
+        detect_splat_format(path),
+        None if path.is_dir() else path.stat().st_size,
+        len(decoded),
+        len(decoded) - len(gaussians),
+        gaussians.sh_degree,
+        gaussians.is_antialiased,
+        make_bounds(low, high),
+        make_bounds(*compute_middle(gaussians.means)),
+        int(find_invented(labels).sum()),
+        int((labels == NEW_PHOTO_ID).sum()),
+        tuple(list_runs(labels, runs)),
+        defect,
+        measure_pictures(gaussians, cameras, options.device) if cameras else (),
+        notes,
+    )
+
+
+def locate(file: Path) -> tuple[Path, Path | None]:
+    """Find the splat, and the folder of the completion that it lies in, or None."""
+    if (file / SUMMARY_FILE).is_file():
+        return file / COMPLETED_FILE, file
+    path = resolve_splat(file)
+    beside = path.parent
+    is_result = (beside / SUMMARY_FILE).is_file() and (beside / COMPLETED_FILE).is_file()
+    return path, beside if is_result else None
+
+
+def make_bounds(low: Float[Tensor, "3"], high: Float[Tensor, "3"]) -> Bounds:
+    """Pair the smallest and the largest coordinate of each axis."""
+    return tuple(zip(low.tolist(), high.tolist(), strict=True))
+
+
+def compute_middle(means: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
+    """Compute the quantiles `MIDDLE` of the coordinates, those of Gaussians that exist."""
+    # numpy sorts any number of them, and torch no more than 16 million.
+    low, high = np.quantile(means.numpy(), MIDDLE, axis=0, method="nearest")
+    return torch.from_numpy(low), torch.from_numpy(high)
+
+
+def find_invented(labels: UInt8[Tensor, "n"]) -> Tensor:
+    """Mark the Gaussians that were added or recoloured for a target, by their labels."""
+    return (labels > 0) & (labels != NEW_PHOTO_ID)
+
+
+def list_runs(labels: UInt8[Tensor, "n"], runs: Sequence[RunRecord]) -> Iterator[RunRow]:
+    """List what each run invented, and at last what no run claims."""
+    rest = find_invented(labels)
+    for run in runs:
+        mine = torch.zeros_like(rest)
+        if run.labels is not None:
+            first, last = run.labels
+            mine = rest & (labels >= first) & (labels <= last)
+        rest = rest & ~mine
+        yield RunRow(int(mine.sum()), run.labels, run)
+    if rest.any():
+        unknown = labels[rest]
+        yield RunRow(int(rest.sum()), (int(unknown.min()), int(unknown.max())), None)
+
+
+def list_cameras(
+    options: InspectOptions, folder: Path | None, gaussians: Gaussians
+) -> tuple[list[tuple[str, Camera]], tuple[str, ...]]:
+    """List the cameras of pictures with their names, and notes on those that are missing."""
+    content = ViewerContent("", gaussians, None)
+    summary = None if folder is None else read_summary(folder)
+    if summary is not None:
+        content = replace(
+            content,
+            transform=np.array(summary.frame.transform),
+            origin=np.array(summary.frame.origin),
+        )
+    if options.cameras is not None:
+        cameras = load_scene_cameras(
+            options.cameras, content.transform, content.origin, options.resolution
+        )
+        return [(f"Camera {number}", camera) for number, camera in enumerate(cameras, 1)], ()
+    if folder is None or summary is None:
+        return [], ()
+    known, notes = load_known_cameras(folder, summary, content)
+    return [(one.title, one.camera) for one in known], notes
+
+
+def measure_pictures(
+    gaussians: Gaussians, cameras: Sequence[tuple[str, Camera]], device: Device
+) -> tuple[PictureRow, ...]:
+    """Measure what pictures show of a splat whose labels are known."""
+    chosen = choose_device(device)
+    compile_kernels([chosen])
+    renderer = load_renderer(chosen)
+    painted = paint_labels(gaussians).to(chosen)
+    return tuple(
+        measure_picture(painted, name, camera.to(chosen), renderer) for name, camera in cameras
+    )
+
+
+def paint_labels(gaussians: Gaussians) -> Gaussians:
+    """Paint what is invented red, what photographs show green, and the rest blue."""
+    labels = gaussians.generated
+    from_photographs = labels == NEW_PHOTO_ID
+    colors = torch.stack([find_invented(labels), from_photographs, labels == 0], dim=1)
+    return replace(gaussians, sh=sh_from_rgb(colors.float()))
+
+
+def measure_picture(
+    painted: Gaussians, name: str, camera: Camera, renderer: Renderer
+) -> PictureRow:
+    """Measure a picture of painted Gaussians: each channel of a pixel is the weight of its kind."""
+    render = renderer.render(painted, camera)
+    invented, from_photographs, given = render.image.mean(dim=(0, 1)).tolist()
+    return PictureRow(name, invented, from_photographs, given, 1 - render.alpha.mean().item())
+
+
+def print_inspection(found: Inspection, as_json: bool) -> None:
+    """Print the result as JSON, or as lines and a table."""
+    if as_json:
+        print(json.dumps(asdict(found), indent=2))
+        return
+    console = Console(highlight=False, markup=False)
+    console.print(found.file, soft_wrap=True)
+    for title, text in describe_splat(found):
+        console.print(f"  {title:12} {text}", soft_wrap=True)
+    if found.pictures:
+        console.print(make_picture_table(found.pictures))
+    for note in found.notes:
+        console.print(note, soft_wrap=True)
+
+
+def describe_splat(found: Inspection) -> Iterator[tuple[str, str]]:
+    """Describe a splat in lines of a title and a text."""
+    size = "" if found.bytes is None else f", {found.bytes / 1e6:,.1f} MB"
+    yield "format", f"{found.format}{size}"
+    yield "Gaussians", f"{found.gaussians:,}, harmonics of degree {found.sh_degree}"
+    yield "not finite", f"{found.nonfinite:,}"
+    yield "antialiased", "yes" if found.antialiased else "no"
+    yield "extent", describe_bounds(found.extent)
+    yield "98 % of it", describe_bounds(found.extent_of_98_percent)
+    count = found.gaussians - found.nonfinite
+    yield "invented", f"{found.invented:,} ({format_percent(found.invented / count)})"
+    shown = format_percent(found.from_photographs / count)
+    yield "photographs", f"{found.from_photographs:,} ({shown}) added or recoloured as they show"
+    for row in found.runs:
+        yield "made by", describe_run(row)
+    if found.record_defect is not None:
+        yield "made by", found.record_defect
+    elif not found.runs:
+        yield "made by", "the file does not say"
+
+
+def describe_bounds(bounds: Bounds) -> str:
+    """Describe an extent in scene units."""
+    axes = zip("xyz", bounds, strict=True)
+    return ", ".join(f"{axis} {low:.4g} to {high:.4g}" for axis, (low, high) in axes)
+
+
+def describe_run(row: RunRow) -> str:
+    """Describe who made what, on one line."""
+    if row.labels is None:
+        part = "nothing invented"
+    else:
+        first, last = row.labels
+        labels = f"label {first}" if first == last else f"labels {first} to {last}"
+        part = f"{row.gaussians:,} of {labels}"
+    run = row.made_by
+    if run is None:
+        return f"{part}: the file does not say"
+    models = [describe_model(model) for model in (run.reconstructor, run.depth, run.generator)]
+    used = [model for model in models if model]
+    used += [f"painted by {quote_value(run.painter)}"] if run.painter else []
+    used += [] if run.seed is None else [f"seed {run.seed}"]
+    used += [] if run.given is None else [f"given SHA-256 {run.given}"]
+    tool = f"{quote_value(run.tool)} {quote_value(run.version)}"
+    return f"{tool} ({part}; {'; '.join(used)})"
+
+
+def describe_model(model: ModelRecord | None) -> str:
+    """Describe a model with its weights and licence; empty for none."""
+    if model is None:
+        return ""
+    weights = "" if model.weights in (None, model.name) else f" with {quote_value(model.weights)}"
+    licence = "licence not known" if model.licence is None else quote_value(model.licence)
+    return f"{quote_value(model.name)}{weights} ({licence})"
+
+
+def make_picture_table(rows: Sequence[PictureRow]) -> Table:
+    """Make the table of what pictures show."""
+    table = Table("picture", "invented", "from photographs", "given", "empty", box=None)
+    for row in rows:
+        shares = (row.invented, row.from_photographs, row.given, row.empty)
+        table.add_row(row.camera, *(format_percent(share) for share in shares))
+    return table

@@ -1,0 +1,118 @@
+"""After a target: close the thin gaps that open where the camera moves on (not in the paper).
+
+Two surfaces that adjoin at the target lie at different depths. A camera beside it sees the dark
+between them, and so it does where a surface of the context is half transparent at its edge. No
+network is needed for that: a gap is a few pixels wide, and the farther of both surfaces goes on
+behind the nearer one. Nor is Ψ: the depth is that of this surface (decision 057).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import max_pool2d
+
+from gscompleter.config import GapConfig
+from gscompleter.generators.smooth import continue_smoothly
+from gscompleter.numerics.geometry import pad_camera
+from gscompleter.numerics.image_ops import dilate, keep_thin
+from gscompleter.reconstructors.plane_sweep.gaussians import compute_normals, make_discs
+from gscompleter.render.cache import SceneRenderer
+from gscompleter.render.reference import adapt_to_mode
+from gscompleter.stages.select_anchor import find_nearest_view
+from gscompleter.stages.synthesize import GeneratedView
+from gscompleter.stages.target_view import TargetView, render_target
+from gscompleter.state import Completion
+from gscompleter.system.timing import timed_stage
+from gscompleter.types import Camera, Gaussians, View
+
+DISC_SIGMA = 0.55
+"""Standard deviation of an addition across its ray, in pixels, as those of plane-sweep have it."""
+RIM = 1
+"""Pixels around a gap that are covered as well, and whose mixed colours and depths do not count."""
+REACH = 16
+"""Radius in pixels around a known pixel within which the farthest surface is looked for."""
+SHARPNESS = 16
+"""Power of the depth of a pixel, relative to the largest one there, by which it weighs in a gap."""
+
+
+def move_on(target: Camera, views: Sequence[View], displacement: float) -> Camera:
+    """Move a target camera on, away from its nearest photograph, by a share of their baseline.
+
+    There the gaps of parallax between the known and the completed part open widest. The camera is
+    not turned.
+    """
+    nearest = views[find_nearest_view(target, views)].camera
+    c2w = target.c2w.clone()
+    c2w[:3, 3] = target.center + displacement * (target.center - nearest.center)
+    return replace(target, c2w=c2w)
+
+
+@timed_stage("integrate")
+def view_gaps(
+    state: Completion, target: Camera, scenes: SceneRenderer, config: GapConfig
+) -> TargetView:
+    """Render the scene of a completed target where the camera moves on from it.
+
+    More is a hole there than at a target: gaps at the edges of surfaces are half transparent.
+    """
+    holes = replace(state.config.holes, max_alpha=config.max_alpha, dilation=RIM)
+    strict = replace(state, config=replace(state.config, holes=holes))
+    camera = move_on(state.with_depth_range(target), state.views, config.displacement)
+    return render_target(strict, pad_camera(camera, 0.0), scenes)
+
+
+def find_gaps(view: TargetView) -> Bool[Tensor, "h w"]:
+    """Find the thin parts of the holes of a view."""
+    return keep_thin(view.empty)
+
+
+@timed_stage("integrate")
+def continue_surfaces(
+    view: TargetView, gaps: Bool[Tensor, "h w"]
+) -> tuple[GeneratedView, Gaussians]:
+    """Continue the farther surfaces beside gaps into them.
+
+    Return the image with closed gaps, and a Gaussian for each pixel of a gap and of its rim,
+    labelled with the id of the target. There is none if nothing is known beside them.
+    """
+    camera = view.camera.padded
+    layers, known = collect_layers(view)
+
+    # Of two surfaces that adjoin a gap the farther one goes on in it. A power and no limit, as most
+    # steps of depth are small, and a slanted surface has its own.
+    depths = layers[..., 3].exp().where(known, 0.0)
+    side = 2 * REACH + 1
+    farthest = max_pool2d(depths[None, None], side, stride=1, padding=REACH)[0, 0]
+    weight = (depths / farthest.where(known, 1.0)) ** SHARPNESS
+    filled = continue_smoothly(layers.cpu(), weight.cpu()).to(layers)
+
+    # Known pixels keep their colours, from which those of the additions are blended.
+    image = layers[..., :3].where(known[..., None], filled[..., :3]).clamp(0, 1)
+    reference = GeneratedView(image, camera)
+    depth = filled[..., 3].exp()
+    discs = make_discs(reference, depth, compute_normals(depth, reference), DISC_SIGMA)
+
+    chosen = dilate(gaps, RIM).flatten() & known.any()
+    added = adapt_to_mode(view.state.rendered_context, discs[chosen], camera)
+    label = torch.full_like(added.generated, view.state.next_target_id)
+    return reference, replace(added, generated=label)
+
+
+def collect_layers(view: TargetView) -> tuple[Float[Tensor, "h w 4"], Bool[Tensor, "h w"]]:
+    """Collect the colour and the logarithm of the depth of known pixels, and tell which are known.
+
+    Those beside a hole show a part of what lies behind it, and are not known.
+    """
+    render = view.render
+    max_alpha = view.state.config.holes.max_alpha
+    surface = render.depth_map(max_alpha)
+    known = surface.valid & ~dilate(view.empty, RIM)
+    # The render is over black: its colours are divided by alpha.
+    colors = render.image / render.alpha.clamp_min(max_alpha)[..., None]
+    depth = surface.depth.where(known, 1.0)
+    return torch.cat([colors, depth.log()[..., None]], dim=-1), known

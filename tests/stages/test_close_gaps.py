@@ -1,0 +1,124 @@
+"""Thin gaps beside a target: closed by the farther surface, and nowhere else."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gscompleter import CompleterConfig, load_renderer
+from gscompleter.config import GapConfig
+from gscompleter.numerics.geometry import compute_z_depths, pad_camera
+from gscompleter.render.cache import SceneRenderer
+from gscompleter.stages.close_gaps import continue_surfaces, find_gaps, move_on, view_gaps
+from gscompleter.stages.target_view import TargetView, render_target
+from gscompleter.types import Gaussians, View, merge
+from knowing_models import knowing
+from scenes import Room, camera_at, gaussians_of, view_of
+from target_views import begin_with
+
+SIZE = 64
+CAMERA = camera_at(0.0, size=SIZE)
+WALL = 4.0
+SCREEN = 2.0
+COLUMN = 30
+"""First column of the gap; the screen is left of it, the wall right of it."""
+WIDTH = 3
+
+
+def make_torn_scene(width: int = WIDTH) -> tuple[View, Gaussians]:
+    """Return a photograph of a wall, and the wall behind a screen with a gap beside its edge."""
+    image = torch.full((SIZE, SIZE, 3), 0.2)
+    image[:, :COLUMN] = torch.tensor([0.8, 0.3, 0.1])
+    depth = torch.full((SIZE, SIZE), WALL)
+    depth[:, :COLUMN] = SCREEN
+    photograph = View(image, CAMERA, 0, depth)
+    columns = torch.arange(SIZE * SIZE) % SIZE
+    is_gap = (columns >= COLUMN) & (columns < COLUMN + width)
+    return photograph, gaussians_of(photograph)[~is_gap]
+
+
+def look_at_gap(width: int = WIDTH) -> TargetView:
+    photograph, scene = make_torn_scene(width)
+    scenes = SceneRenderer(load_renderer("cpu"))
+    state = begin_with(scene, [photograph], CompleterConfig())
+    # The camera does not move on: it is that of the photograph.
+    return view_gaps(state, CAMERA, scenes, GapConfig())
+
+
+def test_the_camera_moves_on_from_its_nearest_photograph_without_turning():
+    views = [view_of(Room(), camera_at(x, size=SIZE)) for x in (-1.0, 0.0)]
+    target = camera_at(0.4, yaw=12, size=SIZE)
+    moved = move_on(target, views, 0.5)
+    assert moved.center.tolist() == pytest.approx([0.6, 0.0, 0.0], abs=1e-6)
+    assert torch.equal(moved.c2w[:3, :3], target.c2w[:3, :3])
+    assert torch.equal(moved.K, target.K)
+
+
+def test_a_gap_takes_depth_and_colour_of_the_farther_surface():
+    view = look_at_gap()
+    gaps = find_gaps(view)
+    assert gaps[SIZE // 2].nonzero()[:, 0].tolist() == [COLUMN, COLUMN + 1, COLUMN + 2]
+    image, added = continue_surfaces(view, gaps)
+    depths = compute_z_depths(added.means, CAMERA)
+    assert (depths - WALL).abs().max() < 0.02 * WALL
+    assert (image.image[:, COLUMN : COLUMN + WIDTH] - 0.2).abs().max() < 0.05
+    # All pixels of the gap are opaque now.
+    after = view.frozen.composite(added)
+    assert view.render.alpha[gaps].max() < 0.85
+    assert after.alpha[gaps].min() > 0.85
+    assert not find_gaps(replace_frozen(view, added)).any()
+
+
+def replace_frozen(view: TargetView, added: Gaussians) -> TargetView:
+    state = replace(view.state, parts=(*view.state.parts, added))
+    return render_target(state, view.camera, view.scenes)
+
+
+def test_what_is_wide_or_opaque_is_no_gap():
+    assert not find_gaps(look_at_gap(12)).any()
+    assert not find_gaps(look_at_gap(0)).any()
+
+
+def test_where_nothing_is_known_nothing_is_added():
+    photograph, scene = make_torn_scene()
+    scenes = SceneRenderer(load_renderer("cpu"))
+    state = begin_with(scene[:0], [photograph], CompleterConfig())
+    view = render_target(state, pad_camera(CAMERA, 0.0), scenes)
+    _, added = continue_surfaces(view, torch.ones((SIZE, SIZE), dtype=torch.bool))
+    assert len(added) == 0
+
+
+def views_of_room() -> list[View]:
+    return [view_of(Room(), camera_at(x, size=SIZE), i) for i, x in enumerate((-0.3, 0.1))]
+
+
+def complete(config: CompleterConfig) -> tuple[float, Gaussians]:
+    """Complete the room; return the share of gaps where the camera moves on, and the additions."""
+    views = views_of_room()
+    completer = knowing(config)
+    done = completer(views, camera_at(0.7, yaw=12, size=SIZE))
+    (result,) = done.targets
+    looked = view_gaps(done, result.target, completer.scenes, GapConfig())
+    return find_gaps(looked).float().mean().item(), result.added
+
+
+def test_a_completion_leaves_fewer_gaps_under_the_number_of_its_target():
+    with_gaps, former = complete(replace(CompleterConfig(), gaps=GapConfig(displacement=0.0)))
+    without, added = complete(CompleterConfig())
+    assert with_gaps > 0
+    assert without < with_gaps
+    # What the target added before is still there, and comes first.
+    assert len(added) > len(former)
+    assert torch.equal(added.means[: len(former)], former.means)
+    assert set(added.generated.tolist()) == {1}
+
+
+def test_the_paper_closes_none(monkeypatch):
+    monkeypatch.setattr("gscompleter.completer.view_gaps", None)
+    _, added = complete_plainly(CompleterConfig.paper())
+    assert len(added) > 0
+
+
+def complete_plainly(config: CompleterConfig) -> tuple[Gaussians, Gaussians]:
+    done = knowing(config)(views_of_room(), camera_at(0.7, yaw=12, size=SIZE))
+    return done.scene, merge([result.added for result in done.targets])
