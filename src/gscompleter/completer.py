@@ -22,6 +22,7 @@ from gscompleter.numerics.geometry import pad_camera, pad_like
 from gscompleter.numerics.image_ops import is_enclosed
 from gscompleter.numerics.value_checks import check_camera, check_gaussians, check_inputs
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
+from gscompleter.reconstructors.depth_predictors import predict_nothing
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
@@ -179,7 +180,7 @@ class GSCompleter:
                 Trust(),
                 is_given=scene is not None,
                 seed=self.seed,
-                made_with=(name_model(self.reconstructor), name_model(self.generator)),
+                models=self.name_models(),
             )
             # Guards measure the scene as it was given, so before anything changes.
             state = prepare_guards(state, self.scenes)
@@ -200,6 +201,17 @@ class GSCompleter:
             state = replace(state, trust=trust)
             state = recolor_to_photos(state, [context.views[i] for i in new], self.scenes)
         return replace(state, exposure_gains=context.exposure_gains, seconds=seconds)
+
+    def name_models(self) -> dict[str, str]:
+        """Name Ψ, the depth that helps it, and Φ, for the record of what is invented."""
+        depth = getattr(self.reconstructor, "predict_depth", predict_nothing)
+        phi = self.generator
+        models = {
+            "reconstructor": self.reconstructor,
+            "depth": None if depth is predict_nothing else depth,
+            "generator": phi.function if isinstance(phi, FunctionGenerator) else phi,
+        }
+        return {key: name_model(model) for key, model in models.items() if model is not None}
 
     @show_in_notebook()
     def advance(
@@ -331,6 +343,12 @@ class GSCompleter:
         return synthesize(self.generator, inputs, views[0].state.config.synthesis)
 
 
+def name_model(model: object) -> str:
+    """Name a model by its own `name`, or that of its function or class."""
+    own = getattr(model, "name", None) or getattr(model, "__name__", None)
+    return own if isinstance(own, str) else type(model).__name__
+
+
 def list_targets(target: object) -> list[Camera]:
     """List one or several target cameras; raise InputError for anything else or none."""
     targets = [target] if isinstance(target, Camera) else target
@@ -360,10 +378,3 @@ def check_any_completed(state: Completion) -> None:
     if all(reasons):
         more = "" if len(reasons) == 1 else f" The same holds for the other {len(reasons) - 1}."
         raise InputError(f"{reasons[0]}{more}", "target")
-
-
-def name_model(model: object) -> str:
-    """Name Ψ or Φ by the module and the name of its function, or else of its class."""
-    inner = model.function if isinstance(model, FunctionGenerator) else model
-    named = inner if hasattr(inner, "__qualname__") else type(inner)
-    return f"{named.__module__}.{named.__qualname__}"

@@ -220,8 +220,8 @@ class Completion(Displayed):
     """True if the context is a scene that was given, and Ψ did not reconstruct it."""
     seed: int = 0
     """Seed of all random numbers."""
-    made_with: tuple[str, str] = ("", "")
-    """Modules and names of the classes, or functions, of Ψ and Φ."""
+    models: Mapping[str, str] = field(default_factory=dict)
+    """Names of the `reconstructor`, its `depth` and the `generator`, for those who read files."""
 
     def summarize(self) -> str:
         """Describe the targets and the Gaussians."""

@@ -47,10 +47,14 @@ def test_an_example_takes_the_place_of_a_model(option, word, room, tmp_path, mon
 def test_the_guard_of_the_example_drops_what_is_faint(room, tmp_path, monkeypatch):
     guard = f"{EXAMPLES / '09_own_guard.py'}:DropFaint"
     usual = ("image-agreement", "psnr")
-    summary = complete(monkeypatch, room, tmp_path / "out", "--config.guards", *usual, guard)
+    # Without padding, at whose end additions fade after all guards.
+    margin = ("--config.margin", 0)
+    summary = complete(
+        monkeypatch, room, tmp_path / "out", *margin, "--config.guards", *usual, guard
+    )
     assert summary["settings"]["config"]["guards"] == [*usual, guard]
     # `psnr` fades what makes a photograph worse.
-    complete(monkeypatch, room, tmp_path / "usual", "--config.guards", *usual)
+    complete(monkeypatch, room, tmp_path / "usual", *margin, "--config.guards", *usual)
     added, faded = (gsc.load_ply(tmp_path / out / "generated.ply") for out in ("out", "usual"))
     assert faded.opacities.min() < 0.19
     assert len(added) == int((faded.opacities >= 0.2).sum()) > 0

@@ -98,6 +98,20 @@ def test_a_removal_is_undone_by_strip(completion, room, saved, monkeypatch, tmp_
     assert back.read_bytes() == file.read_bytes()
 
 
+def test_models_are_recorded_by_their_names(completion):
+    assert completion.models == {"reconstructor": "plane-sweep", "generator": "warp-inpaint"}
+
+    def paint(nearest, target, context):
+        return context.target_render.image
+
+    own = gsc.GSCompleter(gsc.PlaneSweep(predict_depth=lambda view: None), paint)
+    assert own.name_models() == {
+        "reconstructor": "plane-sweep",
+        "depth": "<lambda>",
+        "generator": "paint",
+    }
+
+
 def test_another_file_is_refused(completion, saved):
     with pytest.raises(InputError, match="holds another scene"):
         completion.save(saved.parent / "other", splat=saved / "completed.ply")

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -64,6 +65,8 @@ FINE_REACH = 8
 @dataclass(frozen=True)
 class WarpInpaint:
     """Φ by depth-aware warping of all photographs and exemplar-based filling."""
+
+    name: ClassVar[str] = "warp-inpaint"
 
     seed: int = 0
 

@@ -7,13 +7,12 @@ from pathlib import Path
 
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.inputs.task import CompletionTask
-from gscompleter.apps.report.maker import LICENCE, make_run
+from gscompleter.apps.report.run_record import LICENCE, OWN_MODELS, make_run_record
 from gscompleter.models.diffusion.published import PE_FIELD, find_usual_licence
 from gscompleter.models.weights.published import PUBLISHED, UNSTATED
 from gscompleter.splats.provenance import ModelRecord, RunRecord, shorten
 from gscompleter.state import Completion
 
-OWN_MODELS = ("plane-sweep", "warp-inpaint")
 PUBLISHED_BY_AUTHORS = {
     "pe-field": ModelRecord("pe-field", PE_FIELD.location, "non-commercial, of FLUX.1-Kontext-dev"),
 }
@@ -26,13 +25,12 @@ def describe_maker(
     """Describe a completion as the run that made its files."""
     synthesis = options.synthesis
     weights = getattr(synthesis.make_settings(), "weights", None)
-    has_depth = options.depth != "none"
-    return make_run(
+    return make_run_record(
         completion,
-        task.splat_file,
         describe_model(options.reconstructor, options.weights),
+        None if options.depth == "none" else describe_model(options.depth, options.depth_weights),
         describe_model(synthesis.generator, weights),
-        describe_model(options.depth, options.depth_weights) if has_depth else None,
+        None if task.splat_file is None else task.splat_file.path,
     )
 
 

@@ -19,8 +19,8 @@ from gscompleter.apps.inputs.splat import locate_splat
 from gscompleter.apps.inputs.task import InputSplatFile, Target
 from gscompleter.apps.report.completion import GENERATED_FILE, make_score_rows, write_report
 from gscompleter.apps.report.film import VIDEO_FILE
-from gscompleter.apps.report.maker import make_run_of_objects
 from gscompleter.apps.report.page import REPORT_FILE, write_completion_page
+from gscompleter.apps.report.run_record import describe_python_run
 from gscompleter.apps.report.schema import RECORD_FILE
 from gscompleter.data.scene import write_cameras
 from gscompleter.editing.removal import restore_surroundings
@@ -159,7 +159,7 @@ def write_result(folder: Path, judged: Judged, splat_file: InputSplatFile | None
         judged.cameras,
         partial(render_pairs, completion, aside, judged.renderer),
         judged.held_out,
-        run=make_run_of_objects(completion, splat_file),
+        run=describe_python_run(completion, None if splat_file is None else splat_file.path),
     )
     if completion.targets:
         write_cameras(folder / TARGETS_FILE, [result.target for result in completion.targets])
@@ -175,6 +175,7 @@ def describe_values(judged: Judged, splat_file: InputSplatFile | None) -> Mappin
         "settings": {
             "folder": None,
             "scene": splat,
+            **completion.models,
             "resolution": [camera.height, camera.width],
             "near": camera.near,
             "far": camera.far,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import torch
@@ -46,6 +47,8 @@ which takes an eighth of the time. Photographs never are: of five it would cost 
 @dataclass(frozen=True)
 class PlaneSweep(Splatter):
     """Reconstructor by plane-sweep stereo, surface completion and splatting."""
+
+    name: ClassVar[str] = "plane-sweep"
 
     predict_depth: DepthPredictor = predict_nothing
     """Monocular depth, used where stereo measures nothing."""

@@ -1,0 +1,65 @@
+"""The record of a completion that was made in Python, for the files that it writes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from gscompleter import __version__
+from gscompleter.splats.provenance import ModelRecord, RunRecord, shorten
+from gscompleter.state import NEW_PHOTO_ID, Completion
+from gscompleter.system.files.reading import hash_file
+
+TOOL = "gscompleter"
+LICENCE = "Apache-2.0"
+"""Licence of gscompleter, whose own models have no weights."""
+OWN_MODELS = ("plane-sweep", "warp-inpaint")
+
+
+def make_run_record(
+    completion: Completion,
+    reconstructor: ModelRecord | None,
+    depth: ModelRecord | None,
+    generator: ModelRecord | None,
+    given: Path | None,
+) -> RunRecord:
+    """Make the record of a completion with its models; `given` is the file of a given scene."""
+    added = completion.added.generated
+    recolored = completion.recolored_context.generated[completion.recolored_mask]
+    labels = [*added.unique().tolist(), *recolored.unique().tolist()]
+    invented = [label for label in labels if label != NEW_PHOTO_ID]
+    painters = [result.painter for result in completion.targets if result.painter]
+    return RunRecord(
+        TOOL,
+        __version__,
+        (min(invented), max(invented)) if invented else None,
+        reconstructor,
+        depth,
+        generator if invented else None,
+        shorten(painters[0]) if painters and invented else None,
+        completion.seed,
+        None if given is None else hash_given(given),
+    )
+
+
+def describe_python_run(completion: Completion, given: Path | None) -> RunRecord:
+    """Describe a completion of the Python interface, whose models are known by their names."""
+    names = completion.models
+    return make_run_record(
+        completion,
+        name_model(names.get("reconstructor")),
+        name_model(names.get("depth")),
+        name_model(names.get("generator")),
+        given,
+    )
+
+
+def name_model(name: str | None) -> ModelRecord | None:
+    """Record a model by its name; None if there is none."""
+    if not name:
+        return None
+    return ModelRecord(shorten(name), None, LICENCE if name in OWN_MODELS else None)
+
+
+def hash_given(path: Path) -> str | None:
+    """Compute the SHA-256 of the given splat; None for the folder of a .sog."""
+    return hash_file(path) if path.is_file() else None
