@@ -179,18 +179,18 @@ def my_painter(nearest, target, context):
 
 
 @pytest.mark.parametrize("generator", [None, my_painter])
-def test_a_completion_in_python_names_its_models_by_their_classes(room, tmp_path, generator):
+def test_a_completion_in_python_names_its_models(room, tmp_path, generator):
     views = [gsc.load_views(room)[number] for number in (0, 1)]
     target = gsc.load_camera(room, frame=2)
     named = {} if generator is None else {"generator": generator}
     completion = gsc.GSCompleter(seed=5, **named)(views, target)
     completion.save(tmp_path / "out")
     (made,) = read_provenance(tmp_path / "out" / "completed.ply").runs
-    assert made.reconstructor.name == "PlaneSweep"
+    assert made.reconstructor.name == "plane-sweep"
     assert made.reconstructor.licence == "Apache-2.0"
     assert made.seed == 5
     if len(completion.added):
-        expected = "WarpInpaint" if generator is None else f"{__name__}.my_painter"
+        expected = "warp-inpaint" if generator is None else "my_painter"
         assert made.generator.name == expected
         assert made.generator.licence == ("Apache-2.0" if generator is None else None)
     assert generator is not None or len(completion.added)
