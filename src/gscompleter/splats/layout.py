@@ -47,6 +47,7 @@ from gscompleter.system.files.ply import PlyFile, release_pages, write_ply_file
 from gscompleter.system.files.writing import REMOVED_FILE
 from gscompleter.types import NUM_SH, Gaussians, merge
 
+_STORED = ("means", "quats", "scales", "opacities", "sh", "generated")
 _LABEL_LINE = re.compile(rb"^property\s+\w+\s+generated\s*?\n", re.M)
 _ELEMENT_LINE = re.compile(rb"^(?:element|end_header)", re.M)
 
@@ -154,6 +155,26 @@ def _add_label_line(header: bytes) -> bytes:
     first, others, end = split_header(header)
     ending = b"\r\n" if end.endswith(b"\r\n") else b"\n"
     return b"".join([first, b"property uchar generated", ending, others, end])
+
+
+def is_same_scene(path: Path, other: Path) -> bool:
+    """Return True if two .ply hold the same Gaussians in the same order; some are read at a time.
+
+    Their columns may have another order, and their headers other comments.
+    """
+    if {detect_splat_format(path), detect_splat_format(other)} != {"ply"}:
+        return False
+    scenes = [read_scene(path), read_scene(other)]
+    if len(scenes[0].rows) != len(scenes[1].rows) or count_rest(scenes[0]) != count_rest(scenes[1]):
+        return False
+    for start in range(0, len(scenes[0].rows), CHUNK_ROWS):
+        rows = slice(start, start + CHUNK_ROWS)
+        first, second = (decode_gaussians(replace(s, rows=s.rows[rows])) for s in scenes)
+        if first.is_antialiased != second.is_antialiased:
+            return False
+        if not all(torch.equal(getattr(first, f), getattr(second, f)) for f in _STORED):
+            return False
+    return True
 
 
 def strip(path: Path, out: Path) -> tuple[int, int]:

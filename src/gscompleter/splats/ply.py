@@ -15,9 +15,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -181,7 +182,7 @@ def find_columns(scene: PlyFile) -> Int64[ndarray, "c"] | None:
 
     None if some are no little-endian float32 at a multiple of four bytes, or are not there.
     """
-    fields = scene.rows.dtype.fields or {}
+    fields: Mapping[str, Any] = scene.rows.dtype.fields or {}
     places = []
     for name in name_columns(scene):
         dtype, offset = fields.get(name, (np.dtype(np.uint8), 0))[:2]
@@ -393,7 +394,7 @@ def make_rows(gaussians: Gaussians, provenance: bool, block: slice | None = None
         *(gaussians.sh, gaussians.encoded),
     )
     plain = make_row_type(gaussians, provenance=False)
-    table = np.empty((stop - start, len(plain)), np.float32)
+    table = np.empty((stop - start, len(plain.names or ())), np.float32)
     kernels.encode_rows(0, len(table), start, *map(_to_array, properties), table)
     rows = table.astype("<f4", copy=False).view(plain)[:, 0]
     if not provenance:

@@ -14,6 +14,7 @@ from rich.console import Console
 from gscompleter.apps.command_line.exit_codes import DONE, ERROR
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.completing.holes import EXPORTED, refuse_painted, write_holes
+from gscompleter.apps.completing.keeping import keep_small
 from gscompleter.apps.completing.marking import prepare_marked
 from gscompleter.apps.completing.preparation import Prepared
 from gscompleter.apps.completing.printing import print_completion, print_export, print_plan
@@ -40,7 +41,7 @@ from gscompleter.system.errors import print_error, quote_value
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.files.video import find_ffmpeg
 from gscompleter.system.files.writing import (
-    COMPLETED_FILE,
+    COMPLETED_FILES,
     CONTEXT_FILE,
     REMOVED_FILE,
     RENDERS_FILE,
@@ -53,7 +54,8 @@ from gscompleter.types import Camera
 
 COMMAND = "complete"
 RESULTS = (
-    *(COMPLETED_FILE, CONTEXT_FILE, GENERATED_FILE, REMOVED_FILE, TARGETS_FILE),
+    *(*COMPLETED_FILES, *(f"{name}.generated.json" for name in COMPLETED_FILES[1:])),
+    *(CONTEXT_FILE, GENERATED_FILE, REMOVED_FILE, TARGETS_FILE),
     RENDERS_FILE,
     *(REPORT_FILE, RECORD_FILE, SUMMARY_FILE, VIDEO_FILE, "images/target*.png"),
     *("images/photograph*.png", "images/context*.png"),
@@ -102,6 +104,12 @@ def complete_folder(
         if options.video:
             photographs = list(ready.cameras.values())
             write_comparison_video(folder, completion, photographs, ready.completer.renderer)
+        if options.save_as is not None:
+            given = ready.options.scene
+            # An earlier result in OUT may be the input, and is replaced.
+            if given is not None and options.out.resolve() in given.resolve().parents:
+                given = None
+            summary = keep_small(folder, options.save_as, summary, given)
     return summary
 
 
