@@ -52,8 +52,8 @@ class CompleteOptions(CompletingOptions):
     """Folder for completed.ply, the report (report.html), images and summary.json."""
     save_as: Literal[".ply", ".spz", ".sog"] | None = None
     """Keep results small: write the completed scene in this format, with its labels, and
-    context.ply only if it differs from the file of --scene. `.spz` and `.sog` round, so that
-    `strip` does not give back the same bytes."""
+    context.ply only if it differs from the input splat. `.spz` and `.sog` round, so that `strip`
+    does not give back the same bytes."""
     video: bool = False
     """Also write video.mp4: a flight through the holes, before and after side by side."""
 
