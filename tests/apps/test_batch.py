@@ -20,7 +20,8 @@ from command import run
 from gscompleter import InputError
 from gscompleter.apps.batch.manifest import list_results, read_manifest
 from gscompleter.apps.batch.rows import parse_row
-from gscompleter.system.errors import OutputError
+from gscompleter.system.errors import FullDiskError, OutputError
+from gscompleter.system.files.writing import replace_file
 from gscompleter.system.jobs import jobs as batch
 from gscompleter.system.jobs.engines import connect_to_ray, open_submitit
 from gscompleter.system.jobs.jobs import Job, find_missing_jobs, parse_shard, run_job, run_jobs
@@ -181,11 +182,41 @@ def test_shards_add_up_and_each_job_is_done_once(tmp_path):
     assert find_missing_jobs(jobs, tmp_path, False) == []
 
 
+def test_a_disk_that_fails_for_a_moment_is_written_again(tmp_path, monkeypatch):
+    monkeypatch.setattr("gscompleter.system.jobs.jobs.RETRY_SECONDS", 0.0)
+    failures = [OSError(errno.EIO, "Input/output error")] * 2
+    sync = os.fsync
+
+    def fail_at_first(file: int) -> None:
+        if failures:
+            raise failures.pop()
+        sync(file)
+
+    # The first write is that of the work, and the second that of the row.
+    monkeypatch.setattr(os, "fsync", fail_at_first)
+    calls = []
+
+    def write() -> dict[str, int]:
+        calls.append(len(failures))
+        if len(calls) == 1:
+            with replace_file(tmp_path / "result") as file:
+                file.write(b"content")
+        return {"size": 7}
+
+    run_job(Job("one"), tmp_path, write, retries=1)
+    assert calls == [2, 1]
+    assert row_of(tmp_path, "one")["attempts"] == 2
+    failures += [OSError(errno.EIO, "Input/output error")] * 3
+    with pytest.raises(OutputError, match="Input/output error"):
+        run_job(Job("two"), tmp_path, lambda: {"size": 7}, retries=1)
+    assert not (tmp_path / "rows" / "two.json").exists()
+
+
 def test_a_full_disk_ends_the_run_and_loses_nothing(tmp_path, monkeypatch):
     run_job(Job("first"), tmp_path, lambda: {"size": 1}, retries=2)
 
     def full() -> dict[str, int]:
-        raise OutputError("Cannot write it: there is no space left.")
+        raise FullDiskError("Cannot write it: there is no space left.")
 
     with pytest.raises(OutputError, match="no space left"):
         run_job(Job("second"), tmp_path, full, retries=2)

@@ -14,15 +14,18 @@ from command import run
 from gscompleter import InputError, load_cameras, load_ply
 from gscompleter.apps.commands.shared_options import parse_resolution
 from gscompleter.apps.completing import complete as command
-from gscompleter.apps.completing import preparation
+from gscompleter.apps.completing import keeping, preparation
+from gscompleter.apps.completing.keeping import describe_size
 from gscompleter.apps.evaluating.cases import collect_tasks
 from gscompleter.apps.inputs.memory import estimate_memory
 from gscompleter.apps.inputs.reading import read_task
 from gscompleter.apps.inputs.selection import select_near_and_far
 from gscompleter.apps.inputs.task import CompletionTask, Opened
+from gscompleter.apps.viewer.exhibit import load_viewer_completion
 from gscompleter.cli import parse_command
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.scene import write_cameras
+from gscompleter.splats.formats import load_splat
 from gscompleter.types import View
 from pose_files import write_colmap_text, write_photographs
 from scenes import camera_at, photographed
@@ -259,3 +262,31 @@ def test_a_splat_is_doubted_by_photographs_that_are_near_and_by_some_from_everyw
     assert max(b - a for a, b in zip(chosen, [*chosen[1:], 118], strict=True)) < 118 / 4
     assert select_near_and_far([camera_at(0.45)], path, 60) == list(path)
     assert select_near_and_far([camera_at(0.45)], {}, 16) == []
+
+
+def test_a_result_is_kept_small_with_its_labels_and_without_a_copy_of_the_input(
+    scene, chosen, tmp_path, monkeypatch
+):
+    given = chosen[0] / "context.ply"
+    out = tmp_path / "out"
+    words = (*SMALL, "--no-recolor", "--scene", given)
+    assert run(monkeypatch, *complete(scene, out, *words, "--save-as", ".spz")) == 0
+    assert describe_size(out, can_be_smaller=True) == "The results take 1 MB."
+    monkeypatch.setattr(keeping, "LARGE_BYTES", 1)
+    assert "--save-as .spz" in describe_size(out, can_be_smaller=True)
+    assert "--save-as" not in describe_size(out, can_be_smaller=False)
+    assert not (out / "completed.ply").exists()
+    assert not (out / "context.ply").exists()
+    assert (out / "generated.ply").is_file()
+    summary = summary_of(out)
+    assert summary["scene"]["context"] == str(given.resolve())
+    assert {"completed.spz", "completed.spz.generated.json"} <= set(summary["files"])
+    labels = load_splat(out / "completed.spz").generated
+    assert int((labels > 0).sum()) == summary["gaussians"]["added"] > 0
+    # What reads a result finds both scenes, and a further run replaces them.
+    content = load_viewer_completion(out, drop_nonfinite=False)
+    assert len(content.after) == len(labels)
+    assert len(content.before) == summary["gaussians"]["context"]
+    assert run(monkeypatch, *complete(scene, out, *words, "--overwrite")) == 0
+    assert not (out / "completed.spz").exists()
+    assert (out / "context.ply").is_file()

@@ -11,7 +11,7 @@ from gscompleter.numerics.kernels.splat_rows import permute_rows
 from gscompleter.numerics.value_checks import find_finite
 from gscompleter.splats import ply
 from gscompleter.splats.formats import convert_splat
-from gscompleter.splats.layout import save_like
+from gscompleter.splats.layout import is_same_scene, save_like
 from gscompleter.splats.morton import argsort_nearby, sort_nearby
 from gscompleter.splats.ply import encode, make_row_type, make_rows, save_parts
 from gscompleter.system.files.ply import read_ply_file, release_pages
@@ -168,3 +168,21 @@ def test_the_chunks_of_a_damaged_ply_are_refused_or_left_out_together(tmp_path, 
     assert convert_splat(given, out, drop_nonfinite=True) == (47, 0, None)
     save_ply(tmp_path / "expected.ply", load_ply(given, drop_nonfinite=True))
     assert out.read_bytes() == (tmp_path / "expected.ply").read_bytes()
+
+
+def test_files_of_the_same_gaussians_are_known_whatever_their_headers_say(tmp_path):
+    gaussians = random_gaussians(30, sh_degree=1)
+    first = tmp_path / "first.ply"
+    save_ply(first, gaussians)
+    other = tmp_path / "other.ply"
+    data = first.read_bytes()
+    other.write_bytes(data.replace(b"element vertex", b"comment by another\nelement vertex", 1))
+    assert is_same_scene(first, other)
+    save_ply(other, replace(gaussians, opacities=gaussians.opacities * 0.5))
+    assert not is_same_scene(first, other)
+    save_ply(other, gaussians[:29])
+    assert not is_same_scene(first, other)
+    save_ply(other, replace(gaussians, is_antialiased=True))
+    assert not is_same_scene(first, other)
+    convert_splat(first, tmp_path / "other.spz")
+    assert not is_same_scene(first, tmp_path / "other.spz")

@@ -7,8 +7,6 @@ import numpy as np
 import torch
 from jaxtyping import Bool, Float, Float32
 from numpy import ndarray
-from scipy.sparse import diags, kronsum
-from scipy.sparse.linalg import splu
 from torch import Tensor
 
 from gscompleter.numerics.kernels.pyramid_fill import build_pyramid, compute_means
@@ -89,6 +87,10 @@ def fit_membrane(
     minimizes Σ FIDELITY w (m - v)² + MEAN_WEIGHT (m - mean)² + Σ (m - m')² over its cells m, where
     v are the values, w their weights, and m' the right and the lower neighbour of m.
     """
+    # Imported here, since SciPy is slow to import.
+    from scipy.sparse import diags, kronsum
+    from scipy.sparse.linalg import splu
+
     # The membrane is smooth, so that a coarse grid is enough: 128 instead of 96 cells gain nothing
     # (decision 042).
     height, width = weight.shape

@@ -54,6 +54,7 @@ from gscompleter.system.files.ply import PlyFile, release_pages, write_ply_file
 from gscompleter.system.files.writing import REMOVED_FILE
 from gscompleter.types import NUM_SH, Gaussians, merge
 
+_STORED = ("means", "quats", "scales", "opacities", "sh", "generated")
 _LABEL_LINES = re.compile(
     rb"^property\s+\w+\s+generated\s*?\n(?:comment gscompleter-provenance/[^\n]*\n)*", re.M
 )
@@ -178,6 +179,26 @@ def _add_run(header: bytes, run: RunRecord) -> bytes:
     assert lines is not None
     ending = b"\r\n" if lines[0].endswith(b"\r\n") else b"\n"
     return header[: lines.end()] + make_comment_lines([run], ending) + header[lines.end() :]
+
+
+def is_same_scene(path: Path, other: Path) -> bool:
+    """Return True if two .ply hold the same Gaussians in the same order; some are read at a time.
+
+    Their columns may have another order, and their headers other comments.
+    """
+    if {detect_splat_format(path), detect_splat_format(other)} != {"ply"}:
+        return False
+    scenes = [read_scene(path), read_scene(other)]
+    if len(scenes[0].rows) != len(scenes[1].rows) or count_rest(scenes[0]) != count_rest(scenes[1]):
+        return False
+    for start in range(0, len(scenes[0].rows), CHUNK_ROWS):
+        rows = slice(start, start + CHUNK_ROWS)
+        first, second = (decode_gaussians(replace(s, rows=s.rows[rows])) for s in scenes)
+        if first.is_antialiased != second.is_antialiased:
+            return False
+        if not all(torch.equal(getattr(first, f), getattr(second, f)) for f in _STORED):
+            return False
+    return True
 
 
 def strip(path: Path, out: Path) -> tuple[int, int]:

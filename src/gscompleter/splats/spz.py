@@ -209,14 +209,19 @@ def encode_spz_blocks(path: Path, make_blocks: Callable[[], Iterable[Gaussians]]
         degree = block.sh_degree
         flags = ANTIALIASED_FLAG if block.is_antialiased else 0
     header = HEADER.pack(MAGIC, 3, sum(count for count, _ in parts), degree, bits, flags, 0)
-    # The stream of a .gz with the header that Python writes, whatever its level.
-    packer = zlib.compressobj(6, zlib.DEFLATED, 31)
-    packed = [packer.compress(header)]
-    for stream in streams:
-        packed += [packer.compress(content) for content in stream]
+    # What `gzip.compress` gives for all of it at once: a header, the packed data, and its checksum.
+    packer = zlib.compressobj(6, zlib.DEFLATED, -zlib.MAX_WBITS)
+    packed = [GZIP_HEADER]
+    checksum = 0
+    size = 0
+    for stream in ([header], *streams):
+        for content in stream:
+            packed.append(packer.compress(content))
+            checksum = zlib.crc32(content, checksum)
+            size += len(content)
         stream.clear()
-    content = b"".join([*packed, packer.flush()])
-    return GZIP_HEADER + content[len(GZIP_HEADER) :]
+    trailer = struct.pack("<II", checksum, size % 2**32)
+    return b"".join([*packed, packer.flush(), trailer])
 
 
 def _cut(count: int) -> Iterator[slice]:

@@ -11,7 +11,7 @@ from annotated_types import Interval
 
 from gscompleter.apps.commands.shared_options import EngineOptions, list_inputs
 from gscompleter.system.files.overlap import refuse_overlap
-from gscompleter.system.jobs.engines import EngineName
+from gscompleter.system.jobs.engine_names import EngineName
 from gscompleter.system.process import import_without_collection
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 from annotated_types import Interval
 
@@ -50,6 +50,10 @@ class CompleteOptions(CompletingOptions):
     """Name of their painter, for the report."""
     out: Path
     """Folder for completed.ply, the report (report.html), images and summary.json."""
+    save_as: Literal[".ply", ".spz", ".sog"] | None = None
+    """Keep results small: write the completed scene in this format, with its labels, and
+    context.ply only if it differs from the input splat. `.spz` and `.sog` round, so that `strip`
+    does not give back the same bytes."""
     video: bool = False
     """Also write video.mp4: a flight through the holes, before and after side by side."""
 

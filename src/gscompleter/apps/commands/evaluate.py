@@ -18,7 +18,7 @@ from gscompleter.apps.commands.shared_options import (
 )
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.system.files.overlap import refuse_overlap
-from gscompleter.system.jobs.engines import EngineName
+from gscompleter.system.jobs.engine_names import EngineName
 from gscompleter.system.process import import_without_collection
 
 # fmt: off

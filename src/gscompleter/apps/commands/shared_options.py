@@ -16,7 +16,7 @@ from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Seed, Settings
 from gscompleter.system.files.overlap import refuse_overlap
-from gscompleter.system.jobs.engines import EngineName
+from gscompleter.system.jobs.engine_names import EngineName
 
 Device = Literal["auto", "cpu", "cuda", "mps"]
 Words = Annotated[tuple[int | str, ...] | None, tyro.conf.arg(metavar="PHOTO [PHOTO ...]")]

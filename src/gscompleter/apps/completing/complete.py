@@ -16,6 +16,7 @@ from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.command_line.exit_codes import DONE, ERROR
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.completing.holes import EXPORTED, refuse_painted, write_holes
+from gscompleter.apps.completing.keeping import keep_small
 from gscompleter.apps.completing.maker import describe_maker
 from gscompleter.apps.completing.marking import prepare_marked
 from gscompleter.apps.completing.preparation import Prepared
@@ -94,6 +95,12 @@ def complete_folder(
         if options.video:
             photographs = list(ready.cameras.values())
             write_comparison_video(folder, completion, photographs, ready.completer.renderer)
+        if options.save_as is not None:
+            given = ready.options.scene
+            # An earlier result in OUT may be the input, and is replaced.
+            if given is not None and options.out.resolve() in given.resolve().parents:
+                given = None
+            summary = keep_small(folder, options.save_as, summary, given)
     return summary
 
 

@@ -12,17 +12,18 @@ from rich.table import Table
 
 from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.commands.complete import CompleteOptions
+from gscompleter.apps.completing.keeping import describe_size
 from gscompleter.apps.inputs.holes_file import read_holes
 from gscompleter.apps.inputs.task import Opened, Target
 from gscompleter.apps.report.completion import IMAGES
 from gscompleter.apps.report.film import VIDEO_FILE
 from gscompleter.apps.report.page import REPORT_FILE
 from gscompleter.apps.report.plain_words import group_target_notes, list_notes, list_shared_notes
-from gscompleter.apps.report.schema import CompletionSummary, read_summary
+from gscompleter.apps.report.schema import CompletionSummary, find_completed, read_summary
 from gscompleter.evaluation.verdict.numbers import average, format_number, format_percent
 from gscompleter.evaluation.verdict.outcome import name_unused, select_testing
 from gscompleter.system.errors import quote_value
-from gscompleter.system.files.writing import COMPLETED_FILE, SUMMARY_FILE, TARGETS_FILE
+from gscompleter.system.files.writing import SUMMARY_FILE, TARGETS_FILE
 
 
 def answer_completion(
@@ -97,8 +98,9 @@ def describe_result(summary: CompletionSummary, options: CompleteOptions) -> Ite
     seconds = summary.seconds["total"]
     yield (
         f"Added {counts['added']:,} Gaussians to {counts['context']:,} in {seconds:.1f} s: "
-        f"{options.out / COMPLETED_FILE}"
+        f"{find_completed(options.out)}"
     )
+    yield describe_size(options.out, options.save_as is None)
     yield f"Report: {options.out / REPORT_FILE}"
     if options.video and summary.targets:
         yield f"Video: {options.out / VIDEO_FILE}"

@@ -14,10 +14,10 @@ from gscompleter.apps.commands.shared_options import SceneOptions
 from gscompleter.apps.inputs.describing import describe_missing
 from gscompleter.apps.inputs.selection import select_closest
 from gscompleter.apps.inputs.task import CompletionTask, Opened
+from gscompleter.apps.report.schema import find_completed
 from gscompleter.config import CleaningConfig, CompleterConfig
 from gscompleter.evaluation.verdict.held_out import HeldOut
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.writing import COMPLETED_FILE
 from gscompleter.types import Camera, View
 
 MAX_HELD_OUT = 8
@@ -97,5 +97,5 @@ def read_held_out(
 
 def refuse_results(out: Path) -> None:
     """Refuse the output folder of a dry run that holds a scene, which would be replaced."""
-    if os.path.lexists(out / COMPLETED_FILE):
+    if os.path.lexists(find_completed(out)):
         raise InputError(f"{quote_value(out)} holds a result; name another folder.", "out")

@@ -50,6 +50,9 @@ VIEWER_FILE = "view.html"
 INDEX_FILE = "index.html"
 TABLE_FILE = "table.csv"
 
+MAX_LISTED = 2000
+"""Most jobs, and most failures, on the page of a batch, which a browser opens at once; the table
+has all."""
 TARGET_COLUMNS = ("hole_fraction", "psnr_before", "psnr_after")
 TABLE_COLUMNS = (
     *("job", "state", "reason", "attempts"),
@@ -232,15 +235,19 @@ def format_csv(rows: Iterable[Mapping[str, Any]]) -> str:
 def render_batch_page(out: Path, rows: Sequence[Mapping[str, Any]]) -> str:
     """Render the page of the batch in `out`."""
     good = [row for row in rows if row["state"] == "done"]
+    bad = [row for row in rows if row["state"] == "failed"]
     gains = [r["psnr_after"] - r["psnr_before"] for r in good if r["psnr_after"] is not None]
     seconds = [row["seconds"] for row in good]
     return render_template(
         "batch.html",
         {
-            "jobs": good,
-            "failures": [row for row in rows if row["state"] == "failed"],
+            "counts": {"done": len(good), "failed": len(bad)},
+            "jobs": good[:MAX_LISTED],
+            "failures": bad[:MAX_LISTED],
             "reported": {
-                row["job"] for row in rows if os.path.isfile(out / JOBS / row["job"] / REPORT_FILE)
+                row["job"]
+                for row in bad[:MAX_LISTED]
+                if os.path.isfile(out / JOBS / row["job"] / REPORT_FILE)
             },
             "gain": median(gains) if gains else None,
             "seconds": median(seconds) if seconds else None,

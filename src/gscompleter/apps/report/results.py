@@ -39,7 +39,7 @@ from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import open_output_folder
 from gscompleter.system.files.writing import (
-    COMPLETED_FILE,
+    COMPLETED_FILES,
     CONTEXT_FILE,
     REMOVED_FILE,
     RENDERS_FILE,
@@ -52,7 +52,8 @@ from gscompleter.types import Camera, View
 
 COMMAND = "complete"
 RESULTS = (
-    *(COMPLETED_FILE, CONTEXT_FILE, GENERATED_FILE, REMOVED_FILE, TARGETS_FILE),
+    *(*COMPLETED_FILES, *(f"{name}.generated.json" for name in COMPLETED_FILES[1:])),
+    *(CONTEXT_FILE, GENERATED_FILE, REMOVED_FILE, TARGETS_FILE),
     RENDERS_FILE,
     *(REPORT_FILE, RECORD_FILE, SUMMARY_FILE, VIDEO_FILE, "images/target*.png"),
     *("images/photograph*.png", "images/context*.png"),

@@ -16,7 +16,7 @@ from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow, ScoreRow
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import read_command
 from gscompleter.system.files.typed_json import read_typed_json
-from gscompleter.system.files.writing import COMPLETED_FILE, SUMMARY_FILE
+from gscompleter.system.files.writing import COMPLETED_FILES, SUMMARY_FILE
 
 RECORD_FILE = "report.json"
 ADVICE = "complete the scene again"
@@ -125,6 +125,8 @@ class SceneRow:
     photographs: int
     used: int
     splat: str | None = None
+    context: str | None = None
+    """Path of the input splat that `context.ply` would repeat; None if that file is there."""
     renders_from: str | None = None
     """Source of the cameras of renders that took the place of photographs: `cameras` of a
     file, around the `targets` or the `place` of a removal, the `pixels` of the splat, or
@@ -185,6 +187,12 @@ class CompletionRecord:
     pairs: tuple[PairsRow, ...]
 
 
+def find_completed(folder: Path) -> Path:
+    """Find the completed scene of a completion; the usual path if there is none."""
+    paths = [folder / name for name in COMPLETED_FILES]
+    return next((path for path in paths if os.path.lexists(path)), paths[0])
+
+
 def read_summary(folder: Path) -> CompletionSummary:
     """Read `summary.json`; raise an InputError if it is missing, damaged or not of a completion."""
     command = read_command(folder)
@@ -193,7 +201,7 @@ def read_summary(folder: Path) -> CompletionSummary:
             f"{quote_value(folder)} holds a result of `{quote_value(command)}`, which is no "
             "completion; name the output folder of a completion."
         )
-    if command and not os.path.lexists(folder / COMPLETED_FILE):
+    if command and not os.path.lexists(find_completed(folder)):
         raise InputError(
             f"{quote_value(folder)} holds no completed scene, but perhaps the plan of a dry run; "
             "complete the scene first."

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from gscompleter.apps.report.schema import CompletionSummary, read_summary
+from gscompleter.apps.report.schema import CompletionSummary, find_completed, read_summary
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.frame import Frame
@@ -23,7 +23,6 @@ from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import encode_jpeg, read_pixels, turn_upright
 from gscompleter.system.files.output_folder import POSES
 from gscompleter.system.files.writing import (
-    COMPLETED_FILE,
     CONTEXT_FILE,
     RENDERS_FILE,
     TARGETS_FILE,
@@ -94,8 +93,8 @@ def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:
     summary = read_summary(folder)
     content = ViewerContent(
         folder.resolve().name,
-        after=load_splat(folder / COMPLETED_FILE, drop_nonfinite),
-        before=load_splat(folder / CONTEXT_FILE, drop_nonfinite),
+        after=load_splat(find_completed(folder), drop_nonfinite),
+        before=load_splat(Path(summary.scene.context or folder / CONTEXT_FILE), drop_nonfinite),
         transform=np.array(summary.frame.transform),
         origin=np.array(summary.frame.origin),
     )

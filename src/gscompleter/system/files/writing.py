@@ -28,6 +28,8 @@ CONTEXT_FILE = "context.ply"
 """Scene before its completion."""
 COMPLETED_FILE = "completed.ply"
 """Scene after its completion."""
+COMPLETED_FILES = (COMPLETED_FILE, "completed.spz", "completed.sog")
+"""Files of the scene after its completion, of which there is one."""
 REMOVED_FILE = "removed.ply"
 """Originals of changed and removed Gaussians of a given scene, beside the completed one."""
 

@@ -17,7 +17,7 @@ from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import handle_stop_signals
@@ -25,14 +25,14 @@ from gscompleter.system.jobs.jobs import Pool, Share
 from gscompleter.system.memory import estimate_bytes, read_memory_bytes
 from gscompleter.system.threads import count_available_cores, limit_threads
 
-EngineName = Literal["local", "ray", "submitit"]
-
 PIXELS = 640 * 480
 """Pixels per image of a typical completion; its memory limits the default number of workers."""
 IMAGES = 8
 """Images of a typical completion."""
 STOP_SECONDS = 10.0
 """Time, in seconds, that stopped workers have to remove what they have not finished."""
+MAX_REFERENCES = 1000
+"""Tasks of Ray, ended ones included, from which on the ended ones are forgotten."""
 RAY_VARIABLES = {"RAY_USAGE_STATS_ENABLED": "0", "RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO": "0"}
 """Environment of Ray. The first variable turns off usage reports to its makers, the second a
 warning on standard error."""
@@ -140,6 +140,9 @@ def open_ray(
     started: list[Any] = []
 
     def start(share: Share) -> Any:
+        # References keep what they refer to: of a million tasks only the running ones are kept.
+        if len(started) > MAX_REFERENCES:
+            started[:] = ray.wait(started, num_returns=len(started), timeout=0)[1]
         started.append(task.remote(share, threads))
         return started[-1].future()
 

@@ -21,7 +21,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gscompleter.system.errors import InputError, OutputError, quote_value
+from gscompleter.system.errors import FullDiskError, InputError, OutputError, quote_value
 from gscompleter.system.files.reading import read_json
 from gscompleter.system.files.unfinished import UNFINISHED_PREFIX, remove_left_behind_below
 from gscompleter.system.files.writing import convert_write_errors, replace_file
@@ -53,11 +53,25 @@ def run_job(job: Job, out: Path, work: Callable[[], Mapping[str, Any]], retries:
     """Run a job and write its row, unless it has one.
 
     `work` returns further entries of the row. It is repeated after a killed worker or any error
-    other than InputError, at most `retries` times.
+    other than InputError, at most `retries` times. A full disk, or one that still cannot be written
+    after as many attempts, ends the run and is no fault of the job.
     """
     if not has_row(job, out):
         row = {"job": job.name, "options": dict(job.options)}
-        write_json(get_row_path(job, out), row | run_with_retries(work, job.lost, retries))
+        row |= run_with_retries(work, job.lost, retries)
+        write_row(get_row_path(job, out), row, retries)
+
+
+def write_row(path: Path, row: Mapping[str, Any], retries: int) -> None:
+    """Write a row, at most `retries` times again where the disk cannot be written for a moment."""
+    for number in range(1, retries + 2):
+        try:
+            write_json(path, row)
+            return
+        except OutputError as error:
+            if isinstance(error, FullDiskError) or number > retries:
+                raise
+        time.sleep(RETRY_SECONDS * number)
 
 
 def run_with_retries(
@@ -69,8 +83,10 @@ def run_with_retries(
     for number in range(lost + 1, retries + 2):
         try:
             return {"state": "done", "reason": None, "attempts": number, **work()}
-        except OutputError:
-            raise
+        except OutputError as error:
+            # A network disk that fails for a moment is written again; a full one stays full.
+            if isinstance(error, FullDiskError) or number > retries:
+                raise
         except InputError as error:
             return {"state": "failed", "reason": str(error), "attempts": number}
         except Exception as error:  # one broken job must not stop the others

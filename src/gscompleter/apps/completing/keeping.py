@@ -1,0 +1,51 @@
+"""Results that are kept: the completed scene in a small format, and no copy of the input."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from gscompleter.apps.report.schema import find_completed
+from gscompleter.splats.formats import convert_splat
+from gscompleter.splats.layout import is_same_scene
+from gscompleter.system.files.output_folder import read_listing
+from gscompleter.system.files.writing import COMPLETED_FILE, CONTEXT_FILE, SUMMARY_FILE
+
+LARGE_BYTES = 100 * 10**6
+"""Size of results, in bytes, from which on the terminal says how to keep them smaller."""
+
+
+def keep_small(
+    folder: Path, suffix: str, summary: Mapping[str, Any], given: Path | None
+) -> dict[str, Any]:
+    """Write the completed scene in the format of a suffix, with its labels; return the summary.
+
+    `given` is the file of the input splat if it outlasts the run: if it holds the Gaussians of
+    `context.ply`, the summary names it instead.
+    """
+    if suffix != COMPLETED_FILE.removeprefix("completed"):
+        convert_splat(folder / COMPLETED_FILE, folder / f"completed{suffix}")
+        (folder / COMPLETED_FILE).unlink()
+    context = None
+    if given is not None and is_same_scene(given, folder / CONTEXT_FILE):
+        (folder / CONTEXT_FILE).unlink()
+        context = str(given.resolve())
+    changed = {**summary, "scene": {**summary["scene"], "context": context}}
+    (folder / SUMMARY_FILE).write_bytes(json.dumps(changed, indent=2).encode() + b"\n")
+    return changed
+
+
+def describe_size(out: Path, can_be_smaller: bool) -> str:
+    """Write the sentence on the size of the results, and if they are large on what to do."""
+    sizes = [(out / name).stat().st_size for name in read_listing(out)]
+    total = sum(sizes)
+    sentence = f"The results take {max(round(total / 1e6), 1):,} MB."
+    if total < LARGE_BYTES or not can_be_smaller:
+        return sentence
+    size = find_completed(out).stat().st_size / 1e6
+    return (
+        f"{sentence} With --save-as .spz the completed scene takes about a seventh of {size:,.0f} "
+        "MB, rounded as that format is."
+    )
