@@ -65,7 +65,7 @@ def completion() -> Completion:
     drawn = load_renderer("reference").render(context, target)
     mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
     made = TargetResult(target, drawn, drawn, mask, drawn.alpha, 0, False, right)
-    return begin_with(context, [view]).extended(made, {"total": 0.0})
+    return begin_with(context, [view]).extended(made, {"total": 0.0}, (right,))
 
 
 def decoded(path: Path) -> tuple[dict, np.ndarray]:

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from gscompleter import CompleterConfig, GSCompleter, load_renderer
-from gscompleter.config import HoleConfig
+from gscompleter.config import GapConfig, HoleConfig
 from gscompleter.config.settings import COVERED
 from gscompleter.generators.warp import warp_photographs
 from gscompleter.numerics.geometry import project
@@ -61,7 +61,10 @@ def test_a_pixel_covered_by_less_than_max_alpha_is_a_hole_that_is_painted_and_ke
 
     # The photographs show the thin square, too, and would fill it before the target.
     config = CompleterConfig(
-        margin=0.0, holes=HoleConfig(max_alpha, dilation=0), add_observed=False
+        margin=0.0,
+        holes=HoleConfig(max_alpha, dilation=0),
+        add_observed=False,
+        gaps=GapConfig(displacement=0.0),
     ).without_guard("free-space")
     views = [view_of(Room(), camera_at(x, size=SIZE), i) for i, x in enumerate((-0.3, 0.0))]
     (result,) = GSCompleter(room_of, phi, config=config)(views, TARGET, thin_scene()).targets

@@ -12,6 +12,7 @@ from gscompleter.evaluation.cases import Case
 from gscompleter.evaluation.protocols import make_case_task
 from gscompleter.evaluation.runner import RunConfig, evaluate, prepare_task
 from gscompleter.evaluation.store import get_step_path, get_task_folder, load_prediction
+from gscompleter.splats.formats import read_provenance
 from gscompleter.splats.ply import save_ply
 from gscompleter.system.files.image import write_image
 from moving_object import CAMERAS, ROOM, SIZE, photographed
@@ -47,7 +48,9 @@ def test_a_case_gives_the_bytes_of_complete(method, config, scene, tmp_path, mon
     folder = get_task_folder(results, task.name)
     context = prepare_task(task, folder, RunConfig()).context
     prediction = load_prediction(get_step_path(folder, method, 1), context)
-    save_ply(tmp_path / "evaluated.ply", prediction.scene, provenance=True)
+    # The file of a completion says who made it.
+    made_by = read_provenance(out / "completed.ply")
+    save_ply(tmp_path / "evaluated.ply", prediction.scene, provenance=True, made_by=made_by)
     assert (tmp_path / "evaluated.ply").read_bytes() == (out / "completed.ply").read_bytes()
 
 

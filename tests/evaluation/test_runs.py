@@ -147,7 +147,7 @@ def test_what_was_added_and_all_that_was_lifted_are_compared_with_the_context(fi
         assert added["f_score"] > 0.15
         assert registered["f_score"] > 0.9
         assert registered["abs_rel"] < 0.1
-        assert registered["pixels"] > 2 * added["pixels"] > 0
+        assert registered["pixels"] > 1.5 * added["pixels"] > 0
     for method in ("context", "densify-100"):
         for scores in scores_of(finished, method):
             assert scores["seam_step"] is scores["added"] is scores["registered"] is None

@@ -186,13 +186,16 @@ def test_a_sequence_of_nothing_or_too_much_is_refused(text):
 def test_ours_improves_every_view_of_a_sequence_and_stays_metric(begun, ours):
     assert [step.frame for step in ours.steps] == [2, 3, 4]
     assert ours.error is None
+    scales = [step.depth_scale for step in ours.steps if step.depth_scale is not None]
+    # What is left of the hole at a later step may be too little to compare.
+    assert scales
     for step in ours.steps:
         assert step.scores.target_after.psnr > step.scores.target_before.psnr + 2
         assert step.psnr_end > step.scores.target_after.psnr - 0.1
         # The median of some 50 pixels at the rim of the hole, where free space moves additions
         # behind the objects that hide them: more than 1.
-        assert step.depth_scale == pytest.approx(1.2, abs=0.2)
-    assert compute_scale_drift([step.depth_scale for step in ours.steps]) < 0.15
+        assert step.depth_scale is None or step.depth_scale == pytest.approx(1.2, abs=0.2)
+    assert max(scales) / min(scales) < 1.15
     assert ours.steps[-1].psnr_end == ours.steps[-1].scores.target_after.psnr
     assert torch.equal(ours.scene.means[: len(begun.context)], begun.context.means)
 
@@ -384,7 +387,9 @@ def test_the_tables_say_what_the_steps_say(finished):
     assert full["psnr"] == pytest.approx(sum(map(psnr_of, steps)) / 2)
     assert full["gain"] == pytest.approx(full["psnr"] - full["psnr_before"])
     assert full["psnr_end"] == sum(step["psnr_end"] for step in steps) / 2
-    assert full["scale_drift"] == compute_scale_drift([s["depth_scale"] for s in steps])
+    assert full["scale_drift"] == compute_scale_drift(
+        [s["depth_scale"] for s in steps if s["depth_scale"] is not None]
+    )
     assert content["methods"]["context"]["gain"]["value"] == 0
     assert "seconds" not in json.dumps(content)
     seconds = write_tables(finished).compute_seconds("full")

@@ -10,7 +10,7 @@ import torch
 
 from command import run
 from gscompleter.apps.inputs.task import InputSplatFile
-from gscompleter.apps.report.completion import restore_file_order
+from gscompleter.apps.report.completion import find_file_order
 from gscompleter.completer import GSCompleter
 from gscompleter.config import (
     AlignmentConfig,
@@ -221,9 +221,9 @@ def test_a_sorted_scene_is_the_same_in_the_order_of_its_file():
     is_changed = torch.arange(len(SCENE)) % 3 == 0
     ids = is_changed[order].to(torch.uint8)
     state = replace(state, parts=(replace(state.rendered_context, generated=ids),))
-    context, changed = restore_file_order(state, given)
-    assert torch.equal(context.means, SCENE.means)
-    assert torch.equal(changed, is_changed)
+    in_file = find_file_order(state.context, given)
+    assert torch.equal(state.context.means[in_file], SCENE.means)
+    assert torch.equal(state.recolored_mask[in_file], is_changed)
 
 
 def test_the_command_refuses_a_scene_that_does_not_fit(tmp_path, monkeypatch, capsys):

@@ -37,7 +37,7 @@ def find_finite(gaussians: Gaussians) -> Bool[Tensor, "n"]:
     """Mark Gaussians of finite numbers below `LARGEST` whose quaternion is a rotation."""
     names = ("means", "quats", "scales", "opacities", "sh")
     values = [getattr(gaussians, name).detach() for name in names]
-    if all(value.dtype == torch.float32 and not value.is_cuda for value in values):
+    if all(value.dtype == torch.float32 and value.device.type == "cpu" for value in values):
         # In one pass, without a copy of the harmonics that says which of them are too large.
         values[-1] = values[-1].flatten(1)
         arrays = [value.contiguous().numpy() for value in values]
