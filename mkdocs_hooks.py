@@ -34,7 +34,7 @@ TEXTS = {
 FILES = ("LICENSE", "CITATION.cff")
 """Files of the repository that pages link to and that are copied as they are."""
 LLMS = "llms.txt"
-"""What assistants read first; its links are converted to pages of the site."""
+"""Start page for assistants; its links are converted to pages of the site."""
 STAGES = (
     "context",
     "target_view",

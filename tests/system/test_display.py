@@ -1,4 +1,4 @@
-"""What values print, and what a notebook shows of them."""
+"""Values print one line, and a notebook shows pictures of them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is in a splat, and what of it is invented."""
+"""Inspect a splat: its Gaussians, and the part of them that is invented."""
 
 from __future__ import annotations
 
@@ -15,7 +15,6 @@ from rich.table import Table
 from torch import Tensor
 
 from gscompleter.apps.commands.inspect import InspectOptions
-from gscompleter.apps.commands.shared_options import Device
 from gscompleter.apps.report.schema import read_summary
 from gscompleter.apps.viewer.exhibit import (
     ViewerContent,
@@ -23,6 +22,7 @@ from gscompleter.apps.viewer.exhibit import (
     load_scene_cameras,
 )
 from gscompleter.apps.warmup import compile_kernels
+from gscompleter.config.settings import Device
 from gscompleter.evaluation.verdict.numbers import format_percent
 from gscompleter.numerics.value_checks import find_finite
 from gscompleter.render.device import choose_device
@@ -45,7 +45,7 @@ Bounds = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class RunRow:
-    """What one run added, or what has no run that says so."""
+    """Gaussians that one run added, or whose run the file does not name."""
 
     gaussians: int
     """Gaussians with its labels."""
@@ -56,20 +56,20 @@ class RunRow:
 
 @dataclass(frozen=True)
 class PictureRow:
-    """What a picture shows, in shares of its area that add up to 1."""
+    """Shares of the area of a picture by the origin of the Gaussians; they add up to 1."""
 
     camera: str
     invented: float
     from_photographs: float
     """Added or recoloured as photographs show."""
     given: float
-    """Of the scene before the completion."""
+    """Share of the scene before the completion."""
     empty: float
 
 
 @dataclass(frozen=True)
 class Inspection:
-    """What is in a splat."""
+    """Contents and origin of a splat."""
 
     file: str
     format: str

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
 
 from annotated_types import Interval
 
@@ -23,6 +23,8 @@ S = TypeVar("S", bound="Settings")
 Count = Annotated[int, Interval(ge=0, le=100_000)]
 Share = Annotated[float, Interval(ge=0, le=1)]
 Weight = Annotated[float, Interval(ge=0, le=1e6)]
+Device = Literal["auto", "cpu", "cuda", "mps"]
+"""Choice of one device for renderer and networks; with `mps` the renderer stays on the CPU."""
 COVERED = 0.5
 """Alpha from which a pixel is covered, unless `holes.max_alpha` (τ of Eq. 12) demands more."""
 # Levels and rounds add to the seed.

@@ -86,8 +86,8 @@ def remove_gaussians(
     views = [hide_removed(photo.view, remaining, scenes.renderer) for photo in state.photos]
     shown = scenes.freeze_at(parts, [view.camera for view in views])
     photos = tuple(
-        # So that no model copies from ignored pixels.
-        # Budgets of the photographs with the object would forbid what fills its place.
+        # Painted over, so that no model copies from ignored pixels. Budgets of the photographs with
+        # the object would forbid what fills its place.
         replace(photo, view=view.paint_ignored(scene.render.image.clamp(0, 1)), budgets=())
         for photo, view, scene in zip(state.photos, views, shown, strict=True)
     )

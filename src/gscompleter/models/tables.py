@@ -22,7 +22,7 @@ from gscompleter.reconstructors import Reconstructor
 from gscompleter.types import View
 
 FFGS_VARIANT = "FAMILY/VARIANT"
-"""What stands for a model of ffgs in the list of names."""
+"""Placeholder of the models of ffgs in the list of names."""
 
 
 # Imports are local, so that naming a model imports neither torch nor the packages of the others.

@@ -14,8 +14,9 @@ from torch import Tensor
 
 from gscompleter.numerics.value_checks import check_gaussians
 from gscompleter.reconstructors.depth_predictors import DepthPredictor, load_depth_predictor
+from gscompleter.reconstructors.own_models import load_own_model
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.plugins import is_in_file, load_from_file, load_plugins
+from gscompleter.system.plugins import is_in_file, load_plugins
 from gscompleter.system.tensor_checks import describe, iterate_tensors, name_dtype
 from gscompleter.types import Reconstruction, View
 
@@ -234,19 +235,9 @@ def check_reconstructor(name: str) -> None:
 
 
 def load_own(name: str, weights: Path | str | None) -> Reconstructor:
-    """Load a reconstructor from `file.py:function`; raise InputError for anything else there."""
-    if weights is not None:
-        raise InputError(
-            "A reconstructor of a file opens its own weights; leave the file of weights out.",
-            "weights",
-        )
-    reconstructor = load_from_file(name, "reconstructor")
-    if not callable(reconstructor):
-        raise InputError(
-            f"'{quote_value(name)}' has to be a function from views to a Reconstruction, and is "
-            f"{describe(reconstructor)}.",
-            "reconstructor",
-        )
+    """Load a reconstructor from `file.py:function`; errors as of `load_own_model`."""
+    form = "views to a Reconstruction"
+    reconstructor: Reconstructor = load_own_model(name, "reconstructor", form, weights, "weights")
     return reconstructor
 
 

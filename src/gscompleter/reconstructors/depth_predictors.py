@@ -9,9 +9,9 @@ from pathlib import Path
 import torch
 
 from gscompleter.numerics.value_checks import check_depth
+from gscompleter.reconstructors.own_models import load_own_model
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.plugins import is_in_file, load_from_file, load_plugins
-from gscompleter.system.tensor_checks import describe
+from gscompleter.system.plugins import is_in_file, load_plugins
 from gscompleter.types import DepthMap, View
 
 DepthPredictor = Callable[[View], DepthMap]
@@ -56,19 +56,9 @@ def load_depth_predictor(
 ) -> DepthPredictor:
     """Load a predictor by name or from `file.py:function`; raise InputError if there is none."""
     if is_in_file(name):
-        if weights is not None:
-            raise InputError(
-                "A depth of a file opens its own weights; leave the file of weights out.",
-                "depth-weights",
-            )
-        predictor = load_from_file(name, "depth")
-        if not callable(predictor):
-            raise InputError(
-                f"'{quote_value(name)}' has to be a function from a View to a DepthMap, and is "
-                f"{describe(predictor)}.",
-                "depth",
-            )
-        return predictor
+        form = "a View to a DepthMap"
+        own: DepthPredictor = load_own_model(name, "depth", form, weights, "depth-weights")
+        return own
     loaders = DEPTH_PREDICTORS | load_plugins(PLUGINS)
     if name not in loaders:
         raise InputError(

@@ -9,14 +9,13 @@ from typing import Literal
 
 import torch
 
+from gscompleter.config.settings import Device
 from gscompleter.render.gsplat_kernels import explain_missing_gpu, explain_missing_renderer
 from gscompleter.system.errors import InputError
 
 RendererDevice = Literal["cpu", "cuda"]
 NetworkDevice = Literal["cpu", "cuda", "mps"]
 """AMD's GPUs are `cuda` as well (torch for ROCm); `mps` is the GPU of a Mac."""
-Device = Literal["auto", "cpu", "cuda", "mps"]
-"""Choice of one device for both; with `mps` the renderer stays on the CPU."""
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,11 @@ MARGIN = 0.01
 
 def mask_removed(source: ContextScene, camera: Camera, renderer: Renderer) -> Bool[Tensor, "h w"]:
     """Mark the pixels that showed something removed, and their border."""
-    shown = find_removed(source, camera, renderer)
+    return add_border(find_removed(source, camera, renderer))
+
+
+def add_border(shown: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    """Add the border of pixels that showed something removed."""
     return dilate(shown, max(round(MARGIN * max(shown.shape)), 1))
 
 

@@ -20,7 +20,7 @@ from gscompleter.config import GapConfig
 from gscompleter.generators.smooth import continue_smoothly
 from gscompleter.numerics.geometry import pad_camera
 from gscompleter.numerics.image_ops import dilate, keep_thin
-from gscompleter.reconstructors.plane_sweep.gaussians import compute_normals, make_discs
+from gscompleter.reconstructors.plane_sweep.gaussians import DISC_SIGMA, compute_normals, make_discs
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.reference import adapt_to_mode
 from gscompleter.stages.select_anchor import find_nearest_view
@@ -30,8 +30,6 @@ from gscompleter.state import Completion
 from gscompleter.system.timing import timed_stage
 from gscompleter.types import Camera, Gaussians, View
 
-DISC_SIGMA = 0.55
-"""Standard deviation of an addition across its ray, in pixels, as those of plane-sweep have it."""
 RIM = 1
 """Pixels around a gap that are covered as well, and whose mixed colours and depths do not count."""
 REACH = 16

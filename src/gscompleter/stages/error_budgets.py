@@ -42,16 +42,11 @@ def set_error_budgets(
     limits it over the whole photograph. Both allow a loss of PSNR of `max_drop`, and any loss above
     `invisible_psnr`. The last allows a loss of SSIM of `max_ssim_drop`.
     """
-    # Relative to its error, a photograph that the scene shows perfectly could lose nothing.
-    invisible_error = 10 ** (-config.invisible_psnr / 10)
 
     def set_budget(view: View, metric: Literal["mse", "dssim"]) -> ErrorBudget:
         unlimited = ErrorBudget(view, metric, 0.0)
         error = compute_pixel_errors(image.clamp(0, 1), unlimited).sum().item()
-        if metric == "mse":
-            limit = add_psnr_loss(error, max(config.max_drop, MIN_PSNR_LOSS))
-            return ErrorBudget(view, metric, max(limit, invisible_error))
-        return ErrorBudget(view, metric, error + config.max_ssim_drop)
+        return ErrorBudget(view, metric, limit_error(metric, error, config))
 
     # The part without holes has a budget of its own. A closed hole lowers the error of the whole
     # image, and could pay for an error elsewhere: a photograph of 33 dB lost 1.3 dB where its
@@ -66,6 +61,15 @@ def set_error_budgets(
     if min(photograph.image.shape[:2]) > 2 * SSIM_RADIUS:
         budgets.append(set_budget(photograph, "dssim"))
     return tuple(budgets)
+
+
+def limit_error(metric: Literal["mse", "dssim"], error: float, config: PsnrGuardConfig) -> float:
+    """Compute the largest error after the loss that the settings allow of this error."""
+    if metric == "dssim":
+        return error + config.max_ssim_drop
+    # Relative to its error, a photograph that the scene shows perfectly could lose nothing.
+    invisible = 10 ** (-config.invisible_psnr / 10)
+    return max(add_psnr_loss(error, max(config.max_drop, MIN_PSNR_LOSS)), invisible)
 
 
 def set_total_budgets(
@@ -104,12 +108,9 @@ def share_budgets(
 
 def share_budget(budget: ErrorBudget, error: float, config: PsnrGuardConfig) -> ErrorBudget:
     """Limit what one target may add to an `error`, within the budget for all targets."""
-    if budget.metric == "mse":
-        own = add_psnr_loss(error, max(config.max_drop, MIN_PSNR_LOSS))
-        invisible = 10 ** (-config.invisible_psnr / 10)
-    else:
-        own = error + config.max_ssim_drop
-        invisible = 0.0
+    own = limit_error(budget.metric, error, config)
+    # Of an image without any error, all that may be lost is what is invisible.
+    invisible = limit_error("mse", 0.0, config) if budget.metric == "mse" else 0.0
     # Half of what is left: a later target is not refused because an earlier one took all. Before
     # that, the fourth target in a row often was (decision 058).
     half = error + max(budget.limit - error, 0.0) / 2

@@ -15,7 +15,7 @@ from gscompleter.numerics.image_ops import blur_gaussian, dilate
 from gscompleter.numerics.sky import mask_out_sky
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.protocols import FrozenScene
-from gscompleter.render.removed import find_removed, mask_removed
+from gscompleter.render.removed import add_border, find_removed
 from gscompleter.stages.enclosed_holes import keep_enclosed
 from gscompleter.stages.error_budgets import share_budgets
 from gscompleter.stages.select_anchor import AnchorChoice, compute_overlap, select_anchor
@@ -81,7 +81,7 @@ class TargetView:
         source = self.state.source
         if not self.state.config.holes.forces_removed or len(source.removed) == 0:
             return None
-        forced = find_removed(source, self.camera.padded, self.scenes.renderer)
+        forced = self.removed
         # What an earlier target filled is no hole any more.
         filled = [part[part.generated != NEW_PHOTO_ID] for part in self.state.parts[1:]]
         if sum(map(len, filled)) == 0:
@@ -95,7 +95,12 @@ class TargetView:
         state = self.state
         if "removal" not in state.config.guards or len(state.source.removed) == 0:
             return None
-        return mask_removed(state.source, self.camera.padded, self.scenes.renderer)
+        return add_border(self.removed)
+
+    @cached_property
+    def removed(self) -> Bool[Tensor, "h w"]:
+        """Pixels that showed something removed."""
+        return find_removed(self.state.source, self.camera.padded, self.scenes.renderer)
 
     def render_at(self, camera: Camera) -> Render:
         """Render the same scene at another camera."""

@@ -8,8 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from gscompleter.apps.commands.shared_options import Device
-from gscompleter.config.settings import Settings
+from gscompleter.config.settings import Device, Settings
 from gscompleter.system.process import import_without_collection
 
 

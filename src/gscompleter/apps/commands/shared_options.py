@@ -14,11 +14,10 @@ from annotated_types import Interval
 from gscompleter.apps.inputs.scene_request import LONG_SIDE, PosesRequest, SceneRequest
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import GeneratorOptions
-from gscompleter.config.settings import Seed, Settings
+from gscompleter.config.settings import Device, Seed, Settings
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.jobs.engine_names import EngineName
 
-Device = Literal["auto", "cpu", "cuda", "mps"]
 Words = Annotated[tuple[int | str, ...] | None, tyro.conf.arg(metavar="PHOTO [PHOTO ...]")]
 Threads = Annotated[int, Interval(ge=1, le=1024)]
 Port = Annotated[int, Interval(ge=0, le=65535)]

@@ -255,6 +255,8 @@ def score_targets(
 
 def measure_flights(completion: Completion, renderer: Renderer) -> list[float]:
     """Compute the share of thin gaps on the way from a photograph to each target."""
+    if not completion.targets:
+        return []
     # As stages see it: of a large scene its proxy, which shows the same gaps.
     scene = merge(completion.parts)
     photographs = [view.camera for view in completion.views]

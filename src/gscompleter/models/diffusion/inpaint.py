@@ -97,8 +97,7 @@ class Painter:
         known = inspect.signature(self.pipeline.__call__).parameters
         painted = self.pipeline(**{k: v for k, v in wanted.items() if k in known}).images[0]
 
-        back = resize_antialiased(painted.float().permute(1, 2, 0), (hole.shape[0], hole.shape[1]))
-        return back.clamp(0, 1).to(image.device)
+        return restore_size(painted, image)
 
 
 @dataclass(frozen=True)
@@ -133,8 +132,15 @@ class Editor(Painter):
             output_type="pt",
             **arguments,
         ).images[0]
-        back = resize_antialiased(edited.float().permute(1, 2, 0), (hole.shape[0], hole.shape[1]))
-        return back.clamp(0, 1).to(image.device)
+        return restore_size(edited, image)
+
+
+def restore_size(
+    painted: Float[Tensor, "3 _ _"], image: Float[Tensor, "h w 3"]
+) -> Float[Tensor, "h w 3"]:
+    """Scale what a pipeline painted to the size of `image`, on its device, in [0, 1]."""
+    back = resize_antialiased(painted.float().permute(1, 2, 0), (image.shape[0], image.shape[1]))
+    return back.clamp(0, 1).to(image.device)
 
 
 @dataclass(frozen=True)

@@ -41,6 +41,8 @@ THICKNESS = 0.15
 """Standard deviation along the normal, relative to that across the viewing ray."""
 MAX_STRETCH = 6.0
 """Largest elongation of a disc on a slanted surface, relative to a frontal one."""
+DISC_SIGMA = 0.55
+"""Standard deviation of a disc across the viewing ray, in pixels."""
 OPACITY = 0.98
 """Initial opacity of every disc."""
 COLOR_ROUNDS = 4
@@ -51,7 +53,7 @@ COLOR_ROUNDS = 4
 class Splatter:
     """Base of reconstructors that splat depth maps and fit the Gaussians."""
 
-    disc_sigma: float = 0.55
+    disc_sigma: float = DISC_SIGMA
     """Standard deviation of a Gaussian across the viewing ray, in pixels."""
     renderer: Renderer = field(default_factory=lambda: load_renderer("cpu"))
 
