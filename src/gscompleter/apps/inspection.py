@@ -95,11 +95,13 @@ class Inspection:
 def inspect_splat(options: InspectOptions) -> Inspection:
     """Inspect a file, and the pictures of it at the cameras that are known."""
     path, folder = locate(options.file)
+    # Other readers refuse a file with NaN; here those Gaussians are counted, and left out.
     decoded = decode_splat(path)
     finite = find_finite(decoded)
     if not finite.any():
         raise InputError(f"{quote_value(path)} holds no Gaussian that is finite; write it anew.")
     gaussians = decoded[finite]
+    # A damaged record is told beside the Gaussians, which can be read without it.
     defect = None
     runs: tuple[RunRecord, ...] = ()
     try:
@@ -159,6 +161,7 @@ def find_invented(labels: UInt8[Tensor, "n"]) -> Tensor:
 
 def list_runs(labels: UInt8[Tensor, "n"], runs: Sequence[RunRecord]) -> Iterator[RunRow]:
     """List what each run invented, and at last what no run claims."""
+    # A label that two runs name counts for the first of them, so that the counts add up.
     rest = find_invented(labels)
     for run in runs:
         mine = torch.zeros_like(rest)
@@ -176,6 +179,7 @@ def list_cameras(
     options: InspectOptions, folder: Path | None, gaussians: Gaussians
 ) -> tuple[list[tuple[str, Camera]], tuple[str, ...]]:
     """List the cameras of pictures with their names, and notes on those that are missing."""
+    # Cameras are read into the frame of the file: that of the photographs, then its transform.
     content = ViewerContent("", gaussians, None)
     summary = None if folder is None else read_summary(folder)
     if summary is not None:
@@ -220,6 +224,7 @@ def measure_picture(
     painted: Gaussians, name: str, camera: Camera, renderer: Renderer
 ) -> PictureRow:
     """Measure a picture of painted Gaussians: each channel of a pixel is the weight of its kind."""
+    # Colours are over black, so that the channels and 1 - alpha add up to 1.
     render = renderer.render(painted, camera)
     invented, from_photographs, given = render.image.mean(dim=(0, 1)).tolist()
     return PictureRow(name, invented, from_photographs, given, 1 - render.alpha.mean().item())

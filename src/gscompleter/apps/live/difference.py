@@ -58,7 +58,7 @@ class PageScene:
             name: self._list_hidden(rows, gone | recolored) for name, rows in self._layers.items()
         }
         # A Gaussian with new colours is another one.
-        new = merge([completion.recolored_context[recolored & ~gone], *completion.parts[1:]])
+        new = merge([completion.recolored[~gone[recolored]], *completion.parts[1:]])
         shown = self._place(new[is_within_page(new, self.frame)].to("cpu").detach())
         for name, count in self._counts.items():
             numbers = shown.get(name, set())

@@ -24,8 +24,9 @@ def make_run_record(
 ) -> RunRecord:
     """Make the record of a completion with its models; `given` is the file of a given scene."""
     added = completion.added.generated
-    recolored = completion.recolored_context.generated[completion.recolored_mask]
+    recolored = completion.recolored.generated
     labels = [*added.unique().tolist(), *recolored.unique().tolist()]
+    # What photographs show was added as well, and nobody invented it.
     invented = [label for label in labels if label != NEW_PHOTO_ID]
     painters = [result.painter for result in completion.targets if result.painter]
     return RunRecord(
