@@ -363,16 +363,18 @@ class Completion(Displayed):
         first = 0
         for start in range(0, max(len(self.context), 1), count):
             block = slice(start, start + count)
-            rows = is_recolored[block].nonzero()[:, 0]
-            new = self.recolored[first : first + len(rows)]
-            first += len(rows)
             part = self.context[block]
-            part = replace(
-                part,
-                sh=part.sh.index_copy(0, rows, new.sh),
-                generated=part.generated.index_copy(0, rows, new.generated),
-            )
-            yield part[~is_gone[block]]
+            # Only what was recoloured takes memory of its own.
+            rows = is_recolored[block].nonzero()[:, 0]
+            if len(rows) > 0:
+                new = self.recolored[first : first + len(rows)]
+                first += len(rows)
+                part = replace(
+                    part,
+                    sh=part.sh.index_copy(0, rows, new.sh),
+                    generated=part.generated.index_copy(0, rows, new.generated),
+                )
+            yield part[~is_gone[block]] if is_gone[block].any() else part
 
     @property
     def next_target_id(self) -> int:

@@ -205,6 +205,28 @@ def test_an_extended_view_is_the_frozen_view_of_both(renderer, antialiased):
             assert torch.equal(getattr(ours, name), getattr(truth, name)), name
 
 
+@MODES
+@pytest.mark.parametrize("renderer", [CPU, REFERENCE], ids=["cpu", "reference"])
+def test_a_repainted_view_is_the_frozen_view_in_new_colours(renderer, antialiased):
+    context, new = context_and_new(antialiased)
+    rows = torch.arange(len(context) - 1, 0, -3)  # in any order
+    painted = replace(context[rows], sh=context.sh[rows].flip(0))
+    repainted = renderer.freeze(context, CAMERA).repaint(rows, painted)
+    frozen = renderer.freeze(
+        replace(context, sh=context.sh.index_copy(0, rows, painted.sh)), CAMERA
+    )
+    assert not torch.equal(frozen.render.image, renderer.freeze(context, CAMERA).render.image)
+    for ours, truth in (
+        (repainted.render, frozen.render),
+        (repainted.composite(new), frozen.composite(new)),
+        (repainted.extend(new).render, frozen.extend(new).render),
+    ):
+        for name in DRAWN:
+            assert torch.equal(getattr(ours, name), getattr(truth, name)), name
+    image = frozen.render.image
+    assert torch.equal(repainted.backproject(image), frozen.backproject(image))
+
+
 def test_a_frozen_view_keeps_no_splat_that_no_tile_draws():
     wall = gaussians_of(view_of(Room(), camera_at(size=64)))
     hidden = replace(wall, means=2 * wall.means, scales=2 * wall.scales)
@@ -455,6 +477,11 @@ def test_gsplat_is_called_so_that_frozen_views_draw_what_the_reference_does(name
     plain = REFERENCE.freeze(context, CAMERA)
     check_frozen(view, plain, new, 1e-4)
     check_sums(view, plain, new, 1e-4)
+    rows = torch.arange(0, len(context), 3)
+    painted = replace(context[rows], sh=-context.sh[rows])
+    repainted = replace(context, sh=context.sh.index_copy(0, rows, painted.sh))
+    plain = REFERENCE.freeze(repainted, CAMERA)
+    check_frozen(view.repaint(rows, painted), plain, new, 1e-4)
     more = replace(random_gaussians(30, seed=6), is_antialiased=context.is_antialiased)
     extended = view.extend(new[:0]).extend(new)
     plain = REFERENCE.freeze(merge([context, new]), CAMERA)

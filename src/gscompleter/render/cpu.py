@@ -120,6 +120,23 @@ class CpuFrozenScene:
         frame = frame._replace(used=used)
         return CpuFrozenScene(self.viewpoint, layer, frame, depth_limits, rows, count)
 
+    def repaint(self, rows: Int64[Tensor, "m"], painted: Gaussians) -> CpuFrozenScene:
+        """Composite the frozen lists once more, in the new colours: nothing is sorted or binned."""
+        # Row of `painted` for each splat, or -1. What a tile shows does not depend on colours.
+        row_of_gaussian = np.full(self.count, -1, np.int32)
+        row_of_gaussian[rows.numpy()] = np.arange(len(rows), dtype=np.int32)
+        row_of_splat = row_of_gaussian[self.rows]
+        is_painted = row_of_splat >= 0
+        new = self.viewpoint.project(to_arrays(painted), painted.is_antialiased)
+        splats = self.layer.splats.copy()
+        splats[is_painted, project.RED :] = new.columns[row_of_splat[is_painted], project.RED :]
+
+        layer = self.layer._replace(splats=splats)
+        frame, _ = freeze_nothing(self.viewpoint).composite_layer(layer)
+        # The layer was composited as a new one, whose entries the second column counts.
+        frame = frame._replace(used=np.ascontiguousarray(frame.used[:, ::-1]))
+        return replace(self, layer=layer, frame=frame)
+
     def backproject(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """Backproject `image` by the backward pass on the frozen frame."""
         # Kernels give gradients to new splats only, so that the context is passed as the new layer

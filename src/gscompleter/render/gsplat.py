@@ -19,7 +19,7 @@ from gscompleter.render.device import choose_device
 from gscompleter.render.protocols import ColorErrors, ColorSums, OpacityRender
 from gscompleter.render.redraw import RedrawnScene, make_empty_render, set_colors
 from gscompleter.render.spherical_harmonics import evaluate_colors
-from gscompleter.types import Camera, Gaussians, Render, merge
+from gscompleter.types import Camera, Gaussians, Render, merge, sh_from_rgb
 
 EPS_2D = 0.3
 """Low-pass of 3DGS: pixels² that are added to the variances of each footprint."""
@@ -312,6 +312,21 @@ class CudaFrozenScene(RedrawnScene):
         rows = torch.cat([self.rows[self.visible_rows], numbers])
         count = self.count + len(new)
         return replace(self, scene=merge([self.visible_scene, new]), rows=rows, count=count)
+
+    def repaint(self, rows: Int64[Tensor, "m"], painted: Gaussians) -> CudaFrozenScene:
+        """Give the visible ones among the Gaussians at `rows` new colours."""
+        # The scene holds colours instead of harmonics where it was extended before, and lacks what
+        # was invisible then.
+        place = rows.new_full((self.count,), -1)
+        place[rows] = torch.arange(len(rows), device=rows.device)
+        sources = place[self.rows[self.visible_rows]]
+        painted_here = (sources >= 0).nonzero()[:, 0]
+        new = painted[sources[painted_here]]
+        center = self.camera.center.to(new.means.device)
+        colors = sh_from_rgb(evaluate_colors(new.sh, new.means, center))
+        sh = self.visible_scene.sh.index_copy(0, painted_here, colors)
+        scene = replace(self.visible_scene, sh=sh)
+        return replace(self, scene=scene, rows=self.rows[self.visible_rows])
 
     def backproject(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """Sum `image` over the compositing weights; they are 0 for invisible Gaussians."""

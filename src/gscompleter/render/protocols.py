@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Protocol, runtime_checkable
 
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from gscompleter.types import Camera, Gaussians, Render
@@ -32,6 +32,9 @@ class FrozenScene(Protocol):
 
     def extend(self, new: Gaussians) -> FrozenScene:
         """Add `new` to the frozen scene, after its Gaussians."""
+
+    def repaint(self, rows: Int64[Tensor, "m"], painted: Gaussians) -> FrozenScene:
+        """Give the Gaussians at distinct `rows` the colours of `painted`, the same Gaussians."""
 
     def backproject(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """Sum `image` over the compositing weights of each Gaussian: Σ_p w_ip image_p."""

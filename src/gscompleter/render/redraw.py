@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int64
 from torch import Tensor
 
 from gscompleter.numerics.geometry import move_to_depths
@@ -48,6 +48,11 @@ class RedrawnScene:
     def extend(self, new: Gaussians) -> RedrawnScene:
         """Add `new` to the scene."""
         return replace(self, scene=merge([self.scene, new]))
+
+    def repaint(self, rows: Int64[Tensor, "m"], painted: Gaussians) -> RedrawnScene:
+        """Give Gaussians of the scene the harmonics of `painted`."""
+        sh = self.scene.sh.index_copy(0, rows, painted.sh.to(self.scene.sh))
+        return replace(self, scene=replace(self.scene, sh=sh))
 
     def backproject(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """Sum `image` over the compositing weights of each visible Gaussian."""

@@ -9,7 +9,7 @@ a 3DGS .ply with a further element `place` that has one property `uint row`.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -345,15 +345,16 @@ def save_removed(
     if layout is None:
         has_labels = bool((removed.generated > 0).any())
         header = make_scene_header(removed, has_labels)
-        values = make_rows(removed, has_labels)
+        blocks: Iterable[ndarray] = [make_rows(removed, has_labels)]
     else:
         numbers = rows.numpy() if kept is None else np.flatnonzero(kept.numpy())[rows.numpy()]
         header = layout.header
-        values = layout.rows[numbers]
+        # Rows that lie all over a file would map the whole of it.
+        blocks = (values for _, values in iterate_rows(layout, numbers))
     first, _, end = split_header(header)
     place = f"element place {len(rows)}\nproperty uint row\n".encode()
     trailer = rows.numpy().astype("<u4")
-    write_ply_file(path, b"".join([first, place, end]), len(values), [values], trailer)
+    write_ply_file(path, b"".join([first, place, end]), len(rows), blocks, trailer)
 
 
 def reinsert(

@@ -50,6 +50,7 @@ from gscompleter.system.errors import print_error, quote_value
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.files.video import find_ffmpeg
 from gscompleter.system.files.writing import RENDERS_FILE, TARGETS_FILE
+from gscompleter.system.process import release_free_memory
 from gscompleter.system.progress import show_progress, stage
 from gscompleter.system.timing import add_seconds
 from gscompleter.types import Camera
@@ -89,6 +90,7 @@ def complete_folder(
 
         # Frozen views of the scene take memory, and the report does not use them.
         ready.completer.scenes.clear()
+        release_free_memory()
         with stage("report"):
             summary = write_done(folder, ready, completion)
             write_targets(folder, ready.task)

@@ -200,7 +200,8 @@ def score_views(completion: Completion, views: Sequence[View], renderer: Rendere
         shown = hide_removed(view, completion.source, renderer)
         return compute_scores(render_before_after(completion, view.camera, renderer), shown)
 
-    return list(get_view_map(completion.added.means)(score, views))
+    map_views = get_view_map(completion.context.means, len(completion.context))
+    return list(map_views(score, views))
 
 
 def score_photographs(

@@ -34,14 +34,16 @@ class HeldOut:
 def render_before_after(completion: Completion, camera: Camera, renderer: Renderer) -> RenderPair:
     """Render the context and the completed scene."""
     with torch.no_grad():
-        before = renderer.freeze(completion.context, camera)
-        # Without recolouring and removal the context is the same, and is projected once.
-        after = before
-        if completion.has_changed_context:
-            after = renderer.freeze(completion.context[:0], camera)
+        frozen = renderer.freeze(completion.context, camera)
+        before = frozen.render
+        if completion.source.gone_mask.any():
+            frozen = renderer.freeze(completion.context[:0], camera)
             for part in completion.iterate_kept(BLOCK):
-                after = after.extend(part)
-        return RenderPair(before.render, after.composite(completion.added))
+                frozen = frozen.extend(part)
+        elif len(completion.recolored) > 0:
+            rows = completion.recolored_mask.nonzero()[:, 0]
+            frozen = frozen.repaint(rows, completion.recolored)
+        return RenderPair(before, frozen.composite(completion.added))
 
 
 def score_held_out(
@@ -61,7 +63,8 @@ def score_held_out(
         row = replace(row, is_check=photograph.is_check)
         return row if likeness is None else replace(row, **asdict(likeness))
 
-    return list(get_view_map(completion.added.means)(score, held_out))
+    map_views = get_view_map(completion.context.means, len(completion.context))
+    return list(map_views(score, held_out))
 
 
 def score_photograph(completion: Completion, view: View, renderer: Renderer) -> HeldOutRow:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import pickle
 import re
@@ -17,7 +16,7 @@ from torch import Tensor
 from gscompleter.models.weights.fetching import fetch
 from gscompleter.models.weights.published import PUBLISHED, PublishedWeights
 from gscompleter.system.errors import InputError, join_names, quote_value, refuse_pointer
-from gscompleter.system.files.reading import open_file
+from gscompleter.system.files.reading import hash_file, open_file
 
 IGNORED_PREFIXES = ("decoder.", "losses.")
 """Prefixes of tensors of other parts that training checkpoints contain."""
@@ -72,11 +71,7 @@ def check_kind(path: Path, name: str) -> None:
 
 def check_sha256(path: Path, expected: str, name: str) -> None:
     """Raise InputError if the SHA-256 of a file does not start with `expected`."""
-    hashed = hashlib.sha256()
-    with path.open("rb") as file:
-        while block := file.read(1 << 20):
-            hashed.update(block)
-    digest = hashed.hexdigest()
+    digest = hash_file(path)
     if digest.startswith(expected):
         return
     for other in PUBLISHED.values():

@@ -59,8 +59,12 @@ def read_head(path: Path, count: int) -> bytes:
 
 
 def hash_file(path: Path) -> str:
-    """Compute the SHA-256 of a file, in hexadecimal."""
-    return hashlib.sha256(read_bytes(path)).hexdigest()
+    """Compute the SHA-256 of a file, in hexadecimal; files of gigabytes are not held in memory."""
+    digest = hashlib.sha256()
+    with open_file(path) as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
 
 
 def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
