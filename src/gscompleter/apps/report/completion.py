@@ -18,6 +18,7 @@ from torch.nn.functional import normalize
 
 from gscompleter import __version__
 from gscompleter.apps.inputs.task import InputSplatFile, Target
+from gscompleter.apps.report.removal_pictures import draw_removal
 from gscompleter.apps.report.schema import (
     RECORD_FILE,
     SCORES,
@@ -146,10 +147,14 @@ def write_report(
     for number, found in enumerate(gaps, start=1):
         write_pixels(folder / IMAGES / f"target{number}_gaps.png", draw_gap(found.worst))
     write_photographs(folder / IMAGES, completion, shown, renderer)
+    removal = draw_removal(completion, renderer, files)
+    if removal is not None:
+        write_images(folder / IMAGES, "removal", removal.name_images())
     record = make_record(completion, thin_evenly(photographs, MAX_PHOTOGRAPHS))
     (folder / RECORD_FILE).write_bytes(json.dumps(asdict(record)).encode() + b"\n")
     coverage = {"coverage": asdict(compute_coverage(around))} if around else {}
-    counts = {**count_changes(completion), "seconds": dict(completion.seconds)}
+    left = {} if removal is None else {"removal": asdict(removal.row)}
+    counts = {**count_changes(completion), **left, "seconds": dict(completion.seconds)}
     summary = {
         "version": __version__,
         "outcome": scores.pop("outcome"),

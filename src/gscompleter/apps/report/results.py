@@ -61,7 +61,7 @@ RESULTS = (
     *(CONTEXT_FILE, GENERATED_FILE, REMOVED_FILE, TARGETS_FILE),
     RENDERS_FILE,
     *(REPORT_FILE, RECORD_FILE, SUMMARY_FILE, VIDEO_FILE, "images/target*.png"),
-    *("images/photograph*.png", "images/context*.png"),
+    *("images/photograph*.png", "images/context*.png", "images/removal*.png"),
 )
 """Globs of the files that a completion may write."""
 FORMAT = "python"
