@@ -90,17 +90,24 @@ def test_the_worst_place_is_the_window_with_most_gaps_of_all_renders():
     assert worst.share == pytest.approx((64 + 30) / WINDOW**2)
     assert worst.left <= 100 < 113 <= worst.left + WINDOW
     assert worst.top <= 150 < 160 <= worst.top + WINDOW
-    window = much[worst.top : worst.top + WINDOW, worst.left : worst.left + WINDOW]
+    # Around the middle of its gaps.
+    assert worst.left + WINDOW // 2 == (100 + 113) // 2
+    window = much[worst.box]
     assert torch.equal(worst.crop[..., 0], window)
 
     picture = draw_gap(worst)
-    assert picture.shape == (LABEL_HEIGHT + ZOOM * WINDOW, ZOOM * WINDOW, 3)
-    # The pixels of the window as squares below a line that is not empty.
-    assert (picture[LABEL_HEIGHT::ZOOM, ::ZOOM, 0] == (255 * window + 0.5).int().numpy()).all()
+    side = ZOOM * WINDOW
+    assert picture.shape == (LABEL_HEIGHT + side, 2 * side, 3)
+    # The pixels of the window as squares below a line that is not empty, and again with marks.
+    pixels = picture[LABEL_HEIGHT::ZOOM, ::ZOOM]
+    assert (pixels[:, :WINDOW, 0] == (255 * window + 0.5).int().numpy()).all()
+    is_marked = (pixels[:, WINDOW:] == (255, 0, 255)).all(axis=-1)
+    assert (is_marked == find_thin_gaps(much)[worst.box].numpy()).all()
+    assert is_marked.mean() == pytest.approx(worst.share)
     assert (picture[:LABEL_HEIGHT] == 0).any()
 
 
 def test_without_gaps_there_is_no_place_and_the_picture_says_so():
     assert find_worst_gap({"at the target": make_render(torch.ones(80, 90))}) is None
-    assert draw_gap(None).shape == (LABEL_HEIGHT, ZOOM * WINDOW, 3)
+    assert draw_gap(None).shape == (LABEL_HEIGHT, 2 * ZOOM * WINDOW, 3)
     assert (draw_gap(None) == 0).any()

@@ -43,6 +43,14 @@ class WorstGap:
     """Pixel of the image at the upper left corner of the window."""
     crop: Float[Tensor, "s s 3"]
     """What the window shows, over black."""
+    gaps: Bool[Tensor, "s s"]
+    """The thin gaps in it."""
+
+    @property
+    def box(self) -> tuple[slice, slice]:
+        """Rows and columns of the window."""
+        height, width = self.gaps.shape
+        return slice(self.top, self.top + height), slice(self.left, self.left + width)
 
     def describe(self) -> str:
         """Describe the window in two lines."""
@@ -74,10 +82,16 @@ def find_worst_gap(renders: Mapping[str, Render]) -> WorstGap | None:
         shares = avg_pool2d(gaps.to(torch.float64)[None, None], side, stride=1)[0, 0]
         share = shares.max().item()
         if share > (0.0 if worst is None else worst.share):
-            top, left = divmod(int(shares.argmax()), shares.shape[1])
+            row, column = divmod(int(shares.argmax()), shares.shape[1])
+            # The first such window has its gaps at its lower right. One around their middle has the
+            # same, since none has more.
+            inside = gaps[row : row + side, column : column + side].nonzero()
+            middle = (inside.amin(dim=0) + inside.amax(dim=0) + 1) // 2 - side // 2
+            top = min(max(row + int(middle[0]), 0), height - side)
+            left = min(max(column + int(middle[1]), 0), width - side)
+            box = (slice(top, top + side), slice(left, left + side))
             # A copy, so that the image is not kept for it.
-            crop = render.image[top : top + side, left : left + side].clone()
-            worst = WorstGap(where, share, left, top, crop)
+            worst = WorstGap(where, share, left, top, render.image[box].clone(), gaps[box].clone())
     return worst
 
 
