@@ -63,7 +63,7 @@ def test_out_holds_all_that_the_contract_names(completed):
         "summary.json",
         "targets.json",
     }
-    names = ("before", "after", "reference", "hole_mask", "truth")
+    names = ("before", "after", "reference", "hole_mask", "gaps", "truth")
     images = {p.name for p in (completed / "images").iterdir()}
     assert images == {f"target1_{name}.png" for name in names}
 

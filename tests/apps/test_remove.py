@@ -21,6 +21,7 @@ from gscompleter.apps.inputs.removal import (
     find_same_positions,
     widen_regions,
 )
+from gscompleter.apps.report.removal_pictures import find_largest
 from gscompleter.data.formats import open_photographs
 from gscompleter.numerics.geometry import axis_angle_to_matrix, rotations_to_quats
 from gscompleter.render.loading import load_renderer
@@ -110,8 +111,16 @@ def test_the_crate_goes_its_place_is_filled_and_strip_brings_it_back(scene, tmp_
     counts = json.loads((out / "summary.json").read_text())["gaussians"]
     assert counts["removed"] == len(given) - len(left) == len(load_ply(out / "removed.ply")) > 100
     assert (out / "context.ply").read_bytes() == (scene / "splat.ply").read_bytes()
-    (row,) = json.loads((out / "summary.json").read_text())["targets"]
+    summary = json.loads((out / "summary.json").read_text())
+    (row,) = summary["targets"]
     assert row["added"] > 0
+    rest = summary["removal"]
+    assert rest["frame"] in range(len(CAMERAS))
+    assert 0.03 < rest["shown"] < 0.5
+    assert rest["continued"] < 0.03
+    images = {name: read_image(out / f"images/removal_{name}.png") for name in ("after", "outline")}
+    painted = (images["after"] != images["outline"]).any(-1)
+    assert 0.01 < painted.float().mean() < 0.2
     depth, crate = (cast(room, TARGET)[1] for room in (EMPTY, ROOM))
     after = RENDERER.render(completed, TARGET)
     hole = (RENDERER.render(left, TARGET).alpha < 0.5) & (crate < 0.95 * depth)
@@ -122,6 +131,30 @@ def test_the_crate_goes_its_place_is_filled_and_strip_brings_it_back(scene, tmp_
     again = tmp_path / "again.ply"
     assert run(monkeypatch, "strip", out / "completed.ply", "--out", again, "--quiet") == 0
     assert again.read_bytes() == (scene / "splat.ply").read_bytes()
+
+
+def test_half_of_an_object_that_is_left_is_reported(scene, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    half = (*CRATE[:4], 0.9, CRATE[5])
+    words = [word for word in remove(scene, out, "--box", *half, "--auto", 1) if word != "--quiet"]
+    assert run(monkeypatch, *words) == 0
+    left = json.loads((out / "summary.json").read_text())["removal"]
+    assert left["continued"] > 0.1
+    assert f"Along {100 * left['continued']:.0f} % of the outline" in capsys.readouterr().out
+    page = (out / "report.html").read_text()
+    assert f"What was removed, in photograph {left['frame']}" in page
+    mask = read_image(out / "images" / "removal_outline.png")
+    magenta = (mask == torch.tensor([1.0, 0.0, 1.0])).all(-1)
+    assert magenta.any()
+
+
+def test_the_photograph_that_shows_something_whole_is_chosen():
+    small, large, empty = torch.zeros(3, 20, 20, dtype=torch.bool)
+    small[5:8, 5:8] = True
+    large[0:10, 3:9] = True
+    assert find_largest([empty, large, small]) == 2
+    assert find_largest([empty, large]) == 1
+    assert find_largest([empty]) is None
 
 
 def test_targets_are_photographs_and_what_shows_the_crate_is_not_scored(

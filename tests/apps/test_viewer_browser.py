@@ -273,6 +273,43 @@ def test_a_link_opens_at_its_camera(browser, saved):
     tab.context.close()
 
 
+@pytest.mark.parametrize(("width", "height"), [(4 * SIDE, SIDE), (SIDE, 3 * SIDE)])
+def test_nothing_is_shown_beyond_the_frame_of_a_camera_until_it_is_moved(
+    browser, saved, width, height
+):
+    """Neither after the page is opened nor after the window is resized."""
+    tab = Window(browser, saved, SIDE, SIDE, "#camera=target-1&mode=after")
+    tab.page.add_style_tag(content=BARE)
+    tab.do("gsc.settled()")
+    frame = tab.picture()
+
+    tab.page.set_viewport_size({"width": width, "height": height})
+    tab.do("gsc.settled()")
+    top, left = (height - SIDE) // 2, (width - SIDE) // 2
+    inside = (slice(top, top + SIDE), slice(left, left + SIDE))
+    around = np.ones((height, width), dtype=bool)
+    around[inside] = False
+    shown = tab.picture()
+    assert np.abs(shown[inside] - frame).mean() < 0.01
+    # One colour, which is not the black of holes.
+    assert np.ptp(shown[around], axis=0).max() == 0
+    assert shown[around].min() > 0.2
+
+    tab.key("w")
+    assert not tab.do("gsc.stats().framed")
+    assert np.ptp(tab.picture()[around], axis=0).max() > 0.3
+    tab.key("r")
+    assert np.abs(tab.picture() - shown).max() < 0.02
+    tab.context.close()
+
+
+def test_a_page_without_cameras_fills_the_window(browser, exhibit, libraries, tmp_path):
+    (tmp_path / "page.html").write_bytes(make_page(replace(exhibit, cameras=()), libraries)[0])
+    tab = Window(browser, tmp_path / "page.html", 320, 240)
+    assert not tab.do("gsc.stats().framed")
+    tab.context.close()
+
+
 def test_a_link_plays_the_path_until_it_is_paused(saved, played_browser):
     tab = Window(played_browser, saved, 160, 120, "#camera=target-1&play=1")
     log = tab.page.evaluate(PLAYED)

@@ -3,13 +3,18 @@
 import pytest
 import torch
 
+from gscompleter.evaluation.gap_pictures import LABEL_HEIGHT, ZOOM, draw_gap
 from gscompleter.evaluation.metrics.thin_gaps import (
+    WINDOW,
     find_thin_gaps,
+    find_worst_gap,
     measure_flight,
     measure_thin_gaps,
     plan_flight,
+    render_flight,
 )
 from gscompleter.render.loading import load_renderer
+from gscompleter.types import Render
 from scenes import Room, camera_at, gaussians_of, view_of
 
 SIDE = 40
@@ -56,8 +61,53 @@ def test_gaps_open_on_the_flight_where_gaussians_are_missing():
     renderer = load_renderer("cpu")
     cameras = [view.camera]
     target = camera_at(0.05, size=SIDE)
-    whole = measure_flight(scene, cameras, target, renderer)
+    whole = measure_flight(render_flight(scene, cameras, target, renderer))
     # Two of ten columns of pixels are taken out.
     columns = torch.arange(len(scene)) % SIDE
-    torn = measure_flight(scene[columns % 10 > 1], cameras, target, renderer)
-    assert torn > whole + 0.02
+    flight = render_flight(scene[columns % 10 > 1], cameras, target, renderer)
+    assert measure_flight(flight) > whole + 0.02
+    worst = find_worst_gap(flight)
+    assert worst is not None
+    assert worst.share == pytest.approx(
+        max(measure_thin_gaps(render.alpha) for render in flight.values())
+    )
+
+
+def make_render(alpha: torch.Tensor) -> Render:
+    """Return a white surface of some opacity."""
+    return Render(alpha[..., None].repeat(1, 1, 3), torch.ones_like(alpha), alpha)
+
+
+def test_the_worst_place_is_the_window_with_most_gaps_of_all_renders():
+    little, much = torch.ones(2, 200, 300)
+    little[:, 100] = 0.5
+    much[:, 100] = 0.5
+    much[40:60, 250:252] = 0.0  # 40 pixels, less than the 64 of a line
+    much[150:160, 110:113] = 0.0
+    renders = {"at the target": make_render(little), "beside it": make_render(much)}
+    worst = find_worst_gap(renders)
+    assert worst.where == "beside it"
+    assert worst.share == pytest.approx((64 + 30) / WINDOW**2)
+    assert worst.left <= 100 < 113 <= worst.left + WINDOW
+    assert worst.top <= 150 < 160 <= worst.top + WINDOW
+    # Around the middle of its gaps.
+    assert worst.left + WINDOW // 2 == (100 + 113) // 2
+    window = much[worst.box]
+    assert torch.equal(worst.crop[..., 0], window)
+
+    picture = draw_gap(worst)
+    side = ZOOM * WINDOW
+    assert picture.shape == (LABEL_HEIGHT + side, 2 * side, 3)
+    # The pixels of the window as squares below a line that is not empty, and again with marks.
+    pixels = picture[LABEL_HEIGHT::ZOOM, ::ZOOM]
+    assert (pixels[:, :WINDOW, 0] == (255 * window + 0.5).int().numpy()).all()
+    is_marked = (pixels[:, WINDOW:] == (255, 0, 255)).all(axis=-1)
+    assert (is_marked == find_thin_gaps(much)[worst.box].numpy()).all()
+    assert is_marked.mean() == pytest.approx(worst.share)
+    assert (picture[:LABEL_HEIGHT] == 0).any()
+
+
+def test_without_gaps_there_is_no_place_and_the_picture_says_so():
+    assert find_worst_gap({"at the target": make_render(torch.ones(80, 90))}) is None
+    assert draw_gap(None).shape == (LABEL_HEIGHT, 2 * ZOOM * WINDOW, 3)
+    assert (draw_gap(None) == 0).any()

@@ -16,13 +16,14 @@ from pathlib import Path
 from typing import TypeVar
 
 from gscompleter.evaluation import store
+from gscompleter.evaluation.gap_pictures import draw_gap
 from gscompleter.evaluation.memory import measure_peak_memory
 from gscompleter.evaluation.methods import METHODS, Models, Prediction, mark_target
 from gscompleter.evaluation.metrics import scores as scoring
 from gscompleter.stages.lift import lift_pair
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, OutputError
-from gscompleter.system.files.image import write_image
+from gscompleter.system.files.image import write_image, write_pixels
 from gscompleter.types import DepthMap, Gaussians, View
 
 T = TypeVar("T")
@@ -116,6 +117,7 @@ def advance_task(
     write_image(path.with_suffix(".png"), seen.after.image)
     write_image(path.with_name(f"before-{number:03d}.png"), seen.before.image)
     write_image(path.with_name(f"holes-{number:03d}.png"), seen.holes)
+    write_pixels(path.with_name(f"gaps-{number:03d}.png"), draw_gap(seen.worst_gap))
     write_image(store.get_truth_path(folder, number), target.image)
     return Progress(prediction.scene, (*progress.views, target), (*progress.steps, step))
 
@@ -123,7 +125,7 @@ def advance_task(
 def score_step(
     prediction: Prediction, state: Completion, target: View, task: PreparedTask
 ) -> tuple[SequenceStep, scoring.TargetRenders]:
-    """Score a step and render its target camera."""
+    """Score a step, and return what was rendered at and near its target."""
     truth = scoring.Truth(state.views, target, task.neighbours)
     before = state.scene
     after = prediction.scene

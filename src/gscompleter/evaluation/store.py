@@ -9,6 +9,7 @@ tasks/TASK/METHOD/step-001.pt       prediction for the first target
 tasks/TASK/METHOD/step-001.png      render at the first target after completion
 tasks/TASK/METHOD/before-001.png    render at the first target before completion
 tasks/TASK/METHOD/holes-001.png     mask of the holes before completion
+tasks/TASK/METHOD/gaps-001.png      window with most thin gaps after completion, magnified
 """
 
 from __future__ import annotations

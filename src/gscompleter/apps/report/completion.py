@@ -18,6 +18,7 @@ from torch.nn.functional import normalize
 
 from gscompleter import __version__
 from gscompleter.apps.inputs.task import InputSplatFile, Target
+from gscompleter.apps.report.removal_pictures import draw_removal
 from gscompleter.apps.report.schema import (
     RECORD_FILE,
     SCORES,
@@ -30,9 +31,17 @@ from gscompleter.apps.report.schema import (
 )
 from gscompleter.config.settings import COVERED
 from gscompleter.editing.removal import hide_removed
+from gscompleter.evaluation.gap_pictures import draw_gap
 from gscompleter.evaluation.metrics.coverage import RenderPair, compute_coverage
 from gscompleter.evaluation.metrics.image import compute_masked_psnr, ssim
-from gscompleter.evaluation.metrics.thin_gaps import measure_flight, measure_thin_gaps
+from gscompleter.evaluation.metrics.thin_gaps import (
+    AT_TARGET,
+    WorstGap,
+    find_worst_gap,
+    measure_flight,
+    measure_thin_gaps,
+    render_flight,
+)
 from gscompleter.evaluation.verdict.held_out import HeldOut, render_before_after, score_held_out
 from gscompleter.evaluation.verdict.outcome import judge_completion
 from gscompleter.evaluation.verdict.rows import ScoreRow
@@ -46,7 +55,7 @@ from gscompleter.splats.layout import save_like, save_removed
 from gscompleter.splats.ply import save_parts, save_ply
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, RunRecord
 from gscompleter.state import Completion, TargetResult
-from gscompleter.system.files.image import write_image
+from gscompleter.system.files.image import write_image, write_pixels
 from gscompleter.system.files.writing import (
     COMPLETED_FILE,
     CONTEXT_FILE,
@@ -86,6 +95,18 @@ class DrawingFrame:
         return (points - self.center) @ self.axes.T / self.radius
 
 
+@dataclass(frozen=True)
+class TargetGaps:
+    """Thin gaps after the completion of a target."""
+
+    share: float
+    """Share of the image at the target."""
+    flight_share: float
+    """The same on average on the way from the nearest photograph to the target."""
+    worst: WorstGap | None
+    """The worst place of both; None without thin gaps."""
+
+
 def write_report(
     folder: Path,
     completion: Completion,
@@ -110,8 +131,9 @@ def write_report(
     at_targets = [
         render_before_after(completion, result.target, renderer) for result in completion.targets
     ]
+    gaps = measure_gaps(completion, renderer)
     scores = make_score_rows(
-        completion, targets, at_targets, renderer, held_out, files, has_searched
+        completion, targets, at_targets, gaps, renderer, held_out, files, has_searched
     )
     # Without targets, the photographs are what there is to look at.
     shown: list[View] = []
@@ -122,11 +144,17 @@ def write_report(
     around = render_around()
     name_view = "ignored" if run_info.get("scene", {}).get("renders_from") is None else "render"
     write_pictures(folder / IMAGES, completion, targets, at_targets, name_view)
+    for number, found in enumerate(gaps, start=1):
+        write_pixels(folder / IMAGES / f"target{number}_gaps.png", draw_gap(found.worst))
     write_photographs(folder / IMAGES, completion, shown, renderer)
+    removal = draw_removal(completion, renderer, files)
+    if removal is not None:
+        write_images(folder / IMAGES, "removal", removal.name_images())
     record = make_record(completion, thin_evenly(photographs, MAX_PHOTOGRAPHS))
     (folder / RECORD_FILE).write_bytes(json.dumps(asdict(record)).encode() + b"\n")
     coverage = {"coverage": asdict(compute_coverage(around))} if around else {}
-    counts = {**count_changes(completion), "seconds": dict(completion.seconds)}
+    left = {} if removal is None else {"removal": asdict(removal.row)}
+    counts = {**count_changes(completion), **left, "seconds": dict(completion.seconds)}
     summary = {
         "version": __version__,
         "outcome": scores.pop("outcome"),
@@ -143,6 +171,7 @@ def make_score_rows(
     completion: Completion,
     targets: Sequence[Target],
     at_targets: Sequence[RenderPair],
+    gaps: Sequence[TargetGaps],
     renderer: Renderer,
     held_out: Sequence[HeldOut] = (),
     files: Mapping[int | None, str] = MappingProxyType({}),
@@ -150,7 +179,8 @@ def make_score_rows(
 ) -> dict[str, Any]:
     """Return the verdict and the rows of all photographs and targets, as in `summary.json`.
 
-    `at_targets` are the renders at the targets; the rest is as in `write_report`.
+    `at_targets` are the renders at the targets, and `gaps` their thin gaps; the rest is as in
+    `write_report`.
     """
     held_out_rows = score_held_out(completion, held_out, renderer)
     gains = completion.exposure_gains
@@ -166,7 +196,7 @@ def make_score_rows(
                 derived_file=files.get(row.derived_from),
                 anchor_file=files.get(row.anchor),
             )
-            for row in score_targets(completion, targets, at_targets, renderer)
+            for row in score_targets(completion, targets, at_targets, gaps, renderer)
         ],
     }
     if not completion.targets:
@@ -240,6 +270,7 @@ def score_targets(
     completion: Completion,
     targets: Sequence[Target],
     pairs: Sequence[RenderPair],
+    gaps: Sequence[TargetGaps],
     renderer: Renderer,
 ) -> list[TargetRow]:
     """Make the rows of the targets."""
@@ -249,27 +280,30 @@ def score_targets(
         t.view and hide_removed(t.view.to(device), completion.source, renderer) for t in targets
     ]
     scores = map_in_parallel(compute_scores, pairs, views)
-    flights = measure_flights(completion, renderer)
-    rows = zip(targets, completion.targets, scores, flights, strict=True)
+    rows = zip(targets, completion.targets, scores, gaps, strict=True)
     return [make_target_row(completion, *row) for row in rows]
 
 
-def measure_flights(completion: Completion, renderer: Renderer) -> list[float]:
-    """Compute the share of thin gaps on the way from a photograph to each target."""
+def measure_gaps(completion: Completion, renderer: Renderer) -> list[TargetGaps]:
+    """Measure the thin gaps at each target, and on the way there from a photograph."""
     if not completion.targets:
         return []
     # As stages see it: of a large scene its proxy, which shows the same gaps.
     scene = merge(completion.parts)
     photographs = [view.camera for view in completion.views]
-    return [
-        measure_flight(scene, photographs, result.target, renderer) for result in completion.targets
-    ]
+    gaps = []
+    for result in completion.targets:
+        flight = render_flight(scene, photographs, result.target, renderer)
+        worst = find_worst_gap({AT_TARGET: result.after, **flight})
+        share = measure_thin_gaps(result.after.alpha)
+        gaps.append(TargetGaps(share, measure_flight(flight), worst))
+    return gaps
 
 
 def make_target_row(
-    completion: Completion, target: Target, result: TargetResult, scores: Scores, flight: float
+    completion: Completion, target: Target, result: TargetResult, scores: Scores, gaps: TargetGaps
 ) -> TargetRow:
-    """Make the row of a target; `flight` is the share of thin gaps on the way to it."""
+    """Make the row of a target."""
     fit = result.affine
     added = result.added
     return TargetRow(
@@ -287,8 +321,8 @@ def make_target_row(
         notes=result.notes,
         refused=result.refusal,
         offset=target.offset,
-        thin_gaps=measure_thin_gaps(result.after.alpha),
-        flight_thin_gaps=flight,
+        thin_gaps=gaps.share,
+        flight_thin_gaps=gaps.flight_share,
         painter=result.painter or None,
     )
 

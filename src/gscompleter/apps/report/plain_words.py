@@ -4,7 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
-from gscompleter.apps.report.schema import AlignmentRow, CompletionSummary, TargetRow
+from gscompleter.apps.report.schema import (
+    AlignmentRow,
+    CompletionSummary,
+    RemovalRow,
+    TargetRow,
+)
 from gscompleter.evaluation.verdict.numbers import format_number, format_percent
 
 FRAME_NOTES = {
@@ -26,6 +31,8 @@ ORIGIN_NOTE = (
 )
 MIN_POSE_ERROR = 1.0
 """Error of a pose in pixels from which it is said; that of features alone is 0.1 to 0.3."""
+MIN_CONTINUED = 0.005
+"""Share of the outline of what was removed from which it is said that a surface goes on."""
 POINT_FORMATS = ("colmap", "photographs")
 """Formats whose only depth is that of points which COLMAP triangulated."""
 ORACLE_NOTE = (
@@ -195,6 +202,8 @@ def list_splat_notes(summary: CompletionSummary) -> Iterator[str]:
     num_removed = summary.gaussians.get("removed")
     if num_removed:
         yield f"{num_removed:,} {REMOVED_NOTE}"
+    if summary.removal is not None:
+        yield describe_removal(summary.removal, summary.scene.renders_from is not None)
     margin = summary.settings.get("margin")
     if isinstance(margin, float) and margin > 0:
         yield (
@@ -204,6 +213,21 @@ def list_splat_notes(summary: CompletionSummary) -> Iterator[str]:
     num_recolored = summary.gaussians.get("recolored")
     if num_recolored:
         yield f"{num_recolored:,} {RECOLORED_NOTE}"
+
+
+def describe_removal(row: RemovalRow, is_render: bool) -> str:
+    """Describe what may be left of what was removed."""
+    image = f"{'render' if is_render else 'photograph'} {row.photograph}"
+    if row.continued < MIN_CONTINUED:
+        return (
+            f"Nothing goes on beyond the outline of what was removed, in {image} "
+            "(images/removal_outline.png)."
+        )
+    return (
+        f"Along {format_percent(row.continued, 0)} of the outline of what was removed, in {image}, "
+        "the surface goes on in the same colour: a part of the object is left, or what it touches "
+        "looks the same (images/removal_outline.png, magenta)."
+    )
 
 
 def describe_wanted_photographs(targets: Sequence[TargetRow]) -> str:

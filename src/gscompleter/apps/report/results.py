@@ -17,7 +17,12 @@ import torch
 
 from gscompleter.apps.inputs.splat import locate_splat
 from gscompleter.apps.inputs.task import InputSplatFile, Target
-from gscompleter.apps.report.completion import GENERATED_FILE, make_score_rows, write_report
+from gscompleter.apps.report.completion import (
+    GENERATED_FILE,
+    make_score_rows,
+    measure_gaps,
+    write_report,
+)
 from gscompleter.apps.report.film import VIDEO_FILE
 from gscompleter.apps.report.page import REPORT_FILE, write_completion_page
 from gscompleter.apps.report.run_record import describe_python_run
@@ -56,7 +61,7 @@ RESULTS = (
     *(CONTEXT_FILE, GENERATED_FILE, REMOVED_FILE, TARGETS_FILE),
     RENDERS_FILE,
     *(REPORT_FILE, RECORD_FILE, SUMMARY_FILE, VIDEO_FILE, "images/target*.png"),
-    *("images/photograph*.png", "images/context*.png"),
+    *("images/photograph*.png", "images/context*.png", "images/removal*.png"),
 )
 """Globs of the files that a completion may write."""
 FORMAT = "python"
@@ -109,7 +114,10 @@ def score_result(completion: Completion, unused_views: Sequence[View]) -> dict[s
         render_before_after(completion, result.target, judged.renderer)
         for result in completion.targets
     ]
-    rows = make_score_rows(completion, judged.targets, at_targets, judged.renderer, judged.held_out)
+    gaps = measure_gaps(completion, judged.renderer)
+    rows = make_score_rows(
+        completion, judged.targets, at_targets, gaps, judged.renderer, judged.held_out
+    )
     aside = sample_held_out_cameras(judged.cameras, completion.seed)
     coverage = compute_coverage(render_pairs(completion, aside, judged.renderer))
     return {"outcome": rows.pop("outcome"), "coverage": asdict(coverage), **rows}

@@ -109,6 +109,23 @@ class TargetRow(ScoreRow):
 
 
 @dataclass(frozen=True)
+class RemovalRow:
+    """What a removal may have left, in the photograph that shows what was removed largest."""
+
+    frame: int | None
+    file: str | None
+    shown: float
+    """Share of the image that showed it."""
+    continued: float
+    """Share of its outline beyond which the surface goes on in the same colour."""
+
+    @property
+    def photograph(self) -> str:
+        """Number and file of the photograph."""
+        return name_photograph(self.frame, self.file)
+
+
+@dataclass(frozen=True)
 class ResultFrame:
     """Transform from the photographs to the .ply."""
 
@@ -160,6 +177,8 @@ class CompletionSummary:
     held_out: tuple[HeldOutRow, ...] = ()
     checks: tuple[ContextRow, ...] = ()
     """Small copies of further photographs that guarded a given scene; empty with targets."""
+    removal: RemovalRow | None = None
+    """None if nothing was removed that a photograph shows."""
     new_photographs: int | None = None
     """Photographs that a splat was not trained on; None if the scene was reconstructed."""
 

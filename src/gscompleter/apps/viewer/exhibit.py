@@ -46,6 +46,8 @@ class ViewerCamera:
     """In the frame of the scene."""
     thumbnail: bytes | None = None
     notes: tuple[str, ...] = ()
+    has_frame: bool = True
+    """False for a camera of no photograph or target, with which the whole window is filled."""
 
 
 @dataclass(frozen=True)

@@ -179,7 +179,7 @@ def make_overview(scene: Gaussians) -> ViewerCamera:
     c2w = torch.eye(4)
     c2w[:3, 3] = centre - distance * torch.tensor([0.0, 0.0, 1.0])
     K = torch.tensor([[550.0, 0.0, 320.0], [0.0, 550.0, 240.0], [0.0, 0.0, 1.0]])
-    return ViewerCamera("overview", "Overview", Camera(c2w, K, 640, 480))
+    return ViewerCamera("overview", "Overview", Camera(c2w, K, 640, 480), has_frame=False)
 
 
 def describe_camera(
@@ -199,6 +199,7 @@ def describe_camera(
         "pose": (THREE_FROM_OPENCV @ camera.c2w @ THREE_FROM_OPENCV).flatten().tolist(),
         "lens": [K[0, 0].item(), K[1, 1].item(), K[0, 2].item(), K[1, 2].item()],
         "size": [camera.width, camera.height],
+        "framed": view_camera.has_frame,
         "focus": seen.median().item() if len(seen) else PAGE_EXTENT,
         "thumbnail": None if thumbnail is None else base64.b64encode(thumbnail).decode(),
     }

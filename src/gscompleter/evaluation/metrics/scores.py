@@ -22,7 +22,14 @@ from gscompleter.evaluation.metrics.image import (
     ssim,
 )
 from gscompleter.evaluation.metrics.perceptual import compute_flip_map, compute_lpips, haarpsi
-from gscompleter.evaluation.metrics.thin_gaps import measure_flight, measure_thin_gaps
+from gscompleter.evaluation.metrics.thin_gaps import (
+    AT_TARGET,
+    WorstGap,
+    find_worst_gap,
+    measure_flight,
+    measure_thin_gaps,
+    render_flight,
+)
 from gscompleter.render.protocols import Renderer
 from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.types import Camera, DepthMap, Gaussians, Render, View
@@ -105,11 +112,13 @@ class Scores:
 
 @dataclass(frozen=True)
 class TargetRenders:
-    """Renders at the target, and the holes of the scene before completion."""
+    """Renders at the target, the holes before completion, and the worst thin gaps after it."""
 
     before: Render
     after: Render
     holes: Bool[Tensor, "h w"]
+    worst_gap: WorstGap | None
+    """At the target, its neighbours or on the way from a photograph; None without thin gaps."""
 
 
 @torch.no_grad()
@@ -121,7 +130,7 @@ def score(
     renderer: Renderer,
     registered: Gaussians | None = None,
 ) -> tuple[Scores, TargetRenders]:
-    """Score a completion, and return the renders at the target.
+    """Score a completion, and return what was rendered at and near the target.
 
     `added` is None if existing Gaussians were changed; `registered` has all lifted Gaussians.
     """
@@ -155,10 +164,14 @@ def score(
         agreement = measure_alignment(added, before, camera, renderer)
     # Where cracks open as the camera leaves the photographs.
     flight = None
+    looks = {AT_TARGET: now}
+    for view, (_, completed) in zip(truth.neighbours, beside, strict=True):
+        looks[f"at neighbour {view.frame}"] = completed
     if truth.views:
         photographs = [view.camera for view in truth.views]
-        gaps = [measure_flight(scene, photographs, camera, renderer) for scene in (before, after)]
-        flight = Change(*gaps)
+        ways = [render_flight(scene, photographs, camera, renderer) for scene in (before, after)]
+        flight = Change(*map(measure_flight, ways))
+        looks |= ways[1]
 
     lifted = None
     if registered:
@@ -183,7 +196,7 @@ def score(
         ),
         flight_thin_gaps=flight,
     )
-    return scores, TargetRenders(was, now, holes)
+    return scores, TargetRenders(was, now, holes, find_worst_gap(looks))
 
 
 def measure_quality(image: Image, photograph: View) -> Quality:

@@ -6,22 +6,56 @@ that, so that no score of holes tells of them, and they are seen as dark lines a
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from statistics import fmean
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
 from gscompleter.numerics.geometry import measure_baseline
 from gscompleter.numerics.image_ops import keep_thin
 from gscompleter.planning.candidates import interpolate_camera
 from gscompleter.render.protocols import Renderer
-from gscompleter.types import Camera, Gaussians
+from gscompleter.types import Camera, Gaussians, Render
 
 OPAQUE = 0.85
 """Alpha below which black is seen through a surface."""
 FLIGHT_SHARES = (0.2, 0.4, 0.6, 0.8)
 """Places of the cameras of a flight, as shares of the way to the target."""
+AT_TARGET = "at the target"
+WINDOW = 64
+"""Side in pixels of the window in which the worst place of gaps is looked for."""
+
+
+@dataclass(frozen=True)
+class WorstGap:
+    """The window that has most thin gaps."""
+
+    where: str
+    """Camera that sees it, in words that follow a noun."""
+    share: float
+    """Share of the window that is thin gaps."""
+    left: int
+    top: int
+    """Pixel of the image at the upper left corner of the window."""
+    crop: Float[Tensor, "s s 3"]
+    """What the window shows, over black."""
+    gaps: Bool[Tensor, "s s"]
+    """The thin gaps in it."""
+
+    @property
+    def box(self) -> tuple[slice, slice]:
+        """Rows and columns of the window."""
+        height, width = self.gaps.shape
+        return slice(self.top, self.top + height), slice(self.left, self.left + width)
+
+    def describe(self) -> str:
+        """Describe the window in two lines."""
+        side = len(self.crop)
+        return f"{100 * self.share:.1f} % of {side} x {side} pixels,\n{self.where}"
 
 
 def find_thin_gaps(alpha: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
@@ -34,6 +68,33 @@ def measure_thin_gaps(alpha: Float[Tensor, "h w"]) -> float:
     return find_thin_gaps(alpha).float().mean().item()
 
 
+def find_worst_gap(renders: Mapping[str, Render]) -> WorstGap | None:
+    """Find the window with the largest share of thin gaps in renders by where they were taken.
+
+    Return None if there are no thin gaps. Of equal windows it is the first one.
+    """
+    worst = None
+    for where, render in renders.items():
+        gaps = find_thin_gaps(render.alpha)
+        height, width = gaps.shape
+        # A crop is square, and an image may be smaller than the window.
+        side = min(WINDOW, height, width)
+        shares = avg_pool2d(gaps.to(torch.float64)[None, None], side, stride=1)[0, 0]
+        share = shares.max().item()
+        if share > (0.0 if worst is None else worst.share):
+            row, column = divmod(int(shares.argmax()), shares.shape[1])
+            # The first such window has its gaps at its lower right. One around their middle has the
+            # same, since none has more.
+            inside = gaps[row : row + side, column : column + side].nonzero()
+            middle = (inside.amin(dim=0) + inside.amax(dim=0) + 1) // 2 - side // 2
+            top = min(max(row + int(middle[0]), 0), height - side)
+            left = min(max(column + int(middle[1]), 0), width - side)
+            box = (slice(top, top + side), slice(left, left + side))
+            # A copy, so that the image is not kept for it.
+            worst = WorstGap(where, share, left, top, render.image[box].clone(), gaps[box].clone())
+    return worst
+
+
 def plan_flight(photographs: Sequence[Camera], target: Camera) -> list[Camera]:
     """Place cameras between the nearest photograph and the target, with the lens of the target."""
     nearest = min(photographs, key=lambda camera: measure_baseline(camera, target))
@@ -41,9 +102,17 @@ def plan_flight(photographs: Sequence[Camera], target: Camera) -> list[Camera]:
     return [interpolate_camera(target, nearest, 1 - share) for share in FLIGHT_SHARES]
 
 
-def measure_flight(
+def render_flight(
     scene: Gaussians, photographs: Sequence[Camera], target: Camera, renderer: Renderer
-) -> float:
-    """Compute the mean share of thin gaps on the way from the nearest photograph to the target."""
+) -> dict[str, Render]:
+    """Render the way from the nearest photograph to the target; by where that is."""
     cameras = plan_flight(photographs, target)
-    return fmean(measure_thin_gaps(renderer.render(scene, camera).alpha) for camera in cameras)
+    return {
+        f"at {100 * share:.0f} % of the way": renderer.render(scene, camera)
+        for share, camera in zip(FLIGHT_SHARES, cameras, strict=True)
+    }
+
+
+def measure_flight(flight: Mapping[str, Render]) -> float:
+    """Compute the mean share of thin gaps of the renders of a flight."""
+    return fmean(measure_thin_gaps(render.alpha) for render in flight.values())

@@ -53,10 +53,15 @@ def write_image(
     path: Path | str, image: Float[Tensor, "h w 3"] | Float[Tensor, "h w"] | Bool[Tensor, "h w"]
 ) -> None:
     """Write colours, or a grey image or mask, as an 8-bit PNG."""
+    write_pixels(path, convert_to_pixels(image))
+
+
+def write_pixels(
+    path: Path | str, pixels: UInt8[np.ndarray, "h w 3"] | UInt8[np.ndarray, "h w"]
+) -> None:
+    """Write 8-bit colours or grey as a PNG."""
     with replace_file(path) as file:
-        Image.fromarray(convert_to_pixels(image)).save(
-            file, format="PNG", compress_level=PNG_COMPRESSION
-        )
+        Image.fromarray(pixels).save(file, format="PNG", compress_level=PNG_COMPRESSION)
 
 
 def write_depth(path: Path | str, depth: Float[Tensor, "h w"], unit: float) -> None:

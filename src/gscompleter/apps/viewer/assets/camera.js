@@ -6,7 +6,7 @@ function goTo(name) {
   play(false);
   state.seconds = path.find((stop) => stop.shot === shot).time;
   lookFrom(numbersOf(shot));
-  state.shot = name;
+  Object.assign(state, { shot: name, framed: shot.framed });
   tellShot(shot);
   link();
   return true;
@@ -27,6 +27,12 @@ function upOfAll() {
   return up.lengthSq() > 0 ? up.normalize() : new THREE.Vector3(0, 1, 0);
 }
 
+/* Shows all that the window has room for, since the camera is no longer that of a photograph. */
+function leaveFrame() {
+  state.framed = false;
+  changed();
+}
+
 /* Turns by angles to the right and down: the camera about itself, or about what it looks at. */
 function turnBy(right, down, orbits) {
   const sideways = new THREE.Quaternion().setFromAxisAngle(state.up, -right);
@@ -41,18 +47,18 @@ function turnBy(right, down, orbits) {
     state.eye.copy(pivot).addScaledVector(turned, -state.focus);
   }
   state.turn.premultiply(turn).normalize();
-  changed();
+  leaveFrame();
 }
 
 function moveBy(right, up, back) {
   state.eye.addScaledVector(axis(1, 0, 0), right).addScaledVector(axis(0, 1, 0), up).addScaledVector(axis(0, 0, 1), back);
-  changed();
+  leaveFrame();
 }
 
 /* Goes nearer to what is looked at, or farther from it, by a factor. */
 function dolly(factor) {
   state.eye.addScaledVector(axis(0, 0, -1), state.focus * (1 - factor));
   if (state.drag !== "fly") state.focus *= factor;
-  changed();
+  leaveFrame();
 }
 

@@ -129,7 +129,7 @@ function goToFrame({ fl_x, fl_y, cx, cy, w, h, transform_matrix }) {
   pose.set(...rows.flat(), 0, 0, 0, 1);
   state.eye = new THREE.Vector3().setFromMatrixPosition(pose);
   state.turn = new THREE.Quaternion().setFromRotationMatrix(pose);
-  Object.assign(state, { lens: [fl_x, fl_y, cx, cy], size: [w, h] });
+  Object.assign(state, { lens: [fl_x, fl_y, cx, cy], size: [w, h], framed: true });
   changed();
 }
 

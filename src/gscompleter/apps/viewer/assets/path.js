@@ -37,7 +37,7 @@ function seek(seconds) {
     + length * u * (1 - u) * ((1 - u) * speed(before, to, i) - u * speed(from, after, i))));
   const { shot } = u < 0.5 ? from : to;
   if (shot.name !== state.shot) tellShot(shot);
-  Object.assign(state, { seconds, shot: shot.name });
+  Object.assign(state, { seconds, shot: shot.name, framed: true });
 }
 
 /* Plays the path from the camera shown last on, or pauses it. */

@@ -63,6 +63,7 @@ class Picture {
     this.renderer.setPixelRatio(Math.min(window.devicePixelRatio, 2));
     this.renderer.setSize(width, height, false);
     this.place(width, height);
+    this.canvas.style.clipPath = state.framed ? clipToFrame(state.size, width, height) : "none";
     this.renderer.render(this.scene, this.camera);
     this.stale = true;
     if (!this.updating) this.update();
@@ -101,6 +102,12 @@ class Picture {
   }
 }
 
+/* The CSS that cuts a canvas down to the photograph in its middle. */
+function clipToFrame([photoWidth, photoHeight], width, height) {
+  const zoom = Math.min(width / photoWidth, height / photoHeight);
+  return `inset(${(height - zoom * photoHeight) / 2}px ${(width - zoom * photoWidth) / 2}px)`;
+}
+
 /* The projection of a lens onto a canvas that shows the whole photograph, in its middle. */
 function projection([fx, fy, cx, cy], [photoWidth, photoHeight], width, height) {
   const zoom = Math.min(width / photoWidth, height / photoHeight);
@@ -122,6 +129,7 @@ function changed() {
 function drawAll() {
   pending = 0;
   stage.dataset.shown = state.held ? "before" : state.mode;
+  stage.classList.toggle("framed", state.framed);
   stage.style.setProperty("--divider", `${state.divider}%`);
   for (const picture of pictures) picture.draw();
   drawMarks();

@@ -48,6 +48,8 @@ const shotNamed = new Map(content.shots.map((shot) => [shot.name, shot]));
 const byId = (id) => document.getElementById(id);
 const stage = byId("stage");
 
+/* `framed` is true while nothing is shown beyond the photograph of the camera: from a jump to it until
+   the camera is moved. What was completed ends at that frame. */
 const state = {
   mode: content.layers.before ? "side" : "after",
   held: false,
@@ -61,6 +63,7 @@ const state = {
   focus: 1,
   lens: null,
   size: null,
+  framed: false,
   seconds: 0,
   playing: false,
   brush: 0.06,

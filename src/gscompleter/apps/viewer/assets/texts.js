@@ -66,6 +66,7 @@ function stats() {
     mode: state.mode,
     generated: state.generated,
     drag: state.drag,
+    framed: state.framed,
     strokes: strokes.length,
     live: latest,
     chunks: Object.keys(pictures.at(-1).meshes),
