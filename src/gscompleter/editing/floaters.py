@@ -6,7 +6,7 @@ but so are their neighbours, and together they leave no gaps: they stay.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from jaxtyping import Bool, Float
@@ -18,6 +18,8 @@ from gscompleter.types import Gaussians
 
 MAX_BREADTH = 10.0
 """Largest factor by which the limit of opacity rises with the size of a Gaussian."""
+QUERIES = 250_000
+"""Gaussians whose neighbours are measured at a time, to save memory."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +50,13 @@ def find_floaters(
             f"The scene has {len(scene)} Gaussians, too few to compare each with "
             f"{config.neighbors} neighbours; give its photographs."
         )
+    # Nothing here depends on colours by direction, which are most of the memory of a scene.
+    scene = replace(scene, sh=scene.sh[:, :1], encoded=None)
     masks: dict[str, Bool[Tensor, "n"]] = {}
     remaining = torch.arange(len(scene), device=scene.means.device)
-    while len(remaining) > config.neighbors:
-        is_floater_by_reason = rate_gaussians(scene[remaining], config)
+    rest = scene
+    while len(rest) > config.neighbors:
+        is_floater_by_reason = rate_gaussians(rest, config)
         for reason, is_floater in is_floater_by_reason.items():
             none = torch.zeros_like(scene.generated, dtype=torch.bool)
             known = masks.get(reason, none)
@@ -60,6 +65,7 @@ def find_floaters(
         if not gone.any():
             break
         remaining = remaining[~gone]
+        rest = rest[~gone]
     return masks
 
 
@@ -91,20 +97,31 @@ def measure_surroundings(scene: Gaussians, neighbors: int) -> Surroundings:
     from scipy.spatial import cKDTree
 
     means = scene.means.double().cpu().numpy()
-    workers = torch.get_num_threads()
-    distances, indices = cKDTree(means).query(means, neighbors + 1, workers=workers)
-    # The first neighbour of a Gaussian is itself.
+    tree = cKDTree(means)
     sigmas = scene.scales.sort(dim=1, descending=True).values
-    apart = torch.from_numpy(distances[:, 1:]).to(sigmas)
-    rows = torch.from_numpy(indices[:, 1:]).to(scene.means.device)
-
     longest = sigmas[:, 0]
-    distance = apart.median(dim=1).values
-    # `spacing` is at least that of the scene, so that nothing is remote in its densest parts.
-    return Surroundings(
-        sigmas,
-        sigma=longest[rows].median(dim=1).values,
-        distance=distance,
-        spacing=distance[rows].median(dim=1).values.clamp_min(distance.median()),
-        gap=(apart / (longest[:, None] + longest[rows])).median(dim=1).values,
-    )
+    sigma = torch.empty_like(longest)
+    distance = torch.empty_like(longest)
+    gap = torch.empty_like(longest)
+    # The numbers of all neighbours are kept, in 32 bits, since `spacing` needs all distances. What
+    # else is known of each neighbour is held for some Gaussians at a time.
+    numbers = torch.empty(len(means), neighbors, dtype=torch.int32)
+    for start in range(0, len(means), QUERIES):
+        block = slice(start, start + QUERIES)
+        found = tree.query(means[block], neighbors + 1, workers=torch.get_num_threads())
+        # The first neighbour of a Gaussian is itself.
+        apart, rows = (torch.from_numpy(values[:, 1:]).to(sigmas.device) for values in found)
+        apart = apart.to(sigmas.dtype)
+        numbers[block] = rows.cpu()
+        sigma[block] = longest[rows].median(dim=1).values
+        distance[block] = apart.median(dim=1).values
+        reach = longest[block, None] + longest[rows]
+        gap[block] = (apart / reach).median(dim=1).values
+
+    spacing = torch.empty_like(longest)
+    for start in range(0, len(means), QUERIES):
+        block = slice(start, start + QUERIES)
+        rows = numbers[block].long().to(sigmas.device)
+        spacing[block] = distance[rows].median(dim=1).values
+    # At least that of the scene, so that nothing is remote in its densest parts.
+    return Surroundings(sigmas, sigma, distance, spacing.clamp_min(distance.median()), gap)

@@ -211,17 +211,19 @@ def encode_spz_blocks(path: Path, make_blocks: Callable[[], Iterable[Gaussians]]
     header = HEADER.pack(MAGIC, 3, sum(count for count, _ in parts), degree, bits, flags, 0)
     # What `gzip.compress` gives for all of it at once: a header, the packed data, and its checksum.
     packer = zlib.compressobj(6, zlib.DEFLATED, -zlib.MAX_WBITS)
-    packed = [GZIP_HEADER]
+    packed = io.BytesIO()
+    packed.write(GZIP_HEADER)
     checksum = 0
     size = 0
     for stream in ([header], *streams):
         for content in stream:
-            packed.append(packer.compress(content))
+            packed.write(packer.compress(content))
             checksum = zlib.crc32(content, checksum)
             size += len(content)
         stream.clear()
-    trailer = struct.pack("<II", checksum, size % 2**32)
-    return b"".join([*packed, packer.flush(), trailer])
+    packed.write(packer.flush())
+    packed.write(struct.pack("<II", checksum, size % 2**32))
+    return packed.getvalue()  # the bytes themselves, without a copy
 
 
 def _cut(count: int) -> Iterator[slice]:

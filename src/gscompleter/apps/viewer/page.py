@@ -13,6 +13,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -87,8 +88,13 @@ def compute_page_frame(gaussians: Gaussians) -> PageFrame:
 
 def is_within_page(gaussians: Gaussians, frame: PageFrame) -> Bool[Tensor, "n"]:
     """Find the Gaussians that are near enough to be shown."""
-    # .spz has fixed-point positions: what lies beyond their range cannot be written.
-    return frame.normalize(gaussians).means.norm(dim=1) <= MAX_DISTANCE
+    # .spz has fixed-point positions: what lies beyond their range cannot be written. In float64
+    # positions take much memory, and so are moved some at a time.
+    is_within = torch.empty_like(gaussians.opacities, dtype=torch.bool)
+    for start in range(0, len(gaussians), BLOCK):
+        block = slice(start, start + BLOCK)
+        is_within[block] = frame.normalize(gaussians[block]).means.norm(dim=1) <= MAX_DISTANCE
+    return is_within
 
 
 def make_page(
@@ -98,6 +104,14 @@ def make_page(
 
     A live page may ask the server that it came from, and no other.
     """
+    parts, notes = make_page_parts(viewer_content, libraries, is_live)
+    return b"".join(parts), notes
+
+
+def make_page_parts(
+    viewer_content: ViewerContent, libraries: Libraries, is_live: bool = False
+) -> tuple[Iterator[bytes], tuple[str, ...]]:
+    """Make a page as `make_page` does, part by part, so that it is never in memory as a whole."""
     frame = compute_page_frame(viewer_content.after)
     after = viewer_content.after
     # The Gaussians of each layer by number: a copy of a layer would take as much as its scene.
@@ -140,10 +154,9 @@ def make_page(
     }
     omitted = sum(len(layers[name]) - len(shown[name]) for name in ("observed", "generated"))
     notes = (f"{omitted:,} Gaussians are too far away to be shown.",) if omitted else ()
-    # Most bytes of the page are those of its sources, which are joined to it once.
     head, tail = fill_template(content, SOURCES_MARK).split(SOURCES_MARK)
-    page = [encode_text(head), *make_scripts(sources), encode_text(tail)]
-    return b"".join(page), (*viewer_content.notes, *notes)
+    page = chain([encode_text(head)], make_scripts(sources), [encode_text(tail)])
+    return page, (*viewer_content.notes, *notes)
 
 
 def encode_layer(name: str, scene: Gaussians, rows: Int64[Tensor, "m"], frame: PageFrame) -> bytes:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import webbrowser
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from http.server import ThreadingHTTPServer
 
@@ -18,7 +18,7 @@ from gscompleter.apps.viewer.exhibit import (
     load_viewer_files,
 )
 from gscompleter.apps.viewer.http import HTML, PageHandler, PageServer
-from gscompleter.apps.viewer.page import make_page
+from gscompleter.apps.viewer.page import make_page_parts
 from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.sog import META
 from gscompleter.system.errors import InputError, quote_value
@@ -38,15 +38,15 @@ def show_scenes(options: ViewOptions) -> None:
             raise InputError(f"{name} is no .html file; name it *.html.", "save")
         # Reserved first: a file that may not be replaced ends the command before scenes are read.
         with reserve_file(options.save, options.overwrite):
-            page, notes = load_page(options)
+            parts, notes = load_page(options)
             with replace_file(options.save) as file:
-                file.write(page)
+                file.writelines(parts)
         content = {"page": str(options.save), "notes": list(notes)}
         print_answer(options, content, [*notes, options.save])
         return
 
-    page, notes = load_page(options)
-    with make_page_server(page, options.port) as server, suppress(KeyboardInterrupt):
+    parts, notes = load_page(options)
+    with make_page_server(b"".join(parts), options.port) as server, suppress(KeyboardInterrupt):
         address = f"http://{ADDRESS}:{server.server_address[1]}/"
         # Printed once the server listens.
         if options.json:
@@ -63,12 +63,12 @@ def show_scenes(options: ViewOptions) -> None:
         server.serve_forever()
 
 
-def load_page(options: ViewOptions) -> tuple[bytes, Sequence[str]]:
-    """Make the page of the scenes and cameras of the options, with notes on it."""
+def load_page(options: ViewOptions) -> tuple[Iterator[bytes], Sequence[str]]:
+    """Make the parts of the page of the scenes and cameras of the options, with notes on it."""
     # Libraries first: they may have to be downloaded, and a lack of network is said before large
     # scenes are read.
     libraries = packages.load_libraries()
-    return make_page(load_content(options), libraries)
+    return make_page_parts(load_content(options), libraries)
 
 
 def load_content(options: ViewOptions) -> ViewerContent:
