@@ -12,7 +12,7 @@ numbers. The numbers in large tensors are checked where they enter (`value_check
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, Literal, TypeVar
@@ -732,6 +732,11 @@ class ContextScene:
         """Return a context from which nothing was removed yet."""
         none = gaussians[:0]
         return ContextScene(gaussians, rendered, index, replace(none, sh=none.sh[:, :1]))
+
+    @cached_property
+    def removed_pixels(self) -> dict[Hashable, Bool[Tensor, "h w"]]:
+        """Known results of `find_removed` by camera: each takes a render of the whole scene."""
+        return {}
 
     @property
     def stand_ins(self) -> Int64[Tensor, "n"]:

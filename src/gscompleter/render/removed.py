@@ -9,6 +9,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gscompleter.numerics.image_ops import dilate
+from gscompleter.render.cache import make_camera_key
 from gscompleter.render.protocols import Renderer
 from gscompleter.types import Camera, ContextScene
 
@@ -29,7 +30,16 @@ def add_border(shown: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
 
 
 def find_removed(source: ContextScene, camera: Camera, renderer: Renderer) -> Bool[Tensor, "h w"]:
-    """Mark the pixels that showed something removed."""
+    """Mark the pixels that showed something removed; a camera that is known is not drawn again."""
+    known = source.removed_pixels
+    key = make_camera_key(camera)
+    if key not in known:
+        known[key] = draw_removed(source, camera, renderer)
+    return known[key]
+
+
+def draw_removed(source: ContextScene, camera: Camera, renderer: Renderer) -> Bool[Tensor, "h w"]:
+    """Draw the removed Gaussians among those that are left or were revealed, and mark them."""
     scene = source.gaussians
     removed = source.removed
     # What is chosen for removal is among `removed`, too, and must not be drawn twice.

@@ -8,12 +8,13 @@ element of bytes over [-4, 4].
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32
 from numpy import ndarray
 
 from gscompleter.splats.packing import (
@@ -25,7 +26,7 @@ from gscompleter.splats.packing import (
     restore_largest,
     unpack_fractions,
 )
-from gscompleter.splats.ply import MODE_COMMENT, encode, has_mode_comment
+from gscompleter.splats.ply import MODE_COMMENT, encode, has_mode_comment, iterate_blocks
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, add_comments
 from gscompleter.system.files.ply import make_header, read_header
 from gscompleter.system.files.writing import replace_file
@@ -45,6 +46,20 @@ QUAT_BITS = (10, 10, 10)
 """Bits of three components of a rotation; the number of the fourth has the upper two."""
 COLOR_BITS = (8, 8, 8, 8)
 """Bits of colour and opacity."""
+
+
+def tabulate_rest() -> Float32[ndarray, "256"]:
+    """Tabulate the coefficient that each byte stands for: the middle of its interval.
+
+    The first and the last byte stand for the ends, so that they are reached exactly.
+    """
+    shares = (np.arange(256, dtype=np.float32) + 0.5) / 256
+    shares[[0, -1]] = [0, 1]
+    return shares * 8 - 4
+
+
+REST_VALUES = tabulate_rest()
+"""Coefficient of SH of degree 1 and above that each byte stands for."""
 
 
 def read_compressed_ply(path: Path) -> Gaussians:
@@ -99,14 +114,18 @@ def _read_tables(path: Path) -> tuple[bytes, dict[str, ndarray]]:
 
 
 def _unpack_sh_rest(table: ndarray) -> Float[ndarray, "n k 3"]:
-    """Unpack SH of degree 1 and above; a byte stands for the middle of its interval."""
-    count = len(table)
-    num_rest = len(table.dtype.names or ())
-    packed = np.stack([table[f"f_rest_{i}"] for i in range(num_rest)], axis=1)
-    values = np.clip((packed.astype(np.float32) + 0.5) / 256, 0, 1)
-    # The first and the last byte stand for the ends, so that they are reached exactly.
-    values = np.where(packed == 0, 0, np.where(packed == 255, 1, values)) * 8 - 4
-    return values.reshape(count, 3, num_rest // 3).transpose(0, 2, 1)
+    """Unpack SH of degree 1 and above."""
+    fields: Mapping[str, Any] = table.dtype.fields or {}
+    # The file has one channel after the other.
+    names = [f"f_rest_{i}" for i in range(len(fields))]
+    if any(fields[name][0] != np.uint8 for name in names):
+        raise ValueError("its spherical harmonics are no bytes")
+    columns = np.array([fields[name][1] for name in names]).reshape(3, -1).T
+    rows = table.view(np.uint8).reshape(len(table), table.dtype.itemsize)
+    rest = np.empty((len(table), *columns.shape), np.float32)
+    for block in iterate_blocks(len(table)):
+        rest[block] = REST_VALUES[rows[block][:, columns]]
+    return rest
 
 
 def write_compressed_ply(
@@ -137,15 +156,18 @@ def write_compressed_ply(
         pack_fractions(scale, VECTOR_BITS),
         pack_fractions(rgba, COLOR_BITS),
     ]
-    rest = gaussians.sh[:, 1:].transpose(1, 2).reshape(len(gaussians), -1).numpy()
-    # The byte of the interval that a value in [-4, 4] lies in.
-    rest_bytes = np.clip(np.floor((rest / 8 + 0.5) * 256), 0, 255).astype(np.uint8)
+    num_rest = 3 * (gaussians.sh.shape[1] - 1)
     with replace_file(path) as file:
-        header = _make_header(gaussians, len(starts), rest.shape[1])
+        header = _make_header(gaussians, len(starts), num_rest)
         file.write(add_comments(header, made_by))
         file.write(np.concatenate(bounds, axis=1).astype("<f4").tobytes())
         file.write(np.stack(columns, axis=1).astype("<u4").tobytes())
-        file.write(rest_bytes.tobytes())
+        # Some at a time, so that all steps find their numbers in the cache.
+        for block in iterate_blocks(len(gaussians)):
+            rest = gaussians.sh[block, 1:].transpose(1, 2).numpy()
+            # The byte of the interval that a value in [-4, 4] lies in.
+            places = np.floor((rest / 8 + 0.5) * 256)
+            file.write(np.clip(places, 0, 255).astype(np.uint8).tobytes())
 
 
 def _make_header(gaussians: Gaussians, chunks: int, num_rest: int) -> bytes:

@@ -54,6 +54,8 @@ SIGN_SIZE_BITS = (1, 9) * 3
 MAX_FRACTIONAL_BITS = 16
 BLOCK = 1 << 16
 """Gaussians that are encoded at a time."""
+REST_VALUES = (np.arange(256, dtype=np.float32) - 128) / 128
+"""Coefficient of SH of degree 1 and above that each byte stands for."""
 GZIP_HEADER = gzip.compress(b"", compresslevel=6, mtime=0)[:10]
 """Signature, method, no time and the mark of the system, as the module `gzip` writes them."""
 
@@ -151,7 +153,7 @@ def _decode_streams(header: SpzHeader, streams: list[bytes]) -> Gaussians:
         for stream, width in zip(streams, header.widths, strict=True)
     ]
     colour = 0.5 + SH_C0 * (colours.astype(np.float32) / 255 - 0.5) / COLOR_SCALE
-    higher = (rest.astype(np.float32) - 128) / 128
+    higher = REST_VALUES[rest]
     return build_gaussians(
         np.ldexp(_decode_int24(positions).astype(np.float32), -header.fractional_bits),
         _decode_quats_v2(rotations) if header.version == 2 else _decode_quats_v3(rotations),
