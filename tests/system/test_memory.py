@@ -48,9 +48,9 @@ def test_the_estimate_of_a_scene_holds_what_was_measured(count, measured):
 
 
 def test_the_estimate_of_a_scene_with_harmonics_holds_what_was_measured():
-    """The same of two million with harmonics of degree 3, and 40 photographs."""
-    needed = estimate_bytes(180 * 320, 4) + estimate_scene_bytes(2 * 10**6, 64, [180 * 320] * 40)
-    assert 0.95 * 5.81e9 < needed < 2 * 5.81e9
+    """The same of `remove` with four million of degree 3, and 40 photographs."""
+    needed = estimate_bytes(144 * 256, 4) + estimate_scene_bytes(4 * 10**6, 62, [144 * 256] * 40)
+    assert 0.95 * 3.92e9 < needed < 2 * 3.92e9
 
 
 def test_memory_grows_less_than_with_each_photograph_of_a_large_scene():
