@@ -1,5 +1,6 @@
 """Every shape in an annotation is checked at run time while the tests run."""
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -11,6 +12,9 @@ if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
     threads = (os.cpu_count() or 1) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, threads)))
     os.environ.setdefault("NUMBA_NUM_THREADS", str(max(1, threads)))
+
+# Imports and collected tests stay; searches among them for garbage cost seconds in each worker.
+gc.disable()
 
 import pytest
 from jaxtyping import install_import_hook
@@ -33,6 +37,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     for item in items:
         if sys.platform != "linux" and item.get_closest_marker("linux"):
             item.add_marker(pytest.mark.skip(reason="needs Linux"))
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage again, but none of what was imported and collected."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")

@@ -196,7 +196,10 @@ def test_auto_chooses_a_gpu_that_draws(device):
     assert choose_devices("auto") == Devices("cuda", "cuda")
 
 
-@pytest.mark.parametrize("name", CONFIGS)
+# With gaps, the same stages are bounded as well.
+@pytest.mark.parametrize(
+    "name", [pytest.param("default", marks=pytest.mark.slow), "with gaps", "paper"]
+)
 def test_a_completion_stays_on_the_device_and_waits_no_more_than_it_has_to(device, name):
     views = make_views()
     target = camera_at(0.5, yaw=10, size=SIZE)
