@@ -19,7 +19,7 @@ gc.disable()
 import pytest
 from jaxtyping import install_import_hook
 
-from paths import DATA, PACKAGE
+from paths import DATA, PACKAGE, TESTS
 
 # The whole package except `gscompleter.numerics.kernels`, whose functions numba compiles. The name
 # of a package stands for all modules in it, so those of `numerics` are listed one by one.
@@ -32,8 +32,18 @@ CHECKED = sorted(
 install_import_hook(CHECKED, "beartype.beartype")
 
 
+LONGEST = (
+    "apps/test_live.py",
+)
+"""Files that take longest, in the order in which processes of pytest-xdist begin them: one that
+began a long file last would be waited for."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip tests of Linux elsewhere."""
+    """Put the longest files first, and skip tests of Linux elsewhere."""
+    ranks = {TESTS / name: rank for rank, name in enumerate(LONGEST)}
+    # The order within a file, and of all others, stays.
+    items.sort(key=lambda item: ranks.get(item.path, len(ranks)))
     for item in items:
         if sys.platform != "linux" and item.get_closest_marker("linux"):
             item.add_marker(pytest.mark.skip(reason="needs Linux"))

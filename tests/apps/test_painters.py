@@ -19,7 +19,7 @@ from gscompleter.system.files.image import read_depth, read_image, read_pixels
 from gscompleter.system.files.video import read_video, write_video
 from scenes import Room, camera_at, cast, photographed, view_of
 
-SIZE = 56
+SIZE = 64
 PLACES = ((-0.3, 0), (0.1, 0), (0.7, 12), (-0.9, -12))
 TARGETS = (2, 3)
 MAGENTA = (255, 0, 255)
