@@ -32,9 +32,7 @@ CHECKED = sorted(
 install_import_hook(CHECKED, "beartype.beartype")
 
 
-LONGEST = (
-    "apps/test_live.py",
-)
+LONGEST = ("apps/test_live.py",)
 """Files that take longest, in the order in which processes of pytest-xdist begin them: one that
 began a long file last would be waited for."""
 

@@ -254,8 +254,12 @@ def test_bad_input_is_refused_with_a_sentence():
         knowing()(views[:1], target)
     with pytest.raises(InputError, match="No target"):
         knowing()(views, [])
+    # One target is left, and two are named.
+    whole = gaussians_of(views[0])
+    numbered = replace(whole, generated=torch.full_like(whole.generated, 253))
+    knowing()(views, views[0].camera, numbered)
     with pytest.raises(InputError, match="254"):
-        knowing()(views, [target] * 256)
+        knowing()(views, [views[0].camera] * 2, numbered)
     far_away = gaussians_of(view_of(Room(), camera_at(size=8)))
     behind = replace(far_away, means=far_away.means - torch.tensor([0.0, 0.0, 100.0]))
     views = [replace(v, camera=replace(v.camera, near=None)) for v in views]

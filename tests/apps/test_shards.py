@@ -68,12 +68,11 @@ def claimed(out: Path, count: int, kinds: int = 1) -> tuple[list[int], str]:
 
 @pytest.mark.linux
 def test_of_many_simultaneous_claims_none_is_refused(tmp_path):
-    for number in range(2):
-        out = tmp_path / f"out-{number}" / "deep"
-        codes, refused = claimed(out, 75)
-        assert codes == [0] * 75, refused
-        assert os.listdir(out) == ["run.json"]
-        assert read_run_file(out / "run.json") == {"version": VERSION, "seed": 0}
+    out = tmp_path / "out" / "deep"
+    codes, refused = claimed(out, 60)
+    assert codes == [0] * 60, refused
+    assert os.listdir(out) == ["run.json"]
+    assert read_run_file(out / "run.json") == {"version": VERSION, "seed": 0}
 
 
 @pytest.mark.linux
