@@ -32,7 +32,28 @@ CHECKED = sorted(
 install_import_hook(CHECKED, "beartype.beartype")
 
 
-LONGEST = ("apps/test_live.py",)
+LONGEST = (
+    "apps/test_viewer_browser.py",
+    "apps/test_cli.py",
+    "test_completer.py",
+    "apps/test_live.py",
+    "models/test_feed_forward.py",
+    "apps/test_painters.py",
+    "evaluation/test_steps.py",
+    "project/test_snippets.py",
+    "models/test_diffusion.py",
+    "test_fake_device.py",
+    "apps/test_batch.py",
+    "project/test_release.py",
+    "apps/test_shards.py",
+    "test_devices.py",
+    "apps/test_live_browser.py",
+    "splats/alignment/test_estimate.py",
+    "project/test_fuzz.py",
+    "data/test_video.py",
+    "data/test_poses.py",
+    "models/test_volsplat.py",
+)
 """Files that take longest, in the order in which processes of pytest-xdist begin them: one that
 began a long file last would be waited for."""
 
