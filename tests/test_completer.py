@@ -224,7 +224,7 @@ def test_with_the_embedded_models_the_same_seed_gives_the_same_bytes():
         assert torch.equal(tensor, tensors(b.scene)[name]), name
 
 
-@pytest.mark.parametrize("unit", [0.001, 1000.0])
+@pytest.mark.parametrize("unit", [pytest.param(0.001, marks=pytest.mark.slow), 1000.0])
 def test_with_the_embedded_models_the_unit_scales_the_result_and_changes_no_image(unit):
     ours, theirs = completed_by_embedded_models(1.0), completed_by_embedded_models(unit)
     (a,), (b,) = ours.targets, theirs.targets

@@ -211,6 +211,7 @@ def test_what_is_saved_of_a_splat_in_a_frame_of_its_own_is_too(tmp_path, monkeyp
     assert the_same_as_complete(monkeypatch, ready, tmp_path, "--scene", options.scene)
 
 
+@pytest.mark.slow
 def test_an_antialiased_splat_is_saved_as_one(room, tmp_path):
     scene = merge([gaussians_of(view_of(Room(), camera)) for camera in CAMERAS[:2]])
     save_ply(tmp_path / "splat.ply", replace(scene, is_antialiased=True))

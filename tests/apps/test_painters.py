@@ -105,6 +105,8 @@ def test_an_export_has_what_a_painter_needs(scene, exported):
     assert sorted(path.name for path in exported.iterdir()) == listed
 
 
+# A repaired video, below, brings the truth as well.
+@pytest.mark.slow
 def test_truth_in_the_mask_gives_what_the_oracle_gives(scene, holes, tmp_path, monkeypatch):
     paint_truth(scene, holes)
     painted = ("--images", holes, "--painter", "Photoshop 2026")

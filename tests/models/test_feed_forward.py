@@ -461,7 +461,7 @@ def test_the_second_run_gives_the_same_and_its_result_can_be_optimised():
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-@pytest.mark.parametrize("number", [3, 5])
+@pytest.mark.parametrize("number", [3, pytest.param(5, marks=pytest.mark.slow)])
 def test_any_number_of_views_will_do(name, number):
     views = [off_centre(0.2 * i, 32, 48) for i in range(number)]
     result = FeedForward(network(name))(views)

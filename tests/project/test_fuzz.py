@@ -32,7 +32,7 @@ def test_mutated_inputs_end_in_a_sentence_or_a_result():
 @pytest.mark.linux
 def test_odd_values_and_damaged_files_end_in_a_sentence_or_a_result():
     """Calls of the Python interface and its readers, in a process of its own with its limits."""
-    calls, files = os.environ.get("FUZZ_CALLS", "40"), os.environ.get("FUZZ_FILES", "68")
+    calls, files = os.environ.get("FUZZ_CALLS", "20"), os.environ.get("FUZZ_FILES", "68")
     words = ["--calls", calls, "--files", files, "--seed", "2"]
     command = [sys.executable, str(SUPPORT / "fuzz_python.py"), *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
