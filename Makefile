@@ -17,7 +17,10 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 # wheels.
 GPU_WHEELS := $(VENV)/wheels/fetched
 
-.PHONY: demo test test-slow golden check-golden lint format types docs dist release-check fuzz evaluate reproduce held-out results-pages bench gpu clean
+# Tests start hundreds of processes, which would compile all modules again. (Empty is not set.)
+export PYTHONDONTWRITEBYTECODE =
+
+.PHONY: demo set-up kernels test test-slow golden check-golden lint format types docs dist release-check fuzz evaluate reproduce held-out results-pages bench gpu clean
 
 demo: $(VENV)/installed
 ifneq ($(NVIDIA),)
@@ -27,9 +30,17 @@ endif
 endif
 	$(BIN)/gscompleter demo --out demo --overwrite
 
+# All that the tests and the checks need, in one go.
+set-up: $(VENV)/installed-dev $(GPU_WHEELS)
+
+# Compiled once, instead of in each process of the tests.
+kernels: $(VENV)/installed-test
+	$(BIN)/gscompleter warmup --quiet
+
 # A process for each core, up to four: most tests wait for one core, and files share what they set up.
-test: $(VENV)/installed-test $(GPU_WHEELS)
-	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile
+# Longest files come first, as tests/conftest.py says; pytest-xdist would begin with the most tests.
+test: $(VENV)/installed-test $(GPU_WHEELS) kernels
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
 
 test-slow: $(VENV)/installed-test $(GPU_WHEELS)
 	$(BIN)/python -m pytest -m slow

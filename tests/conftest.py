@@ -1,5 +1,6 @@
 """Every shape in an annotation is checked at run time while the tests run."""
 
+import gc
 import os
 import sys
 from pathlib import Path
@@ -12,10 +13,13 @@ if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
     os.environ.setdefault("OMP_NUM_THREADS", str(max(1, threads)))
     os.environ.setdefault("NUMBA_NUM_THREADS", str(max(1, threads)))
 
+# Imports and collected tests stay; searches among them for garbage cost seconds in each worker.
+gc.disable()
+
 import pytest
 from jaxtyping import install_import_hook
 
-from paths import DATA, PACKAGE
+from paths import DATA, PACKAGE, TESTS
 
 # The whole package except `gscompleter.numerics.kernels`, whose functions numba compiles. The name
 # of a package stands for all modules in it, so those of `numerics` are listed one by one.
@@ -28,11 +32,46 @@ CHECKED = sorted(
 install_import_hook(CHECKED, "beartype.beartype")
 
 
+LONGEST = (
+    "apps/test_viewer_browser.py",
+    "apps/test_cli.py",
+    "test_completer.py",
+    "apps/test_live.py",
+    "models/test_feed_forward.py",
+    "apps/test_painters.py",
+    "evaluation/test_steps.py",
+    "project/test_snippets.py",
+    "models/test_diffusion.py",
+    "test_fake_device.py",
+    "apps/test_batch.py",
+    "project/test_release.py",
+    "apps/test_shards.py",
+    "test_devices.py",
+    "apps/test_live_browser.py",
+    "splats/alignment/test_estimate.py",
+    "project/test_fuzz.py",
+    "data/test_video.py",
+    "data/test_poses.py",
+    "models/test_volsplat.py",
+)
+"""Files that take longest, in the order in which processes of pytest-xdist begin them: one that
+began a long file last would be waited for."""
+
+
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Skip tests of Linux elsewhere."""
+    """Put the longest files first, and skip tests of Linux elsewhere."""
+    ranks = {TESTS / name: rank for rank, name in enumerate(LONGEST)}
+    # The order within a file, and of all others, stays.
+    items.sort(key=lambda item: ranks.get(item.path, len(ranks)))
     for item in items:
         if sys.platform != "linux" and item.get_closest_marker("linux"):
             item.add_marker(pytest.mark.skip(reason="needs Linux"))
+
+
+def pytest_collection_finish() -> None:
+    """Collect garbage again, but none of what was imported and collected."""
+    gc.freeze()
+    gc.enable()
 
 
 @pytest.fixture(scope="session")

@@ -224,7 +224,7 @@ def test_with_the_embedded_models_the_same_seed_gives_the_same_bytes():
         assert torch.equal(tensor, tensors(b.scene)[name]), name
 
 
-@pytest.mark.parametrize("unit", [0.001, 1000.0])
+@pytest.mark.parametrize("unit", [pytest.param(0.001, marks=pytest.mark.slow), 1000.0])
 def test_with_the_embedded_models_the_unit_scales_the_result_and_changes_no_image(unit):
     ours, theirs = completed_by_embedded_models(1.0), completed_by_embedded_models(unit)
     (a,), (b,) = ours.targets, theirs.targets
@@ -254,8 +254,12 @@ def test_bad_input_is_refused_with_a_sentence():
         knowing()(views[:1], target)
     with pytest.raises(InputError, match="No target"):
         knowing()(views, [])
+    # One target is left, and two are named.
+    whole = gaussians_of(views[0])
+    numbered = replace(whole, generated=torch.full_like(whole.generated, 253))
+    knowing()(views, views[0].camera, numbered)
     with pytest.raises(InputError, match="254"):
-        knowing()(views, [target] * 256)
+        knowing()(views, [views[0].camera] * 2, numbered)
     far_away = gaussians_of(view_of(Room(), camera_at(size=8)))
     behind = replace(far_away, means=far_away.means - torch.tensor([0.0, 0.0, 100.0]))
     views = [replace(v, camera=replace(v.camera, near=None)) for v in views]

@@ -82,8 +82,9 @@ def few_steps(config: CompleterConfig) -> CompleterConfig:
     """Reduce the stages to a few steps."""
     name = "registration" if config.registration_method == "ours" else "paper_registration"
     registration = replace(getattr(config, name), iterations=2)
-    refine = replace(config.refine, iterations=2)
-    return replace(config, **{name: registration}, refine=refine)
+    refine = replace(config.refine, iterations=2, color_rounds=1)
+    recolor = replace(config.recolor, iterations=1)
+    return replace(config, **{name: registration}, refine=refine, recolor=recolor)
 
 
 # tests/test_fake_device.py has the same, where the wheel of gsplat is at hand.

@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
-from concurrent.futures import Future
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 
+from batch_jobs import open_here
 from command import run
 from fake_cuda import CUDA, Counts, FakeCudaTensor
 from fake_gsplat import WHEEL, fake_gsplat, find_gsplat
@@ -26,7 +25,6 @@ from gscompleter.config import GapConfig
 from gscompleter.render.device import Devices, choose_devices
 from gscompleter.render.gsplat import TILE_SIZE, CudaRenderer
 from gscompleter.splats.ply import load_ply, save_ply
-from gscompleter.system.jobs.jobs import Pool, Share
 from gscompleter.system.timing import STAGES
 from gscompleter.types import View, merge
 from parity import assert_close
@@ -196,7 +194,10 @@ def test_auto_chooses_a_gpu_that_draws(device):
     assert choose_devices("auto") == Devices("cuda", "cuda")
 
 
-@pytest.mark.parametrize("name", CONFIGS)
+# With gaps, the same stages are bounded as well.
+@pytest.mark.parametrize(
+    "name", [pytest.param("default", marks=pytest.mark.slow), "with gaps", "paper"]
+)
 def test_a_completion_stays_on_the_device_and_waits_no_more_than_it_has_to(device, name):
     views = make_views()
     target = camera_at(0.5, yaw=10, size=SIZE)
@@ -248,22 +249,11 @@ def test_something_is_removed_and_a_splat_cleaned(device, room, tmp_path, monkey
     assert (tmp_path / "cleaned" / "completed.ply").is_file()
 
 
-@contextmanager
-def open_here(workers: int) -> Iterator[Pool]:
-    """Open a pool whose shares run in this process, which alone has the device."""
-
-    def start(share: Share) -> Future[Exception | None]:
-        future: Future[Exception | None] = Future()
-        future.set_result(share())
-        return future
-
-    yield Pool(workers, start)
-
-
 def test_a_batch_completes_on_the_device(device, room, tmp_path, monkeypatch):
     row = {"folder": str(room), "context": [0, 1], "target": [2], "near": 0.5, "far": 20}
     manifest = tmp_path / "manifest.jsonl"
     manifest.write_text(json.dumps(row | {"resolution": SIZE, "device": "cuda"}) + "\n")
+    # This process alone has the device.
     monkeypatch.setattr(engine, "open_local", open_here)
     out = tmp_path / "out"
     words = ("batch", manifest, "--out", out, "--workers", 1, "--quiet")

@@ -15,9 +15,10 @@ from pathlib import Path
 
 import pytest
 
-from batch_jobs import Writing, engine_named, plain_jobs, run_all
+from batch_jobs import Writing, engine_named, open_here, plain_jobs, run_all
 from command import run
 from gscompleter import InputError
+from gscompleter.apps.batch import engine as batch_engine
 from gscompleter.apps.batch.manifest import list_results, read_manifest
 from gscompleter.apps.batch.rows import parse_row
 from gscompleter.system.errors import FullDiskError, OutputError
@@ -311,6 +312,7 @@ def test_a_wrong_row_is_a_sentence(row, sentence, tmp_path):
 
 
 def test_a_path_that_is_no_text_fails_its_row_alone(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(batch_engine, "open_local", open_here)
     rows = [{"folder": ["a"], "name": "one"}, {"folder": "a", "scene": ["b"], "name": "two"}]
     (tmp_path / "m.jsonl").write_text("\n".join(map(json.dumps, rows)))
     assert run(monkeypatch, "batch", tmp_path / "m.jsonl", "--out", tmp_path / "out") == 1

@@ -582,7 +582,7 @@ def num_written(folder: Path) -> int:
 
 @pytest.mark.linux
 @pytest.mark.skipif(os.name != "posix", reason="kills with a POSIX signal")
-@pytest.mark.parametrize("written", [2, 8])
+@pytest.mark.parametrize("written", [2, pytest.param(8, marks=pytest.mark.slow)])
 def test_a_kill_leaves_no_half_written_scene(scene, tmp_path, written):
     """The process is killed after it has begun to write this many files and folders."""
     out = tmp_path / "out"

@@ -16,6 +16,7 @@ SIZE = 96
 PLACES = (-0.6, -0.3, 0.0, 0.3, 0.6)
 CAMERAS = [camera_at(x, size=SIZE) for x in PLACES]
 TARGET = 2
+SMALL = ("--far", 20, "--resolution", 64)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,7 @@ def test_the_generator_invents_only_what_no_photograph_shows(
     room, cut, tmp_path, monkeypatch, capsys
 ):
     out = tmp_path / "out"
-    words = ("complete", room, "--scene", cut, "--target", TARGET, "--far", 20, "--out", out)
+    words = ("complete", room, "--scene", cut, "--target", TARGET, *SMALL, "--out", out)
     assert run(monkeypatch, *words) == 0
     summary = read_summary(out)
     counts = summary["gaussians"]
@@ -62,7 +63,7 @@ def test_the_generator_invents_only_what_no_photograph_shows(
 
 def test_without_the_generator_there_are_no_targets(room, cut, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
-    words = ("complete", room, "--scene", cut, "--far", 20, "--out", out)
+    words = ("complete", room, "--scene", cut, *SMALL, "--out", out)
     assert run(monkeypatch, *words, "--from-photographs-only") == 0
     summary = read_summary(out)
     assert summary["targets"] == []

@@ -178,7 +178,7 @@ def my_painter(nearest, target, context):
     return torch.full((target.height, target.width, 3), 0.5)
 
 
-@pytest.mark.parametrize("generator", [None, my_painter])
+@pytest.mark.parametrize("generator", [pytest.param(None, marks=pytest.mark.slow), my_painter])
 def test_a_completion_in_python_names_its_models(room, tmp_path, generator):
     views = [gsc.load_views(room)[number] for number in (0, 1)]
     target = gsc.load_camera(room, frame=2)

@@ -6,8 +6,10 @@ from pathlib import Path
 
 import pytest
 
+from batch_jobs import open_here
 from command import run
 from gscompleter import load_ply
+from gscompleter.apps.batch import engine
 from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.cli import COMMANDS, OptionClasses
 from gscompleter.system.files.reading import hash_file
@@ -99,7 +101,8 @@ def test_what_is_installed_and_known_answers(answer):
     assert answer("warmup")["folder"]
 
 
-def test_a_batch_answers_with_its_rows(room, tmp_path, answer):
+def test_a_batch_answers_with_its_rows(room, tmp_path, answer, monkeypatch):
+    monkeypatch.setattr(engine, "open_local", open_here)
     manifest = tmp_path / "scenes.csv"
     lines = ["folder,name,context,target,near,far,resolution"]
     lines += [f"{room},good,0 1,2,0.5,20,32", f"{tmp_path / 'nothing'},bad,0 1,2,0.5,20,32"]

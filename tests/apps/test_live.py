@@ -101,9 +101,23 @@ def begun(ready) -> Session:
     return serving.begin_session(ready)
 
 
-def test_undo_goes_back_and_the_same_camera_leads_to_the_same_scene(begun):
-    one, text = complete_camera(begun, HOLES[0])
-    two, _ = complete_camera(one, HOLES[1])
+@pytest.fixture(scope="module")
+def completed(begun) -> tuple[Session, str, list[str], int]:
+    """Return the session with a hole completed, what is said, the stages heard, and how many."""
+    heard: list[str] = []
+    with notify_of_stages(heard.append):
+        one, text = complete_camera(begun, HOLES[0])
+    return one, text, heard, len(heard)
+
+
+@pytest.fixture(scope="module")
+def twice(completed) -> Session:
+    """Return the session with both holes completed."""
+    return complete_camera(completed[0], HOLES[1])[0]
+
+
+def test_undo_goes_back_and_the_same_camera_leads_to_the_same_scene(begun, completed, twice):
+    (one, text, *_), two = completed, twice
     assert "Gaussians are added in a hole" in text
     assert one.latest.targets[-1].hole_fraction > 0.1
     assert len(begun.latest.added) < len(one.latest.added) < len(two.latest.added)
@@ -114,8 +128,8 @@ def test_undo_goes_back_and_the_same_camera_leads_to_the_same_scene(begun):
         assert torch.equal(getattr(again.latest.scene, name), getattr(two.latest.scene, name)), name
 
 
-def test_what_is_undone_is_done_again_until_something_else_is_done(begun):
-    two, _ = complete_camera(complete_camera(begun, HOLES[0])[0], HOLES[1])
+def test_what_is_undone_is_done_again_until_something_else_is_done(twice):
+    two = twice
     back = undo_step(undo_step(two))
     assert redo_step(redo_step(back)) == two
     assert redo_step(back).latest is two.completions[1]
@@ -136,13 +150,10 @@ def test_a_camera_that_adds_nothing_is_no_step(begun):
     assert text == "The target is a context view: nothing to complete."
 
 
-def test_stages_are_heard_as_they_begin(begun):
-    heard: list[str] = []
-    with notify_of_stages(heard.append):
-        complete_camera(begun, HOLES[0])
+def test_stages_are_heard_as_they_begin(completed, twice):
+    *_, heard, count = completed
     assert list(dict.fromkeys(heard)) == list(STAGES)
-    complete_camera(begun, HOLES[0])
-    assert list(dict.fromkeys(heard)) == list(STAGES)
+    assert len(heard) == count, "the second completion was heard, too"
 
 
 def the_same_as_complete(monkeypatch, ready: serving.Prepared, tmp_path: Path, *more) -> bool:
@@ -200,6 +211,7 @@ def test_what_is_saved_of_a_splat_in_a_frame_of_its_own_is_too(tmp_path, monkeyp
     assert the_same_as_complete(monkeypatch, ready, tmp_path, "--scene", options.scene)
 
 
+@pytest.mark.slow
 def test_an_antialiased_splat_is_saved_as_one(room, tmp_path):
     scene = merge([gaussians_of(view_of(Room(), camera)) for camera in CAMERAS[:2]])
     save_ply(tmp_path / "splat.ply", replace(scene, is_antialiased=True))
@@ -284,11 +296,16 @@ def remove_box(session: Session, box: tuple[float, ...]) -> tuple[Session, str]:
     return apply_step(session, step)
 
 
+@pytest.fixture(scope="module")
+def without_crate(splat_begun) -> tuple[Session, str]:
+    """Return the session of the splat without the crate, and what is said."""
+    return remove_box(splat_begun, CRATE)
+
+
 def test_a_box_is_removed_completed_undone_and_saved(
-    splat_ready, splat_begun, splat, tmp_path, monkeypatch
+    splat_ready, splat_begun, without_crate, splat, tmp_path, monkeypatch
 ):
-    begun = splat_begun
-    removed, text = remove_box(begun, CRATE)
+    begun, (removed, text) = splat_begun, without_crate
     count = int(removed.latest.source.gone_mask.sum())
     assert count > 100
     assert f"{count:,} Gaussians are removed" in text
@@ -313,8 +330,8 @@ def test_a_box_is_removed_completed_undone_and_saved(
     assert json.loads((out / "summary.json").read_text())["gaussians"]["added"] == len(rest)
 
 
-def test_after_a_removal_another_hole_is_completed_as_before(splat_begun):
-    removed, _ = remove_box(splat_begun, CRATE)
+def test_after_a_removal_another_hole_is_completed_as_before(without_crate):
+    removed, _ = without_crate
     elsewhere, _ = complete_camera(removed, HOLES[1])
     assert len(elsewhere.latest.added) > len(removed.latest.added)
     assert elsewhere.latest.config == removed.latest.config
@@ -324,13 +341,25 @@ def marked(session: Session, action: str, mask: bytes | None = SPOT) -> Step:
     return Step(action, save_camera(session, CAMERAS[1]), mask)
 
 
-def test_what_is_marked_is_removed_filled_and_repaired(splat_begun):
-    removed, _ = apply_step(splat_begun, marked(splat_begun, "remove"))
+@pytest.fixture(scope="module")
+def without_spot(splat_begun) -> Session:
+    """Return the session of the splat without what is marked."""
+    return apply_step(splat_begun, marked(splat_begun, "remove"))[0]
+
+
+@pytest.fixture(scope="module")
+def repaired_spot(splat_begun) -> tuple[Session, str]:
+    """Return the session of the splat with what is marked repaired, and what is said."""
+    return apply_step(splat_begun, marked(splat_begun, "repair"))
+
+
+def test_what_is_marked_is_removed_filled_and_repaired(without_spot, repaired_spot):
+    removed = without_spot
     gone = removed.latest.source.gone_mask
     assert 50 < int(gone.sum()) < 0.2 * len(gone)
     filled, _ = apply_step(removed, marked(removed, "fill"))
     assert len(filled.latest.added) > 50
-    repaired, text = apply_step(splat_begun, marked(splat_begun, "repair"))
+    repaired, text = repaired_spot
     assert torch.equal(repaired.latest.source.gone_mask, gone)
     assert "are removed" in text
     # To touch the hole is enough.
@@ -340,10 +369,9 @@ def test_what_is_marked_is_removed_filled_and_repaired(splat_begun):
     assert removed.cameras == ()
 
 
-def test_only_holes_that_are_marked_are_filled(splat_begun):
+def test_only_holes_that_are_marked_are_filled(without_spot):
     other = mark(slice(18, 28), slice(2, 12))
-    removed, _ = apply_step(splat_begun, marked(splat_begun, "remove"))
-    removed, _ = apply_step(removed, marked(removed, "remove", other))
+    removed, _ = apply_step(without_spot, marked(without_spot, "remove", other))
     filled, _ = apply_step(removed, marked(removed, "fill"))
     camera = filled.latest.targets[-1].target
     added = filled.latest.targets[-1].added
@@ -354,8 +382,8 @@ def test_only_holes_that_are_marked_are_filled(splat_begun):
     assert len(both.latest.added) > 1.2 * len(filled.latest.added)
 
 
-def test_what_was_added_is_removed_by_marks_too(splat_begun):
-    repaired, _ = apply_step(splat_begun, marked(splat_begun, "repair"))
+def test_what_was_added_is_removed_by_marks_too(repaired_spot):
+    repaired, _ = repaired_spot
     again, _ = apply_step(repaired, marked(repaired, "remove"))
     assert len(again.latest.added) < 0.2 * len(repaired.latest.added)
 
@@ -415,12 +443,12 @@ def read_count(packed: bytes) -> int:
     return int.from_bytes(gzip.decompress(packed)[8:12], "little")
 
 
-def test_only_what_changed_is_sent(splat_begun, tmp_path):
+def test_only_what_changed_is_sent(splat_begun, repaired_spot, tmp_path):
     given = splat_begun.latest.context
     scene = PageScene(given)
     assert shown_in(scene, splat_begun.latest, given) == len(splat_begun.latest.scene)
     begun = set(scene._chunks)
-    repaired, _ = apply_step(splat_begun, marked(splat_begun, "repair"))
+    repaired, _ = repaired_spot
     assert shown_in(scene, repaired.latest, given) == len(repaired.latest.scene)
     (name,) = set(scene._chunks) - begun
     path = tmp_path / "chunk.spz"
@@ -678,9 +706,9 @@ def answer_of(server: LiveServer, name: str, origin: str | None) -> int:
 
 
 def test_a_saved_session_is_replayed_to_the_same_bytes(
-    splat_ready, splat_begun, splat, room, tmp_path, monkeypatch
+    splat_ready, repaired_spot, splat, room, tmp_path, monkeypatch
 ):
-    session, _ = apply_step(splat_begun, marked(splat_begun, "repair"))
+    session, _ = repaired_spot
     session, _ = complete_camera(session, HOLES[1])
     removed = mark(slice(30, 40), slice(8, 20))
     session, _ = apply_step(session, marked(session, "remove", removed))
@@ -707,6 +735,8 @@ def test_a_saved_session_is_replayed_to_the_same_bytes(
     assert restored.read_bytes() == splat.read_bytes()
 
 
+# A splat with photographs, above, and photographs alone, below, are replayed in seconds.
+@pytest.mark.slow
 def test_a_session_of_a_splat_alone_is_replayed_to_the_same_bytes(tmp_path, monkeypatch):
     splat = tmp_path / "splat.ply"
     save_ply(splat, gaussians_of(view_of(Room(), camera_at(size=SIZE))))

@@ -22,7 +22,7 @@ from scenes import camera_at, photographed
 
 PLACES = [(-0.9 + 0.3 * number, -12 + 4 * number) for number in range(7)]
 CONTEXT, TARGET = (0, 2, 4), 6
-SIZE = ("--resolution", 64, "--near", 0.5, "--far", 20)
+SIZE = ("--resolution", 48, "--near", 0.5, "--far", 20)
 
 
 @pytest.fixture(scope="module")

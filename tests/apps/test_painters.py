@@ -105,6 +105,8 @@ def test_an_export_has_what_a_painter_needs(scene, exported):
     assert sorted(path.name for path in exported.iterdir()) == listed
 
 
+# A repaired video, below, brings the truth as well.
+@pytest.mark.slow
 def test_truth_in_the_mask_gives_what_the_oracle_gives(scene, holes, tmp_path, monkeypatch):
     paint_truth(scene, holes)
     painted = ("--images", holes, "--painter", "Photoshop 2026")
@@ -127,7 +129,10 @@ def test_truth_in_the_mask_gives_what_the_oracle_gives(scene, holes, tmp_path, m
     assert [row["frame"] for row in summary["context"]] == [0, 1]
 
 
-@pytest.mark.parametrize("ending", ["png", "jpg", "webp"])
+# Tests below read PNG and WebP as well.
+@pytest.mark.parametrize(
+    "ending", ["jpg", *(pytest.param(e, marks=pytest.mark.slow) for e in ("png", "webp"))]
+)
 def test_a_painting_of_any_kind_and_size_ends_in_the_splat(
     scene, exported, tmp_path, monkeypatch, ending
 ):
@@ -204,7 +209,7 @@ def test_wrong_images_are_refused(scene, holes, tmp_path, monkeypatch, capsys):
     assert "is not an image that can be read" in refused(monkeypatch, capsys, *command)
 
     Image.open(holes / "target2.png").crop((0, 0, SIZE, SIZE - 4)).save(holes / "target1.png")
-    assert f"target1.png has 64 x 60 pixels, and its target {SIZE} x" in refused(
+    assert f"target1.png has {SIZE} x {SIZE - 4} pixels, and its target {SIZE} x" in refused(
         monkeypatch, capsys, *command
     )
 

@@ -44,12 +44,18 @@ def read_summary(out: Path) -> dict:
     return json.loads((out / "summary.json").read_text())
 
 
-def test_what_is_marked_is_filled_with_what_continues_it(folder, tmp_path, monkeypatch):
-    splat = folder / "splat.ply"
-    out = tmp_path / "out"
+@pytest.fixture(scope="module")
+def repaired(folder, tmp_path_factory) -> Path:
+    """Return the output of a repair of what one mask marks."""
+    out = tmp_path_factory.mktemp("repaired") / "out"
     words = ("--camera", folder / "one.json", "--mask", folder / "first.png", "--quiet")
-    assert run(monkeypatch, "repair", splat, *words, "--out", out) == 0
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        assert run(monkeypatch, "repair", folder / "splat.ply", *words, "--out", out) == 0
+    return out
 
+
+def test_what_is_marked_is_filled_with_what_continues_it(folder, repaired, tmp_path, monkeypatch):
+    splat, out = folder / "splat.ply", repaired
     completed = load_ply(out / "completed.ply")
     given = load_ply(splat)
     camera = camera_at(0.02, size=SIZE)
@@ -73,12 +79,9 @@ def test_what_is_marked_is_filled_with_what_continues_it(folder, tmp_path, monke
     assert back.read_bytes() == splat.read_bytes()
 
 
-def test_it_is_a_completion_of_what_masks_mark(folder, tmp_path, monkeypatch):
+def test_it_is_a_completion_of_what_masks_mark(folder, repaired, tmp_path, monkeypatch):
     splat = folder / "splat.ply"
     mask = ("--mask", folder / "first.png", "--quiet")
-    repaired = tmp_path / "repaired"
-    words = ("repair", "--scene", splat, "--camera", folder / "one.json")
-    assert run(monkeypatch, *words, *mask, "--out", repaired) == 0
     completed = tmp_path / "completed"
     words = ("complete", splat, "--target", folder / "one.json")
     assert run(monkeypatch, *words, *mask, "--out", completed) == 0

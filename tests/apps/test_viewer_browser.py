@@ -470,6 +470,7 @@ def touch(page: Any, count: int) -> None:
     page.evaluate("gsc.settled()")
 
 
+@pytest.mark.slow
 def test_a_lasso_marks_its_inside_and_strokes_come_back(browser, saved, tmp_path):
     tab = Window(browser, saved, 420, 400)
     tab.do('gsc.goTo("target-1")')

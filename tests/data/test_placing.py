@@ -80,8 +80,9 @@ def test_new_photographs_are_placed_and_known_cameras_stay(known, new, tmp_path)
     assert np.array_equal(again.frames[7].c2w, joined.frames[7].c2w)
 
 
-def test_a_far_origin_does_not_matter(known, new, tmp_path):
+def test_a_far_origin_does_not_matter_and_what_shows_something_else_is_named(known, new, tmp_path):
     pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
+    Image.new("RGB", (160, 160), "grey").save(new / "wall.png")
     origin = np.array([4e5, -5e6, 120.0])
     moved = []
     for frame in known.frames:
@@ -89,17 +90,11 @@ def test_a_far_origin_does_not_matter(known, new, tmp_path):
         c2w[:3, 3] += origin
         moved.append(replace(frame, c2w=c2w))
     far = replace(known, frames=tuple(moved), origin=origin)
-    joined, _ = place_photographs(new, far, tmp_path / "colmap")
+    joined, placed = place_photographs(new, far, tmp_path / "colmap")
+    assert len(joined) == 8
     for frame, number in zip(joined.frames[6:], NEW, strict=True):
         true = CAMERAS[number].c2w[:3, 3].double().numpy() + origin
         assert np.linalg.norm(frame.c2w[:3, 3] - true) < 0.02
-
-
-def test_a_photograph_of_something_else_is_named_with_the_reason(known, new, tmp_path):
-    pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
-    Image.new("RGB", (160, 160), "grey").save(new / "wall.png")
-    joined, placed = place_photographs(new, known, tmp_path / "colmap")
-    assert len(joined) == 8
     first, second = placed.notes
     assert first == "2 of 3 new photographs were placed among those of the scene."
     assert second == (

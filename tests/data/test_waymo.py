@@ -270,10 +270,10 @@ def test_a_real_road_is_evaluated(shared, tmp_path, monkeypatch, capsys):
     """The protocol of two photographs and one beyond them, with true depth of the road."""
     root = kitti_city_segment(shared, tmp_path / "waymo", count=5)
     words = ("--protocol", "n-2", "--limit", 1, "--resolution", 36, 120, "--quiet")
-    methods = ("--methods", "context", "full", "paper")
+    methods = ("--methods", "context", "full")
     assert run(monkeypatch, "evaluate", root, *words, *methods, "--out", tmp_path / "out") == 0
     rows = [read_run_file(path) for path in list_row_paths(tmp_path / "out")]
-    assert sorted(row["method"] for row in rows) == ["context", "full", "paper"]
+    assert sorted(row["method"] for row in rows) == ["context", "full"]
     assert {row["task"]["name"] for row in rows} == {f"{SEGMENT} 0+2>4"}
     scores = {row["method"]: row["steps"][0]["scores"] for row in rows}
     assert all(score["depth_observed"] is not None for score in scores.values())

@@ -44,7 +44,7 @@ def test_a_case_gives_the_bytes_of_complete(method, config, scene, tmp_path, mon
 
     results = tmp_path / "results"
     task = make_case_task(Case(scene, (0, 1), 2, (), (SIZE, SIZE), 0.5, 20.0))
-    evaluate([task], ["context", "full", "paper"], results)
+    evaluate([task], ["context", method], results)
     folder = get_task_folder(results, task.name)
     context = prepare_task(task, folder, RunConfig()).context
     prediction = load_prediction(get_step_path(folder, method, 1), context)

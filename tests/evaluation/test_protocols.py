@@ -229,6 +229,8 @@ def test_published_indices_are_read_unchanged(shared, tmp_path, name, scenes, sk
     assert read_evaluation_index(tmp_path / "ours.json") == index
 
 
+# Real scenes are opened as clips by test_waymo.py, too.
+@pytest.mark.slow
 def test_the_scenes_of_the_development_cases_are_clips(shared):
     clips = list(open_clips(shared / "data"))
     assert len({clip.name for clip in clips}) == len(clips) > 1

@@ -410,6 +410,8 @@ def test_a_damaged_row_is_named(finished, tmp_path):
 # The command
 
 
+# tests/evaluation/test_runs.py runs the command with other protocols.
+@pytest.mark.slow
 def test_the_command_runs_end_to_end(tmp_path, monkeypatch, capsys):
     for scene, count in (("long", 4), ("short", 2)):
         photographed(tmp_path / scene, CAMERAS[:count], ROOM)

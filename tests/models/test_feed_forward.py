@@ -102,7 +102,8 @@ def test_mvsplat_equals_the_authors_code_with_more_views_and_pixels(shared, case
         "small-s1-u4-l4_v3_64x96",
         "small-s1-u4-l4_v5_64x64",
         "small-s1-u8-l8_v2_64x96",
-        "base-s2-u4-l8_v2_64x96",
+        # Two scales are compared above, and eight layers in the line before.
+        pytest.param("base-s2-u4-l8_v2_64x96", marks=pytest.mark.slow),
         pytest.param("small-s1-u4-l4_v2_256x256", marks=pytest.mark.slow),
     ],
 )
@@ -460,7 +461,7 @@ def test_the_second_run_gives_the_same_and_its_result_can_be_optimised():
 
 
 @pytest.mark.parametrize("name", NETWORKS)
-@pytest.mark.parametrize("number", [3, 5])
+@pytest.mark.parametrize("number", [3, pytest.param(5, marks=pytest.mark.slow)])
 def test_any_number_of_views_will_do(name, number):
     views = [off_centre(0.2 * i, 32, 48) for i in range(number)]
     result = FeedForward(network(name))(views)

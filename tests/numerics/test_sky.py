@@ -116,9 +116,9 @@ def test_a_room_with_a_white_ceiling_has_no_sky(name):
 @pytest.mark.parametrize(
     ("scene", "frames", "size"),
     [
-        ("hololens_room", (0, 1), None),
+        pytest.param("hololens_room", (0, 1), None, marks=pytest.mark.slow),
         ("hololens_room", (3, 4), (256, 256)),
-        ("redkitchen", (0, 1), None),
+        pytest.param("redkitchen", (0, 1), None, marks=pytest.mark.slow),
         ("redkitchen", (18, 19), (256, 256)),
         ("open3d_rgbd", (0, 2), (256, 256)),
         ("re10k_000c3ab1", (30, 31), None),

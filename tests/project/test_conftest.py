@@ -12,6 +12,7 @@ import gscompleter
 from gscompleter.evaluation.baselines.optimization import ssim_map
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.numerics.geometry import quats_to_rotations
+from paths import TESTS
 
 MODULES = [
     module.name
@@ -36,3 +37,10 @@ def test_every_module_but_the_compiled_ones_is_loaded_by_the_hook():
 def test_a_wrong_shape_is_refused(function, shapes):
     with pytest.raises(TypeCheckError):
         function(*(torch.zeros(shape) for shape in shapes))
+
+
+def test_files_that_begin_first_are_files(pytestconfig):
+    plugins = pytestconfig.pluginmanager.get_plugins()
+    (names,) = [plugin.LONGEST for plugin in plugins if hasattr(plugin, "LONGEST")]
+    assert [name for name in names if not (TESTS / name).is_file()] == []
+    assert len(set(names)) == len(names) > 0

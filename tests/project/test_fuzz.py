@@ -20,19 +20,19 @@ def test_mutated_inputs_end_in_a_sentence_or_a_result():
     """It runs in a process of its own, whose forks inherit no threads."""
     script = SUPPORT / "fuzz.py"
     # A machine that is busy with other tests is no hang.
-    words = ["--count", "24", "--seed", "1", "--workers", "2", "--limit", "120"]
+    words = ["--count", "12", "--seed", "1", "--workers", "2", "--limit", "120"]
     command = [sys.executable, str(script), *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
-    refused = re.search(r"24 mutations, 0 findings, (\d+) refused", done.stdout)
+    refused = re.search(r"12 mutations, 0 findings, (\d+) refused", done.stdout)
     assert refused is not None
-    assert 0 < int(refused[1]) < 24
+    assert 0 < int(refused[1]) < 12
 
 
 @pytest.mark.linux
 def test_odd_values_and_damaged_files_end_in_a_sentence_or_a_result():
     """Calls of the Python interface and its readers, in a process of its own with its limits."""
-    calls, files = os.environ.get("FUZZ_CALLS", "40"), os.environ.get("FUZZ_FILES", "68")
+    calls, files = os.environ.get("FUZZ_CALLS", "20"), os.environ.get("FUZZ_FILES", "68")
     words = ["--calls", calls, "--files", files, "--seed", "2"]
     command = [sys.executable, str(SUPPORT / "fuzz_python.py"), *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -34,6 +34,7 @@ from release_check import (
     ROOT,
     built,
     check_answers,
+    check_completion,
     check_demo,
     environment,
     install,
@@ -114,8 +115,7 @@ def test_the_wheel_runs_by_itself_in_another_folder(wheel, tmp_path):
     check_answers(programs, folder)
     found = ran(programs, folder, "python", "-c", "import gscompleter as g; print(g.__file__)")
     assert Path(found.strip()).parent == packages / "gscompleter"
-    check_demo(programs, folder)
-    summary = json.loads((folder / "demo" / "completion" / "summary.json").read_text())
+    summary = json.loads((check_completion(programs, folder) / "summary.json").read_text())
     assert summary["version"] == __version__
 
 

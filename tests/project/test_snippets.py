@@ -39,7 +39,7 @@ NOT_RUN = {
     "batch": "needs a manifest; test_batch.py has some",
     "live": "serves until it is closed; test_live.py presses its buttons",
     "poses": "needs photographs that COLMAP can match; test_poses.py has them",
-    "demo": "takes half a minute; `make release-check` runs it",
+    "demo": "takes half a minute; test_demo.py runs it on small images",
     "bench": "takes minutes; test_bench.py runs it on less",
     "warmup": "test_rehearsal.py compiles in advance",
     "evaluate": "needs sequences or takes hours; test_runs.py evaluates a room",

@@ -1,12 +1,14 @@
 """The renderer of a Mac's GPU: its twin in PyTorch draws here what our renderers draw."""
 
 import importlib.util
+from dataclasses import replace
 
 import pytest
 import torch
 
 from fake_gsplat import find_package
-from gscompleter import GSCompleter, InputError, load_renderer
+from gscompleter import CompleterConfig, GSCompleter, InputError, load_renderer
+from gscompleter.config import GapConfig
 from gscompleter.render.metal import MetalRenderer, explain_missing_metal
 from parity import assert_close
 from render_scenes import (
@@ -68,8 +70,19 @@ def test_a_given_scene_is_completed_with_it(twin):
     views = [view_of(Room(), camera_at(x, size=24), i) for i, x in enumerate((-0.3, 0.1))]
     target = camera_at(0.5, yaw=10, size=24)
     scene = gaussians_of(views[0])
-    ours = GSCompleter()(views, target, scene)
-    done = GSCompleter(renderer=twin)(views, target, scene)
+    # The twin takes a second for an image that the kernels draw in a thousandth.
+    config = CompleterConfig()
+    config = replace(
+        config,
+        guards=("contribution",),
+        add_observed=False,
+        margin=0.0,
+        registration=replace(config.registration, iterations=2),
+        refine=replace(config.refine, color_rounds=1, iterations=2),
+        gaps=GapConfig(displacement=0.0),
+    )
+    ours = GSCompleter(config=config)(views, target, scene)
+    done = GSCompleter(renderer=twin, config=config)(views, target, scene)
     assert len(done.added) > 20
     # Both fill the same hole; which Gaussians of a wall cover others differs.
     assert len(done.added) == pytest.approx(len(ours.added), rel=0.2)

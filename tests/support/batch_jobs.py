@@ -7,7 +7,9 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import Future
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -20,12 +22,26 @@ from gscompleter.system.jobs.jobs import (
     JOBS,
     Engine,
     Job,
+    Pool,
+    Share,
     find_missing_jobs,
     has_row,
     make_folder,
     run_job,
     run_jobs,
 )
+
+
+@contextmanager
+def open_here(workers: int) -> Iterator[Pool]:
+    """Open a pool whose shares run in this process: no other has to start."""
+
+    def start(share: Share) -> Future[Exception | None]:
+        future: Future[Exception | None] = Future()
+        future.set_result(share())
+        return future
+
+    yield Pool(workers, start)
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from pathlib import Path
 from gscompleter import __version__
 from gscompleter.apps.installation import PURPOSES
 from paths import ROOT
+from scenes import camera_at, photographed
 
 IMPORT_ALL = "import gscompleter; [getattr(gscompleter, name) for name in gscompleter.__all__]"
 """Every public name."""
@@ -82,10 +83,25 @@ def check_answers(programs: Path, folder: Path) -> None:
     assert there["viewer", "libraries"], found
 
 
+def check_completion(programs: Path, folder: Path) -> Path:
+    """Complete a small room, and write a page that shows it; returns the folder of the result."""
+    cameras = [camera_at(x, yaw=yaw, size=32) for x, yaw in ((-0.3, 0), (0.1, 0), (0.7, 12))]
+    room, out = photographed(folder / "room", cameras), folder / "out"
+    frames = ("--context", 0, 1, "--target", 2, "--near", 0.5, "--far", 20)
+    ran(programs, folder, "gscompleter", "complete", room, *frames, "--out", out, "--quiet")
+    check_page(programs, folder, out)
+    return out
+
+
 def check_demo(programs: Path, folder: Path) -> None:
     """Complete the demo, and write a page that shows it."""
     ran(programs, folder, "gscompleter", "demo", "--out", "demo", "--quiet")
     out = folder / "demo" / "completion"
+    check_page(programs, folder, out)
+
+
+def check_page(programs: Path, folder: Path, out: Path) -> None:
+    """Check that a completion added something, and write a page that shows it."""
     assert json.loads((out / "summary.json").read_text())["gaussians"]["added"] > 0
     ran(programs, folder, "gscompleter", "view", out, "--save", "page.html")
     page = (folder / "page.html").read_text()

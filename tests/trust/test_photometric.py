@@ -236,7 +236,13 @@ def test_the_command_refuses_a_scene_that_does_not_fit(tmp_path, monkeypatch, ca
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("worth", [0, MIN_PROXY_GAUSSIANS], ids=["sorted", "as-given"])
+@pytest.mark.parametrize(
+    "worth",
+    [
+        pytest.param(0, id="sorted"),
+        pytest.param(MIN_PROXY_GAUSSIANS, id="as-given", marks=pytest.mark.slow),
+    ],
+)
 def test_rows_of_another_program_come_back_whole(tmp_path, monkeypatch, worth):
     monkeypatch.setattr("gscompleter.apps.completing.preparation.MIN_PROXY_GAUSSIANS", worth)
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])

@@ -28,10 +28,8 @@ from gscompleter.types import merge
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 
 RENDERER = load_renderer("cpu")
-CAMERAS = [
-    camera_at(x, y, z, yaw, size=192)
-    for x, y, z, yaw in ((-0.6, 0, 0, 6), (0, -0.3, 0.2, 0), (0.6, 0.1, 0, -6), (0.2, 0.3, 0.4, 0))
-]
+PLACES = ((-0.6, 0, 0, 6), (0, -0.3, 0.2, 0), (0.6, 0.1, 0, -6), (0.2, 0.3, 0.4, 0))
+CAMERAS = [camera_at(*place, size=96) for place in PLACES]
 ARBITRARY = make_similarity(
     0.3, Rotation.from_rotvec([0.9, -1.7, 0.4]).as_matrix(), np.array([5.0, 3.0, -2.0])
 )
@@ -192,7 +190,11 @@ def test_a_result_is_relative_to_an_origin_where_the_splat_lies_there(
     assert ("relative to a local origin" in capsys.readouterr().out) == any(place)
 
 
-def test_floaters_kilometres_away_change_nothing(splat, room, tmp_path):
+def test_floaters_kilometres_away_change_nothing(tmp_path):
+    """The frame is found in the images, which have to be larger for it."""
+    cameras = [camera_at(*place, size=192) for place in PLACES]
+    room = photographed(tmp_path / "room", cameras)
+    splat = merge([gaussians_of(view_of(Room(), cameras[i])) for i in (0, 2)])
     some = splat[:: len(splat) // 300]
     away = torch.nn.functional.normalize(some.means, dim=1) * 1e5
     floaters = in_frame(splat, ARBITRARY)[: len(some)]
