@@ -99,6 +99,7 @@ def test_a_completion_stays_on_the_device_of_its_views_and_is_that_of_the_cpu(vi
     assert torch.equal(done.scene.opacities.cpu(), plain.scene.opacities)
 
 
+@pytest.mark.slow
 def test_a_session_in_the_browser_stays_on_the_device_of_its_views(views):
     config = few_steps(CompleterConfig.splat())
     completer = GSCompleter(renderer=REFERENCE, config=config)

@@ -189,6 +189,7 @@ def test_what_others_wrote_is_not_replaced(room, tmp_path):
         serving.prepare(options_for(room, tmp_path / "out"), QUIET)
 
 
+@pytest.mark.slow
 def test_what_is_saved_of_a_splat_in_a_frame_of_its_own_is_too(tmp_path, monkeypatch):
     """Cameras are written in the frame of the photographs without loss."""
     room = photographed(tmp_path / "room", CAMERAS)
@@ -799,6 +800,7 @@ def test_what_is_wrong_is_named_once(splat, tmp_path, monkeypatch, capsys, words
     assert said in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_a_scene_of_photographs_is_repaired_and_replayed_too(
     ready, begun, room, tmp_path, monkeypatch
 ):

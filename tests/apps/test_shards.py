@@ -187,6 +187,7 @@ def test_three_shards_at_once_end_so_ten_times_out_of_ten(scenes, finished, tmp_
         three_at_once(scenes, tmp_path / f"out-{number}", finished)
 
 
+@pytest.mark.slow
 def test_rows_that_come_while_tables_are_written_get_into_them(finished, tmp_path, monkeypatch):
     """Another shard ends after the rows are read and before tables are written."""
     out, late = tmp_path / "out", tmp_path / "late.json"

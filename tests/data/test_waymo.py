@@ -266,6 +266,7 @@ def test_without_pyarrow_a_sentence_says_what_to_install(tmp_path, monkeypatch):
         open_photographs(root)
 
 
+@pytest.mark.slow
 def test_a_real_road_is_evaluated(shared, tmp_path, monkeypatch, capsys):
     """The protocol of two photographs and one beyond them, with true depth of the road."""
     root = kitti_city_segment(shared, tmp_path / "waymo", count=5)
