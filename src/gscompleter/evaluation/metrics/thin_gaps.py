@@ -79,7 +79,11 @@ def find_worst_gap(renders: Mapping[str, Render]) -> WorstGap | None:
         height, width = gaps.shape
         # A crop is square, and an image may be smaller than the window.
         side = min(WINDOW, height, width)
-        shares = avg_pool2d(gaps.to(torch.float64)[None, None], side, stride=1)[0, 0]
+        # Whole numbers, which add up without rounding: along x, then along y.
+        counts = gaps.to(torch.float64)[None, None]
+        for window in ((1, side), (side, 1)):
+            counts = avg_pool2d(counts, window, stride=1, divisor_override=1)
+        shares = counts[0, 0] / side**2
         share = shares.max().item()
         if share > (0.0 if worst is None else worst.share):
             row, column = divmod(int(shares.argmax()), shares.shape[1])
