@@ -21,10 +21,8 @@ BYTES_PER_VIEW_PIXEL = 250
 
 MAX_FROZEN_BYTES = 2 * 2**30
 """Bytes of splats that the frozen views of an input splat may hold together."""
-COPIES = 2
-"""Copies of a scene: itself, and as much for its proxy and for what is recoloured or cut of it."""
-# Measured on 4 M Gaussians of degree 3 and 40 photographs: 3.8 GB for `complete`, 3.9 GB for
-# `remove`, where this estimates 5.8 GB.
+# A scene is held once. Measured on 4 M and 10 M Gaussians of degree 3 with 40 photographs: 3.8 and
+# 5.7 GB for `complete`, where these numbers give 4.8 and 6.7 GB.
 FREEZING_BYTES = 60
 """Bytes per Gaussian while a view is frozen."""
 BYTES_PER_SPLAT = 52
@@ -81,7 +79,7 @@ def estimate_scene_bytes(count: int, numbers: int, photographs: Sequence[int]) -
     views = number * rendered * BYTES_PER_SPLAT
     observed = 2 * 4 * number * rendered  # areas and agreement of every Gaussian
     fitted = BYTES_PER_PHOTO_PIXEL * sum(photographs)
-    return count * (COPIES * 4 * numbers + FREEZING_BYTES) + views + observed + fitted
+    return count * (4 * numbers + FREEZING_BYTES) + views + observed + fitted
 
 
 def count_fitting_gaussians(number: int) -> int:
