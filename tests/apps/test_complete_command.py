@@ -127,7 +127,7 @@ def test_the_estimated_memory_grows_with_pixels(scene):
     cameras = [replace(view.camera, width=1000, height=1000) for view in task.views]
     image = torch.zeros(1, 1, 3).expand(1000, 1000, 3)
     large = replace(task, views=[View(image, camera) for camera in cameras])
-    assert estimate_memory(task, None) < 1e9 < 3e9 < estimate_memory(large, None) < 4e9
+    assert estimate_memory(task, None) < 1e9 < 3e9 < estimate_memory(large, None) < 5e9
 
 
 def test_the_summary_says_what_was_opened_and_between_which_depths(chosen):

@@ -37,6 +37,10 @@ def test_the_estimate_holds_what_was_measured_and_not_twice_as_much():
         assert 0.95 * measured < estimate_bytes(pixels, 3) < 2 * measured
 
 
+def test_the_estimate_holds_what_forty_photographs_took():
+    assert 0.95 * 4.74e9 < estimate_bytes(360 * 640, 41) < 2 * 4.74e9
+
+
 WITNESSES = [256 * 384] * 2 + [213 * 320] * 28
 
 
