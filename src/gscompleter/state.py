@@ -346,11 +346,6 @@ class Completion(Displayed):
         )
 
     @cached_property
-    def has_changed_context(self) -> bool:
-        """True if Gaussians of the context were recoloured or removed."""
-        return bool(self.recolored_mask.any()) or bool(self.source.gone_mask.any())
-
-    @cached_property
     def kept_context(self) -> Gaussians:
         """The recoloured context without removed Gaussians."""
         gone = self.source.gone_mask

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from jaxtyping import UInt8
 from PIL import Image, ImageDraw, ImageFont
 
 from gscompleter.evaluation.metrics.thin_gaps import WINDOW, WorstGap
+from gscompleter.numerics.image_ops import paint_marked
 from gscompleter.system.files.image import convert_to_pixels
 
 ZOOM = 4
@@ -15,16 +15,14 @@ ZOOM = 4
 LABEL_HEIGHT = 52
 """Height of two lines of text, in pixels."""
 FONT_SIZE = 18
-MARK_COLOR = (1.0, 0.0, 1.0)
 NOTHING_THIN = "No thin gaps at the target\nor near it"
 
 
 def draw_gap(worst: WorstGap | None) -> UInt8[np.ndarray, "h w 3"]:
     """Draw the worst place as it is rendered, and beside it with its gaps in magenta.
 
-    Above them is said where it is, and how much of it are gaps.
-
-    Without thin gaps there are only words that say so.
+    A line above them says where it is, and how much of it are gaps. Without thin gaps there are
+    only words that say so.
     """
     side = ZOOM * WINDOW
     height = LABEL_HEIGHT + (0 if worst is None else side)
@@ -34,8 +32,7 @@ def draw_gap(worst: WorstGap | None) -> UInt8[np.ndarray, "h w 3"]:
     ImageDraw.Draw(canvas).text((4, LABEL_HEIGHT // 2), label, "black", font, anchor="lm")
     if worst is not None:
         # Each pixel becomes a square: smoothed, a gap of one pixel would look like a shade.
-        color = worst.crop.new_tensor(MARK_COLOR)
-        marked = torch.where(worst.gaps[..., None], color, worst.crop)
+        marked = paint_marked(worst.crop, worst.gaps)
         for number, crop in enumerate((worst.crop, marked)):
             shown = Image.fromarray(convert_to_pixels(crop))
             shown = shown.resize((side, side), Image.Resampling.NEAREST)

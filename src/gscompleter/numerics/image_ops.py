@@ -17,6 +17,8 @@ SSIM_SIGMA = 1.5
 """Standard deviation of the window, in pixels."""
 THIN_RADIUS = 2
 """Half the width, in pixels, of a square that fits into nothing thin: 5 pixels."""
+MARK_COLOR = (1.0, 0.0, 1.0)
+"""A colour that no scene has: magenta."""
 MAX_REGIONS = 3
 """Most regions that are listed, the largest first."""
 
@@ -96,6 +98,15 @@ def average_box(values: Float[Tensor, "h w"], radius: int) -> Float[Tensor, "h w
 def blur_gaussian(values: Float[Tensor, "h w *c"], sigma: float) -> Float[Tensor, "h w *c"]:
     """Blur an image by a Gaussian of standard deviation `sigma` in pixels."""
     return torch.from_numpy(cv2.GaussianBlur(values.cpu().numpy(), (0, 0), sigma)).to(values)
+
+
+def paint_marked(
+    image: Float[Tensor, "h w 3"],
+    mask: Bool[Tensor, "h w"],
+    color: tuple[float, float, float] = MARK_COLOR,
+) -> Float[Tensor, "h w 3"]:
+    """Paint the pixels of `mask` over an image."""
+    return torch.where(mask[..., None], image.new_tensor(color), image)
 
 
 def dilate(mask: Bool[Tensor, "h w"], radius: int) -> Bool[Tensor, "h w"]:

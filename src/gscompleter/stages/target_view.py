@@ -97,7 +97,7 @@ class TargetView:
             return None
         return add_border(self.removed)
 
-    @cached_property
+    @property
     def removed(self) -> Bool[Tensor, "h w"]:
         """Pixels that showed something removed."""
         return find_removed(self.state.source, self.camera.padded, self.scenes.renderer)

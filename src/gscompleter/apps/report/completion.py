@@ -46,7 +46,7 @@ from gscompleter.evaluation.verdict.held_out import HeldOut, render_before_after
 from gscompleter.evaluation.verdict.outcome import judge_completion
 from gscompleter.evaluation.verdict.rows import ScoreRow
 from gscompleter.numerics.geometry import estimate_up
-from gscompleter.numerics.image_ops import compute_mask_fraction
+from gscompleter.numerics.image_ops import compute_mask_fraction, paint_marked
 from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.reconstructors.features.consistency import measure_pose_errors
 from gscompleter.render.protocols import Renderer
@@ -71,7 +71,6 @@ MAX_PHOTOGRAPHS = 200
 """Largest number of photographs in the drawing and for the path of the video."""
 MIN_POSED = 3
 """Fewest photographs whose poses are compared."""
-IGNORED_COLOR = (1.0, 0.0, 1.0)
 FRUSTUM = ((-1, -1, 1), (1, -1, 1), (1, 1, 1), (-1, 1, 1))
 """Image corners of a camera pyramid, whose apex is the origin."""
 FRUSTUM_DEPTH = 0.11
@@ -516,8 +515,7 @@ def write_photographs(
 
 def paint_ignored(view: View) -> Float[Tensor, "h w 3"]:
     """Paint the ignored pixels of a photograph in a colour that no scene has."""
-    color = view.image.new_tensor(IGNORED_COLOR)
-    return torch.where(view.valid_mask[..., None], view.image, color)
+    return paint_marked(view.image, ~view.valid_mask)
 
 
 def paint_unfilled(result: TargetResult, pair: RenderPair) -> Float[Tensor, "h w 3"] | None:
@@ -525,8 +523,7 @@ def paint_unfilled(result: TargetResult, pair: RenderPair) -> Float[Tensor, "h w
     if not result.unfilled.describe():
         return None
     is_open = result.hole_mask & (pair.after.alpha < COVERED)
-    color = pair.after.image.new_tensor(IGNORED_COLOR)
-    return torch.where(is_open[..., None], color, pair.after.image)
+    return paint_marked(pair.after.image, is_open)
 
 
 def name_target_images(

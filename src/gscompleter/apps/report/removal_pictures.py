@@ -1,11 +1,10 @@
-"""What a removal may have left of an object: a number, and pictures of one photograph."""
+"""Measure and draw the parts of an object that a removal may have left, in one photograph."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -13,12 +12,11 @@ from gscompleter.apps.report.schema import RemovalRow
 from gscompleter.editing.outline import Outline, trace_outline
 from gscompleter.evaluation.metrics.coverage import RenderPair
 from gscompleter.evaluation.verdict.held_out import render_before_after
-from gscompleter.numerics.image_ops import compute_mask_fraction
+from gscompleter.numerics.image_ops import compute_mask_fraction, paint_marked
 from gscompleter.render.protocols import Renderer
 from gscompleter.render.removed import find_removed
 from gscompleter.state import Completion
 
-CONTINUED_COLOR = (1.0, 0.0, 1.0)
 ENDED_COLOR = (0.0, 1.0, 1.0)
 """Colour of the outline where what was removed ends."""
 
@@ -82,9 +80,5 @@ def reaches_border(mask: Bool[Tensor, "h w"]) -> bool:
 
 def paint_outline(image: Float[Tensor, "h w 3"], outline: Outline) -> Float[Tensor, "h w 3"]:
     """Paint the outline of what was removed over an image, by whether the surface goes on."""
-    color = torch.where(
-        outline.continued[..., None],
-        image.new_tensor(CONTINUED_COLOR),
-        image.new_tensor(ENDED_COLOR),
-    )
-    return torch.where(outline.pixels[..., None], color, image)
+    traced = paint_marked(image, outline.pixels, ENDED_COLOR)
+    return paint_marked(traced, outline.continued)

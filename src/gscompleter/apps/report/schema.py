@@ -110,7 +110,7 @@ class TargetRow(ScoreRow):
 
 @dataclass(frozen=True)
 class RemovalRow:
-    """What a removal may have left, in the photograph that shows what was removed largest."""
+    """Possible remainder of a removed object, in the photograph that shows the object largest."""
 
     frame: int | None
     file: str | None

@@ -42,7 +42,7 @@ class WorstGap:
     top: int
     """Pixel of the image at the upper left corner of the window."""
     crop: Float[Tensor, "s s 3"]
-    """What the window shows, over black."""
+    """Rendered colours of the window, over black."""
     gaps: Bool[Tensor, "s s"]
     """The thin gaps in it."""
 

@@ -36,6 +36,8 @@ def render_before_after(completion: Completion, camera: Camera, renderer: Render
     with torch.no_grad():
         frozen = renderer.freeze(completion.context, camera)
         before = frozen.render
+        # What a removed Gaussian hid comes to light, so that the rest is projected anew. New
+        # colours alone change no depth and no opacity, and the frozen scene is painted over.
         if completion.source.gone_mask.any():
             frozen = renderer.freeze(completion.context[:0], camera)
             for part in completion.iterate_kept(BLOCK):

@@ -2,7 +2,7 @@
 
 /* Pixels of the canvas per pixel of the photograph, which is in its middle. */
 function zoomOfStage() {
-  return Math.min(stage.clientWidth / state.size[0], stage.clientHeight / state.size[1]);
+  return zoomToFit(state.size, stage.clientWidth, stage.clientHeight);
 }
 
 /* The pixel of the photograph at a place of the window. */

@@ -102,15 +102,20 @@ class Picture {
   }
 }
 
+/* Pixels of a canvas for each one of the photograph, all of which it shows. */
+function zoomToFit([photoWidth, photoHeight], width, height) {
+  return Math.min(width / photoWidth, height / photoHeight);
+}
+
 /* The CSS that cuts a canvas down to the photograph in its middle. */
 function clipToFrame([photoWidth, photoHeight], width, height) {
-  const zoom = Math.min(width / photoWidth, height / photoHeight);
+  const zoom = zoomToFit([photoWidth, photoHeight], width, height);
   return `inset(${(height - zoom * photoHeight) / 2}px ${(width - zoom * photoWidth) / 2}px)`;
 }
 
 /* The projection of a lens onto a canvas that shows the whole photograph, in its middle. */
 function projection([fx, fy, cx, cy], [photoWidth, photoHeight], width, height) {
-  const zoom = Math.min(width / photoWidth, height / photoHeight);
+  const zoom = zoomToFit([photoWidth, photoHeight], width, height);
   const x = width / 2 + zoom * (cx - photoWidth / 2);
   const y = height / 2 + zoom * (cy - photoHeight / 2);
   const depth = FAR - NEAR;
