@@ -18,7 +18,7 @@ from gscompleter.generators import (
     load_generator,
 )
 from gscompleter.guards import Attempt, place, prepare_guards, verify
-from gscompleter.numerics.geometry import pad_camera, pad_like
+from gscompleter.numerics.geometry import is_inside, pad_camera, pad_like, project
 from gscompleter.numerics.image_ops import is_enclosed
 from gscompleter.numerics.value_checks import check_camera, check_gaussians, check_inputs
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
@@ -261,6 +261,7 @@ class GSCompleter:
                 affine=affine,
                 losses={"register": moved.losses, "refine": refined.losses},
                 registered=moved.gaussians if self.keep_registered else None,
+                num_outside=count_outside(added, target) if state.is_given else 0,
                 num_recolored=recolored.count,
                 synthesis_notes=image.notes,
                 painter=image.painter,
@@ -331,8 +332,10 @@ class GSCompleter:
 
     def pad_target(self, state: Completion, target: Camera) -> PaddedCamera:
         """Pad a target camera by as much as the settings and Φ allow."""
-        margin = state.config.margin if as_generator(self.generator).supports_padding else 0.0
-        return pad_camera(state.with_depth_range(target), margin)
+        # `begin` has chosen the margin.
+        margin = state.config.margin or 0.0
+        can_pad = as_generator(self.generator).supports_padding
+        return pad_camera(state.with_depth_range(target), margin if can_pad else 0.0)
 
     @timed_stage("generate")
     def synthesize(self, views: Sequence[TargetView]) -> list[GeneratedView]:
@@ -341,6 +344,11 @@ class GSCompleter:
             return []
         inputs = [(view.camera.padded, view.make_generator_input()) for view in views]
         return synthesize(self.generator, inputs, views[0].state.config.synthesis)
+
+
+def count_outside(added: Gaussians, target: Camera) -> int:
+    """Count the Gaussians outside of the image of a target, in its padding."""
+    return len(added) - int(is_inside(*project(added.means, target), target).sum())
 
 
 def name_model(model: object) -> str:

@@ -29,6 +29,8 @@ from gscompleter.types import (
 
 NEW_PHOTO_ID = 255
 """Value of `generated` for Gaussians that were recoloured to a new photograph, or cut."""
+MANY_TIMES = 4
+"""Gaussians outside of the image of a target, against those in it, from which on they are many."""
 MAX_SHOWN_TARGETS = 4
 """Most targets whose pictures a notebook shows."""
 RESULTS = "gscompleter.apps.report.results"
@@ -141,6 +143,8 @@ class TargetResult(Displayed):
     """All registered Gaussians, hole or not; None without `GSCompleter.keep_registered`."""
     target_id: int = 0
     """Value of `generated` for what this target added or recoloured."""
+    num_outside: int = 0
+    """Number of added Gaussians outside of the image of the target, if the scene was given."""
     num_recolored: int = 0
     """Number of rendered context Gaussians that got new colours."""
     synthesis_notes: tuple[str, ...] = ()
@@ -188,7 +192,19 @@ class TargetResult(Displayed):
         if self.rejection.guard:
             notes += [self.rejection.reason, NOTHING_ADDED]
         notes.append(self.unfilled.describe())
+        notes.append(self.describe_outside())
         return tuple(filter(None, notes))
+
+    def describe_outside(self) -> str:
+        """Write a sentence if far more was added outside of the image than in its hole."""
+        inside = len(self.added) - self.num_outside
+        if self.num_outside <= MANY_TIMES * inside:
+            return ""
+        return (
+            f"{self.num_outside:,} of the {len(self.added):,} added Gaussians lie outside of the "
+            f"image of the target, whose hole has {int(self.hole_mask.sum()):,} pixels: they fill "
+            "its padding (config.margin 0 leaves them out)."
+        )
 
 
 @dataclass(frozen=True, repr=False)
@@ -207,7 +223,8 @@ class Completion(Displayed):
     """Trust in `rendered_context`; added Gaussians have full trust."""
     targets: tuple[TargetResult, ...] = ()
     free_space_cameras: tuple[Camera, ...] = ()
-    """Further cameras whose free space stays empty; their images are not read."""
+    """Further cameras whose free space stays empty, such as the witnesses of a splat; their images
+    are not read."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Wall time of context, generate, lift, register, integrate and total."""
     exposure_gains: Float[Tensor, "v 3"] | None = None

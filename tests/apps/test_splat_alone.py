@@ -63,7 +63,10 @@ def test_a_named_target_is_completed_from_renders_around_it(folder, done, tmp_pa
     page = (done / "report.html").read_text()
     assert "Renders in place of photographs" in page
     assert "No photograph checked this" in page
-    assert "0.2 dB on average" in page
+    kept = summary["kept"]
+    assert kept["cameras"] >= 3
+    assert kept["worst_psnr"] > 45
+    assert f"Seen from {kept['cameras']} cameras that decided nothing" in page
     for number in range(1, len(summary["context"]) + 1):
         assert (done / "images" / f"context{number}_render.png").is_file()
     assert len(load_cameras(done / "renders.json")) == len(summary["context"])
@@ -224,7 +227,7 @@ def test_with_nothing_named_the_camera_of_a_pixel_aligned_splat_is_found(
     assert run(monkeypatch, *words) == 0
     said = capsys.readouterr()
     assert "renders of the splat at 8 cameras that follow from the sizes" in said.err
-    assert "0.5 dB on average" in said.out
+    assert "cameras that decided nothing, what the splat showed stays as it was" in said.out
     summary = read_summary(out)
     assert summary["scene"]["renders_from"] == "pixels"
     assert summary["targets"][0]["added"] > 100

@@ -130,6 +130,9 @@ class HoleConfig(Settings):
     """Pixels by which the hole mask is dilated to hide seams; 0 disables it (paper)."""
     kind: Literal["all", "enclosed"] = "all"
     """What is a hole: all empty pixels, or in an object on nothing only those that it encloses."""
+    padding: Literal["all", "beside"] = "all"
+    """Holes in the padding of the target image that count: all, or those beside a hole that reaches
+    the border of the image."""
     forces_removed: bool = False
     """Pixels that showed something removed are holes, whatever stands behind it."""
     candidate_radius: Pixels | None = 16
@@ -289,6 +292,9 @@ class CleaningConfig(Settings):
     floaters: FloaterConfig = FloaterConfig()
 
 
+LIFTED_MARGIN = 0.25
+"""`margin` for a scene that was lifted from pixels, beside which everything is empty."""
+
 GUARDS = {
     "dynamic-masks": "gscompleter.guards.dynamic_masks:DynamicMasks",
     "image-agreement": "gscompleter.guards.agreement:ImageAgreement",
@@ -334,9 +340,10 @@ class CompleterConfig(Settings):
     add_observed: bool = True
     """Add what the photographs of a given scene show and the scene lacks, before Φ invents
     anything (paper: False)."""
-    margin: Annotated[float, Interval(ge=0, le=4)] = 0.25
+    margin: Annotated[float, Interval(ge=0, le=4)] | None = None
     """Padding of the target image on every side, relative to its size, if a hole reaches its
-    border, so that nearby cameras see no new hole there (paper: 0)."""
+    border, so that nearby cameras see no new hole there (paper: 0). None: 0.25 for a scene that was
+    lifted from pixels, 0 for a trained splat."""
     ego_mask: bool = True
     """Ignore image regions that stay the same while the camera moves, such as the bonnet of the
     car that carries it (paper: use all pixels)."""
@@ -390,6 +397,7 @@ class CompleterConfig(Settings):
             guards=("image-agreement", "free-space", "psnr", "contribution"),
             margin=0.0,
             registration=SPLAT_REGISTRATION,
+            holes=HoleConfig(padding="beside"),
         )
 
     @staticmethod
@@ -398,12 +406,14 @@ class CompleterConfig(Settings):
 
         Renders confirm all that the splat shows, so it has full trust, and they show nothing that
         it lacks. Nothing moves in them. The error budgets are not relative to their error, which is
-        zero: what is invisible is allowed (`psnr_guard.invisible_psnr`).
+        zero: what is invisible is allowed (`psnr_guard.invisible_psnr`). No photograph tests what
+        is added, so no more is added than the hole asks for.
         """
         return CompleterConfig(
             guards=("image-agreement", "free-space", "psnr", "contribution"),
             add_observed=False,
             registration=SPLAT_REGISTRATION,
+            holes=HoleConfig(padding="beside"),
         )
 
     @staticmethod

@@ -230,7 +230,10 @@ def add_free_space_cameras(completion: Completion, cameras: Sequence[Camera]) ->
     """Keep the free space of a spread subset of cameras empty.
 
     An input splat gets none: its renders may be wrong there, and check views protect it better.
+    One without photographs has its witnesses already.
     """
+    if completion.free_space_cameras:
+        return completion
     context = [view.camera for view in completion.views]
     others = [
         completion.with_depth_range(camera)

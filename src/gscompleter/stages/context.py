@@ -10,7 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
-from gscompleter.config import CompleterConfig, get_named_config
+from gscompleter.config import LIFTED_MARGIN, CompleterConfig, get_named_config
 from gscompleter.numerics.geometry import add_near_plane, compute_z_depths, project_mask
 from gscompleter.reconstructors import (
     DepthAware,
@@ -27,6 +27,7 @@ from gscompleter.reconstructors.features.depth_range import (
 from gscompleter.render.lod import build_proxy
 from gscompleter.render.protocols import Renderer
 from gscompleter.system.errors import InputError
+from gscompleter.trust.lifted import is_lifted
 from gscompleter.types import Camera, ContextScene, Gaussians, Reconstruction, View
 
 MIN_CONTRAST = 0.02
@@ -57,6 +58,10 @@ def choose_config(
     # Without check views nothing tells how far a given scene can be trusted.
     is_splat = scene is not None and check_views is not None
     config = config or get_named_config("default", is_splat)
+    if config.margin is None:
+        # A trained splat is opaque beyond what was photographed, and needs no padding.
+        needs_padding = scene is None or is_lifted(scene)
+        config = replace(config, margin=LIFTED_MARGIN if needs_padding else 0.0)
     if scene and bool((scene.generated > 0).any()):
         config = replace(config, recolor=replace(config.recolor, iterations=0))
     return config

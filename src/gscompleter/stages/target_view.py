@@ -8,6 +8,7 @@ from functools import cached_property
 
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import pad
 
 from gscompleter.config import HoleConfig
 from gscompleter.numerics.geometry import is_same_camera, shrink_camera
@@ -67,6 +68,8 @@ class TargetView:
         """Decide what a hole is, given the accumulated opacity [h, w] that counts."""
         config = self.state.config.holes
         holes = compute_hole_mask(alpha, config)
+        if config.padding == "beside":
+            holes = holes & beside_holes(holes, self.camera, config.dilation)
         # Beside an object nothing is missing; nor is it where an object was taken away from there.
         if config.kind == "enclosed":
             holes = keep_enclosed(holes, self.render, self.camera.padded, self.render_at)
@@ -241,6 +244,21 @@ def compute_hole_mask(
 ) -> Bool[Tensor, "h w"]:
     """Return True where alpha is below the threshold, before dilation (paper, Eq. 12)."""
     return alpha < config.max_alpha
+
+
+def beside_holes(
+    holes: Bool[Tensor, "wide_h wide_w"], camera: PaddedCamera, dilation: int
+) -> Bool[Tensor, "wide_h wide_w"]:
+    """Mark the image of the target, and its padding beside holes that reach the border.
+
+    What is not beside them was not asked for: one pixel of a hole at the border would open all of
+    the padding. `dilation` in pixels is that of the hole mask.
+    """
+    inside = dilate(camera.crop(holes), dilation)[None, None].float()
+    sides = (camera.left, camera.left, camera.top, camera.top)
+    continued = pad(inside, sides, mode="replicate")[0, 0] > 0
+    camera.crop(continued).fill_(True)
+    return continued
 
 
 def render_target(state: Completion, camera: PaddedCamera, scenes: SceneRenderer) -> TargetView:

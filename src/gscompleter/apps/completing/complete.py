@@ -242,6 +242,7 @@ def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[st
             ready.opened.files,
             has_searched=not options.from_photographs_only,
             run=describe_maker(options, task, completion),
+            testing=[completion.with_depth_range(camera) for camera in task.witnesses.testing],
         )
     write_render_cameras(folder, ready)
     write_completion_page(folder)

@@ -76,7 +76,9 @@ class Prepared:
     def begin(self) -> Completion:
         """Initialize the context."""
         task = self.task
-        return self.completer.begin(task.views, task.scene, task.check_views, task.target_cameras)
+        begun = self.completer.begin(task.views, task.scene, task.check_views, task.target_cameras)
+        guarding = tuple(begun.with_depth_range(camera) for camera in task.witnesses.guarding)
+        return replace(begun, free_space_cameras=guarding)
 
     # `PreparedRemoval` adds the selection to them.
     def describe_settings(self) -> dict[str, Any]:

@@ -30,6 +30,7 @@ from gscompleter.virtual_capture.pixel_aligned import (
     move_beside,
 )
 from gscompleter.virtual_capture.standpoints import choose_cameras_around_place, find_standpoints
+from gscompleter.virtual_capture.witnesses import MAX_WITNESSES
 
 MAX_AROUND = 12
 """Most cameras around all targets together: each takes the memory of a frozen scene."""
@@ -88,6 +89,8 @@ class Capture:
     """Clause that says which cameras they are."""
     more: str
     """Clause on what else could be given; empty if the user named the cameras."""
+    others: Sequence[Camera] = ()
+    """Further cameras from which the splat looks well, and at which it is not rendered."""
 
 
 def find_cameras_beside(splat: Path) -> Path | None:
@@ -155,13 +158,15 @@ def find_standing_cameras(scene: Gaussians, renderer: Renderer, request: RenderR
     """Find cameras from which a trained splat looks like a photograph."""
     up = request.make_up(scene)
     side = choose_side(request.reading.resolution)
-    cameras = find_standpoints(scene, up, side, renderer, NUM_STANDPOINTS)
+    cameras = find_standpoints(scene, up, side, renderer, MAX_WITNESSES)
     if not cameras:
         raise InputError(
             "There is no place from which the splat looks like a photograph; name its cameras with "
             "--cameras, or which way is up with --up."
         )
-    return name_capture(cameras, "standpoints", "cameras from which it looks like a photograph")
+    best = cameras[:NUM_STANDPOINTS]
+    where = "cameras from which it looks like a photograph"
+    return replace(name_capture(best, "standpoints", where), others=cameras[NUM_STANDPOINTS:])
 
 
 def search_around_place(

@@ -20,11 +20,9 @@ from gscompleter.stages.enclosed_holes import keep_enclosed
 from gscompleter.stages.target_view import compute_hole_mask, explain_little_covered
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import read_mask
+from gscompleter.trust.lifted import is_lifted
 from gscompleter.types import Camera, Gaussians
 from gscompleter.virtual_capture.kind import is_object
-from gscompleter.virtual_capture.pixel_aligned import (
-    find_pixel_center,
-)
 
 HoleKind = Literal["all", "enclosed"]
 OPAQUE = (
@@ -47,7 +45,7 @@ def choose_kind(
     """Choose what a hole is: of an object on nothing, only what it encloses."""
     if kind == "enclosed" or (
         kind == "auto"
-        and find_pixel_center(scene) is None
+        and not is_lifted(scene)
         and is_object(scene, [camera.to(scene.means.device) for camera in cameras], renderer)
     ):
         return "enclosed"

@@ -58,6 +58,7 @@ from gscompleter.system.files.image import convert_to_pixels
 from gscompleter.system.memory import check_memory
 from gscompleter.types import Camera, Gaussians, View
 from gscompleter.virtual_capture.render_views import render_views
+from gscompleter.virtual_capture.witnesses import choose_witnesses
 
 FORMAT = "renders"
 """Format of photographs that are renders of the splat."""
@@ -117,6 +118,11 @@ def open_renders(
         notes.append(OBJECT_NOTE)
 
     cameras = {number: capture.cameras[number].to(device) for number in chosen}
+    # Cameras of a file that are not rendered know the splat as well as those that are.
+    unused = [camera for number, camera in enumerate(capture.cameras) if number not in chosen]
+    others = [camera.to(device) for camera in (*unused, *capture.others)]
+    up = request.make_up(scene)
+    witnesses = choose_witnesses(scene, list(cameras.values()), others, up, renderer)
     check_images([*cameras.values(), *(target.camera for target in targets)])
     opened = Opened(
         reading,
@@ -134,6 +140,7 @@ def open_renders(
         scene=scene,
         splat_file=splat_file,
         frame_description="the frame of the splat",
+        witnesses=witnesses,
     )
     return opened, task, kind
 

@@ -16,6 +16,7 @@ from gscompleter.data.photograph_names import name_target
 from gscompleter.data.photographs import Photographs
 from gscompleter.generators.painted import Painting
 from gscompleter.types import Camera, Gaussians, View
+from gscompleter.virtual_capture.witnesses import Witnesses
 
 
 @dataclass(frozen=True)
@@ -120,6 +121,8 @@ class CompletionTask:
     """Check views of the input splat, at low resolution."""
     depth_notes: tuple[str, ...] = ()
     """Sentences about the unit of the given depth."""
+    witnesses: Witnesses = Witnesses()
+    """Further cameras from which a splat without photographs looks well."""
 
     @property
     def device(self) -> torch.device:

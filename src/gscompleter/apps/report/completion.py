@@ -43,6 +43,7 @@ from gscompleter.evaluation.metrics.thin_gaps import (
     render_flight,
 )
 from gscompleter.evaluation.verdict.held_out import HeldOut, render_before_after, score_held_out
+from gscompleter.evaluation.verdict.kept import measure_kept
 from gscompleter.evaluation.verdict.outcome import judge_completion
 from gscompleter.evaluation.verdict.rows import ScoreRow
 from gscompleter.numerics.geometry import estimate_up
@@ -119,13 +120,14 @@ def write_report(
     files: Mapping[int | None, str] = MappingProxyType({}),
     has_searched: bool = True,
     run: RunRecord | None = None,
+    testing: Sequence[Camera] = (),
 ) -> dict[str, Any]:
     """Write the scenes, `images/`, `report.json` and `summary.json`; return the summary.
 
     `photographs` are the cameras of all, in the frame of the result. `render_around` renders the
     views whose coverage is measured. `files` are those of the photographs by frame. `has_searched`
     is False if targets were neither named nor searched for. `run` is what the files say about who
-    made them.
+    made them. `testing` are cameras that decided nothing, at which what is kept is measured.
     """
     at_targets = [
         render_before_after(completion, result.target, renderer) for result in completion.targets
@@ -153,6 +155,8 @@ def write_report(
     (folder / RECORD_FILE).write_bytes(json.dumps(asdict(record)).encode() + b"\n")
     coverage = {"coverage": asdict(compute_coverage(around))} if around else {}
     left = {} if removal is None else {"removal": asdict(removal.row)}
+    kept = measure_kept(completion, testing, renderer)
+    left |= {} if kept is None else {"kept": asdict(kept)}
     counts = {**count_changes(completion), **left, "seconds": dict(completion.seconds)}
     summary = {
         "version": __version__,

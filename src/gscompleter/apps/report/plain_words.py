@@ -10,6 +10,7 @@ from gscompleter.apps.report.schema import (
     RemovalRow,
     TargetRow,
 )
+from gscompleter.evaluation.verdict.kept import KeptRow
 from gscompleter.evaluation.verdict.numbers import format_number, format_percent
 
 FRAME_NOTES = {
@@ -52,12 +53,6 @@ BARE_NOTE = (
     "scores only say how much the completion changed them. What was given stays bit for bit, and "
     "strip takes the rest away."
 )
-RISKS = {
-    "cameras": "0.1 dB on average where the cameras came from a file",
-    "targets": "0.2 dB on average where they were found around a target",
-    "pixels": "0.5 dB on average where they were found from the splat alone",
-}
-"""Loss of photographs that nobody had given, by where the cameras came from (decision 053)."""
 NOTHING_NEW_NOTE = (
     "The splat reproduces all photographs. Where it is wrong from elsewhere, only smooth colours "
     "are known: little is to be gained without new photographs of the place or a learned generator."
@@ -75,9 +70,7 @@ def list_notes(summary: CompletionSummary) -> Iterator[str]:
         yield ORIGIN_NOTE
     if scene.renders_from is not None:
         yield BARE_NOTE
-        worse = "Real photographs of the scene that were not given may get worse"
-        risk = RISKS.get(scene.renders_from)
-        yield f"{worse}." if risk is None else f"{worse}: on development cases they lost {risk}."
+        yield describe_kept(summary.kept)
     else:
         yield from list_photograph_notes(summary)
     if scene.renders_from is None and summary.settings.get("context") is None:
@@ -87,6 +80,23 @@ def list_notes(summary: CompletionSummary) -> Iterator[str]:
     if targets and all(row.psnr_after is None for row in targets):
         yield "No target has a photograph, so there are no scores at targets."
     yield from list_splat_notes(summary)
+
+
+def describe_kept(kept: KeptRow | None) -> str:
+    """Describe what cameras that decided nothing still see of a splat without photographs."""
+    if kept is None:
+        return (
+            "No further camera could tell what the additions hide: photographs of the scene that "
+            "were not given may get worse."
+        )
+    seen = f"Seen from {kept.cameras} cameras that decided nothing"
+    worst = f"{format_number(kept.worst_psnr, 1)} dB at worst"
+    if kept.is_unseen:
+        return f"{seen}, what the splat showed stays as it was: {worst}, and 45 dB is not seen."
+    return (
+        f"{seen}, additions hide a part of what the splat showed: {worst}, where 45 dB is not "
+        "seen. Look at it from aside (`gscompleter view`); strip takes the additions away."
+    )
 
 
 def group_target_notes(targets: Sequence[TargetRow]) -> dict[tuple[str, ...], list[int]]:

@@ -12,6 +12,7 @@ import numpy as np
 
 from gscompleter.data.photograph_names import name_photograph, name_target
 from gscompleter.evaluation.metrics.coverage import Coverage
+from gscompleter.evaluation.verdict.kept import KeptRow
 from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow, ScoreRow
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import read_command
@@ -179,6 +180,8 @@ class CompletionSummary:
     """Small copies of further photographs that guarded a given scene; empty with targets."""
     removal: RemovalRow | None = None
     """None if nothing was removed that a photograph shows."""
+    kept: KeptRow | None = None
+    """What cameras that decided nothing still see of a splat without photographs."""
     new_photographs: int | None = None
     """Photographs that a splat was not trained on; None if the scene was reconstructed."""
 
