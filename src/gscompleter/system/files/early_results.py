@@ -51,14 +51,14 @@ class EarlyResults:
 def describe_early(folder: Path, content: Mapping[str, Any]) -> EarlyResults | None:
     """Describe the results of an early version by its summary; None if it is not of one."""
     entries = content.keys()
-    counts = content.get("gaussians")
-    is_counted = isinstance(counts, dict)
+    gaussians = content.get("gaussians")
+    counts = gaussians.keys() if isinstance(gaussians, dict) else frozenset()
     if "files" in entries:
         return None
-    if is_counted and entries >= COMPLETION_ENTRIES:
+    if counts and entries >= COMPLETION_ENTRIES:
         command = "complete"
         files = [name for name in _list_files(folder) if COMPLETION_FILES.fullmatch(name)]
-    elif is_counted and entries >= CLEANING_ENTRIES and counts.keys() == CLEANING_COUNTS:
+    elif counts == CLEANING_COUNTS and entries >= CLEANING_ENTRIES:
         command = "clean"
         known = {COMPLETED_FILE, REMOVED_FILE, SUMMARY_FILE}
         files = [name for name in _list_files(folder) if name in known]

@@ -130,10 +130,11 @@ def reserve_output(
     with ExitStack() as stack:
         draft = stack.enter_context(_reserve(given, target, overwrite, takes_over))
         # Killed runs first: what they completed counts as an earlier result.
-        if _finish_interrupted(given, target):
-            _check_free(given, target, overwrite)
+        is_finished = _finish_interrupted(given, target)
         remove_left_behind(target)
         remove_left_behind(target.parent, target.name)
+        if is_finished:
+            _check_free(given, target, overwrite)
         refuse_later_results(target)
         with convert_write_errors(given):
             listed = read_listing(target)
@@ -506,6 +507,8 @@ def _finish_moves(draft: Path, target: Path, replaced: Path) -> None:
     for source, destination in _list_new_moves(draft, target):
         rename(source, destination)
     _remove_replaced(target, replaced, listed)
+    # The renames count as a sign of its owner.
+    shutil.rmtree(draft, ignore_errors=True)
 
 
 def _list_replaced(target: Path, replaced: Path) -> frozenset[str]:

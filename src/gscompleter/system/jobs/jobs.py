@@ -24,7 +24,7 @@ from typing import Any
 
 from gscompleter.system.errors import FullDiskError, InputError, OutputError, quote_value
 from gscompleter.system.files.reading import read_json
-from gscompleter.system.files.unfinished import is_unfinished, remove_left_behind_below
+from gscompleter.system.files.unfinished import UNFINISHED_PREFIX, remove_left_behind_below
 from gscompleter.system.files.writing import convert_write_errors, replace_file
 
 JOBS = "jobs"
@@ -152,7 +152,7 @@ def claim_folder(out: Path, kind: str, content: Mapping[str, Any]) -> None:
             f"{quote_value(out)} cannot be read: {error.strerror}; name another."
         ) from error
     # Listed first, as another process may be writing the marker.
-    is_used = not all(is_unfinished(name) for name in names)
+    is_used = any(not name.startswith(UNFINISHED_PREFIX) for name in names)
     if is_used and not marker.is_file():
         raise InputError(f"{quote_value(out)} holds something other than a {kind}; name another.")
     refuse_links_out(out)
