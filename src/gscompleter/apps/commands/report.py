@@ -26,9 +26,6 @@ def run_report(options: ReportOptions) -> None:
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
         from gscompleter.apps.report.page import REPORT_FILE, write_completion_page
-        from gscompleter.system.files.output_folder import refuse_foreign_file
-
-    refuse_foreign_file(options.out, REPORT_FILE)
     write_completion_page(options.out)
     path = options.out / REPORT_FILE
     print_answer(options, {"report": str(path)}, [path])
