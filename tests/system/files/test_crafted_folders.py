@@ -76,7 +76,7 @@ def draft_is_a_link(it: Crafted) -> None:
 
 def link_in_the_old_folder(it: Crafted) -> None:
     it.write(it.draft, "completed.ply")
-    it.write(it.out, "images/thesis.tex")
+    it.write(it.out, "images/thesis.tex", "images/letter.tex")
     (it.replaced / "images").symlink_to("../../home")
 
 
@@ -134,7 +134,7 @@ REFUSED = {
     link_of_images: "images is in the way of a result",
     old_folder_is_a_link: "is no folder that a run of yours left",
     draft_is_a_link: "is no folder that a run of yours left",
-    link_in_the_old_folder: "is a link or no file, which no run leaves",
+    link_in_the_old_folder: "is nothing that a killed run leaves",
     link_in_the_draft: "is a link or no file, which no run leaves",
     file_in_the_draft_is_a_link: "is a link or no file, which no run leaves",
     file_that_the_draft_does_not_list: "is nothing that a killed run leaves",

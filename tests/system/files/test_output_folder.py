@@ -463,6 +463,24 @@ def test_a_run_that_is_killed_while_results_are_replaced_is_finished_by_the_next
 
 
 @pytest.mark.linux
+@pytest.mark.parametrize("renames", range(6))
+def test_so_is_one_that_replaces_the_results_of_a_version_that_listed_no_files(results, renames):
+    entries = ["version", "settings", "seed", "device", "scene", "frame", "targets", "seconds"]
+    early = {**dict.fromkeys(entries), "gaussians": {"context": 1, "added": 1}, "text": "old"}
+    (results / SUMMARY).write_text(json.dumps(early))
+    (results / "images" / "old.png").rename(results / "images" / "target1_before.png")
+    with writing(results, renames) as process:
+        stopped(process, signal.SIGKILL)
+    check_output(results, overwrite=True)
+    assert tree(results) == {
+        "completed.ply": "new",
+        "images/new.png": "new",
+        "mine.txt": "old",
+        SUMMARY: "new",
+    }
+
+
+@pytest.mark.linux
 @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP", "SIGINT"])
 def test_a_process_that_is_told_to_stop_cleans_up(tmp_path, results, name):
     before = tree(results)

@@ -50,7 +50,8 @@ FILES = "files"
 COMMAND = "command"
 """Entry of `summary.json`: the command that wrote them."""
 COMMANDS = frozenset({"bench", "clean", "complete", "demo", "poses"})
-"""Commands whose summaries say no program, as all did before formats had numbers."""
+"""Commands that write an output folder. One of them is named by the summaries of versions before
+formats had numbers, which do not name the program."""
 POSES = "colmap"
 """Folder of the cameras that a completion found for its photographs; it has its own summary."""
 
@@ -208,20 +209,24 @@ def refuse_link(folder: Path) -> None:
         )
 
 
+def _read_summary(folder: Path) -> dict[str, Any]:
+    """Read the summary of a folder; empty if there is none."""
+    path = folder / SUMMARY_FILE
+    try:
+        if not stat.S_ISREG(path.lstat().st_mode) or path.stat().st_size > MAX_SUMMARY_BYTES:
+            return {}
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
 def _read_own_summary(folder: Path) -> dict[str, Any] | None:
     """Read the summary of a folder; None if there is none, or if another program wrote it.
 
     That of an early version, which listed no files, gets the entries of later ones.
     """
-    path = folder / SUMMARY_FILE
-    try:
-        if not stat.S_ISREG(path.lstat().st_mode) or path.stat().st_size > MAX_SUMMARY_BYTES:
-            return None
-        content = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
-        return None
-    if not isinstance(content, dict):
-        return None
+    content = _read_summary(folder)
     command = content.get(COMMAND)
     if is_marked(content) or (isinstance(command, str) and command in COMMANDS):
         return content
@@ -514,24 +519,32 @@ def _finish_moves(draft: Path, target: Path, replaced: Path) -> None:
 def _list_replaced(target: Path, replaced: Path) -> frozenset[str]:
     """List what a killed run was to replace."""
     # The old summary leaves first.
-    return read_listing(replaced if os.path.lexists(replaced / SUMMARY_FILE) else target)
+    if not os.path.lexists(replaced / SUMMARY_FILE):
+        return read_listing(target)
+    # That of an early version lists nothing: what is still in its place is told by its name.
+    early = describe_early(target, _read_summary(replaced))
+    return read_listing(replaced).union([] if early is None else early.files)
 
 
 def _list_left(draft: Path, target: Path, replaced: Path) -> frozenset[str]:
     """List what a killed run was to replace, and what is still in its place."""
     # New files that left the draft have their final name already, and must not be moved away.
     published = read_listing(draft).difference(_list_files(draft))
-    return frozenset(
+    waiting = _list_replaced(target, replaced) - published
+    # What was replaced by then is a file below real folders.
+    moved = {
         name
-        for name in _list_replaced(target, replaced) - published
-        if _find_obstacle(target, name) is None and not os.path.lexists(replaced / name)
-    )
+        for name in waiting
+        if _find_obstacle(replaced, name) is None and os.path.lexists(replaced / name)
+    }
+    return frozenset(name for name in waiting - moved if _find_obstacle(target, name) is None)
 
 
 def _refuse_impossible(given: Path, target: Path, draft: Path, replaced: Path) -> None:
     """Raise InputError for what no killed run leaves, and for what it would have refused itself."""
     for folder in (draft, replaced):
         _refuse_foreign(folder)
+    _refuse_links(draft)
     refuse_later_results(draft)
     new = _list_files(draft)
     written = read_listing(draft)
@@ -548,7 +561,7 @@ def _refuse_impossible(given: Path, target: Path, draft: Path, replaced: Path) -
 
 
 def _refuse_foreign(folder: Path) -> None:
-    """Refuse what is no folder of this user with real folders and files in it alone."""
+    """Refuse what is no folder of this user."""
     status = os.lstat(folder)
     is_own = not hasattr(os, "geteuid") or status.st_uid == os.geteuid()
     if not stat.S_ISDIR(status.st_mode) or not is_own:
@@ -557,6 +570,10 @@ def _refuse_foreign(folder: Path) -> None:
             "another output folder.",
             "out",
         )
+
+
+def _refuse_links(folder: Path) -> None:
+    """Refuse a folder in which there is anything but real folders and files."""
     for home, folders, files in os.walk(folder):
         for name in (*folders, *files):
             path = Path(home, name)
