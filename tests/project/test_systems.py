@@ -20,6 +20,7 @@ GUARDED = {
     ("system/threads.py", "sched_getaffinity"),
     ("numerics/kernels/cache.py", "getuid"),
     ("system/memory.py", "sysconf"),
+    ("system/files/output_folder.py", "geteuid"),
 }
 """Names that a condition or `suppress` precedes."""
 ENCODED = {"read_text": 0, "write_text": 1, "TextIOWrapper": 1}

@@ -129,7 +129,10 @@ def test_a_splat_in_another_format_keeps_its_record_when_it_is_completed(tmp_pat
     [
         (f"{SCHEMA} {{", "is no JSON"),
         (f'{SCHEMA} {{"tool": "x"}}', "is damaged"),
-        ("gscompleter-provenance/2 {}", "and gscompleter-provenance/1 is read"),
+        (
+            "gscompleter-provenance/2 {}",
+            r"later version of gscompleter \(gscompleter-provenance/2, and .* is read\); update it",
+        ),
     ],
 )
 def test_a_damaged_record_is_refused_and_the_splat_is_not(tmp_path, comment, sentence):

@@ -213,7 +213,7 @@ def test_without_proc_a_folder_of_another_run_is_told_by_its_age(no_proc, tmp_pa
     mine.mkdir()
     (entry,) = unfinished.list_unfinished(tmp_path)
     assert entry.is_running()
-    old = unfinished.FOLDER_LEASE_SECONDS + 60
+    old = unfinished.LEASE_SECONDS + 60
     status = mine.stat()
     os.utime(mine, (status.st_atime - old, status.st_mtime - old))
     assert not entry.is_running()

@@ -14,6 +14,7 @@ from gscompleter.data.limits import check_planes, require
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
 from gscompleter.system.errors import quote_value, require_path
+from gscompleter.system.files.result_format import MARK
 from gscompleter.system.files.writing import replace_file
 from gscompleter.types import Camera, View
 
@@ -93,7 +94,7 @@ def write_cameras(
     if file_paths is not None:
         pairs = zip(file_paths, frames, strict=True)
         frames = [{"file_path": file_path, **frame} for file_path, frame in pairs]
-    content = {"camera_model": "PINHOLE", "frames": frames}
+    content = {**MARK, "camera_model": "PINHOLE", "frames": frames}
     with replace_file(path) as file:
         file.write((json.dumps(content, indent=1) + "\n").encode())
 

@@ -28,6 +28,7 @@ from gscompleter.data.points import read_point_cloud
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.image import read_depth
 from gscompleter.system.files.reading import is_json_list, read_json
+from gscompleter.system.files.result_format import is_marked, refuse_later
 
 NAME = "transforms.json"
 ADVICE = "export the scene again"
@@ -104,6 +105,8 @@ def _find_any_case(path: Path, listings: FolderListings | None = None) -> Path |
 def read_frames(path: Path) -> list[Frame]:
     """Read the frames of a JSON file in its order, with exactly rigid poses (`make_rigid`)."""
     content = read_json(path, ADVICE)
+    if is_marked(content):  # `targets.json`, for example
+        refuse_later(content, quote_value(path))
     entries = get_part(content, "frames", list)
     require(entries, f"{path} lists no frames; its `frames` has to be a list with cameras.")
     # Integers in depth maps are millimetres by default, as nerfstudio takes them.

@@ -12,7 +12,7 @@ import lzma
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
@@ -52,6 +52,7 @@ from gscompleter.splats.splat import read_splat_rows, write_splat
 from gscompleter.splats.spz import read_spz, write_spz
 from gscompleter.splats.usd import read_usd, read_usd_remarks, write_usd
 from gscompleter.system.errors import InputError, quote_value, refuse_pointer, require_path
+from gscompleter.system.files.output_file import check_free, reserve_file
 from gscompleter.system.files.ply import read_header
 from gscompleter.system.files.reading import hash_file, open_file, read_json
 from gscompleter.system.files.writing import replace_file
@@ -318,6 +319,20 @@ def get_labels_path(path: Path) -> Path:
     return path.with_name(f"{path.name}.generated.json")
 
 
+@contextlib.contextmanager
+def reserve_splat(path: Path, overwrite: bool) -> Iterator[None]:
+    """Reserve the file of a splat as `reserve_file` does, with the one of its labels.
+
+    Raise an InputError for a name without a format, too.
+    """
+    write = get_writer(path)
+    with reserve_file(path, overwrite):
+        # Labels beside the file are replaced with it, and removed if nothing was generated.
+        if write is not save_ply:
+            check_free(get_labels_path(path), overwrite)
+        yield
+
+
 def save_labels(
     path: Path, generated: UInt8[Tensor, "n"], made_by: Provenance = NOTHING_KNOWN
 ) -> None:
@@ -326,9 +341,11 @@ def save_labels(
     They are removed if nothing was generated.
     """
     place = get_labels_path(path)
-    if not (generated > 0).any():
+    # What a link names lies elsewhere, and stays.
+    if not (generated > 0).any() or place.is_symlink():
         with contextlib.suppress(FileNotFoundError):
             place.unlink()
+    if not (generated > 0).any():
         return
     # Run lengths, as labels come in long runs; the digest ties them to this very file.
     runs = [[label, len(list(run))] for label, run in groupby(generated.tolist())]

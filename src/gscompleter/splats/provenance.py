@@ -94,6 +94,12 @@ def parse_provenance(table: object, name: str) -> Provenance:
         return NOTHING_KNOWN
     schema = table.get("schema") if isinstance(table, Mapping) else None
     if schema != SCHEMA:
+        later = re.fullmatch(r"gscompleter-provenance/([1-9]\d{0,5})", str(schema))
+        if later is not None:
+            raise InputError(
+                f"{name} was written by a later version of gscompleter ({quote_value(schema)}, and "
+                f"{SCHEMA} is read); update it, or drop the record (`gscompleter convert --plain`)."
+            )
         raise InputError(
             f"{name} says who made it by the schema {quote_value(str(schema))}, and {SCHEMA} is "
             f"read; {ADVICE}."

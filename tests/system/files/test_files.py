@@ -2,11 +2,18 @@
 
 import os
 import signal
+import stat
+import time
 from enum import IntEnum
+from pathlib import Path
 
 import pytest
 
 from gscompleter import InputError
+from gscompleter.system.files import unfinished
+from gscompleter.system.files.output_file import reserve_file
+from gscompleter.system.files.output_folder import open_output_folder
+from gscompleter.system.files.unfinished import digest_target
 from gscompleter.system.files.writing import defer_interrupts, replace_file
 
 
@@ -52,3 +59,114 @@ def test_a_pipe_and_a_device_are_never_replaced(tmp_path):
             file.write(b"new")
     assert sorted(os.listdir(tmp_path)) == ["null.ply", "pipe.ply"]
     assert not os.path.isfile("/dev/null")
+
+
+# --------------------------------------------------------------------- marks of other runs
+
+
+def leave_mark(folder: Path, name: str, age: float) -> Path:
+    """Leave the mark of a run on another machine, or before a restart, `age` seconds ago."""
+    mark = folder / f".gscompleter-{digest_target(name)}-deadbeef-4242-777-0123abcd"
+    mark.touch()
+    os.utime(mark, (time.time() - age, time.time() - age))
+    return mark
+
+
+@pytest.mark.parametrize("age", [0, 60, -10])
+def test_a_file_that_another_machine_is_writing_is_refused_with_the_name_of_its_mark(tmp_path, age):
+    mark = leave_mark(tmp_path, "x.sog", age)
+    sentence = r"Another run \(process 4242\) is writing .*x.sog; .* if it was killed, delete "
+    with pytest.raises(InputError, match=sentence) as error, reserve_file(tmp_path / "x.sog", True):
+        pytest.fail("it was let in")
+    assert mark.name in str(error.value)
+    assert os.listdir(tmp_path) == [mark.name]
+
+
+@pytest.mark.parametrize("age", [200, 23 * 3600, -60, -10 * 24 * 3600])
+def test_a_mark_without_a_sign_for_three_minutes_or_of_the_future_is_left_behind(tmp_path, age):
+    """A mark is ahead of the clock once that was set back, and would block the name until then."""
+    leave_mark(tmp_path, "x.sog", age)
+    with reserve_file(tmp_path / "x.sog", False):
+        pass
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_folder_is_free_again_after_a_mark_of_the_future(tmp_path):
+    mark = leave_mark(tmp_path, "out", -10 * 24 * 3600)
+    with open_output_folder(tmp_path / "out"):
+        pass
+    assert not mark.exists()
+
+
+def test_who_writes_a_file_gives_signs(tmp_path, monkeypatch):
+    monkeypatch.setattr(unfinished, "SIGN_SECONDS", 0.01)
+    with reserve_file(tmp_path / "x.sog", False), replace_file(tmp_path / "x.sog") as file:
+        entries = list(tmp_path.iterdir())
+        assert len(entries) == 2  # the mark, and the unfinished file
+        for entry in entries:
+            os.utime(entry, (0, 0))
+        deadline = time.monotonic() + 30
+        while any(entry.stat().st_mtime < 1 for entry in entries):
+            assert time.monotonic() < deadline, "no sign was given"
+            time.sleep(0.01)
+        file.write(b"new")
+    assert os.listdir(tmp_path) == ["x.sog"]
+
+
+# ----------------------------------------------------------------------------- permissions
+
+
+@pytest.mark.linux
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o444, 0o644])
+def test_a_file_that_replaces_another_keeps_its_mode_from_the_first_byte_on(tmp_path, mode):
+    path = tmp_path / "scene.ply"
+    path.write_bytes(b"old")
+    path.chmod(mode)
+    with replace_file(path) as file:
+        (temporary,) = tmp_path.glob(".gscompleter-*")
+        assert stat.S_IMODE(temporary.stat().st_mode) == mode
+        file.write(b"new")
+    assert path.read_bytes() == b"new"
+    assert stat.S_IMODE(path.stat().st_mode) == mode
+
+
+@pytest.mark.linux
+def test_a_file_that_replaces_another_keeps_its_owner(tmp_path):
+    if os.geteuid() != 0:
+        pytest.skip("only root gives files away")
+    path = tmp_path / "scene.ply"
+    path.write_bytes(b"old")
+    os.chown(path, 12345, 23456)
+    with replace_file(path) as file:
+        file.write(b"new")
+    assert (path.stat().st_uid, path.stat().st_gid) == (12345, 23456)
+
+
+@pytest.mark.linux
+def test_a_group_that_cannot_be_kept_may_do_no_more_than_everybody(tmp_path, monkeypatch):
+    path = tmp_path / "scene.ply"
+    path.write_bytes(b"old")
+    path.chmod(0o660)
+    if os.geteuid() != 0:
+        pytest.skip("needs a file of another group")
+    os.chown(path, -1, 23456)
+    monkeypatch.setattr(os, "chown", refuse)
+    with replace_file(path) as file:
+        file.write(b"new")
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+
+def refuse(*_: object) -> None:
+    raise PermissionError(1, "Operation not permitted")
+
+
+@pytest.mark.linux
+def test_results_keep_the_modes_of_those_that_they_replace(tmp_path):
+    out = tmp_path / "out"
+    with open_output_folder(out, command="complete") as folder:
+        (folder / "completed.ply").write_text("old")
+    (out / "completed.ply").chmod(0o600)
+    with open_output_folder(out, overwrite=True, command="complete") as folder:
+        (folder / "completed.ply").write_text("new")
+    assert (out / "completed.ply").read_text() == "new"
+    assert stat.S_IMODE((out / "completed.ply").stat().st_mode) == 0o600

@@ -37,7 +37,7 @@ def read_text(path: Path) -> str:
 
 def write_summary(folder: Path, text: str, files: list[str] | None = None) -> None:
     """Write a summary, with the names that an earlier run has listed."""
-    listed = {} if files is None else {"files": files}
+    listed = {} if files is None else {"command": "complete", "files": files}
     (folder / SUMMARY).write_text(json.dumps({"text": text, **listed}))
 
 
@@ -355,12 +355,21 @@ def test_what_cannot_be_put_back_is_not_thrown_away(results, monkeypatch):
         write_results(folder)
     (replaced,) = results.glob(".gscompleter-*")
     assert {**tree(replaced), "mine.txt": (results / "mine.txt").read_text()} == before
+    # Nor by the next run, as that of another process finds it.
+    monkeypatch.undo()
+    left = replaced.with_name(replaced.name.replace(f"-{os.getpid()}-", "-0-"))
+    replaced.rename(left)
+    with pytest.raises(InputError, match="could not put back"):
+        check_output(results, overwrite=True)
+    assert {**tree(left), "mine.txt": (results / "mine.txt").read_text()} == before
 
 
 def test_what_a_killed_run_left_does_not_make_a_folder_occupied(tmp_path):
-    (tmp_path / "out" / ".gscompleter-0123").mkdir(parents=True)
+    left = tmp_path / "out" / make_unfinished_name("out").replace(f"-{os.getpid()}-", "-0-")
+    left.mkdir(parents=True)
     with open_output_folder(tmp_path / "out") as folder:
         write_summary(folder, "new")
+    assert os.listdir(tmp_path / "out") == [SUMMARY]
     assert read_text(tmp_path / "out" / SUMMARY) == "new"
 
 
@@ -444,6 +453,24 @@ def test_a_run_that_is_killed_while_results_are_replaced_is_finished_by_the_next
     assert any(results.glob(".gscompleter-*.old"))
     with pytest.raises(InputError, match="not empty"):
         check_output(results)
+    check_output(results, overwrite=True)
+    assert tree(results) == {
+        "completed.ply": "new",
+        "images/new.png": "new",
+        "mine.txt": "old",
+        SUMMARY: "new",
+    }
+
+
+@pytest.mark.linux
+@pytest.mark.parametrize("renames", range(6))
+def test_so_is_one_that_replaces_the_results_of_a_version_that_listed_no_files(results, renames):
+    entries = ["version", "settings", "seed", "device", "scene", "frame", "targets", "seconds"]
+    early = {**dict.fromkeys(entries), "gaussians": {"context": 1, "added": 1}, "text": "old"}
+    (results / SUMMARY).write_text(json.dumps(early))
+    (results / "images" / "old.png").rename(results / "images" / "target1_before.png")
+    with writing(results, renames) as process:
+        stopped(process, signal.SIGKILL)
     check_output(results, overwrite=True)
     assert tree(results) == {
         "completed.ply": "new",

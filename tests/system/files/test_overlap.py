@@ -25,7 +25,9 @@ def write_listing(folder: Path, *files: str) -> None:
     for name in files:
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_text("old")
-    (folder / "summary.json").write_text(json.dumps({"files": [*files, "summary.json"]}))
+    (folder / "summary.json").write_text(
+        json.dumps({"command": "complete", "files": [*files, "summary.json"]})
+    )
 
 
 @pytest.mark.parametrize(

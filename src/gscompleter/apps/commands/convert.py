@@ -44,13 +44,11 @@ def run_convert(options: ConvertOptions) -> None:
     with import_without_collection():
         from rich.console import Console
 
-        from gscompleter.splats.formats import convert_splat, get_writer
-        from gscompleter.system.files.output_file import reserve_file
+        from gscompleter.splats.formats import convert_splat, reserve_splat
         from gscompleter.system.progress import show_preparation, show_progress
 
-    get_writer(options.out)  # refuses a name without a format
     with (
-        reserve_file(options.out, options.overwrite),
+        reserve_splat(options.out, options.overwrite),
         show_progress(Console(stderr=True, quiet=options.quiet)),
         show_preparation("converting"),
     ):

@@ -35,12 +35,10 @@ def run_strip(options: StripOptions) -> None:
     """Write the original scene and print the number of Gaussians."""
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
-        from gscompleter.splats.formats import get_writer
+        from gscompleter.splats.formats import reserve_splat
         from gscompleter.splats.layout import strip
-        from gscompleter.system.files.output_file import reserve_file
 
-    get_writer(options.out)  # refuses a name without a format
-    with reserve_file(options.out, options.overwrite):
+    with reserve_splat(options.out, options.overwrite):
         num_given, num_generated = strip(options.completed, options.out)
     content = {"out": str(options.out), "gaussians": num_given, "generated_removed": num_generated}
     line = f"{num_given:,} Gaussians, {num_generated:,} generated ones removed: {options.out}"

@@ -34,7 +34,7 @@ from gscompleter.data.sfm.placing import place_photographs
 from gscompleter.splats.alignment.similarity import transform_view
 from gscompleter.stages.add_observed import MIN_SHARE, find_lacks
 from gscompleter.system.errors import InputError
-from gscompleter.system.files.output_folder import POSES
+from gscompleter.system.files.output_folder import POSES, refuse_link
 from gscompleter.system.progress import show_preparation, track
 
 MAX_LACKING = 16
@@ -93,8 +93,10 @@ def prepare_update(
 def add_new_photographs(update: UpdateOptions, opened: Opened, console: Console) -> Opened:
     """Place new photographs among those of the scene, and add them."""
     assert update.photos is not None
+    kept = update.out / POSES
+    refuse_link(kept)
     photographs, placed = place_photographs(
-        update.photos, opened.photographs, update.out / POSES, update.overwrite
+        update.photos, opened.photographs, kept, update.overwrite
     )
     print_lines(console, *placed.notes)
     photographs = replace(photographs, notes=(*photographs.notes, *placed.notes))

@@ -22,7 +22,7 @@ from gscompleter.data.sfm.poses import find_poses, has_photographs
 from gscompleter.splats.alignment.training_size import find_training_size
 from gscompleter.splats.formats import has_splat_extension
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.output_folder import POSES
+from gscompleter.system.files.output_folder import POSES, refuse_link
 from gscompleter.system.files.writing import SUMMARY_FILE
 
 NUM_SIZE_PHOTOGRAPHS = 8
@@ -60,6 +60,7 @@ def open_scene(
         check()
         # A folder of poses with a summary was written by us, and may be continued or replaced.
         kept = search.out / POSES
+        refuse_link(kept)
         is_ours = search.overwrite or os.path.isfile(kept / SUMMARY_FILE)
         poses = find_poses(folder, kept, is_ours, search.num_frames)
         print_lines(console, *poses.notes)

@@ -23,6 +23,7 @@ from gscompleter.data.scene import describe_camera
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_bytes
+from gscompleter.system.files.result_format import MARK
 from gscompleter.system.files.typed_json import read_typed_json
 from gscompleter.system.files.writing import replace_file
 from gscompleter.types import Camera
@@ -98,6 +99,7 @@ def write_strokes(
             }
         )
     content = {
+        **MARK,
         "version": __version__,
         "resolution": options.resolution,
         "near": options.near,

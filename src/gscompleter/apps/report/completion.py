@@ -57,6 +57,7 @@ from gscompleter.splats.ply import save_parts, save_ply
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, RunRecord
 from gscompleter.state import Completion, TargetResult
 from gscompleter.system.files.image import write_image, write_pixels
+from gscompleter.system.files.result_format import MARK
 from gscompleter.system.files.writing import (
     COMPLETED_FILE,
     CONTEXT_FILE,
@@ -152,7 +153,7 @@ def write_report(
     if removal is not None:
         write_images(folder / IMAGES, "removal", removal.name_images())
     record = make_record(completion, thin_evenly(photographs, MAX_PHOTOGRAPHS))
-    (folder / RECORD_FILE).write_bytes(json.dumps(asdict(record)).encode() + b"\n")
+    (folder / RECORD_FILE).write_bytes(json.dumps({**MARK, **asdict(record)}).encode() + b"\n")
     coverage = {"coverage": asdict(compute_coverage(around))} if around else {}
     left = {} if removal is None else {"removal": asdict(removal.row)}
     kept = measure_kept(completion, testing, renderer)

@@ -41,6 +41,7 @@ from gscompleter.evaluation.verdict.numbers import (
 )
 from gscompleter.evaluation.verdict.rows import ScoreRow
 from gscompleter.system.files.image import encode_jpeg, read_image_size, read_pixels
+from gscompleter.system.files.output_folder import refuse_foreign_file
 from gscompleter.system.files.writing import encode_text, replace_file
 from gscompleter.system.jobs.jobs import JOBS, Job, read_row
 
@@ -136,8 +137,9 @@ def create_environment() -> Environment:
 
 
 def write_completion_page(folder: Path) -> None:
-    """Write `report.html` of the completion in `folder`."""
+    """Write `report.html` of the completion in `folder`; replace only a page that a run wrote."""
     page = render_completion_page(folder)
+    refuse_foreign_file(folder, REPORT_FILE)
     with replace_file(folder / REPORT_FILE) as file:
         file.write(encode_text(page))
 

@@ -6,6 +6,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, Literal, TypeVar
 
 import numpy as np
@@ -15,7 +16,7 @@ from gscompleter.evaluation.metrics.coverage import Coverage
 from gscompleter.evaluation.verdict.kept import KeptRow
 from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow, ScoreRow
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.output_folder import read_command
+from gscompleter.system.files.output_folder import read_command, refuse_later_results
 from gscompleter.system.files.typed_json import read_typed_json
 from gscompleter.system.files.writing import COMPLETED_FILES, SUMMARY_FILE
 
@@ -23,6 +24,16 @@ RECORD_FILE = "report.json"
 ADVICE = "complete the scene again"
 MAX_FRAME_NUMBER = 1e12
 """Largest number of the transform and the origin, in scene units: its square is finite."""
+
+EARLY_ENTRIES: Mapping[str, Any] = MappingProxyType(
+    {
+        "outcome": {
+            "status": "completed",
+            "headline": "An early version completed this scene, and gave no verdict.",
+        }
+    }
+)
+"""Entries of `summary.json` that versions before the first number of a format did not all write."""
 
 SCORES = ("psnr_before", "psnr_after", "ssim_before", "ssim_after")
 
@@ -216,7 +227,11 @@ def find_completed(folder: Path) -> Path:
 
 
 def read_summary(folder: Path) -> CompletionSummary:
-    """Read `summary.json`; raise an InputError if it is missing, damaged or not of a completion."""
+    """Read `summary.json`, also of an early version; raise an InputError if it is of a later one.
+
+    Likewise if it is missing, damaged or not of a completion.
+    """
+    refuse_later_results(folder)
     command = read_command(folder)
     if command not in (None, "complete"):
         raise InputError(
@@ -229,7 +244,7 @@ def read_summary(folder: Path) -> CompletionSummary:
             "complete the scene first."
         )
     path = folder / SUMMARY_FILE
-    summary = read_result(CompletionSummary, path)
+    summary = read_result(CompletionSummary, path, EARLY_ENTRIES)
 
     transform = np.array(summary.frame.transform)
     numbers = np.concatenate([transform.ravel(), np.array(summary.frame.origin)])
@@ -253,11 +268,14 @@ def read_record(folder: Path, summary: CompletionSummary) -> CompletionRecord:
     return record
 
 
-def read_result(kind: type[T], path: Path) -> T:
-    """Read and validate a JSON file of a completion."""
+def read_result(kind: type[T], path: Path, early: Mapping[str, Any] = MappingProxyType({})) -> T:
+    """Read and validate a JSON file of a completion.
+
+    `early` are entries that a version before formats had numbers may not have written.
+    """
     if not os.path.isfile(path):
         raise InputError(
             f"{quote_value(path.parent)} has no {path.name}; name the output folder of a "
             "completion."
         )
-    return read_typed_json(kind, path, ADVICE)
+    return read_typed_json(kind, path, ADVICE, early)

@@ -46,7 +46,7 @@ from gscompleter.system.files.image import (
     read_upright_size,
     turn_upright,
 )
-from gscompleter.system.files.output_folder import reserve_output
+from gscompleter.system.files.output_folder import refuse_later_results, reserve_output
 from gscompleter.system.files.reading import read_json
 from gscompleter.system.files.writing import SUMMARY_FILE
 from gscompleter.system.progress import stage, track
@@ -221,6 +221,7 @@ def read_earlier(out: Path, entry: str, known: Mapping[str, Any]) -> dict[str, A
     """Read the earlier result for these photographs, an entry of the summary; None without one."""
     if not os.path.isfile(out / SUMMARY_FILE) or not os.path.isdir(out / "sparse" / "0"):
         return None
+    refuse_later_results(out)
     content = read_json(out / SUMMARY_FILE, "name another folder")
     is_ours = isinstance(content, dict) and {entry, "photographs"} <= content.keys()
     if not is_ours or content["photographs"] != known:

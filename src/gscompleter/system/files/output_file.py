@@ -9,6 +9,7 @@ from pathlib import Path
 
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.unfinished import (
+    give_signs,
     list_unfinished,
     make_unfinished_name,
     remove_left_behind,
@@ -35,12 +36,10 @@ def reserve_file(path: Path, overwrite: bool) -> Iterator[None]:
         # other.
         for entry in entries:
             if not entry.is_own() and entry.is_running():
-                raise InputError(
-                    f"Another run (process {entry.pid}) is writing {quote_value(path)}; wait for "
-                    "its end, or name another file."
-                )
+                raise InputError(entry.describe_file(path))
         remove_left_behind(target.parent, target.name)
-        yield
+        with give_signs(mark):
+            yield
     finally:
         with suppress(OSError):
             mark.unlink()

@@ -3,6 +3,10 @@
 `summary.json` of an output folder lists under `files` what its run wrote. `--overwrite` replaces
 these files and no others: whatever else lies in the folder stays, and a file in the way of a result
 is refused.
+
+A folder may come from elsewhere, in an archive or a repository. So its names lead to nothing
+outside of it, links in it are not followed, and what a killed run seems to have left is finished
+only as far as that run could have done it.
 """
 
 from __future__ import annotations
@@ -18,28 +22,41 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 from gscompleter.system.errors import InputError, join_names, quote_value
-from gscompleter.system.files.renaming import rename, replace
+from gscompleter.system.files.early_results import describe_early
+from gscompleter.system.files.renaming import rename
+from gscompleter.system.files.result_format import MARK, is_marked, refuse_later
 from gscompleter.system.files.unfinished import (
     REPLACED_SUFFIX,
     UNFINISHED_PREFIX,
     Unfinished,
     give_signs,
+    is_unfinished,
     list_unfinished,
     make_unfinished_name,
     remove_left_behind,
 )
-from gscompleter.system.files.writing import SUMMARY_FILE, convert_write_errors, defer_interrupts
+from gscompleter.system.files.writing import (
+    SUMMARY_FILE,
+    convert_write_errors,
+    defer_interrupts,
+    keep_permissions,
+)
 
 FILES = "files"
 """Entry of `summary.json`: the files of the run."""
 COMMAND = "command"
 """Entry of `summary.json`: the command that wrote them."""
+COMMANDS = frozenset({"bench", "clean", "complete", "demo", "poses"})
+"""Commands that write an output folder. One of them is named by the summaries of versions before
+formats had numbers, which do not name the program."""
 POSES = "colmap"
 """Folder of the cameras that a completion found for its photographs; it has its own summary."""
 
 MAX_SUMMARY_BYTES = 10**9
+MAX_NAME_LENGTH = 60
 MAX_NAMED = 5
 """Most foreign files that a sentence names."""
 ATTEMPTS = 4
@@ -114,9 +131,12 @@ def reserve_output(
     with ExitStack() as stack:
         draft = stack.enter_context(_reserve(given, target, overwrite, takes_over))
         # Killed runs first: what they completed counts as an earlier result.
-        _finish_interrupted(target)
+        is_finished = _finish_interrupted(given, target)
         remove_left_behind(target)
         remove_left_behind(target.parent, target.name)
+        if is_finished:
+            _check_free(given, target, overwrite)
+        refuse_later_results(target)
         with convert_write_errors(given):
             listed = read_listing(target)
             _refuse_unlisted(given, target, [*patterns, *_match(target, patterns)], listed)
@@ -145,14 +165,8 @@ def read_listing(folder: Path) -> frozenset[str]:
 
     Names that lead out of the folder are left out, also through links.
     """
-    path = folder / SUMMARY_FILE
-    try:
-        if not stat.S_ISREG(path.lstat().st_mode) or path.stat().st_size > MAX_SUMMARY_BYTES:
-            return frozenset()
-        content = json.loads(path.read_bytes())
-    except (OSError, ValueError, RecursionError):
-        return frozenset()
-    names = content.get(FILES) if isinstance(content, dict) else None
+    content = _read_own_summary(folder)
+    names = None if content is None else content.get(FILES)
     if not isinstance(names, list) or SUMMARY_FILE not in names:
         return frozenset()
     inside = [name for name in names if isinstance(name, str) and _is_inside(name)]
@@ -166,10 +180,58 @@ def holds_results(folder: Path) -> bool:
 
 def read_command(folder: Path) -> str | None:
     """Read which command wrote an output folder; None if it is unknown."""
-    if not holds_results(folder):
+    content = _read_own_summary(folder)
+    if content is None or not holds_results(folder):
         return None
-    command = json.loads((folder / SUMMARY_FILE).read_bytes()).get(COMMAND)
+    command = content.get(COMMAND)
     return command if isinstance(command, str) else None
+
+
+def refuse_foreign_file(folder: Path, name: str) -> None:
+    """Refuse to write a result again where a link has its name, or a file that no run wrote."""
+    listed = read_listing(folder)
+    is_link = os.path.islink(folder / name)
+    _refuse_unlisted(folder, folder, [name], listed - {name} if is_link else listed)
+
+
+def refuse_later_results(folder: Path) -> None:
+    """Raise InputError if a later version wrote the results in a folder."""
+    refuse_later(_read_own_summary(folder), quote_value(folder / SUMMARY_FILE))
+
+
+def refuse_link(folder: Path) -> None:
+    """Refuse an inner folder of results that is a link: what it names may lie anywhere."""
+    if os.path.islink(folder):
+        raise InputError(
+            f"{quote_value(folder)} is a link, and results are written to real folders; remove it, "
+            "or name another output folder.",
+            "out",
+        )
+
+
+def _read_summary(folder: Path) -> dict[str, Any]:
+    """Read the summary of a folder; empty if there is none."""
+    path = folder / SUMMARY_FILE
+    try:
+        if not stat.S_ISREG(path.lstat().st_mode) or path.stat().st_size > MAX_SUMMARY_BYTES:
+            return {}
+        content = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return {}
+    return content if isinstance(content, dict) else {}
+
+
+def _read_own_summary(folder: Path) -> dict[str, Any] | None:
+    """Read the summary of a folder; None if there is none, or if another program wrote it.
+
+    That of an early version, which listed no files, gets the entries of later ones.
+    """
+    content = _read_summary(folder)
+    command = content.get(COMMAND)
+    if is_marked(content) or (isinstance(command, str) and command in COMMANDS):
+        return content
+    early = describe_early(folder, content)
+    return None if early is None else {**content, COMMAND: early.command, FILES: early.files}
 
 
 @contextmanager
@@ -193,11 +255,7 @@ def _reserve(given: Path, target: Path, overwrite: bool, takes_over: bool) -> It
                 break
             draft.rmdir()
             if attempt == ATTEMPTS:
-                raise InputError(
-                    f"Another run (process {rival.pid}) is writing {quote_value(given)}; wait for "
-                    "its end, or name another folder.",
-                    "out",
-                )
+                raise InputError(rival.describe_folder(given), "out")
             time.sleep(random.uniform(0, MAX_WAIT_SECONDS))
         yield draft
     finally:
@@ -220,13 +278,16 @@ def _check_free(given: Path, target: Path, overwrite: bool) -> None:
     """Raise an error if `target` is a file or contains something that must not be overwritten."""
     names = list[str]()
     with suppress(FileNotFoundError):
-        names = [n for n in os.listdir(target) if not n.startswith(UNFINISHED_PREFIX)]
+        names = sorted(name for name in os.listdir(target) if not is_unfinished(name))
     if names == [POSES] and os.path.isfile(target / POSES / SUMMARY_FILE):
         return  # only the cameras that an earlier run found
     if names and not overwrite:
+        # What `ls` does not show is named.
+        is_hidden = all(name.startswith(".") for name in names)
+        held = f" (it holds {join_names(names, MAX_NAMED)})" if is_hidden else ""
         raise InputError(
-            f"The output folder {quote_value(given)} is not empty; name another one, or overwrite "
-            "the results in it.",
+            f"The output folder {quote_value(given)} is not empty{held}; name another one, or "
+            "overwrite the results in it.",
             "overwrite",
         )
 
@@ -281,7 +342,7 @@ def _find_obstacle(folder: Path, name: str) -> str | None:
 
 
 def _is_inside(name: str) -> bool:
-    """Return True if a relative path leads to a file within its folder."""
+    """Return True if a relative path leads to a file within its folder, and not to a hidden one."""
     path = PurePosixPath(name)
     return (
         name == str(path)
@@ -290,6 +351,7 @@ def _is_inside(name: str) -> bool:
         and "\\" not in name
         and "\0" not in name
         and path.parts != ()
+        and not any(part.startswith(UNFINISHED_PREFIX) for part in path.parts)
     )
 
 
@@ -304,7 +366,7 @@ def _list_others(folder: Path, listed: frozenset[str]) -> Iterator[str]:
         with suppress(OSError):
             for name in sorted(os.listdir(folder / home)):
                 relative = f"{home}/{name}" if home else name
-                is_known = relative in own or name.startswith(UNFINISHED_PREFIX)
+                is_known = relative in own or is_unfinished(name)
                 if not is_known and not holds_results(folder / relative):
                     yield relative
 
@@ -319,12 +381,12 @@ def _list_files(folder: Path) -> list[str]:
 
 
 def _list_in_summary(draft: Path, command: str) -> None:
-    """Add the names of all files to the summary of a draft, or make one of them alone."""
+    """Add the mark and the names of all files to the summary of a draft, or make one of them."""
     path = draft / SUMMARY_FILE
     content = json.loads(path.read_bytes()) if path.is_file() else {}
     origin = {COMMAND: command} if command else {}
     files = sorted({SUMMARY_FILE, *_list_files(draft)})
-    whole = json.dumps({**origin, **content, FILES: files}, indent=2)
+    whole = json.dumps({**MARK, **origin, **content, FILES: files}, indent=2)
     path.write_bytes(whole.encode() + b"\n")
 
 
@@ -335,7 +397,10 @@ def _publish(draft: Path, target: Path) -> None:
         return
     replaced = target / f"{draft.name}{REPLACED_SUFFIX}"
     listed = read_listing(target)
-    _refuse_unlisted(target, target, _list_files(draft), listed)
+    new = _list_files(draft)
+    _refuse_unlisted(target, target, new, listed)
+    for name in listed.intersection(new):
+        keep_permissions(target / name, draft / name)
     # Renames of old files, then of new ones: a run that is killed in between leaves both folders,
     # from which the next one finishes (`_finish_interrupted`).
     created = _make_folders(draft, target)
@@ -409,30 +474,113 @@ def _remove_empty_folders(folder: Path) -> None:
             os.rmdir(home)
 
 
-def _finish_interrupted(target: Path) -> None:
-    """Finish the renames of a run that was killed between them.
+def _finish_interrupted(given: Path, target: Path) -> bool:
+    """Finish the renames of a run that was killed between them; return True if there was one.
 
     All of its new files were complete by then. What they replace lies in a folder beside its draft.
+    Raise InputError, and change nothing, if that is no state in which such a run ends.
     """
+    is_changed = False
     for entry in list_unfinished(target, target.name):
         if not entry.path.name.endswith(REPLACED_SUFFIX) or entry.is_running():
             continue
         name = entry.path.name.removesuffix(REPLACED_SUFFIX)
-        draft = next((d for d in (target / name, target.parent / name) if d.is_dir()), None)
-        if draft is not None and (draft / SUMMARY_FILE).is_file():
-            listed = read_listing(entry.path) or read_listing(target)
-            with suppress(OSError):
-                _finish_moves(draft, target, entry.path, listed)
+        drafts = [folder / name for folder in (target, target.parent)]
+        draft = next((path for path in drafts if os.path.lexists(path / SUMMARY_FILE)), None)
+        if draft is not None:
+            with convert_write_errors(given):
+                _refuse_impossible(given, target, draft, entry.path)
+                _finish_moves(draft, target, entry.path)
+            is_changed = True
+        elif not os.path.lexists(target / SUMMARY_FILE) and _list_files(entry.path):
+            # A disk failed, and its run could not put these files back.
+            raise InputError(
+                f"{quote_value(entry.path)} holds results that a run could not put back; move them "
+                "to where they were, or delete that folder.",
+                "out",
+            )
+    return is_changed
 
 
-def _finish_moves(draft: Path, target: Path, replaced: Path, listed: frozenset[str]) -> None:
+def _finish_moves(draft: Path, target: Path, replaced: Path) -> None:
     """Do the renames that are left: those of earlier files, unless done, and those of new ones."""
-    # New files that left the draft have their final name already, and must not be moved away.
-    published = read_listing(draft).difference(_list_files(draft))
-    left = [n for n in listed - published if not os.path.lexists(replaced / n)]
+    listed = _list_replaced(target, replaced)
+    left = _list_left(draft, target, replaced)
     _make_folders(draft, target)
     for source, destination in _list_old_moves(target, replaced, left):
         rename(source, destination)
     for source, destination in _list_new_moves(draft, target):
-        replace(source, destination)
+        rename(source, destination)
     _remove_replaced(target, replaced, listed)
+    # The renames count as a sign of its owner.
+    shutil.rmtree(draft, ignore_errors=True)
+
+
+def _list_replaced(target: Path, replaced: Path) -> frozenset[str]:
+    """List what a killed run was to replace."""
+    # The old summary leaves first.
+    if not os.path.lexists(replaced / SUMMARY_FILE):
+        return read_listing(target)
+    # That of an early version lists nothing: what is still in its place is told by its name.
+    early = describe_early(target, _read_summary(replaced))
+    return read_listing(replaced).union([] if early is None else early.files)
+
+
+def _list_left(draft: Path, target: Path, replaced: Path) -> frozenset[str]:
+    """List what a killed run was to replace, and what is still in its place."""
+    # New files that left the draft have their final name already, and must not be moved away.
+    published = read_listing(draft).difference(_list_files(draft))
+    waiting = _list_replaced(target, replaced) - published
+    # What was replaced by then is a file below real folders.
+    moved = {
+        name
+        for name in waiting
+        if _find_obstacle(replaced, name) is None and os.path.lexists(replaced / name)
+    }
+    return frozenset(name for name in waiting - moved if _find_obstacle(target, name) is None)
+
+
+def _refuse_impossible(given: Path, target: Path, draft: Path, replaced: Path) -> None:
+    """Raise InputError for what no killed run leaves, and for what it would have refused itself."""
+    for folder in (draft, replaced):
+        _refuse_foreign(folder)
+    _refuse_links(draft)
+    refuse_later_results(draft)
+    new = _list_files(draft)
+    written = read_listing(draft)
+    left = _list_left(draft, target, replaced)
+    unlisted = [draft / name for name in new if name not in written]
+    blocked = [replaced / name for name in left if _find_obstacle(replaced, name) is not None]
+    if unlisted or blocked:
+        raise InputError(
+            f"{quote_value([*unlisted, *blocked][0])} is nothing that a killed run leaves; delete "
+            f"it, or name another output folder than {quote_value(given, MAX_NAME_LENGTH)}.",
+            "out",
+        )
+    _refuse_unlisted(given, target, new, left)
+
+
+def _refuse_foreign(folder: Path) -> None:
+    """Refuse what is no folder of this user."""
+    status = os.lstat(folder)
+    is_own = not hasattr(os, "geteuid") or status.st_uid == os.geteuid()
+    if not stat.S_ISDIR(status.st_mode) or not is_own:
+        raise InputError(
+            f"{quote_value(folder)} is no folder that a run of yours left; delete it, or name "
+            "another output folder.",
+            "out",
+        )
+
+
+def _refuse_links(folder: Path) -> None:
+    """Refuse a folder in which there is anything but real folders and files."""
+    for home, folders, files in os.walk(folder):
+        for name in (*folders, *files):
+            path = Path(home, name)
+            mode = os.lstat(path).st_mode
+            if not stat.S_ISDIR(mode) and not stat.S_ISREG(mode):
+                raise InputError(
+                    f"{quote_value(path)} is a link or no file, which no run leaves; delete it, or "
+                    "name another output folder.",
+                    "out",
+                )

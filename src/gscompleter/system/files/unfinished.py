@@ -5,6 +5,8 @@
 TARGET stands for the name of the result and MACHINE for this computer since it was started. START
 is the time at which the process began, so that another process of the same PID is noticed. A run
 that is killed leaves such entries behind; the next one removes them once their process is gone.
+Of a process that cannot be seen, because it is or was on another machine, the signs count: its
+owner touches an entry twice a minute.
 """
 
 from __future__ import annotations
@@ -23,17 +25,24 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+from gscompleter.system.errors import quote_value
+
 UNFINISHED_PREFIX = ".gscompleter-"
 """Prefix of the names of unfinished entries, which are never taken for results."""
 REPLACED_SUFFIX = ".old"
 """Suffix of the folder beside a draft that takes the files which the draft replaces."""
 
 SIGN_SECONDS = 30.0
-"""Interval at which the owner of a draft shows that it still runs."""
-FOLDER_LEASE_SECONDS = 180.0
-"""Time without a sign after which a draft of another machine counts as left behind."""
-FILE_LEASE_SECONDS = 24 * 3600.0
-"""The same for a file, whose owner gives no signs but only writes."""
+"""Interval at which the owner of an entry shows that it still runs."""
+LEASE_SECONDS = 180.0
+"""Time without a sign after which an entry of another machine counts as left behind."""
+MAX_AHEAD_SECONDS = 30.0
+"""Time by which a sign may lie in the future, where the clocks of two machines differ. One that is
+farther ahead was given before a clock was set back."""
+
+MAX_GIVEN_LENGTH = 60
+MAX_ENTRY_LENGTH = 100
+"""Longest paths in the sentence about a file: as a whole it would be shortened beyond 300."""
 
 _NAME = re.compile(
     re.escape(UNFINISHED_PREFIX)
@@ -64,15 +73,37 @@ class Unfinished:
         try:
             status = self.path.lstat()
             # The clock of the disk counts, which on a server is not that of this machine.
-            now = _read_disk_time(self.path.parent)
+            age = _read_disk_time(self.path) - status.st_mtime
         except OSError:
             return False
-        is_folder = self.path.is_dir()
-        return now - status.st_mtime < (FOLDER_LEASE_SECONDS if is_folder else FILE_LEASE_SECONDS)
+        return -MAX_AHEAD_SECONDS <= age < LEASE_SECONDS
 
     def is_own(self) -> bool:
         """Return True if this process writes the entry."""
         return self.path.name.startswith(f"{UNFINISHED_PREFIX}{self.target}-{_describe_owner()}-")
+
+    def describe_file(self, given: Path) -> str:
+        """Write the sentence that refuses the file `given`, which the owner is writing.
+
+        Whether a process on another machine still lives may be known to the user alone.
+        """
+        whole = str(self.path)
+        entry = whole if len(whole) <= MAX_ENTRY_LENGTH else self.path.name
+        return (
+            f"Another run (process {self.pid}) is writing {quote_value(given, MAX_GIVEN_LENGTH)}; "
+            "wait for its end, or name another file; if it was killed, delete "
+            f"{quote_value(entry, MAX_ENTRY_LENGTH)}."
+        )
+
+    def describe_folder(self, given: Path) -> str:
+        """Write the sentence that refuses the folder `given`, which the owner is writing."""
+        # An entry of a folder is not to be deleted by hand: it may hold results that a killed run
+        # moved already, and the next run finishes its renames.
+        return (
+            f"Another run (process {self.pid}) is writing {quote_value(given)}; wait for its end, "
+            "or name another folder; if it was killed, try again in "
+            f"{LEASE_SECONDS / 60:.0f} minutes."
+        )
 
     def remove(self) -> None:
         """Remove the entry, as far as this user may."""
@@ -83,12 +114,17 @@ class Unfinished:
 
 def make_unfinished_name(target: str) -> str:
     """Make a new name for an unfinished entry of this process that will be called `target`."""
-    return f"{UNFINISHED_PREFIX}{digest_target(target)}-{_describe_owner()}-{secrets.token_hex(4)}"
+    return _make_name(digest_target(target))
 
 
 def digest_target(name: str) -> str:
     """Return the part of an unfinished name that stands for the name of the result."""
     return hashlib.sha256(os.fsencode(name)).hexdigest()[:8]
+
+
+def is_unfinished(name: str) -> bool:
+    """Return True for the name of an unfinished entry; others that only begin alike are foreign."""
+    return _NAME.fullmatch(name) is not None
 
 
 def list_unfinished(folder: Path, target: str | None = None) -> list[Unfinished]:
@@ -120,12 +156,12 @@ def remove_left_behind_below(folder: Path) -> None:
     for home, folders, _ in os.walk(folder):
         remove_left_behind(Path(home))
         # `os.walk` goes on with what is left in its list.
-        folders[:] = [name for name in folders if not name.startswith(UNFINISHED_PREFIX)]
+        folders[:] = [name for name in folders if not is_unfinished(name)]
 
 
 @contextmanager
 def give_signs(path: Path) -> Iterator[None]:
-    """Show other machines during the block that the owner of a draft is running."""
+    """Show other machines during the block that the owner of a draft or file is running."""
     is_over = threading.Event()
 
     def touch() -> None:
@@ -139,6 +175,10 @@ def give_signs(path: Path) -> Iterator[None]:
         yield
     finally:
         is_over.set()
+
+
+def _make_name(digest: str) -> str:
+    return f"{UNFINISHED_PREFIX}{digest}-{_describe_owner()}-{secrets.token_hex(4)}"
 
 
 def _describe_owner() -> str:
@@ -183,9 +223,11 @@ def _is_hidden(pid: int) -> bool:
     return False
 
 
-def _read_disk_time(folder: Path) -> float:
-    """Return the time of the disk of a folder, or of this machine if it cannot be written to."""
-    probe = folder / f"{UNFINISHED_PREFIX}{secrets.token_hex(4)}"
+def _read_disk_time(entry: Path) -> float:
+    """Return the time of the disk of an entry, or of this machine if it cannot be written to."""
+    # Named like an entry of this process, so that one which is left behind is removed, too.
+    target = entry.name.removeprefix(UNFINISHED_PREFIX).partition("-")[0]
+    probe = entry.with_name(_make_name(target))
     try:
         probe.touch(exist_ok=False)
         return probe.stat().st_mtime

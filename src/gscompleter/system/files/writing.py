@@ -8,6 +8,7 @@ from __future__ import annotations
 import errno
 import os
 import signal
+import stat
 import threading
 from collections.abc import Container, Iterator
 from contextlib import contextmanager, suppress
@@ -16,7 +17,7 @@ from typing import BinaryIO
 
 from gscompleter.system.errors import FullDiskError, OutputError, quote_value
 from gscompleter.system.files.renaming import replace
-from gscompleter.system.files.unfinished import make_unfinished_name
+from gscompleter.system.files.unfinished import give_signs, make_unfinished_name
 
 SUMMARY_FILE = "summary.json"
 """File that marks a folder as complete: it is removed first and written last."""
@@ -33,6 +34,9 @@ COMPLETED_FILES = (COMPLETED_FILE, "completed.spz", "completed.sog")
 REMOVED_FILE = "removed.ply"
 """Originals of changed and removed Gaussians of a given scene, beside the completed one."""
 
+ACCESS_LIST = "system.posix_acl_access"
+"""Attribute of a file that lists further users who may read or write it."""
+
 FULL_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 """Numbers of errors of a disk without space, of a full quota and of a limit of a file's size."""
 
@@ -41,9 +45,9 @@ FULL_DISK_ERRORS = {errno.ENOSPC, errno.EDQUOT, errno.EFBIG}
 def replace_file(path: Path | str, keep_existing: bool = False) -> Iterator[BinaryIO]:
     """Open a temporary file that is renamed to `path` once it is completely on the disk.
 
-    An existing file survives every failure. With `keep_existing`, a file that another process
-    wrote at `path` meanwhile is kept, where the file system has hard links. A device or a pipe is
-    never replaced by a file.
+    An existing file survives every failure, and its permissions go over to the new one. With
+    `keep_existing`, a file that another process wrote at `path` meanwhile is kept, where the file
+    system has hard links. A device or a pipe is never replaced by a file.
     """
     # The target of a symbolic link is replaced, not the link.
     target = Path(os.path.realpath(path))
@@ -51,7 +55,9 @@ def replace_file(path: Path | str, keep_existing: bool = False) -> Iterator[Bina
     with convert_write_errors(path):
         refuse_special_file(target)
         try:
-            with temporary.open("xb") as file:
+            with temporary.open("xb") as file, give_signs(temporary):
+                # Before anything is written: a private file has no moment at which others read it.
+                keep_permissions(target, temporary)
                 yield file
                 file.flush()
                 os.fsync(file.fileno())
@@ -64,6 +70,32 @@ def replace_file(path: Path | str, keep_existing: bool = False) -> Iterator[Bina
         finally:
             with suppress(OSError):
                 temporary.unlink()
+
+
+def keep_permissions(old: Path, new: Path) -> None:
+    """Give a file the mode, and where possible the owner and the access list, of one it replaces.
+
+    Nothing happens if there is no such file, or on a system without owners and modes.
+    """
+    try:
+        status = os.lstat(old)
+    except OSError:
+        return
+    if not hasattr(os, "chown") or not stat.S_ISREG(status.st_mode):
+        return
+    # Only root gives files away, and the group has to be one of the user's.
+    for owner, group in ((-1, status.st_gid), (status.st_uid, -1)):
+        with suppress(OSError):
+            os.chown(new, owner, group)
+    if hasattr(os, "getxattr"):  # on Linux; without the list its mask would count as the group
+        with suppress(OSError):
+            os.setxattr(new, ACCESS_LIST, os.getxattr(old, ACCESS_LIST))
+    mode = stat.S_IMODE(status.st_mode) & 0o777
+    with suppress(OSError):
+        # A group that could not be kept may do no more than everybody.
+        if os.lstat(new).st_gid != status.st_gid:
+            mode &= 0o707 | (mode & 0o007) << 3
+        os.chmod(new, mode)
 
 
 def encode_text(text: str) -> bytes:

@@ -11,6 +11,7 @@ row: the loss of that job is counted, and the rest of the share is run again.
 from __future__ import annotations
 
 import json
+import os
 import re
 import time
 from collections import deque
@@ -138,7 +139,8 @@ def find_missing_jobs(jobs: Sequence[Job], out: Path, rerun_failed: bool) -> lis
 def claim_folder(out: Path, kind: str, content: Mapping[str, Any]) -> None:
     """Write `KIND.json` before all other files of a folder, unless it exists.
 
-    Several processes may do so simultaneously. InputError is raised if the folder has other files.
+    Several processes may do so simultaneously. InputError is raised if the folder has other files,
+    or a link out of it, through which results would be written elsewhere.
     """
     marker = out / f"{kind}.json"
     try:
@@ -153,8 +155,29 @@ def claim_folder(out: Path, kind: str, content: Mapping[str, Any]) -> None:
     is_used = any(not name.startswith(UNFINISHED_PREFIX) for name in names)
     if is_used and not marker.is_file():
         raise InputError(f"{quote_value(out)} holds something other than a {kind}; name another.")
+    refuse_links_out(out)
     remove_left_behind_below(out)
     write_json(marker, content, keep_existing=True)
+
+
+def refuse_links_out(out: Path) -> None:
+    """Raise InputError if a folder, or one in it, has a link that leads out of it."""
+    root = Path(os.path.realpath(out))
+    waiting = [root]
+    while waiting:
+        try:
+            entries = list(os.scandir(waiting.pop()))
+        except OSError:  # another shard removes folders that a killed run left
+            continue
+        for entry in entries:
+            if entry.is_dir(follow_symlinks=False):
+                waiting.append(Path(entry.path))
+            elif entry.is_symlink() and root not in Path(os.path.realpath(entry.path)).parents:
+                raise InputError(
+                    f"{quote_value(Path(entry.path))} is a link out of the folder of the results; "
+                    "remove it, or name another folder.",
+                    "out",
+                )
 
 
 def make_folder(folder: Path) -> None:
