@@ -29,7 +29,7 @@ STARTS = {
 
 @pytest.fixture
 def strange(tmp_path, monkeypatch) -> Path:
-    """A working folder in which every module that is imported leaves a trace."""
+    """Change to a working folder in which every module that is imported leaves a trace."""
     folder = tmp_path / "photographs"
     folder.mkdir()
     for name in STRANGERS:
