@@ -348,7 +348,7 @@ def test_what_is_no_splat_is_refused(tmp_path):
 
 
 MANY = 300_000
-"""Gaussians of which properties that are all the same take thousands of bytes for each packed one."""
+"""Gaussians of which a property that is the same for all shrinks to a thousandth and less."""
 
 
 def equal_but_for(*names: str) -> Gaussians:

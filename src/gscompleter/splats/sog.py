@@ -158,8 +158,8 @@ def _open_image(read: FileReader, name: object, count: int) -> Image.Image:
         raise ValueError(f"its {quote_value(name)} has fewer pixels than there are Gaussians")
     if image.width * image.height > most:
         raise ValueError(
-            f"its {quote_value(name)} claims to hold {image.width:,} × {image.height:,} pixels, and "
-            f"there are {count:,} Gaussians"
+            f"its {quote_value(name)} claims to hold {image.width:,} × {image.height:,} pixels, "
+            f"and there are {count:,} Gaussians"
         )
     return image
 
