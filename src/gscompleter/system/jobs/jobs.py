@@ -269,7 +269,7 @@ def collect_rest(future: Any, share: list[Job], retries: int) -> list[Job]:
     if first.lost > retries + 1:
         raise WorkerError(
             f"Processes of the engine cannot start, or end at once ({type(killed).__name__}: "
-            f"{quote_value(str(killed))}); see what they printed above, or leave --engine out."
+            f"{quote_value(str(killed))}); mend what they print above."
         ) from killed
     return [first, *share[1:]]
 
