@@ -41,7 +41,7 @@ from gscompleter.splats.packing import (
 from gscompleter.splats.ply import encode
 from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
 from gscompleter.system.errors import quote_value
-from gscompleter.system.files.reading import read_bytes
+from gscompleter.system.files.reading import read_bytes, read_zip_entry
 from gscompleter.system.files.writing import replace_file
 from gscompleter.types import SH_C0, Gaussians
 
@@ -98,13 +98,9 @@ def read_sog_remarks(path: Path) -> object:
 
 
 def _read_entry(bundle: zipfile.ZipFile, name: str, most: int) -> bytes:
-    entry = bundle.getinfo(name)
-    if entry.flag_bits & 1:
+    if bundle.getinfo(name).flag_bits & 1:
         raise UnsupportedError(f"is encrypted ({quote_value(name)})")
-    if entry.file_size > most:
-        packed, size = f"{entry.compress_size:,}", f"{entry.file_size:,}"
-        raise ValueError(f"{packed} bytes of its {quote_value(name)} claim to hold {size}")
-    return bundle.read(entry)
+    return read_zip_entry(bundle, name, most)
 
 
 def _read_files(read: FileReader, meta: str, stored: int) -> Gaussians:
