@@ -19,7 +19,13 @@ from gscompleter.apps.command_line.failures import explain_failure
 from gscompleter.apps.command_line.words import format_error, parse_words
 from gscompleter.apps.commands.shared_options import ComputeOptions, Options
 from gscompleter.config.settings import validate
-from gscompleter.system.errors import FullDiskError, InputError, NoCaseError, print_error
+from gscompleter.system.errors import (
+    FullDiskError,
+    InputError,
+    NoCaseError,
+    WorkerError,
+    print_error,
+)
 from gscompleter.system.files.writing import FULL_DISK_ERRORS, handle_stop_signals
 from gscompleter.system.process import let_idle_threads_sleep, skip_last_collection
 from gscompleter.system.threads import limit_threads
@@ -127,9 +133,9 @@ def main() -> None:
         run_command = getattr(import_command(words[0]), f"run_{words[0]}")
         code = run_command(command_options)
     except InputError as error:
-        # Both are InputErrors for their sentences alone: no other input would help.
+        # All three are InputErrors for their sentences alone: no other input would help.
         print_error(format_error(error))
-        is_input = not isinstance(error, (FullDiskError, NoCaseError))
+        is_input = not isinstance(error, (FullDiskError, NoCaseError, WorkerError))
         sys.exit(WRONG_INPUT if is_input else ERROR)
     except KeyboardInterrupt as stop:
         # Whoever writes results says if they were complete when the signal came.

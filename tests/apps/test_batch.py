@@ -8,7 +8,10 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
+from concurrent.futures import Future
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -21,11 +24,19 @@ from gscompleter import InputError
 from gscompleter.apps.batch import engine as batch_engine
 from gscompleter.apps.batch.manifest import list_results, read_manifest
 from gscompleter.apps.batch.rows import parse_row
-from gscompleter.system.errors import FullDiskError, OutputError
+from gscompleter.system.errors import FullDiskError, OutputError, WorkerError
 from gscompleter.system.files.writing import replace_file
 from gscompleter.system.jobs import jobs as batch
 from gscompleter.system.jobs.engines import connect_to_ray, open_submitit
-from gscompleter.system.jobs.jobs import Job, find_missing_jobs, parse_shard, run_job, run_jobs
+from gscompleter.system.jobs.jobs import (
+    Job,
+    Pool,
+    Share,
+    find_missing_jobs,
+    parse_shard,
+    run_job,
+    run_jobs,
+)
 from paths import SUPPORT
 from scenes import camera_at, photographed
 from simulate_batch import Fleet, Replay, replay
@@ -158,9 +169,29 @@ class Deadly:
 
 @pytest.mark.slow
 @pytest.mark.linux
-def test_workers_that_cannot_even_list_a_failure_end_the_run():
-    with pytest.raises(BrokenProcessPool):
+def test_workers_that_cannot_even_list_a_failure_end_the_run_with_a_sentence():
+    with pytest.raises(WorkerError, match="Processes of the engine cannot start, or end at once"):
         list(run_jobs([Job("one")], Deadly(), lambda job: False, engine_named("local", 1)))
+
+
+def test_workers_that_cannot_start_are_a_sentence_and_no_fault_of_the_input(
+    tmp_path, monkeypatch, capsys
+):
+    @contextmanager
+    def open_broken(workers: int) -> Iterator[Pool]:
+        def start(share: Share) -> Future[Exception | None]:
+            future: Future[Exception | None] = Future()
+            future.set_exception(BrokenProcessPool("A process was terminated abruptly"))
+            return future
+
+        yield Pool(workers, start)
+
+    monkeypatch.setattr(batch_engine, "open_local", open_broken)
+    (tmp_path / "m.csv").write_text("folder\nroom\n")
+    assert run(monkeypatch, "batch", tmp_path / "m.csv", "--out", tmp_path / "out", "--quiet") == 1
+    errors = capsys.readouterr().err
+    assert "cannot start, or end at once (BrokenProcessPool: A process was terminated" in errors
+    assert errors.count("\n") == 1
 
 
 @pytest.mark.linux
@@ -447,8 +478,16 @@ def test_a_folder_of_something_else_is_refused(tmp_path, manifest, monkeypatch, 
 def test_ray_does_what_is_told_and_tells_of_lost_workers(tmp_path, monkeypatch):
     pytest.importorskip("ray", reason="needs gscompleter[ray]")
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join(p for p in sys.path if p))
+    # Ray would import from the working folder.
+    (tmp_path / "photographs").mkdir()
+    for name in ("numpy", "json"):
+        (tmp_path / "photographs" / f"{name}.py").write_text(
+            f"open({str(tmp_path / 'ran')!r}, 'w')"
+        )
+    monkeypatch.chdir(tmp_path / "photographs")
     jobs = [Job("bad", {"ends": "always killed"}), *plain_jobs(3, 0.0)]
     names = run_all(tmp_path, jobs, engine_named("ray", 1), 0)
+    assert not (tmp_path / "ran").exists()
     found = {name: row_of(tmp_path, name)["state"] for name in names}
     assert found == {"bad": "failed", "job-000": "done", "job-001": "done", "job-002": "done"}
 
@@ -462,14 +501,15 @@ def test_slurm_gives_no_part_of_a_gpu(tmp_path):
         pass
 
 
+@pytest.mark.parametrize("error", [ConnectionError, Exception])
 @pytest.mark.parametrize(
     ("address", "sentence"), [(None, "Ray cannot start on this machine"), ("far:1", "Ray at far:1")]
 )
-def test_ray_that_does_not_answer_is_a_sentence(address, sentence):
+def test_ray_that_does_not_answer_is_a_sentence(address, sentence, error):
     class Ray:
         @staticmethod
         def init(**options):
-            raise ConnectionError("no answer")
+            raise error("no answer")
 
     with pytest.raises(InputError, match=f"{sentence}: no answer"):
         connect_to_ray(Ray, address, 1)

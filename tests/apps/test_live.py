@@ -7,7 +7,9 @@ import gzip
 import http.client
 import io
 import json
+import re
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
@@ -37,6 +39,7 @@ from gscompleter.apps.live.session import (
     save_camera,
     undo_step,
 )
+from gscompleter.apps.viewer import http as served
 from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.cli import parse_command
 from gscompleter.config import CompleterConfig
@@ -491,16 +494,17 @@ def ask(server: LiveServer, method: str, path: str, body: bytes | None = None, *
     """Send a request, and return the status and the bytes of the answer."""
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
     named = {name.replace("_", "-"): value for name, value in headers.items()}
-    connection.request(method, path, body, {**JSON, **named})
+    connection.request(method, f"{path}?token={server.token}", body, {**JSON, **named})
     response = connection.getresponse()
     content = response.read()
     connection.close()
     return response.status, content
 
 
-def request_for(action: str, camera: Camera = CAMERAS[1], **more: object) -> bytes:
-    frame = describe_camera(camera)
-    told = {"camera_model": "PINHOLE", "frames": [frame]}
+def request_for(action: str, camera: Camera | dict = CAMERAS[1], **more: object) -> bytes:
+    told = camera
+    if isinstance(camera, Camera):
+        told = {"camera_model": "PINHOLE", "frames": [describe_camera(camera)]}
     return json.dumps({"action": action, "client": "me", "camera": told, **more}).encode()
 
 
@@ -544,8 +548,9 @@ def test_a_step_is_asked_for_shown_undone_and_done_again(server, page):
 
 def test_messages_arrive_as_they_are_sent(server, page):
     connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
-    connection.request("GET", "/events")
+    connection.request("GET", f"/events?token={server.token}")
     response = connection.getresponse()
+    assert response.getheader("X-Frame-Options") == "DENY"
     assert response.getheader("Content-Type") == "text/event-stream"
 
     def hear() -> dict:
@@ -610,15 +615,150 @@ def test_what_a_request_lacks_is_said(page):
     assert "no camera" in do(page, b'{"action": "complete"}')["text"]
     assert "no base64" in do(page, request_for("fill", mask="*"))["text"]
     empty = parse_request(b'{"action": "complete", "camera": {"frames": []}}', ("complete",))
-    with pytest.raises(InputError):
+    with pytest.raises(InputError, match="0 cameras"):
         empty.read_camera()
+    box = {"box": CRATE, "box_rotation": [float("nan"), 0, 0, 1]}
+    assert "not all zero" in do(page, request_for("remove", **box))["text"]
+    assert "six numbers" in do(page, request_for("remove", box=[-1e999, 0, 0, 1, 1, 1]))["text"]
+
+
+def test_a_request_asks_for_no_file_and_is_told_of_none(page, tmp_path, monkeypatch, capsys):
+    """Neither existence nor sizes of files, nor where the program keeps its own."""
+    picture = tmp_path / "picture.png"
+    picture.write_bytes(SPOT)
+    described = describe_camera(CAMERAS[1])
+    sized = {key: value for key, value in described.items() if key not in ("w", "h")}
+    said = set()
+    for path in (picture, tmp_path / "missing.png", "/proc/self/environ"):
+        told = {"frames": [{**sized, "file_path": str(path)}]}
+        said.add(do(page, request_for("complete", told))["text"])
+    assert said == {"The `file_path` of the camera is unknown; leave it out."}
+    told = {"frames": [sized]}
+    requests = [request_for("complete", told)]
+    wide = Image.new("L", (4 * SIZE, SIZE), 255)
+    file = io.BytesIO()
+    wide.save(file, format="PNG")
+    for mask in (b"no image", SPOT[:60], file.getvalue(), mark(slice(0), slice(0))):
+        requests.append(request_for("repair", mask=base64.b64encode(mask).decode()))
+    monkeypatch.setattr(page, "_find_hole", lambda _: picture.read_text())
+    for request in (*requests, request_for("find")):
+        text = do(page, request)["text"]
+        assert not re.search(r"/\w|\.png|\.json", text), text
+    assert "UnicodeDecodeError" in capsys.readouterr().err
 
 
 def test_a_request_has_a_size_and_a_kind(server):
     body = request_for("undo")
     assert ask(server, "POST", "/do", body, Content_Type="text/plain")[0] == 415
     assert ask(server, "POST", "/do", body, Content_Length="9" * 12)[0] == 413
+    assert ask(server, "POST", "/do", body, Content_Length="9" * 5000)[0] == 413
     assert ask(server, "POST", "/elsewhere", body)[0] == 404
+
+
+PATHS = ("/", "/events", "/difference", "/chunks/added-1", "/elsewhere")
+
+
+@pytest.mark.parametrize("query", ["", "?token=", "?token=no", "?token=%C3%A9%FF", "?open=no"])
+def test_nobody_gets_anything_without_the_token(server, page, query):
+    """Whatever name of a host leads here, and on this machine, too, which may have other users."""
+    before = page.difference
+    for method, path in [*(("GET", path) for path in PATHS), ("POST", "/do")]:
+        connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
+        connection.request(method, path + query, request_for("undo"), JSON)
+        response = connection.getresponse()
+        assert response.status == 403
+        text = response.read().decode()
+        assert text.startswith("Open the whole address that the program printed")
+        assert "Traceback" not in text
+        headers = dict(response.getheaders())
+        assert headers["Content-Security-Policy"] == "frame-ancestors 'none'"
+        assert headers["X-Frame-Options"] == "DENY"
+        connection.close()
+    assert page._requests.empty()
+    assert page.difference == before
+
+
+def test_a_website_whose_name_leads_here_knows_no_token(page):
+    """Of an address that others reach, any name may be asked for, as after DNS rebinding."""
+    server = LiveServer(resolve_host("0.0.0.0"), "0.0.0.0", 0, page)
+    try:
+        name = f"evil.example:{server.server_port}"
+        assert server.url.endswith(f"?token={server.token}")
+        assert len(server.token) >= 20
+        assert answer_of(server, name, f"http://{name}") == 202
+        page.handle(page._requests.get())
+        assert answer_of(server, name, f"http://{name}", token="guessed") == 403
+    finally:
+        server.close()
+
+
+def test_what_opens_the_browser_opens_the_page_once(server):
+    """Command lines are read by all users of a machine."""
+    assert server.token not in server.opening_url
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
+    path = server.opening_url.partition(str(server.server_port))[2]
+    for status, location in ((303, f"/?token={server.token}"), (403, None)):
+        connection.request("GET", path)
+        response = connection.getresponse()
+        response.read()
+        assert (response.status, response.getheader("Location")) == (status, location)
+        connection.close()
+
+
+@pytest.mark.parametrize("length", ["²", "٣", "-1", "1e3", "+5", "1_0", ""])
+def test_a_length_that_is_no_number_is_refused(server, capfd, length):
+    head = (
+        f"POST /do?token={server.token} HTTP/1.1\r\nHost: localhost\r\n"
+        f"Content-Type: application/json\r\nContent-Length: {length}\r\n\r\n"
+    )
+    for encoding in ("latin-1", "utf-8"):
+        with socket.create_connection(("127.0.0.1", server.server_port), timeout=10) as browser:
+            browser.sendall(head.encode(encoding, errors="replace"))
+            assert browser.recv(100).startswith(b"HTTP/1.0 411" if not length else b"HTTP/1.0 400")
+    assert capfd.readouterr().err == ""
+
+
+def test_half_of_a_request_is_dropped_in_time(server, monkeypatch, capfd):
+    """Slowly sent bytes do not make it whole."""
+    monkeypatch.setattr(served, "REQUEST_SECONDS", 0.3)
+    head = f"POST /do?token={server.token} HTTP/1.1\r\nHost: localhost\r\n"
+    whole = head + "Content-Type: application/json\r\nContent-Length: 100\r\n\r\n"
+    for sent in ("", "GET / HT", head, whole, whole + "{"):
+        with socket.create_connection(("127.0.0.1", server.server_port), timeout=10) as browser:
+            browser.sendall(sent.encode())
+            assert not browser.recv(100).startswith(b"HTTP/1.0 2")
+    while server.awaited:  # their threads end
+        time.sleep(0.01)
+    # What waits for messages is a whole request.
+    connection = http.client.HTTPConnection("127.0.0.1", server.server_port, timeout=10)
+    connection.request("GET", f"/events?token={server.token}")
+    response = connection.getresponse()
+    response.readline()
+    response.readline()
+    time.sleep(1.0)
+    server.page.tell("still there")
+    assert b"still there" in response.readline()
+    connection.close()
+    assert capfd.readouterr().err == ""
+
+
+def test_only_so_many_are_served_at_once(page, monkeypatch):
+    monkeypatch.setattr(served, "MAX_CLIENTS", 3)
+    server = LiveServer(resolve_host("127.0.0.1"), "127.0.0.1", 0, page)
+    place = ("127.0.0.1", server.server_port)
+    try:
+        held = [socket.create_connection(place, timeout=10) for _ in range(3)]
+        while len(server.awaited) < 3:
+            time.sleep(0.01)
+        with socket.create_connection(place, timeout=10) as further, suppress(ConnectionError):
+            assert further.recv(1) == b""
+        for browser in held:
+            browser.close()
+        while server.awaited:
+            time.sleep(0.01)
+        assert ask(server, "GET", "/")[0] == 200
+    finally:
+        server.close()
 
 
 def has_ipv6() -> bool:
@@ -693,11 +833,15 @@ def test_pages_from_elsewhere_are_refused(page, host):
         server.close()
 
 
-def answer_of(server: LiveServer, name: str, origin: str | None) -> int:
-    """Ask as a page of `origin` does that calls the server by a name, and return the status."""
+def answer_of(server: LiveServer, name: str, origin: str | None, token: str | None = None) -> int:
+    """Ask as a page of `origin` does that calls the server by a name, and return the status.
+
+    The page knows the token unless another one is given.
+    """
     connection = http.client.HTTPConnection(server.address.host, server.server_port, timeout=10)
     headers = {**JSON, "Host": name, **({} if origin is None else {"Origin": origin})}
-    connection.request("POST", "/do", request_for("undo"), headers)
+    path = f"/do?token={token or server.token}"
+    connection.request("POST", path, request_for("undo"), headers)
     status = connection.getresponse().status
     connection.close()
     return status

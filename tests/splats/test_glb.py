@@ -188,5 +188,11 @@ def test_many_primitives_cannot_unpack_one_spz_without_end(tmp_path):
     table, binary = parse(path.read_bytes())
     table["meshes"][0]["primitives"] *= 20_000
     table["accessors"][0]["count"] = 30
-    with pytest.raises(InputError, match="claim to hold"):
+    with pytest.raises(InputError, match="claims to hold more than 10,000 primitives"):
+        load_splat(write_glb(path, table, binary))
+    # Nodes that share a mesh multiply them, and are counted one by one.
+    table["nodes"] = [{"mesh": 0}] * 20_000
+    table["scenes"][0]["nodes"] = list(range(20_000))
+    table["accessors"][0]["count"] = 10**6
+    with pytest.raises(InputError, match="bytes claim to hold 5,000,000 Gaussians"):
         load_splat(write_glb(path, table, binary))

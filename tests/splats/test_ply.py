@@ -125,6 +125,33 @@ def test_provenance_is_written_where_there_is_any_or_it_is_asked_for(tmp_path):
     assert written(marked, provenance=False) is None
 
 
+@pytest.mark.parametrize("sh_degree", [0, 3])
+def test_a_reader_that_takes_every_property_for_a_float_reads_the_same(tmp_path, sh_degree):
+    """As gsply and many others do."""
+    gaussians = random_gaussians(40, sh_degree=sh_degree)
+    labels = torch.arange(40, dtype=torch.uint8) * 6
+    path = saved(tmp_path, replace(gaussians, generated=labels))
+    header, _, body = path.read_bytes().partition(b"end_header\n")
+    names = [line.split()[-1].decode() for line in header.splitlines() if b"property" in line]
+    table = dict(zip(names, np.frombuffer(body, "<f4").reshape(40, -1).T, strict=True))
+    assert np.array_equal(table["x"], gaussians.means[:, 0].numpy())
+    assert np.array_equal(table["generated"], labels.numpy())
+    assert np.allclose(table["opacity"], gaussians.opacities.logit().numpy(), atol=1e-4)
+    theirs = plyread(str(path))
+    assert np.array_equal(np.asarray(theirs.means), gaussians.means.numpy())
+    assert np.allclose(np.asarray(theirs.opacities), gaussians.opacities.logit().numpy(), atol=1e-4)
+
+
+@pytest.mark.parametrize("kind", ["u1", "<f4", ">f4", "<i4", "f8"])
+def test_labels_of_any_type_are_read(tmp_path, kind):
+    gaussians = replace(random_gaussians(40), generated=torch.arange(40, dtype=torch.uint8) * 6)
+    vertex = plyfile.PlyData.read(str(saved(tmp_path, gaussians)))["vertex"].data
+    rows = vertex.astype([(n, kind if n == "generated" else "<f4") for n in vertex.dtype.names])
+    element = plyfile.PlyElement.describe(rows, "vertex")
+    plyfile.PlyData([element], byte_order="<").write(str(tmp_path / "other.ply"))
+    assert torch.equal(load_ply(tmp_path / "other.ply").generated, gaussians.generated)
+
+
 @pytest.mark.parametrize(
     "options", [{"byte_order": ">"}, {"byte_order": "<"}, {"text": True}], ids=str
 )

@@ -11,6 +11,7 @@ import zipfile
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import plyfile
 import pytest
 import torch
@@ -44,6 +45,7 @@ from splat_files import (
     plausible,
     psnr,
     sog_files,
+    webp,
     write_glb,
     write_ksplat,
     write_sog,
@@ -343,6 +345,101 @@ def test_what_is_no_splat_is_refused(tmp_path):
     ]:
         (tmp_path / name).write_bytes(data)
         refused(tmp_path / name, sentence)
+
+
+MANY = 300_000
+"""Gaussians of which a property that is the same for all shrinks to a thousandth and less."""
+
+
+def equal_but_for(*names: str) -> Gaussians:
+    """Make Gaussians that differ in these properties, and are equal in all others."""
+    gaussians = random_gaussians(MANY, seed=5, sh_degree=1)
+    sh = gaussians.sh.clamp(-0.9, 0.9)
+    whole = replace(gaussians, sh=sh, opacities=torch.ones(MANY))
+    fields = ("means", "quats", "scales", "sh")
+    alike = {n: getattr(whole, n)[:1].expand_as(getattr(whole, n)).clone() for n in fields}
+    return replace(whole, **{name: alike[name] for name in fields if name not in names})
+
+
+@pytest.mark.parametrize("differing", [("means",), ()], ids=["one kind", "one place"])
+@pytest.mark.parametrize(
+    "name",
+    ["a.sog", "a.spz", "four.spz", "a.compressed.ply", "a.splat", "a.glb", "packed.glb", "a.ply"],
+)
+def test_what_is_the_same_for_all_gaussians_is_read_again(tmp_path, name, differing):
+    """As programs write it that turn a mesh or a single photograph into Gaussians of one size."""
+    gaussians = equal_but_for(*differing)
+    path = tmp_path / name
+    if name == "four.spz":
+        write_spz_4(path, made(tmp_path, "scene.spz", gaussians))
+    elif name == "packed.glb":
+        save_splat(tmp_path / "a.spz", gaussians)
+        pack_glb(path, MANY, (tmp_path / "a.spz").read_bytes())
+    else:
+        save_splat(path, gaussians)
+    loaded = load_splat(path)
+    assert len(loaded) == MANY
+    for read, given in (
+        (loaded.scales.log(), gaussians.scales.log()),
+        (loaded.opacities, gaussians.opacities),
+        (loaded.sh[:, 0], gaussians.sh[:, 0]),
+        (covariances(loaded[:9]), covariances(gaussians[:9])),
+    ):
+        assert (read - given[:1]).abs().max() <= 0.02 * given.abs().max()
+    for axis in range(3):
+        read, given = loaded.means[:, axis].sort().values, gaussians.means[:, axis].sort().values
+        assert (read - given).abs().max() <= 2e-3 * gaussians.means.abs().max()
+
+
+def test_a_sog_in_a_folder_and_packed_again_may_have_one_size_too(tmp_path):
+    save_splat(tmp_path / "a.sog", equal_but_for("means"))
+    with zipfile.ZipFile(tmp_path / "a.sog") as bundle:
+        files = {name: bundle.read(name) for name in bundle.namelist()}
+    assert len(files["scales.webp"]) < 100
+    folder = write_sog(tmp_path / "folder", files)
+    with zipfile.ZipFile(tmp_path / "b.sog", "w", zipfile.ZIP_DEFLATED) as bundle:
+        for name, data in files.items():
+            bundle.writestr(name, data)
+    for path in (folder, folder / "meta.json", tmp_path / "b.sog"):
+        assert torch.equal(load_splat(path).scales, load_splat(tmp_path / "a.sog").scales)
+
+
+def test_bombs_of_equal_gaussians_are_refused_before_anything_is_unpacked(tmp_path):
+    """Of a few bytes that keep all promises: what they unpack to would fill the memory."""
+    count = 81_000_000
+    header = struct.pack("<4sIIBBBB", b"NGSP", 3, count, 3, 12, 0, 0)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(header + bytes(10**6)))
+    refused(tmp_path / "a.spz", "bytes claim to hold 81,000,000 Gaussians")
+    pack_glb(tmp_path / "a.glb", count, (tmp_path / "a.spz").read_bytes())
+    refused(tmp_path / "a.glb", "claim to hold 81,000,000 Gaussians")
+    whole = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, count, 0, 12, 0, 5, 32)
+    (tmp_path / "b.spz").write_bytes(whole + bytes(80))
+    refused(tmp_path / "b.spz", "claim to hold 81,000,000 Gaussians")
+    # Images of one colour, as many pixels as the count asks for, or far more than it does.
+    huge = webp(np.full((9_000, 9_000, 4), 255, np.uint8))
+    files = sog_files(plausible(20, 0))
+    images = {name: huge for name in files if name.endswith(".webp")}
+    meta = json.loads(files["meta.json"])
+    for given, sentence in ((count, "claim to hold 81,000,000 Gaussians"), (20, "are 20 Gauss")):
+        table = json.dumps(meta | {"count": given}).encode()
+        write_sog(tmp_path / "a.sog", {"meta.json": table, **images})
+        refused(tmp_path / "a.sog", sentence)
+    with zipfile.ZipFile(tmp_path / "b.sog", "w", zipfile.ZIP_DEFLATED) as bundle:
+        for name, data in files.items():
+            bundle.writestr(name, data + bytes(10**8 if name == "quats.webp" else 0))
+    refused(tmp_path / "b.sog", "its quats.webp is too large: .* bytes claim to hold 100,000,")
+
+
+def pack_glb(path: Path, count: int, spz: bytes) -> None:
+    """Write a .glb with a .spz inside."""
+    extension = {"KHR_gaussian_splatting_compression_spz": {"bufferView": 0}}
+    table, _ = glb_table(plausible(1, 0))
+    primitive = table["meshes"][0]["primitives"][0]
+    primitive["attributes"] = {"POSITION": 0}
+    primitive["extensions"]["KHR_gaussian_splatting"]["extensions"] = extension
+    table["accessors"] = [{"componentType": 5126, "count": count, "type": "VEC3"}]
+    table["bufferViews"] = [{"buffer": 0, "byteLength": len(spz)}]
+    write_glb(path, table, spz)
 
 
 def test_absurd_counts_are_refused_before_anything_is_unpacked(tmp_path):

@@ -126,6 +126,53 @@ def test_ascii_and_big_endian_scenes(tmp_path, monkeypatch, options):
     assert "text" in options or context == kept.read_bytes()
 
 
+def with_bytes(path: Path) -> None:
+    """Write labels as earlier versions did: one byte behind the other properties."""
+    header, end, body = path.read_bytes().partition(b"end_header\n")
+    vertex = plyfile.PlyData.read(str(path), mmap=False)["vertex"].data
+    rows = vertex.astype([(n, "u1" if n == "generated" else k) for n, k in vertex.dtype.descr])
+    assert b"property float generated\n" in header
+    header = header.replace(b"property float generated", b"property uchar generated")
+    path.write_bytes(header + end + rows.tobytes() + body[vertex.nbytes :])
+
+
+@pytest.mark.parametrize("kind", ["ours", "foreign", "big-endian"])
+def test_a_result_of_an_earlier_version_is_completed_again_and_comes_back(
+    tmp_path, monkeypatch, kind
+):
+    given = tmp_path / "given.ply"
+    if kind == "foreign":
+        foreign(given)
+        degree = 1
+    else:
+        degree = 0
+        save_ply(given, random_gaussians(60))
+        data = plyfile.PlyData.read(str(given), mmap=False)
+        order = "<" if kind == "ours" else ">"
+        plyfile.PlyData(list(data.elements), byte_order=order).write(str(given))
+    expected = given.read_bytes()
+    earlier, further = tmp_path / "earlier.ply", tmp_path / "further.ply"
+    save_like(earlier, load_ply(given), added(sh_degree=degree), given)
+    new = load_ply(earlier)
+    with_bytes(earlier)
+    for name in ("means", "scales", "opacities", "sh", "generated"):
+        assert torch.equal(getattr(load_ply(earlier), name), getattr(new, name)), name
+    assert stripped(monkeypatch, earlier, "earlier.ply") == expected
+
+    # Completed again, with some of its Gaussians set aside, all labels are floats.
+    scene, rows = load_ply(earlier), torch.tensor([0, 7, 59])
+    kept = torch.ones(len(scene), dtype=torch.bool)
+    kept[rows] = False
+    save_like(further, scene[kept], added(9, degree), earlier, kept)
+    vertex = plyfile.PlyData.read(str(further))["vertex"].data
+    assert vertex.dtype["generated"].newbyteorder("=") == np.float32
+    labels = torch.cat([scene.generated[kept], added(9).generated])
+    assert np.array_equal(vertex["generated"], labels.numpy())
+    assert torch.equal(load_ply(further).generated, labels)
+    save_removed(tmp_path / "removed.ply", scene[rows], rows, earlier)
+    assert stripped(monkeypatch, further, "further.ply") == expected
+
+
 @pytest.mark.parametrize("case", ["labelled", "fewer harmonics", "another scene", "spz"])
 def test_where_the_layout_cannot_be_kept_ours_is_written(tmp_path, case):
     given, context = tmp_path / "given.ply", replace(random_gaussians(30), is_antialiased=True)

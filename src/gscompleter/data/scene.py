@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,11 +13,14 @@ from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.limits import check_planes, require
 from gscompleter.data.photographs import Photographs, Resolution
-from gscompleter.data.transforms import OPENCV_FROM_OPENGL
+from gscompleter.data.transforms import OPENCV_FROM_OPENGL, parse_camera_frame
 from gscompleter.system.errors import quote_value, require_path
 from gscompleter.system.files.result_format import MARK
 from gscompleter.system.files.writing import replace_file
 from gscompleter.types import Camera, View
+
+CAMERA_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "transform_matrix")
+"""Keys by which `describe_camera` describes a camera."""
 
 
 def load_views(
@@ -80,6 +84,26 @@ def load_cameras(
     zero = np.asarray(origin, dtype=np.float64)
     cameras = Photographs(path.stem, str(path), frames, zero, near, far)
     return [cameras.camera(number, resolution) for number in range(len(cameras))]
+
+
+def parse_camera(
+    described: Mapping[str, Any],
+    title: str,
+    resolution: Resolution = None,
+    origin: Sequence[float] = (0.0, 0.0, 0.0),
+) -> Camera:
+    """Read what `describe_camera` writes, as `load_cameras` does from a file, and nothing else.
+
+    It may come from anybody: keys of a `transforms.json` that name files raise InputError. `title`,
+    such as "the camera", is for sentences.
+    """
+    for key in described:
+        require(
+            key in CAMERA_KEYS, f"The `{quote_value(key)}` of {title} is unknown; leave it out."
+        )
+    frame = parse_camera_frame(described, title)
+    zero = np.asarray(origin, dtype=np.float64)
+    return Photographs(title, title, (frame,), zero, None, None).camera(0, resolution)
 
 
 def write_cameras(

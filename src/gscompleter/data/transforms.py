@@ -137,9 +137,6 @@ def _parse_frame(
 
     # Of nerfstudio, or of NeRFCapture.
     depth = locate_file("depth_file_path") or locate_file("depth_path")
-    c2w = get_array(entry, "transform_matrix", title, (3, 4), (4, 4))
-    if len(c2w) == 3:
-        c2w = np.vstack([c2w, [0, 0, 0, 1]])
 
     # A path of another machine: its longest end that exists here is taken, and becomes the name.
     image = None
@@ -150,17 +147,25 @@ def _parse_frame(
         endings = list_endings(file_path)
         is_moved = len(endings) > 1 and os.path.exists(image) and image != path.parent / file_path
         name = image.relative_to(path.parent).as_posix() if is_moved else file_path
-    frame = Frame(
+    return replace(
+        parse_camera_frame(entry, title, content),
         name=name,
-        title=title,
-        c2w=c2w,
-        # The values of a frame take the place of those of the whole file.
-        intrinsics=_parse_intrinsics({**content, **entry}, title),
         image=image,
         written=file_path if is_moved else None,
         depth=None if depth is None else partial(read_depth, depth, depth_unit),
         mask=locate_file("mask_path"),
     )
+
+
+def parse_camera_frame(entry: Any, title: str, content: Mapping[str, Any] | None = None) -> Frame:
+    """Parse the camera of a frame, with an exactly rigid pose, and none of the files it may name.
+
+    The values of a frame take the place of those of the whole file, `content`.
+    """
+    c2w = get_array(entry, "transform_matrix", title, (3, 4), (4, 4))
+    if len(c2w) == 3:
+        c2w = np.vstack([c2w, [0, 0, 0, 1]])
+    frame = Frame(title, title, c2w, _parse_intrinsics({**(content or {}), **entry}, title), None)
     frame = frame.with_rigid_pose(" (`transform_matrix`)")
     return replace(frame, c2w=frame.c2w @ OPENCV_FROM_OPENGL)
 

@@ -25,7 +25,7 @@ from gscompleter.numerics.geometry import quats_to_rotations
 from gscompleter.splats.packing import (
     UnsupportedError,
     build_gaussians,
-    check_growth,
+    check_count,
     with_labels,
 )
 from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
@@ -64,8 +64,8 @@ POINTS = 0
 NUM_COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 MAX_FILE_BYTES = 2**32 - 1
 """Largest size that the header of a .glb can state."""
-MIN_GAUSSIAN_BYTES = 8
-"""Lower bound on the bytes of a Gaussian; with fewer, the file repeats its data."""
+MAX_PRIMITIVES = 10_000
+"""Most primitives of a scene; nodes that share meshes could name any number of them."""
 
 
 class GlbDocument(NamedTuple):
@@ -78,17 +78,17 @@ class GlbDocument(NamedTuple):
 def read_glb(path: Path) -> Gaussians:
     """Read all Gaussians of the scene in a .glb, in the axes of a .ply."""
     document = _parse_document(read_bytes(path))
-    placed = list(_find_primitives(document))
+    # Nodes and primitives may share bytes, so that a small file can claim any number.
+    placed = []
+    count = 0
+    for primitive, place in _find_primitives(document):
+        placed.append((primitive, place))
+        count += int(_get_accessor(document, primitive, "POSITION")["count"])
+        check_count(count, len(document.binary))
+        if len(placed) > MAX_PRIMITIVES:
+            raise ValueError(f"it claims to hold more than {MAX_PRIMITIVES:,} primitives")
     if not placed:
         raise UnsupportedError(_describe_other_content(document.table))
-    # Accessors may share bytes, so that a small file can claim any number.
-    counts = {True: 0, False: 0}
-    for primitive, _ in placed:
-        is_packed = _find_compression(primitive) is not None
-        counts[is_packed] += _get_accessor(document, primitive, "POSITION")["count"]
-    if counts[False] * MIN_GAUSSIAN_BYTES > len(document.binary):
-        raise ValueError("it claims more Gaussians than fit into it")
-    check_growth(counts[True] * MIN_GAUSSIAN_BYTES, len(document.binary))
     parts = [
         transform_gaussians(_decode_primitive(document, primitive), place)
         for primitive, place in placed

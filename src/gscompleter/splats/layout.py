@@ -1,7 +1,8 @@
 """Splats in the layout of their own .ply: header, foreign columns and property order.
 
-An input splat is completed in its own file: its rows stay byte for byte, `uchar generated` is
-appended to them, and new rows follow. Removing both restores the input file. Gaussians that were
+An input splat is completed in its own file: its rows stay byte for byte, `float generated` is
+appended to them, and new rows follow. A column of bytes, which earlier versions appended, becomes
+one of floats. Removing both restores the input file. Gaussians that were
 removed or recoloured are in `removed.ply` as they were, with their row numbers in the input scene:
 a 3DGS .ply with a further element `place` that has one property `uint row`.
 """
@@ -32,6 +33,7 @@ from gscompleter.splats.formats import (
 from gscompleter.splats.ply import (
     CHUNK_ROWS,
     LABEL_COLUMN,
+    LABEL_TYPES,
     MEANS,
     append_labels,
     check_finite,
@@ -43,6 +45,7 @@ from gscompleter.splats.ply import (
     make_rows,
     make_scene_header,
     read_columns,
+    read_labels,
     read_scene,
     require_finite,
     save_parts,
@@ -59,6 +62,8 @@ _LABEL_LINES = re.compile(
     rb"^property\s+\w+\s+generated\s*?\n(?:comment gscompleter-provenance/[^\n]*\n)*", re.M
 )
 """The line of the labels, with the comments of runs that follow it."""
+_LABEL_TYPE = re.compile(rb"^(property\s+)\w+(\s+generated\s*?\n)", re.M)
+"""The line of the labels, with its type in the middle."""
 _ELEMENT_LINE = re.compile(rb"^(?:element|end_header)", re.M)
 
 
@@ -81,8 +86,8 @@ def drop_generated(layout: PlyFile) -> PlyFile:
     if LABEL_COLUMN not in (layout.rows.dtype.names or ()):
         return layout
     dtype = [column for column in layout.rows.dtype.descr if column[0] != LABEL_COLUMN]
-    rows = require_fields(layout.rows[layout.rows[LABEL_COLUMN] == 0], dtype)
-    return replace(layout, header=_LABEL_LINES.sub(b"", layout.header), rows=rows)
+    rows = require_fields(layout.rows[read_labels(layout.rows) == 0], dtype)
+    return replace(layout, header=_LABEL_LINES.sub(b"", layout.header, 1), rows=rows)
 
 
 def save_like(
@@ -115,14 +120,9 @@ def save_like(
         save_parts(path, parts, provenance=True, made_by=made_by)
         return
     # The file's own columns stay as they are; only `generated` is added, or written anew.
-    header = layout.header
-    label = []
-    if LABEL_COLUMN not in (layout.rows.dtype.names or ()):
-        header = _add_label_line(header)
-        label = [(LABEL_COLUMN, "u1")]
+    header, dtype = _add_labels(layout)
     if run is not None:
         header = _add_run(header, run)
-    dtype = np.dtype([*layout.rows.dtype.descr, *label])
 
     def write_labels(values: ndarray, labels: UInt8[Tensor, "k"]) -> ndarray:
         if values.dtype.descr == dtype.descr[:-1]:
@@ -151,7 +151,7 @@ def iterate_rows(layout: PlyFile, numbers: Int[ndarray, "m"]) -> Iterator[tuple[
 def _can_hold(layout: PlyFile, added: Gaussians) -> bool:
     """Return True if rows of a file can hold `added`, and their labels."""
     names = layout.rows.dtype.names or ()
-    has_other_labels = LABEL_COLUMN in names and layout.rows.dtype[LABEL_COLUMN] != np.uint8
+    has_other_labels = LABEL_COLUMN in names and layout.rows.dtype[LABEL_COLUMN] not in LABEL_TYPES
     has_all_sh = count_rest(layout) == 3 * (added.sh.shape[1] - 1)
     return has_all_sh and not has_surfels(layout) and not has_other_labels
 
@@ -166,11 +166,22 @@ def _is_read_from(
     )
 
 
-def _add_label_line(header: bytes) -> bytes:
-    """Add a line for `generated` at the end of the first element."""
-    first, others, end = split_header(header)
+def _add_labels(layout: PlyFile) -> tuple[bytes, np.dtype]:
+    """Return header and type of rows with `float generated`, after all other columns if it is new.
+
+    Numbers of the file have one byte order.
+    """
+    kind = ">f4" if b"\nformat binary_big_endian" in layout.header else "<f4"
+    columns = [
+        (LABEL_COLUMN, kind) if column[0] == LABEL_COLUMN else column
+        for column in layout.rows.dtype.descr
+    ]
+    if LABEL_COLUMN in (layout.rows.dtype.names or ()):
+        return _LABEL_TYPE.sub(rb"\g<1>float\g<2>", layout.header, 1), np.dtype(columns)
+    first, others, end = split_header(layout.header)
     ending = b"\r\n" if end.endswith(b"\r\n") else b"\n"
-    return b"".join([first, b"property uchar generated", ending, others, end])
+    header = b"".join([first, b"property float generated", ending, others, end])
+    return header, np.dtype([*columns, (LABEL_COLUMN, kind)])
 
 
 def _add_run(header: bytes, run: RunRecord) -> bytes:
@@ -256,7 +267,7 @@ def strip_rows(path: Path, layout: PlyFile, out: Path) -> tuple[int, int] | None
         return None
 
     numbers = np.flatnonzero(labels == 0)
-    header = _LABEL_LINES.sub(b"", layout.header)
+    header = _LABEL_LINES.sub(b"", layout.header, 1)
     dtype = np.dtype([c for c in layout.rows.dtype.descr if c[0] != LABEL_COLUMN])
     originals = np.empty(0, dtype)
     taken = np.zeros(len(numbers), np.bool_)

@@ -18,10 +18,8 @@ NUM_SH_REST = (0, 3, 8, 15)
 MAX_LOG_SCALE = 20.0
 """Largest absolute log-scale that packed formats write, as in other writers."""
 ZIP_MAGIC = b"PK\x03\x04"
-MIN_ALLOWED_BYTES = 1 << 20
-"""Unpacked size in bytes that is allowed for any file, however small."""
-MAX_GROWTH = 256
-"""Largest ratio of unpacked to packed size. Real files reach 2, real images 10."""
+FREE_GAUSSIANS = 1 << 22
+"""Gaussians that any file may hold, however small: they take about a gigabyte at most."""
 
 
 class UnsupportedError(ValueError):
@@ -75,10 +73,17 @@ def drop_largest(
     return largest, np.take_along_axis(unit, places, axis=1)
 
 
-def check_growth(unpacked: int, packed: int, max_growth: int = MAX_GROWTH) -> None:
-    """Raise ValueError if data claim to unpack to over `max_growth` times their size in bytes."""
-    if unpacked > MIN_ALLOWED_BYTES + max_growth * packed:
-        raise ValueError(f"its {packed:,} bytes claim to hold {quote_value(f'{unpacked:,}')}")
+def check_count(count: int, stored: int) -> None:
+    """Raise ValueError if `stored` bytes claim more Gaussians than any file would hold in them.
+
+    What is equal for all Gaussians, such as their size, takes hardly a byte in a packed format, so
+    that no ratio of sizes tells a bomb. Only where a count would fill the memory has each further
+    Gaussian to be a byte: what tells Gaussians apart, such as their positions, takes several.
+    """
+    if count > FREE_GAUSSIANS + stored:
+        raise ValueError(
+            f"its {stored:,} bytes claim to hold {quote_value(f'{count:,}')} Gaussians"
+        )
 
 
 def build_gaussians(

@@ -1,10 +1,11 @@
 """Reader and writer of the .ply files of 3DGS.
 
 Written is the standard layout (binary little-endian float32: x y z nx ny nz f_dc_* f_rest_*
-opacity scale_* rot_*), then `uchar generated`. Read are the same properties in any order and
-type. In the file scales are logarithms, opacities are logits, and f_rest_* has all coefficients
-of red, then green, then blue. A comment marks antialiased Gaussians: Brush's is written,
-Postshot's are read too.
+opacity scale_* rot_*), then `float generated`, because many readers take every property for a
+float. Read are the same properties in any order and type; earlier versions wrote `uchar generated`.
+In the file scales are logarithms, opacities are logits, and f_rest_* has all coefficients of red,
+then green, then blue. A comment marks antialiased Gaussians: Brush's is written, Postshot's are
+read too.
 
 Two variants are read as ordinary Gaussians. A property `filter_3D` (Mip-Splatting, GOF) is fused
 into scales and opacities, as their viewers do. Surfels of 2DGS, which have two scales and the third
@@ -48,6 +49,8 @@ _SCALES = ("scale_0", "scale_1", "scale_2")
 _QUATS = ("rot_0", "rot_1", "rot_2", "rot_3")
 _NEEDED = (*MEANS, *_DC, "opacity", *_SCALES[:2], *_QUATS)
 LABEL_COLUMN = "generated"
+LABEL_TYPES = (np.dtype("<f4"), np.dtype(">f4"), np.dtype("u1"))
+"""Types of labels in files of ours; earlier ones have bytes."""
 FILTER = "filter_3D"
 """Standard deviation of the smoothing filter of Mip-Splatting and GOF, in scene units."""
 SURFEL_THICKNESS = 1e-3
@@ -151,8 +154,7 @@ def decode_gaussians(scene: PlyFile) -> Gaussians:
         places = np.arange(table.shape[1]) if columns is None else columns
         kernels.decode_rows(0, len(part), block.start, table, places, *arrays)
         if LABEL_COLUMN in names:
-            with np.errstate(invalid="ignore"):
-                generated[block] = part[LABEL_COLUMN].astype(np.uint8)
+            generated[block] = read_labels(part)
         release_pages(part)
 
     run_calls(decode_block, [(block,) for block in iterate_blocks(count)])
@@ -170,6 +172,12 @@ def decode_gaussians(scene: PlyFile) -> Gaussians:
     if FILTER not in names:
         return gaussians
     return fuse_filter(gaussians, torch.from_numpy(read_columns(rows, (FILTER,)))[:, 0])
+
+
+def read_labels(rows: ndarray) -> UInt8[ndarray, "n"]:
+    """Read the column `generated` of any type, in which labels are whole numbers from 0 to 255."""
+    with np.errstate(invalid="ignore"):
+        return rows[LABEL_COLUMN].astype(np.uint8)
 
 
 def name_columns(scene: PlyFile) -> tuple[str, ...]:
@@ -296,10 +304,9 @@ def save_ply(
     provenance: bool | None = None,
     made_by: Provenance = NOTHING_KNOWN,
 ) -> None:
-    """Write a standard 3DGS .ply, with `uchar generated` after the standard properties.
+    """Write a standard 3DGS .ply, with `float generated` after the standard properties.
 
     `provenance` decides if `generated` is written; the default is yes if anything was generated.
-    Some readers (such as gsply 0.4) misread rows that end in a byte; False writes the plain layout.
     `made_by` becomes comments.
     """
     path = require_path(path)
@@ -397,7 +404,7 @@ def make_row_type(gaussians: Gaussians, provenance: bool) -> np.dtype:
     """Make the type of a row in the standard layout, with or without `generated`."""
     rest = (f"f_rest_{i}" for i in range(3 * (gaussians.sh.shape[1] - 1)))
     names = (*MEANS, *_NORMALS, *_DC, *rest, "opacity", *_SCALES, *_QUATS)
-    labels = [(LABEL_COLUMN, "u1")] if provenance else []
+    labels = [(LABEL_COLUMN, "<f4")] if provenance else []
     return np.dtype([*((name, "<f4") for name in names), *labels])
 
 
@@ -420,11 +427,12 @@ def make_rows(gaussians: Gaussians, provenance: bool, block: slice | None = None
 
 
 def append_labels(rows: ndarray, dtype: np.dtype, labels: UInt8[ndarray, "n"]) -> ndarray:
-    """Append a byte to each row, or replace its last one: `dtype` ends in `generated`."""
+    """Append labels to rows, or replace those that they end in: `dtype` ends in `generated`."""
+    kind = dtype[LABEL_COLUMN]
     raw = np.empty((len(rows), dtype.itemsize), np.uint8)
-    width = dtype.itemsize - 1
+    width = dtype.itemsize - kind.itemsize
     raw[:, :width] = np.ascontiguousarray(rows).view(np.uint8).reshape(len(rows), -1)[:, :width]
-    raw[:, width] = labels
+    raw[:, width:] = labels.astype(kind)[:, None].view(np.uint8)
     return raw.view(dtype)[:, 0]
 
 

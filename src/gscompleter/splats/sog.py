@@ -16,6 +16,7 @@ import math
 import zipfile
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,7 @@ from gscompleter.splats.packing import (
     UnsupportedError,
     assemble_sh,
     build_gaussians,
-    check_growth,
+    check_count,
     drop_largest,
     restore_largest,
     with_labels,
@@ -40,7 +41,7 @@ from gscompleter.splats.packing import (
 from gscompleter.splats.ply import encode
 from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
 from gscompleter.system.errors import quote_value
-from gscompleter.system.files.reading import read_bytes
+from gscompleter.system.files.reading import read_bytes, read_zip_entry
 from gscompleter.system.files.writing import replace_file
 from gscompleter.types import SH_C0, Gaussians
 
@@ -49,16 +50,22 @@ LABELS = "generated"
 """Name in `meta.json` of an image of the labels, if anything was generated; ours alone."""
 PALETTE_WIDTH = 64
 """Entries of the SH palette in each row of its image."""
-MAX_ENTRY_GROWTH = 8
-"""Largest ratio of unpacked to packed size of a zip entry; images do not shrink."""
+MAX_META = 1 << 24
+"""Most bytes of `meta.json`."""
+FREE_PIXELS = 1 << 20
+"""Pixels that any image may have: a palette of 65,536 rows, the most that are numbered, fits."""
+PADDING = 4
+"""Most pixels for each Gaussian beside these: sides may be rounded up to powers of two."""
+MAX_PIXEL_BYTES = 8
+"""Most bytes that a lossless image takes for each pixel; four are in it."""
 
 ROTATION_MARK = 252
 """Fourth byte of a rotation, plus the number of the dropped component."""
 BLOCK = 4
 """Number of pixels of which the width of images is a multiple, as in other writers."""
 
-FileReader = Callable[[str], bytes]
-"""Function that reads a file of the scene by name, from a folder or a bundle."""
+FileReader = Callable[[str, int], bytes]
+"""Function that reads a file of the scene by name and most bytes, from a folder or a bundle."""
 Coded = tuple[dict[str, Any], dict[str, bytes]]
 """A property as numbers for `meta.json`, and images by file name."""
 
@@ -66,12 +73,17 @@ Coded = tuple[dict[str, Any], dict[str, bytes]]
 def read_sog(path: Path) -> Gaussians:
     """Read a bundle, a folder, or the folder of a `meta.json`."""
     if path.is_dir():
-        return _read_files(lambda name: read_bytes(path / name))
+        return _read_folder(path, META)
     data = read_bytes(path)
     if not data.startswith(ZIP_MAGIC):
-        return _read_files(lambda name: read_bytes(path.parent / name), path.name)
+        return _read_folder(path.parent, path.name)
     with zipfile.ZipFile(io.BytesIO(data)) as bundle:
-        return _read_files(lambda name: _read_entry(bundle, name))
+        return _read_files(partial(_read_entry, bundle), META, len(data))
+
+
+def _read_folder(folder: Path, meta: str) -> Gaussians:
+    stored = sum(file.stat().st_size for file in folder.iterdir() if file.is_file())
+    return _read_files(lambda name, most: read_bytes(folder / name, most), meta, stored)
 
 
 def read_sog_remarks(path: Path) -> object:
@@ -82,30 +94,31 @@ def read_sog_remarks(path: Path) -> object:
     if not data.startswith(ZIP_MAGIC):
         return json.loads(data).get(KEY)
     with zipfile.ZipFile(io.BytesIO(data)) as bundle:
-        return json.loads(_read_entry(bundle, META)).get(KEY)
+        return json.loads(_read_entry(bundle, META, MAX_META)).get(KEY)
 
 
-def _read_entry(bundle: zipfile.ZipFile, name: str) -> bytes:
-    entry = bundle.getinfo(name)
-    if entry.flag_bits & 1:
+def _read_entry(bundle: zipfile.ZipFile, name: str, most: int) -> bytes:
+    if bundle.getinfo(name).flag_bits & 1:
         raise UnsupportedError(f"is encrypted ({quote_value(name)})")
-    check_growth(entry.file_size, entry.compress_size, MAX_ENTRY_GROWTH)
-    return bundle.read(entry)
+    return read_zip_entry(bundle, name, most)
 
 
-def _read_files(read: FileReader, meta: str = META) -> Gaussians:
-    table = json.loads(read(meta))
+def _read_files(read: FileReader, meta: str, stored: int) -> Gaussians:
+    """Read a scene of `stored` bytes."""
+    table = json.loads(read(meta, MAX_META))
     if "means" not in table or table.get("version", 1) not in (1, 2):
         raise UnsupportedError(f"has a {meta} that describes no .sog of version 1 or 2")
     marked = table.get("model") == "antialiased" or table.get("antialias") is True
-    return replace(_decode_scene(read, table), is_antialiased=marked)
+    return replace(_decode_scene(read, table, stored), is_antialiased=marked)
 
 
-def _decode_scene(read: FileReader, table: dict[str, Any]) -> Gaussians:
-    """Decode the Gaussians; only version 2 has codebooks."""
+def _decode_scene(read: FileReader, table: dict[str, Any], stored: int) -> Gaussians:
+    """Decode the Gaussians of `stored` bytes; only version 2 has codebooks."""
     is_coded = table.get("version", 1) == 2
     count = int(table["count"] if is_coded else table["means"]["shape"][0])
     (quats,) = table["quats"]["files"]
+    _open_image(read, quats, count)  # with fewer pixels the count is wrong, whatever it is
+    check_count(count, stored)
     logs = _decode_values(read, table["scales"], count, 3)
     rgba = _decode_values(read, table["sh0"], count, 4)
     rest = _decode_sh_rest(read, table["shN"], count) if table.get("shN") else None
@@ -122,25 +135,35 @@ def _decode_scene(read: FileReader, table: dict[str, Any]) -> Gaussians:
     return with_labels(gaussians, _read_pixels(read, labels, count)[:, 0])
 
 
-def _read_image(read: FileReader, name: object) -> UInt8[ndarray, "h w 4"]:
-    """Read an image that lies directly beside `meta.json`."""
+def _open_image(read: FileReader, name: object, count: int) -> Image.Image:
+    """Open an image of a number of Gaussians that lies directly beside `meta.json`.
+
+    It is not decoded yet.
+    """
     if not isinstance(name, str) or not name or Path(name).name != name:
         raise ValueError(f"it names a file '{quote_value(name)}' that is not beside it")
-    data = read(name)
+    # The images of a scene have a pixel for each Gaussian, so that the count tells how large they
+    # are; of one colour they take any number of pixels in a few bytes.
+    most = FREE_PIXELS + PADDING * max(count, 0)
+    data = read(name, MAX_PIXEL_BYTES * most)
     try:
-        image = Image.open(io.BytesIO(data), formats=["WEBP"])  # does not decode it yet
+        image = Image.open(io.BytesIO(data), formats=["WEBP"])
     except UnidentifiedImageError as error:
         raise ValueError(f"its {quote_value(name)} is no WebP image") from error
-    check_growth(4 * image.width * image.height, len(data))
-    return np.array(image.convert("RGBA"))
+    if not 0 <= count <= image.width * image.height:
+        raise ValueError(f"its {quote_value(name)} has fewer pixels than there are Gaussians")
+    if image.width * image.height > most:
+        raise ValueError(
+            f"its {quote_value(name)} claims to hold {image.width:,} × {image.height:,} pixels, "
+            f"and there are {count:,} Gaussians"
+        )
+    return image
 
 
 def _read_pixels(read: FileReader, name: object, count: int) -> UInt8[ndarray, "n 4"]:
     """Read the first `count` pixels of an image."""
-    pixels = _read_image(read, name).reshape(-1, 4)
-    if not 0 <= count <= len(pixels):
-        raise ValueError(f"its {quote_value(name)} has fewer pixels than there are Gaussians")
-    return pixels[:count]
+    image = _open_image(read, name, count)
+    return np.array(image.convert("RGBA")).reshape(-1, 4)[:count]
 
 
 def _decode_means(read: FileReader, table: dict[str, Any], count: int) -> Float[ndarray, "n 3"]:
@@ -189,7 +212,8 @@ def _get_codebook(table: dict[str, Any]) -> Float[ndarray, "256"]:
 def _decode_sh_rest(read: FileReader, table: dict[str, Any], count: int) -> Float[ndarray, "n k 3"]:
     """Decode SH of degree 1 and above from the palette."""
     centroids, labels = table["files"]
-    palette = _read_image(read, centroids)[:, :, :3]
+    # Its rows are numbered by 16 bits, whatever the number of Gaussians.
+    palette = np.array(_open_image(read, centroids, 0).convert("RGBA"))[:, :, :3]
     k = palette.shape[1] // PALETTE_WIDTH
     if k not in NUM_SH_REST[1:]:
         raise ValueError("its palette has no harmonics of degree 1 to 3")

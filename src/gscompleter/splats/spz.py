@@ -27,7 +27,7 @@ from gscompleter.splats.packing import (
     UnsupportedError,
     assemble_sh,
     build_gaussians,
-    check_growth,
+    check_count,
     drop_largest,
     pack_fractions,
     restore_largest,
@@ -117,8 +117,9 @@ def _unpack_gzip(data: bytes) -> bytes:
     # The header says how long the content is; a bomb is refused before it is unpacked.
     with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
         start = file.read(HEADER.size)
-        size = sum(_parse_header(start).stream_sizes)
-        check_growth(size, len(data))
+        header = _parse_header(start)
+        check_count(header.num_gaussians, len(data))
+        size = sum(header.stream_sizes)
         body = file.read(size)
         file.read(1)  # compares the checksum
     return start + body
@@ -128,7 +129,7 @@ def _read_zstd(header: SpzHeader, data: bytes) -> list[bytes]:
     """Decompress the attributes of version 4, each from its own stream; SH may be absent."""
     import zstandard  # only version 4 needs it
 
-    check_growth(sum(header.stream_sizes), len(data))
+    check_count(header.num_gaussians, len(data))
     # After the header lies the offset of a table with the packed and unpacked size of each stream.
     (place,) = struct.unpack_from("<I", data, HEADER.size)
     table = np.frombuffer(data, "<u8", 2 * header.num_streams, place).reshape(-1, 2)

@@ -51,6 +51,10 @@ class NoCaseError(InputError):
     """No case of an evaluation was completed, so that there is no table or figure to write."""
 
 
+class WorkerError(InputError):
+    """Processes that end before they do anything, which is no fault of the input."""
+
+
 def print_error(sentence: str) -> None:
     """Print a sentence as one line of the standard error, shortened to `MAX_MESSAGE_LENGTH`."""
     print(

@@ -2,11 +2,21 @@
 
 import os
 import socket
+import struct
+import tracemalloc
+import zipfile
+from pathlib import Path
 
 import pytest
 
 from gscompleter import InputError, load_splat
-from gscompleter.system.files.reading import check_plain, read_bytes, read_head, read_lines
+from gscompleter.system.files.reading import (
+    check_plain,
+    read_bytes,
+    read_head,
+    read_lines,
+    read_zip_entry,
+)
 from splat_files import made, plausible
 
 
@@ -71,3 +81,47 @@ def test_a_folder_of_sog_opens_files_alone(tmp_path, others, part, kind):
     (folder / part).symlink_to(others[kind])
     with pytest.raises(InputError, match="no regular file|is a folder without a splat"):
         load_splat(folder)
+
+
+# ---- archives -----------------------------------------------------------------------------------
+
+
+def write_bomb(path: Path, method: int, stated: int) -> None:
+    """Write an archive whose only file has 100 MB of zeros, and states another size."""
+    with zipfile.ZipFile(path, "w", method) as archive:
+        archive.writestr("a", bytes(100_000_000))
+    content = bytearray(path.read_bytes())
+    directory = content.rindex(b"PK\x01\x02")
+    struct.pack_into("<I", content, directory + 24, stated)
+    path.write_bytes(content)
+
+
+@pytest.mark.parametrize(
+    ("method", "stated", "sentence"),
+    [
+        (zipfile.ZIP_DEFLATED, 100_000_000, "its a is too large: .* claim to hold 100,000,000"),
+        (zipfile.ZIP_DEFLATED, 100, "Bad CRC-32"),
+        (zipfile.ZIP_LZMA, 100, "another method than deflate"),
+        (zipfile.ZIP_BZIP2, 100, "another method than deflate"),
+    ],
+)
+def test_a_file_in_an_archive_is_unpacked_to_no_more_than_it_may_have(
+    tmp_path, method, stated, sentence
+):
+    write_bomb(tmp_path / "a.zip", method, stated)
+    with zipfile.ZipFile(tmp_path / "a.zip") as archive:
+        tracemalloc.start()
+        with pytest.raises((ValueError, zipfile.BadZipFile), match=sentence):
+            read_zip_entry(archive, "a", 10_000)
+        most = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+    assert most < 2**20
+
+
+def test_files_in_archives_are_read_whole(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a", b"abc" * 5000)
+        archive.writestr("none", b"")
+    with zipfile.ZipFile(tmp_path / "a.zip") as archive:
+        assert read_zip_entry(archive, "a", 15_000) == b"abc" * 5000
+        assert read_zip_entry(archive, "none", 0) == b""

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import statistics
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -17,6 +15,7 @@ import torch
 from gscompleter.evaluation.memory import Peak, measure_peak_memory
 from gscompleter.render.protocols import Renderer
 from gscompleter.state import Completion
+from gscompleter.system.children import run_python
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.writing import SUMMARY_FILE
 from gscompleter.system.progress import show_progress, track
@@ -143,9 +142,7 @@ def measure_command(words: Sequence[str], out: Path, yardstick: Yardstick) -> Sa
 def run_command(words: Sequence[str]) -> tuple[float, int | None]:
     """Return wall seconds and peak bytes of `gscompleter` in a process; raise its InputError."""
     start = time.perf_counter()
-    done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, *words], capture_output=True, text=True, check=False
-    )
+    done = run_python(PROGRAM, words)
     seconds = time.perf_counter() - start
     if done.returncode == 2:
         raise InputError(done.stderr.strip().removeprefix("gscompleter: "))

@@ -25,7 +25,7 @@ class LiveOptions(CompletingOptions):
     port: Port = 0
     """Port of the page; a free one if not given."""
     host: str = "127.0.0.1"
-    """Address of the page, such as 127.0.0.1 or ::1. Anyone who can reach it can use it."""
+    """Address of the page, such as 127.0.0.1 or ::1. Whoever has what is printed can use it."""
     no_open: bool = False
     """Print the address without opening a browser."""
 

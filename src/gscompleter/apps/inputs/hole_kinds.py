@@ -89,19 +89,23 @@ def pair_masks(masks: Sequence[Path], targets: Sequence[Camera]) -> list[tuple[P
     return list(zip(masks, targets, strict=True)) if masks else []
 
 
-def read_marks(path: Path, target: Camera) -> Bool[Tensor, "h w"]:
-    """Read the white pixels of a mask at the size of its target."""
-    white = ~read_mask(path)
+def read_marks(stored: Path | bytes, target: Camera, name: str = "") -> Bool[Tensor, "h w"]:
+    """Read the white pixels of a mask, or of its bytes, at the size of its target.
+
+    `name` is for errors of bytes.
+    """
+    white = ~read_mask(stored, name)
+    shown = name if isinstance(stored, bytes) else quote_value(stored)
     size = white.shape[1], white.shape[0]
     if not has_same_aspect(size, (target.width, target.height)):
         raise InputError(
-            f"{quote_value(path)} has {size[0]} × {size[1]} pixels, and its target has the aspect "
+            f"{shown} has {size[0]} × {size[1]} pixels, and its target has the aspect "
             f"ratio of {target.width} × {target.height}; paint it on the image of the target.",
             "mask",
         )
     if not white.any() or white.all():
         raise InputError(
-            f"{quote_value(path)} marks {'all' if white.all() else 'nothing'} of its target; paint "
+            f"{shown} marks {'all' if white.all() else 'nothing'} of its target; paint "
             "white what is wrong, and black what is right.",
             "mask",
         )

@@ -57,16 +57,21 @@ def check_selection(selection: Selection) -> None:
 
     # A rest of fewer than six numbers is no box and is refused by their count.
     lows, highs = split_boxes(selection.boxes)
-    if len(selection.boxes) % 6 or not bool((lows < highs).all()):
+    is_finite = bool(np.isfinite(selection.boxes).all())
+    if len(selection.boxes) % 6 or not is_finite or not bool((lows < highs).all()):
         raise InputError(
             "A box needs six numbers: its smallest x, y and z, then its largest; several boxes "
             "need six each.",
             "box",
         )
-    if selection.sphere and selection.sphere[3] <= 0:
-        raise InputError("A sphere needs a positive radius after its centre.", "sphere")
-    if not any(selection.box_rotation):
-        raise InputError("A rotation is a quaternion w x y z that is not zero.", "box-rotation")
+    if selection.sphere and not (np.isfinite(selection.sphere).all() and selection.sphere[3] > 0):
+        raise InputError(
+            "A sphere needs a centre of numbers and a positive radius after it.", "sphere"
+        )
+    if not (np.isfinite(selection.box_rotation).all() and any(selection.box_rotation)):
+        raise InputError(
+            "A rotation is a quaternion w x y z of numbers that are not all zero.", "box-rotation"
+        )
     if selection.masks and not os.path.isdir(selection.masks):
         raise InputError(f"There is no folder {quote_value(selection.masks)}.", "mask")
     # Read only to refuse a damaged file before the scene is opened.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import secrets
 import traceback
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -78,7 +77,6 @@ class LivePage:
         self._scene = scene
         self._find_hole = find_hole
         self._save = save
-        self._number = secrets.token_hex(8)
         self._requests: SimpleQueue[PageRequest] = SimpleQueue()
         self._busy = Lock()
         self._revision = 0
@@ -160,7 +158,6 @@ class LivePage:
         """Show a text on all pages, and where the session is; only `client` goes to `camera`."""
         self.channel.send(
             {
-                "session": self._number,
                 "text": text,
                 "busy": is_busy,
                 "revision": self._revision,
@@ -191,4 +188,7 @@ def run_request(request: Callable[[], Outcome]) -> Outcome:
     # The page stays open and the scene unchanged.
     except Exception as error:
         traceback.print_exc()
-        return Outcome(f"That failed ({type(error).__name__}: {error}); the scene is unchanged.")
+        # The words of libraries may name files.
+        return Outcome(
+            f"That failed ({type(error).__name__}, see the terminal); the scene is unchanged."
+        )

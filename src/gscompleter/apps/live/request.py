@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from base64 import b64decode
 from binascii import Error as Base64Error
 from dataclasses import dataclass, replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, Literal
 
 from gscompleter.apps.inputs.removal import Selection, check_selection
-from gscompleter.data.scene import load_cameras
+from gscompleter.data.scene import parse_camera
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.typed_json import parse_typed_json
 from gscompleter.types import Camera
@@ -24,14 +21,23 @@ class BusyError(Exception):
 
 
 @dataclass(frozen=True)
+class PageCamera:
+    """Camera of the page, as a `transforms.json` with one frame, in the frame of the result."""
+
+    frames: tuple[dict[str, Any], ...]
+    """Has what `describe_camera` writes."""
+    camera_model: Literal["PINHOLE"] = "PINHOLE"
+
+
+@dataclass(frozen=True)
 class PageRequest:
     """A button that was pressed, and what the page shows."""
 
     action: str
     client: str = ""
     """The page that asks, among all that are open."""
-    camera: dict[str, Any] | None = None
-    """Camera of the page, as a `transforms.json` with one frame, in the frame of the result."""
+    camera: PageCamera | None = None
+    """Where the page stands; None if the action needs no camera."""
     mask: str | None = None
     """PNG of the marks in base64; None without any."""
     box: tuple[float, float, float, float, float, float] | None = None
@@ -54,13 +60,9 @@ class PageRequest:
         """Read where the page stands, as a file with this camera would be read."""
         if self.camera is None:
             raise InputError(f"The request has no camera; {ADVICE}.")
-        with TemporaryDirectory() as folder:
-            path = Path(folder) / "camera.json"
-            path.write_text(json.dumps(self.camera), encoding="utf-8")
-            cameras = load_cameras(path)
-        if len(cameras) != 1:
-            raise InputError(f"The request has {len(cameras)} cameras; {ADVICE}.")
-        return replace(cameras[0], near=None, far=None)
+        if len(self.camera.frames) != 1:
+            raise InputError(f"The request has {len(self.camera.frames)} cameras; {ADVICE}.")
+        return replace(parse_camera(self.camera.frames[0], "the camera"), near=None, far=None)
 
 
 def parse_request(body: bytes, actions: tuple[str, ...]) -> PageRequest:

@@ -1,34 +1,48 @@
 """The server of the live page: the page, its messages, what changed, and requests.
 
+Whoever sends a request has to know the token in the address that the program prints: a website
+whose name leads here, others in the network, and other users of this machine do not. The page takes
+the token from its address and sends it with each request. A cookie would go to all servers of this
+machine, as browsers do not keep ports apart.
+
 | request | answer |
 |---|---|
 | `GET /` | the page of the viewer, with the scene as it was given |
+| `GET /?open=CODE` | the way to the page with its token, once (`LiveServer.opening_url`) |
 | `GET /events` | messages as server-sent events, without end |
 | `GET /difference` | what is hidden of each chunk of Gaussians now (`difference.py`) |
 | `GET /chunks/NAME` | Gaussians that a step brought, as .spz |
 | `POST /do` | 202, or 409 while another request runs, or 400 and a sentence |
+| any without the token | 403 and a sentence |
 """
 
 from __future__ import annotations
 
 import json
+import secrets
 import socket
 from socketserver import TCPServer
 from threading import Thread
+from urllib.parse import parse_qs
 
 from gscompleter.apps.live.addresses import Address, check_bindable, explain_bind_error
 from gscompleter.apps.live.channel import Channel
 from gscompleter.apps.live.page import LivePage
 from gscompleter.apps.live.request import BusyError
-from gscompleter.apps.viewer.http import HTML, PageHandler, PageServer
+from gscompleter.apps.viewer.http import HTML, TEXT, PageHandler, PageServer
 from gscompleter.system.errors import InputError
 
 JSON = "application/json"
 EVENTS = "text/event-stream"
 BYTES = "application/octet-stream"
-MAX_REQUEST = 64_000_000
-"""Most bytes of a request: a mask of the largest image fits."""
+MAX_REQUEST = 16_000_000
+"""Most bytes of a request. Its mask is a PNG of few colours: a hundredth of that is usual."""
+MAX_DIGITS = 12
+"""Most digits of a length; Python refuses to read thousands."""
 CHUNKS = "/chunks/"
+TOKEN_BYTES = 16
+"""Random bytes of a token, which nobody can guess."""
+NO_TOKEN = b"Open the whole address that the program printed: its token is missing or wrong.\n"
 
 
 class LiveServer(PageServer):
@@ -38,6 +52,8 @@ class LiveServer(PageServer):
         """Listen at an address, which `host` stands for, and begin to serve."""
         self.address = address
         self.page = page
+        self.token = secrets.token_urlsafe(TOKEN_BYTES)
+        self._code = secrets.token_urlsafe(TOKEN_BYTES)
         self.address_family = address.family
         check_bindable(address, host, port)
         try:
@@ -54,13 +70,34 @@ class LiveServer(PageServer):
 
     @property
     def url(self) -> str:
-        """Address of the page."""
-        return self.address.make_url(self.server_port)
+        """Address of the page, with its token."""
+        return f"{self.address.make_url(self.server_port)}?token={self.token}"
+
+    @property
+    def opening_url(self) -> str:
+        """Address that leads to the page once, for a command line, which all users can read."""
+        return f"{self.address.make_url(self.server_port)}?open={self._code}"
+
+    def has_token(self, query: str) -> bool:
+        """Check whether a query has the token, in a time that tells nothing about it."""
+        return secrets.compare_digest(_get_value(query, "token"), self.token.encode())
+
+    def take_code(self, query: str) -> bool:
+        """Check whether a query has the code of `opening_url`, which then opens nothing more."""
+        is_right = secrets.compare_digest(_get_value(query, "open"), self._code.encode())
+        if is_right:
+            self._code = secrets.token_urlsafe(TOKEN_BYTES)
+        return is_right
 
     def close(self) -> None:
         """End the server."""
         self.shutdown()
         self.server_close()
+
+
+def _get_value(query: str, name: str) -> bytes:
+    """Return the last value of a name in the query of an address; empty without one."""
+    return parse_qs(query).get(name, [""])[-1].encode()
 
 
 class LiveHandler(PageHandler):
@@ -71,16 +108,23 @@ class LiveHandler(PageHandler):
     def do_GET(self) -> None:
         """Answer with the page, a difference, a chunk, or messages."""
         page = self.server.page
-        if not self._is_allowed():
+        path, _, query = self.path.partition("?")
+        if not self._is_from_page():
             return
-        if self.path == "/":
+        if path == "/" and self.server.take_code(query):
+            self.send_response(303)
+            self.send_header("Location", f"/?token={self.server.token}")
+            self.end_headers()
+        elif not self.server.has_token(query):
+            self.send_content(NO_TOKEN, TEXT, 403)
+        elif path == "/":
             self.send_content(page.content, HTML)
-        elif self.path == "/difference":
+        elif path == "/difference":
             self.send_content(page.difference, JSON)
-        elif self.path == "/events":
+        elif path == "/events":
             self._send_events(page.channel)
         else:
-            name = self.path.removeprefix(CHUNKS) if self.path.startswith(CHUNKS) else ""
+            name = path.removeprefix(CHUNKS) if path.startswith(CHUNKS) else ""
             chunk = page.get_chunk(name)
             if chunk is None:
                 self.send_error(404)
@@ -89,20 +133,29 @@ class LiveHandler(PageHandler):
 
     def do_POST(self) -> None:
         """Accept a request of the page."""
-        if not self._is_allowed():
+        path, _, query = self.path.partition("?")
+        if not self._is_from_page():
             return
         length = self.headers.get("Content-Length", "")
-        if self.path != "/do":
+        # Digits of other scripts are digits for Python, too.
+        is_length = length.isascii() and length.isdecimal()
+        if not self.server.has_token(query):
+            self.send_content(NO_TOKEN, TEXT, 403)
+        elif path != "/do":
             self.send_error(404)
         # A form of another site cannot have this type.
         elif self.headers.get_content_type() != JSON:
             self.send_error(415, "A request is JSON")
-        elif not length.isdigit():
+        elif not length:
             self.send_error(411)
-        elif int(length) > MAX_REQUEST:
+        elif not is_length:
+            self.send_error(400, "The length is no number")
+        elif len(length) > MAX_DIGITS or int(length) > MAX_REQUEST:
             self.send_error(413)
         else:
-            self._submit(self.rfile.read(int(length)))
+            body = self.read_body(int(length))
+            if body is not None:
+                self._submit(body)
 
     def _submit(self, body: bytes) -> None:
         answer: dict[str, str] = {}
@@ -117,8 +170,8 @@ class LiveHandler(PageHandler):
             status = 409
         self.send_content(json.dumps(answer).encode(), JSON, status)
 
-    def _is_allowed(self) -> bool:
-        """Refuse requests of other sites."""
+    def _is_from_page(self) -> bool:
+        """Refuse requests of other sites, in whose browsers the page may be open, too."""
         address = self.server.address
         host = self.headers.get("Host", "")
         if not address.knows_host(host):
@@ -132,8 +185,6 @@ class LiveHandler(PageHandler):
     def _send_events(self, channel: Channel) -> None:
         self.send_response(200)
         self.send_header("Content-Type", EVENTS)
-        self.send_header("Cache-Control", "no-store")
-        self.send_header("Cross-Origin-Resource-Policy", "same-origin")
         self.end_headers()
         # Small messages are sent at once.
         self.connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, True)

@@ -98,7 +98,7 @@ def serve(options: LiveOptions, page: LivePage) -> None:
     else:
         print(f"{server.url} (Ctrl-C ends it)", flush=True)
     if not options.no_open:
-        webbrowser.open(server.url)
+        webbrowser.open(server.opening_url)
     with suppress(KeyboardInterrupt):
         page.handle_requests()
     server.close()

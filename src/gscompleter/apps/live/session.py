@@ -5,8 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Literal
 
 import numpy as np
@@ -21,10 +19,10 @@ from gscompleter.apps.live.steps import (
     remove_in_box,
     remove_marked,
 )
-from gscompleter.apps.viewer.exhibit import load_scene_cameras
+from gscompleter.apps.viewer.exhibit import move_scene_camera
 from gscompleter.completer import GSCompleter
 from gscompleter.data.photographs import Resolution
-from gscompleter.data.scene import write_cameras
+from gscompleter.data.scene import describe_camera, parse_camera
 from gscompleter.splats.alignment.similarity import transform_camera_exactly
 from gscompleter.state import NOTHING_ADDED, Completion, TargetResult
 from gscompleter.system.errors import InputError
@@ -105,7 +103,7 @@ def save_camera(session: Session, camera: Camera) -> Camera:
 def apply_step(session: Session, step: Step) -> tuple[Session, str]:
     """Do one step, and describe it; the same session if nothing was changed.
 
-    Camera and mask go through files first, so that the saved ones give the very same result.
+    The camera is first read as from a file, so that the saved one gives the very same result.
     """
     check_step(step)
     start = time.perf_counter()
@@ -193,11 +191,10 @@ def describe_outcome(result: TargetResult) -> str:
 
 
 def place_camera(session: Session, saved: Camera) -> Camera:
-    """Move a saved camera to the frame of the result, through a file as `--target` reads it."""
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "camera.json"
-        write_cameras(path, [saved])
-        (camera,) = load_scene_cameras(path, session.transform, session.origin, session.resolution)
+    """Move a saved camera to the frame of the result, as `--target` reads it from a file."""
+    described = describe_camera(saved)
+    read = parse_camera(described, "the camera", session.resolution, session.origin.tolist())
+    camera = move_scene_camera(read, session.transform, session.origin)
     return camera.to(session.latest.views[0].image.device)
 
 
@@ -205,10 +202,7 @@ def read_step_marks(step: Step, camera: Camera) -> Bool[Tensor, "h w"]:
     """Read the marks of a step at the size of its camera."""
     if step.mask is None:
         raise InputError(UNMARKED)
-    with TemporaryDirectory() as folder:
-        path = Path(folder) / "mask.png"
-        path.write_bytes(step.mask)
-        return read_marks(path, camera)
+    return read_marks(step.mask, camera, "The mask")
 
 
 def undo_step(session: Session) -> Session:

@@ -74,9 +74,15 @@ def load_scene_cameras(
 ) -> list[Camera]:
     """Load the cameras of a file into the frame of a scene; arguments as in `ViewerContent`."""
     cameras = load_cameras(path, resolution, origin=origin.tolist())
-    # Read with an origin, which is taken off in float64, and moved back by the transform.
-    relative = transform @ compute_frame_from_photographs(-origin)
-    return [transform_camera(camera, relative) for camera in cameras]
+    return [move_scene_camera(camera, transform, origin) for camera in cameras]
+
+
+def move_scene_camera(
+    camera: Camera, transform: Float[np.ndarray, "4 4"], origin: Float[np.ndarray, "3"]
+) -> Camera:
+    """Move a camera that was read relative to `origin` into the frame of a scene."""
+    # The origin was taken off in float64, and is moved back by the transform.
+    return transform_camera(camera, transform @ compute_frame_from_photographs(-origin))
 
 
 def load_viewer_files(after: Path, before: Path | None, drop_nonfinite: bool) -> ViewerContent:

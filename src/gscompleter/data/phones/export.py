@@ -24,7 +24,7 @@ from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import open_image
-from gscompleter.system.files.reading import check_file, read_bytes
+from gscompleter.system.files.reading import check_file, read_bytes, read_zip_entry
 
 ADVICE = "export the recording again"
 MAX_ENTRY = 1 << 28
@@ -63,10 +63,7 @@ def find_files(export: Path, pattern: str) -> Files:
 
 def _read_entry(export: Path, path: PurePosixPath) -> bytes:
     with _open_archive(export) as archive:
-        # A zip archive of a few bytes may claim any size.
-        if archive.getinfo(str(path)).file_size > MAX_ENTRY:
-            raise ValueError(f"its {path} is too large")
-        return archive.read(str(path))
+        return read_zip_entry(archive, str(path), MAX_ENTRY)
 
 
 @contextmanager

@@ -14,8 +14,6 @@ import math
 import os
 import re
 import shutil
-import subprocess
-import sys
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -35,6 +33,7 @@ from gscompleter.data.limits import require
 from gscompleter.data.masks import MASK_FOLDERS, find_mask, leave_out_masks, load_mask
 from gscompleter.data.panorama import has_panoramas, split_panorama
 from gscompleter.data.video import NUM_FRAMES, extract_frames, is_video
+from gscompleter.system.children import run_module
 from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.image import (
     HALF_OPAQUE,
@@ -479,14 +478,7 @@ def run_colmap(process: str, job: Mapping[str, Any], folder: Path, title: str) -
         whole = {**job, "work": work, "threads": min(MAX_THREADS, get_thread_count())}
 
         # COLMAP aborts its process on some errors (decision 027), so it has one of its own.
-        done = subprocess.run(
-            [sys.executable, "-m", process],
-            input=json.dumps(whole),
-            capture_output=True,
-            encoding="utf-8",
-            errors="replace",
-            check=False,
-        )
+        done = run_module(process, json.dumps(whole))
 
     if done.returncode != 0:
         complaint = quote_value(done.stderr.strip().rpartition("\n")[2], 200)

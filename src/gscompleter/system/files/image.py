@@ -140,13 +140,13 @@ def read_colors_and_alpha(
     return np.ascontiguousarray(rgba[..., :3]), rgba[..., 3]
 
 
-def read_mask(path: Path) -> Bool[np.ndarray, "h w"]:
+def read_mask(stored: Path | bytes, name: str = "") -> Bool[np.ndarray, "h w"]:
     """Read the black or transparent pixels of a mask: those below half of its largest value.
 
     So a mask of 0 and 1 means the same as one of 0 and 255, and soft or JPEG edges end halfway. A
-    mask without any white is black everywhere.
+    mask without any white is black everywhere. `name` is for errors of bytes.
     """
-    with open_image(path) as image:
+    with open_image(stored, name) as image:
         # 16 bits are not reduced to 8, where 1 would become 0.
         if image.mode == "F" or image.mode == "I" or image.mode.startswith("I;16"):
             values = np.array(image).astype(np.float64)

@@ -6,6 +6,7 @@ import hashlib
 import json
 import os
 import stat
+import zipfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import TextIOWrapper
@@ -72,6 +73,22 @@ def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
     with open_file(path) as file:
         _check_size(path, file, max_bytes)
         return file.read()
+
+
+def read_zip_entry(archive: zipfile.ZipFile, name: str, max_bytes: int) -> bytes:
+    """Read a file in an archive; raise ValueError if it has more than `max_bytes` bytes.
+
+    However little an archive takes, it may hold any number of bytes, and state any other.
+    """
+    entry = archive.getinfo(name)
+    if entry.file_size > max_bytes:
+        claim = f"{entry.compress_size:,} bytes claim to hold {entry.file_size:,}"
+        raise ValueError(f"its {quote_value(name)} is too large: {claim}")
+    # Python unpacks other methods at once, whatever the size that is stated.
+    if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+        raise ValueError(f"its {quote_value(name)} is packed by another method than deflate")
+    with archive.open(entry) as file:
+        return file.read(entry.file_size)
 
 
 def read_lines(

@@ -19,6 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from gscompleter.system.children import hide_working_folder
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import handle_stop_signals
 from gscompleter.system.jobs.jobs import Pool, Share
@@ -53,7 +54,9 @@ def choose_num_workers() -> int:
 def check_processes() -> None:
     """Refuse to start processes on a machine without shared memory, which their queues need."""
     try:
-        multiprocessing.get_context("spawn").Lock()
+        # The first lock starts a process that watches over all of them.
+        with hide_working_folder():
+            multiprocessing.get_context("spawn").Lock()
     except (OSError, ImportError) as error:
         raise InputError(
             f"Processes of this machine need shared memory in /dev/shm, which is missing or cannot "
@@ -77,8 +80,13 @@ def open_local(workers: int) -> Iterator[Pool]:
             for executor, future in futures.items()
             if future.done() and future.exception() is None
         ]
-        executor = idle[0] if idle else ProcessPoolExecutor(1, spawn, follow_parent)
-        futures[executor] = executor.submit(share)
+        if idle:
+            futures[idle[0]] = idle[0].submit(share)
+            return futures[idle[0]]
+        begin = partial(begin_worker, os.getcwd())
+        with hide_working_folder():
+            executor = ProcessPoolExecutor(1, spawn, begin)
+            futures[executor] = executor.submit(share)
         return futures[executor]
 
     try:
@@ -93,8 +101,9 @@ def open_local(workers: int) -> Iterator[Pool]:
             executor.shutdown()
 
 
-def follow_parent() -> None:
-    """Let this process end with its parent, which alone reacts to Ctrl-C."""
+def begin_worker(folder: str) -> None:
+    """Work in a folder, and end with the parent, which alone reacts to Ctrl-C."""
+    os.chdir(folder)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     handle_stop_signals()
     threading.Thread(target=end_with_parent, daemon=True).start()
@@ -143,7 +152,7 @@ def open_ray(
         # References keep what they refer to: of a million tasks only the running ones are kept.
         if len(started) > MAX_REFERENCES:
             started[:] = ray.wait(started, num_returns=len(started), timeout=0)[1]
-        started.append(task.remote(share, threads))
+        started.append(task.remote(share, threads, os.getcwd()))
         return started[-1].future()
 
     try:
@@ -168,8 +177,10 @@ def connect_to_ray(ray: Any, address: str | None, cores: int | None) -> None:
     options = {"address": address} if address else {"address": "local", **here}
     handlers = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
     try:
-        ray.init(log_to_driver=False, logging_level="ERROR", **options)
-    except (ConnectionError, ValueError, RuntimeError) as error:
+        with hide_working_folder():
+            ray.init(log_to_driver=False, logging_level="ERROR", **options)
+    # A machine that is too busy to start Ray in time makes it raise a plain Exception.
+    except Exception as error:
         if address is None:
             reason = f"Ray cannot start on this machine: {quote_value(str(error))}."
         else:
@@ -181,8 +192,10 @@ def connect_to_ray(ray: Any, address: str | None, cores: int | None) -> None:
         signal.signal(number, handler)
 
 
-def run_task(share: Share, threads: int) -> Exception | None:
-    """Run a share in a Ray task or a SLURM job, on `threads` threads."""
+def run_task(share: Share, threads: int, folder: str) -> Exception | None:
+    """Run a share in a Ray task or a SLURM job, on `threads` threads, in a working folder."""
+    with contextlib.suppress(OSError):  # a machine elsewhere may not have it
+        os.chdir(folder)
     limit_threads(threads)  # before the first job imports libraries that read it
     return share()
 
@@ -218,7 +231,9 @@ def open_submitit(
     started: list[Any] = []
 
     def start(share: Share) -> Any:
-        started.append(executor.submit(partial(run_task, share, threads)))
+        task = partial(run_task, share, threads, os.getcwd())
+        with hide_working_folder():
+            started.append(executor.submit(task))
         return started[-1]
 
     try:

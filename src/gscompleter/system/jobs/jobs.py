@@ -22,7 +22,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gscompleter.system.errors import FullDiskError, InputError, OutputError, quote_value
+from gscompleter.system.errors import (
+    FullDiskError,
+    InputError,
+    OutputError,
+    WorkerError,
+    quote_value,
+)
 from gscompleter.system.files.reading import read_json
 from gscompleter.system.files.unfinished import UNFINISHED_PREFIX, remove_left_behind_below
 from gscompleter.system.files.writing import convert_write_errors, replace_file
@@ -271,8 +277,8 @@ def run_jobs(
 def collect_rest(future: Any, share: list[Job], retries: int) -> list[Job]:
     """Return what a killed worker left of its share, with the loss of the first job counted.
 
-    It raises the error of a worker, which ends the run, and the loss of one that only had to list
-    a job as failed.
+    It raises the error of a worker, which ends the run, and WorkerError where one was lost that
+    only had to list a job as failed: then no worker can start.
     """
     killed = future.exception()
     if killed is None:
@@ -284,7 +290,10 @@ def collect_rest(future: Any, share: list[Job], retries: int) -> list[Job]:
         return []
     first = replace(share[0], lost=share[0].lost + 1)
     if first.lost > retries + 1:
-        raise killed
+        raise WorkerError(
+            f"Processes of the engine cannot start, or end at once ({type(killed).__name__}: "
+            f"{quote_value(str(killed))}); mend what they print above."
+        ) from killed
     return [first, *share[1:]]
 
 

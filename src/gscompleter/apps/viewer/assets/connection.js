@@ -4,15 +4,19 @@
 const MARKING = ["repair", "remove", "fill"];
 /* Actions that leave nothing of what is marked to be done. */
 const FILLING = ["repair", "fill"];
+const SILENT = "The program does not answer: it was ended, its machine sleeps, or it was started again and printed another address.";
 /* This page among all that the program serves. */
 const client = Math.random().toString(36).slice(2);
-/* The latest message of the program: session, text, busy, revision, steps, undone, camera, client. */
+/* The latest message of the program: text, busy, revision, steps, undone, camera, client. */
 let latest = null;
 /* The revision of the scene that is shown, and what this page asked for last. */
 let shownRevision = 0;
 let asked = "";
 let answered = () => {};
 let isUpdating = false;
+
+/* The address of a request, with the token that the program printed in that of the page. */
+const addressOf = (path) => `${path}${location.search}`;
 
 /* Begins to listen to the program. Resolves once its first message is shown. */
 async function connect() {
@@ -21,18 +25,16 @@ async function connect() {
   for (const button of document.querySelectorAll("button[data-ask]")) {
     button.addEventListener("click", () => ask(button.dataset.ask));
   }
-  const events = new EventSource("/events");
+  const events = new EventSource(addressOf("/events"));
   const isHeard = new Promise((resolve) => {
     events.addEventListener("message", (event) => hear(JSON.parse(event.data)).then(resolve));
   });
-  events.addEventListener("error", () => say("The program does not answer; it was ended, or its machine sleeps."));
+  events.addEventListener("error", () => say(SILENT));
   await isHeard;
 }
 
 /* Shows what a message says. */
 async function hear(message) {
-  // Another program at the same address has another scene.
-  if (latest && latest.session !== message.session) location.reload();
   latest = message;
   showButtons(message);
   say(message.text);
@@ -67,11 +69,11 @@ async function bringUpToDate() {
 
 /* Fetches what differs from the scene as it was given, and shows it. Returns its revision. */
 async function showDifference() {
-  const difference = await (await fetch("/difference")).json();
+  const difference = await (await fetch(addressOf("/difference"))).json();
   const picture = pictures.at(-1);
   for (const { name, hidden } of difference.chunks) {
     if (picture.meshes[name] || hidden === null) continue;
-    const answer = await fetch(`/chunks/${name}`);
+    const answer = await fetch(addressOf(`/chunks/${name}`));
     await picture.add(name, new Uint8Array(await answer.arrayBuffer()));
   }
   // All at once: nothing is seen of a scene that is half changed.
@@ -101,11 +103,11 @@ async function ask(action) {
   const isDone = new Promise((resolve) => { answered = resolve; });
   try {
     const headers = { "Content-Type": "application/json" };
-    const answer = await fetch("/do", { method: "POST", headers, body: JSON.stringify(request) });
+    const answer = await fetch(addressOf("/do"), { method: "POST", headers, body: JSON.stringify(request) });
     if (answer.ok) return await isDone;
     say((await answer.json()).text);
   } catch {
-    say("The program does not answer; it was ended, or its machine sleeps.");
+    say(SILENT);
   }
   return null;
 }

@@ -1,0 +1,78 @@
+"""Start processes of Python that import nothing from the working folder.
+
+The working folder may hold what strangers made, such as photographs with a `numpy.py` beside them.
+The command itself does not import from there, but Python puts that folder first on the path of
+processes that it starts with `-c` or `-m`, and of multiprocessing.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+SAFE_PATH = {"PYTHONSAFEPATH": "1"}
+"""Environment in which Python 3.11 and later keep the working folder off the path."""
+BEGINNING = """\
+import sys
+# Python 3.10 does not know PYTHONSAFEPATH; `sys` is built in, so nothing was imported before.
+if not getattr(sys.flags, "safe_path", False):
+    del sys.path[0]
+sys.path += [folder for folder in {folders!r} if folder not in sys.path]
+"""
+"""First lines of every program of `run_python`."""
+
+
+def run_python(
+    program: str, words: Sequence[str] = (), text: str | None = None
+) -> subprocess.CompletedProcess[str]:
+    """Run a program in a process of its own, and return its code, output and errors.
+
+    It can import what this process can. Its arguments are `words`, and `text` is its standard
+    input; without one it has that of this process.
+    """
+    package_root = str(Path(__file__).parents[2])
+    # A script's own folder is on the path of this process only. Relative entries, among them that
+    # of an interactive Python, stand for the working folder.
+    folders = [folder for folder in (*sys.path, package_root) if os.path.isabs(folder)]
+    return subprocess.run(
+        [sys.executable, "-c", BEGINNING.format(folders=folders) + program, *words],
+        input=text,
+        capture_output=True,
+        encoding="utf-8",
+        errors="replace",
+        env={**os.environ, **SAFE_PATH},
+        check=False,
+    )
+
+
+def run_module(module: str, text: str) -> subprocess.CompletedProcess[str]:
+    """Run a module as `python -m` does, in a process of its own; `text` is its standard input."""
+    program = f"from runpy import run_module\nrun_module({module!r}, run_name='__main__')"
+    return run_python(program, text=text)
+
+
+@contextmanager
+def hide_working_folder() -> Iterator[None]:
+    """Keep the working folder off the path of processes that libraries start in the block.
+
+    They begin in the folder of Python's own modules, so each has to change to its folder itself.
+    No other thread may rely on the working folder meanwhile.
+    """
+    before = {name: os.environ.get(name) for name in SAFE_PATH}
+    here = os.getcwd()
+    os.environ.update(SAFE_PATH)
+    # Python 3.10 does not know the variable, and Ray names the working folder to its workers.
+    os.chdir(Path(os.__file__).parent)
+    try:
+        yield
+    finally:
+        os.chdir(here)
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
