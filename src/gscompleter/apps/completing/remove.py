@@ -43,12 +43,14 @@ class PreparedRemoval(Prepared):
 
     def begin(self) -> Completion:
         """Initialize the context, and remove the selected Gaussians from it."""
-        begun = super().begin()
         completer = self.completer
+        # Before the context, so that a wrong selection is refused without waiting for it.
         with stage("removing"):
             chosen = choose_gaussians(
                 self.selection, self.task, self.opened, self.cameras, completer.renderer
             )
+        begun = super().begin()
+        with stage("removing"):
             # Gaussians that reach out of a box or the sphere are cut at its border. Those that a
             # mask or a file selects go as a whole.
             return remove_gaussians(begun, chosen, self.contains, completer.scenes)
@@ -88,4 +90,5 @@ def make_selection(options: RemoveOptions) -> Selection:
         options.mask,
         options.select,
         options.drop_nonfinite,
+        mask_reading=options.mark_reading,
     )

@@ -94,7 +94,11 @@ def add_new_photographs(update: UpdateOptions, opened: Opened, console: Console)
     """Place new photographs among those of the scene, and add them."""
     assert update.photos is not None
     photographs, placed = place_photographs(
-        update.photos, opened.photographs, update.out / POSES, update.overwrite
+        update.photos,
+        opened.photographs,
+        update.out / POSES,
+        update.overwrite,
+        opened.request.masks,
     )
     print_lines(console, *placed.notes)
     photographs = replace(photographs, notes=(*photographs.notes, *placed.notes))
@@ -180,7 +184,8 @@ def measure_lacks(ready: Prepared) -> dict[int, float]:
             view = checks[frame]
         else:
             (view,) = opened.photographs.views([frame], CHECK_VIEW_SIZE)
-        view = replace(view, camera=cameras[frame]).to(task.device)
+        # A view refuses an image and a camera on two devices, and cameras are on that of the task.
+        view = replace(view.to(task.device), camera=cameras[frame])
         frames.append(frame)
         views.append(view)
         renders.append(ready.completer.renderer.render(scene, view.camera))
