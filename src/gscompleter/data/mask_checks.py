@@ -133,7 +133,7 @@ def read_selected(path: Path, reading: MaskReading) -> Bool[np.ndarray, "h w"]:
 
 
 def name_ways_out(reading: MaskReading, hides: bool = False) -> str:
-    """Name the options that turn masks or take them as they are; `hides` if photographs have them."""
+    """Name the options that turn masks, or take them as they are; `hides` for those of SCENE."""
     turn = "leave --invert-masks out" if reading.is_inverted else "add --invert-masks"
     if not reading.is_turned_by_option:
         turn = "save them in the other colours"

@@ -42,14 +42,14 @@ class Selection:
     """Centre and radius."""
     masks: Path | None = None
     """Folder of images that are named as photographs, white where something goes."""
-    mask_reading: MaskReading = MaskReading()
-    """How these are read."""
     file: Path | None = None
     """File of selected Gaussians."""
     drop_nonfinite: bool = False
     """True to drop Gaussians of that file that contain NaN or infinity."""
     margin: float = 0.0
     """Distance by which boxes and the sphere reach farther than given, on every side."""
+    mask_reading: MaskReading = MaskReading()
+    """How masks are read."""
 
 
 def check_selection(selection: Selection) -> None:

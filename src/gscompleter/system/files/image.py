@@ -198,8 +198,9 @@ def find_levels_between(values: Shaped[np.ndarray, "h w c"]) -> list[object]:
     Soft edges, and those of a JPEG, are no flat regions; a mask with more than `MAX_LABELS` of them
     is a gradient.
     """
-    # Differences of 8 bits need a sign, and large masks have no more bits than they need.
-    exact = values.astype(np.int16 if values.dtype == np.uint8 else np.float64)
+    # Differences need a sign; large masks of 8 bits get no more than they need.
+    wider = {"u": np.int64, "i": np.int64, "f": np.float64}[values.dtype.kind]
+    exact = values.astype(np.int16 if values.dtype == np.uint8 else wider)
     brightness = exact.max(axis=-1)
     places = np.unravel_index([brightness.argmin(), brightness.argmax()], brightness.shape)
     darkest, brightest = exact[places]
