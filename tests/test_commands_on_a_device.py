@@ -19,10 +19,12 @@ import torch
 from PIL import Image
 from rich.console import Console
 
+from batch_jobs import open_here
 from command import run
 from fake_cuda import Counts, FakeCudaTensor
 from fake_gsplat import WHEEL, fake_gsplat, find_gsplat
 from gscompleter import load_renderer
+from gscompleter.apps.batch import engine
 from gscompleter.apps.commands.live import LiveOptions
 from gscompleter.apps.live import serving
 from gscompleter.apps.live.session import Step, apply_step, save_camera
@@ -228,6 +230,19 @@ def test_a_session_in_the_browser_is_saved(room, tmp_path):
     assert len(session.steps) > 2
     serving.save_session(ready, session)
     check_result(tmp_path / "out", 10)
+
+
+def test_a_batch_completes_its_rows(room, tmp_path, monkeypatch):
+    row = {"folder": str(room), "context": [0, 1], "target": [3], "near": 0.5, "far": 20}
+    manifest = tmp_path / "manifest.jsonl"
+    manifest.write_text(json.dumps(row | {"resolution": SIZE, "device": "cuda"}) + "\n")
+    # This process alone has the device.
+    monkeypatch.setattr(engine, "open_local", open_here)
+    out = tmp_path / "out"
+    words = ("batch", manifest, "--out", out, "--workers", 1, "--quiet")
+    assert run(monkeypatch, *words) == 0
+    (summary,) = out.rglob("summary.json")
+    check_result(summary.parent, 10)
 
 
 def test_methods_are_evaluated(room, tmp_path, monkeypatch):

@@ -16,6 +16,7 @@ from gscompleter.apps.completing.marking import refuse_completed
 from gscompleter.apps.completing.preparation import Prepared, prepare_completion
 from gscompleter.apps.inputs.removal import (
     Selection,
+    check_removal_masks,
     check_selection,
     choose_gaussians,
     find_in_region,
@@ -75,6 +76,10 @@ def prepare_removal(options: RemoveOptions, console: Console) -> PreparedRemoval
     selection = make_selection(options)
     check_selection(selection)
     ready = prepare_completion(options, console, selection)
+    # Of photographs they were checked as soon as these were opened.
+    if options.mask is not None and options.lacks_photographs:
+        names = [frame.name for frame in ready.opened.photographs.frames]
+        check_removal_masks(options.mask, names, options.mark_reading)
 
     refuse_completed(ready, options.scene)
     explorer = PhotographPlanner(ready.completer)
