@@ -11,6 +11,7 @@ import json
 import shutil
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,9 +27,11 @@ from fake_gsplat import WHEEL, fake_gsplat, find_gsplat
 from gscompleter import load_renderer
 from gscompleter.apps.batch import engine
 from gscompleter.apps.commands.live import LiveOptions
+from gscompleter.apps.completing import complete
 from gscompleter.apps.live import serving
 from gscompleter.apps.live.session import Step, apply_step, save_camera
 from gscompleter.data.scene import write_cameras
+from gscompleter.evaluation.metrics.coverage import sample_held_out_cameras
 from gscompleter.evaluation.store import list_row_paths
 from gscompleter.splats.formats import load_splat
 from gscompleter.splats.ply import load_ply, save_ply
@@ -41,13 +44,15 @@ pytestmark = [
     pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU"),
 ]
 
-SIZE = 32
+SIZE = 24
 CAMERAS = [camera_at(0.3 * i - 0.6, y=0.1 * (i % 2), yaw=4 - 2 * i, size=SIZE) for i in range(5)]
-FINE = [camera_at(0.3 * i - 0.6, yaw=4 - 2 * i, size=48) for i in (0, 2, 4)]
+FINE = [camera_at(0.3 * i - 0.6, yaw=4 - 2 * i, size=SIZE) for i in (0, 4)]
 """Cameras of the pixels that the splats are made of."""
 ASIDE = replace(camera_at(0.02, size=SIZE), near=None, far=None)
 """A camera that no photograph has."""
-SPOT = (slice(12, 20), slice(13, 22))
+BESIDE = camera_at(0.8, yaw=16, size=SIZE)
+"""A camera at a hole of the splat."""
+SPOT = (slice(9, 15), slice(10, 17))
 """Rows and columns of the image at that camera which the mask marks."""
 COMMON = ("--device", "cuda", "--resolution", SIZE, SIZE, "--quiet")
 RANGE = ("--near", 0.5, "--far", 20)
@@ -59,8 +64,15 @@ FEW = [
 """Few steps of the stages: an operation on the wrong device fails in the first one."""
 
 
+NUM_ASIDE = 2
+"""Cameras beside the photographs at which the coverage is measured."""
+
+
 @pytest.fixture(autouse=True)
-def device() -> Iterator[Counts]:
+def device(monkeypatch) -> Iterator[Counts]:
+    # All 32 cameras take as long as the rest of a command.
+    few = partial(sample_held_out_cameras, count=NUM_ASIDE)
+    monkeypatch.setattr(complete, "sample_held_out_cameras", few)
     with fake_gsplat() as counts:
         yield counts
 
@@ -81,6 +93,7 @@ def room(tmp_path_factory) -> Path:
         write_image(folder / name, load_renderer("cpu").render(whole, camera).image)
     write_cameras(folder / "transforms.json", CAMERAS, names)
     write_cameras(folder / "aside.json", [ASIDE])
+    write_cameras(folder / "beside.json", [replace(BESIDE, near=None, far=None)])
     mask = torch.zeros(SIZE, SIZE)
     mask[SPOT] = 1.0
     write_image(folder / "mask.png", mask)
@@ -110,6 +123,7 @@ def test_photographs_are_completed_and_unused_ones_score_it(room, tmp_path, monk
     assert all(row["psnr_after"] > 10 for row in summary["held_out"])
 
 
+@pytest.mark.slow
 def test_a_splat_is_completed_where_photographs_and_a_search_find_holes(
     room, tmp_path, monkeypatch
 ):
@@ -120,6 +134,13 @@ def test_a_splat_is_completed_where_photographs_and_a_search_find_holes(
     assert [row["frame"] for row in summary["held_out"]] == [1, 2, 3]
 
 
+@pytest.mark.slow
+def test_holes_of_a_splat_alone_are_completed(room, tmp_path, monkeypatch):
+    words = ("complete", room / "splat.ply", "--target", room / "beside.json", *FEW, *COMMON)
+    assert run(monkeypatch, *words, "--out", tmp_path / "out") == 0
+    check_result(tmp_path / "out", 10)
+
+
 def test_what_a_mask_marks_in_a_splat_alone_is_completed(room, tmp_path, monkeypatch):
     words = ("complete", room / "splat.ply", "--target", room / "aside.json")
     mask = ("--mask", room / "mask.png")
@@ -127,6 +148,7 @@ def test_what_a_mask_marks_in_a_splat_alone_is_completed(room, tmp_path, monkeyp
     assert check_result(tmp_path / "out", 10)["gaussians"]["removed"] > 10
 
 
+@pytest.mark.slow
 def test_holes_are_exported_and_painted_images_come_back(room, tmp_path, monkeypatch):
     words = ("complete", room, "--context", 0, 1, "--target", 3, *RANGE, *FEW, *COMMON)
     out, holes = tmp_path / "out", tmp_path / "holes"
@@ -162,20 +184,14 @@ def test_new_photographs_are_placed_and_update_a_splat(tmp_path, monkeypatch):
     assert len(summary["held_out"]) == 1
 
 
-@pytest.mark.parametrize("with_photographs", [True, pytest.param(False, marks=pytest.mark.slow)])
-def test_what_a_mask_marks_is_repaired(room, tmp_path, monkeypatch, with_photographs):
+def test_what_a_mask_marks_is_repaired_with_photographs(room, tmp_path, monkeypatch):
     marked = ("--camera", room / "aside.json", "--mask", room / "mask.png")
-    places = (room, "--scene", room / "splat.ply") if with_photographs else (room / "splat.ply",)
-    words = ("repair", *places, *marked, *FEW, *COMMON)
-    assert run(monkeypatch, *words, "--out", tmp_path / "out") == 0
+    words = ("repair", room, "--scene", room / "splat.ply", *marked, "--context", 0, 2, 4)
+    assert run(monkeypatch, *words, *FEW, *COMMON, "--out", tmp_path / "out") == 0
     summary = check_result(tmp_path / "out", 10)
     assert summary["gaussians"]["removed"] > 10
-    if not with_photographs:
-        return
-    # A photograph that is not needed tests it.
-    words = (*words, "--context", 0, 2, 4, "--out", tmp_path / "some")
-    assert run(monkeypatch, *words) == 0
-    assert [row["frame"] for row in read_summary(tmp_path / "some")["held_out"]] == [1, 3]
+    # Photographs that were not needed test it.
+    assert [row["frame"] for row in summary["held_out"]] == [1, 3]
 
 
 @pytest.mark.parametrize("by", ["mask", pytest.param("box", marks=pytest.mark.slow)])
@@ -218,7 +234,7 @@ def test_a_session_in_the_browser_is_saved(room, tmp_path):
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, format="PNG")
     camera = save_camera(session, ASIDE.to("cuda"))
-    aside = save_camera(session, camera_at(0.8, yaw=16, size=SIZE).to("cuda"))
+    aside = save_camera(session, BESIDE.to("cuda"))
     for step in (
         Step("repair", camera, file.getvalue()),
         Step("remove", camera, box=(-0.6, 0.2, 2.1, 0.4, 1.47, 3.1)),
