@@ -115,14 +115,6 @@ def check_result(out: Path, num_added: int) -> dict:
     return summary
 
 
-def test_photographs_are_completed_and_unused_ones_score_it(room, tmp_path, monkeypatch):
-    words = ("complete", room, "--context", 0, 1, "--target", 3, *RANGE, *FEW, *COMMON)
-    assert run(monkeypatch, *words, "--out", tmp_path / "out") == 0
-    summary = check_result(tmp_path / "out", 10)
-    assert [row["frame"] for row in summary["held_out"]] == [2, 4]
-    assert all(row["psnr_after"] > 10 for row in summary["held_out"])
-
-
 @pytest.mark.slow
 def test_a_splat_is_completed_where_photographs_and_a_search_find_holes(
     room, tmp_path, monkeypatch
@@ -238,17 +230,16 @@ def test_a_session_in_the_browser_is_saved(room, tmp_path):
     for step in (
         Step("repair", camera, file.getvalue()),
         Step("remove", camera, box=(-0.6, 0.2, 2.1, 0.4, 1.47, 3.1)),
-        Step("fill", camera, file.getvalue()),
         Step("complete", aside),
     ):
         session, _ = apply_step(session, step)
         assert isinstance(session.latest.scene.means, FakeCudaTensor)
-    assert len(session.steps) > 2
+    assert len(session.steps) >= 2
     serving.save_session(ready, session)
     check_result(tmp_path / "out", 10)
 
 
-def test_a_batch_completes_its_rows(room, tmp_path, monkeypatch):
+def test_photographs_are_completed_in_a_batch_and_unused_ones_score_it(room, tmp_path, monkeypatch):
     row = {"folder": str(room), "context": [0, 1], "target": [3], "near": 0.5, "far": 20}
     manifest = tmp_path / "manifest.jsonl"
     manifest.write_text(json.dumps(row | {"resolution": SIZE, "device": "cuda"}) + "\n")
@@ -257,8 +248,10 @@ def test_a_batch_completes_its_rows(room, tmp_path, monkeypatch):
     out = tmp_path / "out"
     words = ("batch", manifest, "--out", out, "--workers", 1, "--quiet")
     assert run(monkeypatch, *words) == 0
-    (summary,) = out.rglob("summary.json")
-    check_result(summary.parent, 10)
+    (path,) = out.rglob("summary.json")
+    held_out = check_result(path.parent, 10)["held_out"]
+    assert [row["frame"] for row in held_out] == [2, 4]
+    assert all(row["psnr_after"] > 10 for row in held_out)
 
 
 def test_methods_are_evaluated(room, tmp_path, monkeypatch):
@@ -267,7 +260,7 @@ def test_methods_are_evaluated(room, tmp_path, monkeypatch):
     content = {"resolution": [SIZE, SIZE], "cases": [case]}
     cases = room.parent / "cases.json"
     cases.write_text(json.dumps(content))
-    words = ("evaluate", cases, "--methods", "context", "full", "--device", "cuda", "--quiet")
+    words = ("evaluate", cases, "--methods", "full", "--device", "cuda", "--quiet")
     assert run(monkeypatch, *words, "--out", tmp_path / "out") == 0
     for path in list_row_paths(tmp_path / "out"):
         (step,) = json.loads(path.read_text())["steps"]
