@@ -139,7 +139,10 @@ def test_cameras_alone_let_targets_be_found(folder, tmp_path, monkeypatch):
             "There are 2 masks and 1 target cameras",
         ),
         (("splat.ply", "--target", "target.json", "--mask", "wide.png"), "aspect ratio of 64 × 64"),
-        (("splat.ply", "--target", "target.json", "--mask", "black.png"), "marks nothing"),
+        (
+            ("splat.ply", "--target", "target.json", "--mask", "black.png"),
+            "black.png is black everywhere",
+        ),
         (("photographs", "--target", "target.json", "--mask", "mask.png"), "Without a splat"),
         (("splat.ply", "--scene", "splat.ply"), "Two splats are named"),
         (("splat.ply", "--target", "3"), "'3' is no target: there are no photographs to name"),
