@@ -179,8 +179,8 @@ def write_refused(folder: Path) -> None:
     write_cameras(folder / "object.json", [make_camera()])
     mask = torch.zeros((SIZE, SIZE), dtype=torch.bool)
     write_image(folder / "black.png", mask)
-    write_image(folder / "wide.png", torch.zeros((SIZE, 2 * SIZE)).bool())
     mask[20:30, 20:34] = True
+    write_image(folder / "wide.png", mask.repeat(1, 2))
     write_image(folder / "mask.png", mask)
     narrow = make_camera()
     narrow.K[[0, 1], [0, 1]] *= 2
