@@ -42,6 +42,7 @@ LONGEST = (
     "evaluation/test_steps.py",
     "project/test_snippets.py",
     "models/test_diffusion.py",
+    "test_commands_on_a_device.py",
     "test_fake_device.py",
     "apps/test_batch.py",
     "project/test_release.py",

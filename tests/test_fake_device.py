@@ -1,35 +1,30 @@
 """What a GPU is asked to do, on a CUDA device that is none: see `support/fake_cuda.py`.
 
 No tensors of two devices meet, gsplat is given float32 alone, nothing reads memory that its kernels
-leave unset, and no stage makes the host wait more often than it has to.
+leave unset, and no stage makes the host wait more often than it has to. What commands do there is
+in `test_commands_on_a_device.py`.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from batch_jobs import open_here
-from command import run
 from fake_cuda import CUDA, Counts, FakeCudaTensor
 from fake_gsplat import WHEEL, fake_gsplat, find_gsplat
 from gscompleter import CompleterConfig, GSCompleter, load_renderer
-from gscompleter.apps.batch import engine
 from gscompleter.config import GapConfig
 from gscompleter.render.device import Devices, choose_devices
 from gscompleter.render.gsplat import TILE_SIZE, CudaRenderer
-from gscompleter.splats.ply import load_ply, save_ply
 from gscompleter.system.timing import STAGES
 from gscompleter.types import View, merge
 from parity import assert_close
 from render_scenes import CAMERA, REFERENCE, SCENES, compute_gradients, in_dtype
-from scenes import Room, camera_at, gaussians_of, photographed, view_of
+from scenes import Room, camera_at, gaussians_of, view_of
 
 pytestmark = [
     pytest.mark.skipif(
@@ -217,16 +212,6 @@ def test_a_completion_stays_on_the_device_and_waits_no_more_than_it_has_to(devic
         assert found <= MOST_WAITS[name][stage], f"{stage}:\n{device.list_waits(stage)}"
 
 
-@pytest.fixture(scope="module")
-def room(tmp_path_factory) -> Path:
-    """Write photographs of the room, and a splat of what the first two show."""
-    cameras = [camera_at(x, yaw=yaw, size=32) for x, yaw in ((-0.4, 4), (0.0, 0), (0.4, -4))]
-    folder = photographed(tmp_path_factory.mktemp("fake") / "room", cameras)
-    seen = [gaussians_of(view_of(Room(), camera)) for camera in cameras[:2]]
-    save_ply(folder / "splat.ply", merge(seen))
-    return folder
-
-
 def test_a_given_splat_is_completed_with_photographs_that_check_it(device):
     views = [view.to("cuda") for view in make_views((-0.3, 0.1, 0.2))]
     scene = merge([gaussians_of(view.to("cpu")) for view in views[:2]]).to("cuda")
@@ -235,28 +220,3 @@ def test_a_given_splat_is_completed_with_photographs_that_check_it(device):
     done = complete(views[:2], target, scene, check_views=views)
     assert isinstance(done.scene.means, FakeCudaTensor)
     assert len(done.added) > 30
-
-
-def test_something_is_removed_and_a_splat_cleaned(device, room, tmp_path, monkeypatch):
-    common = ("--scene", room / "splat.ply", "--device", "cuda", "--resolution", 32, 32, "--quiet")
-    box = ("--box", -0.6, 0.2, 2.1, 0.4, 1.47, 3.1)
-    words = ("remove", room, *box, "--target", 1, "--near", 0.5, "--far", 20)
-    assert run(monkeypatch, *words, *common, "--out", tmp_path / "cut") == 0
-    assert json.loads((tmp_path / "cut" / "summary.json").read_text())["device"] == "cuda"
-    assert len(load_ply(tmp_path / "cut" / "removed.ply")) > 50
-
-    assert run(monkeypatch, "clean", room, *common, "--out", tmp_path / "cleaned") == 0
-    assert (tmp_path / "cleaned" / "completed.ply").is_file()
-
-
-def test_a_batch_completes_on_the_device(device, room, tmp_path, monkeypatch):
-    row = {"folder": str(room), "context": [0, 1], "target": [2], "near": 0.5, "far": 20}
-    manifest = tmp_path / "manifest.jsonl"
-    manifest.write_text(json.dumps(row | {"resolution": SIZE, "device": "cuda"}) + "\n")
-    # This process alone has the device.
-    monkeypatch.setattr(engine, "open_local", open_here)
-    out = tmp_path / "out"
-    words = ("batch", manifest, "--out", out, "--workers", 1, "--quiet")
-    assert run(monkeypatch, *words) == 0
-    (summary,) = out.rglob("summary.json")
-    assert json.loads(summary.read_text())["device"] == "cuda"

@@ -202,7 +202,8 @@ def test_boxes_are_rotated_about_their_centres():
 def test_masks_choose_what_lies_in_them(scene, tmp_path):
     photographs, splat = open_photographs(scene), load_ply(scene / "splat.ply")
     cameras = {number: photographs.camera(number) for number in range(len(CAMERAS))}
-    masks = find_masks(write_masks(tmp_path / "masks"), photographs)
+    names = [frame.name for frame in photographs.frames]
+    masks = find_masks(write_masks(tmp_path / "masks"), names)
     assert sorted(masks) == [0, 3]
     chosen = find_in_masks(masks, splat, photographs, cameras, None, RENDERER)
     crate = find_in_boxes(splat.means, CRATE, UPRIGHT)
@@ -289,7 +290,8 @@ def test_masks_of_the_fox_choose_the_fox(fox, tmp_path):
         weight = RENDERER.freeze(splat, camera).splat(inside.float())
         name = Path(photographs.frames[number].name).stem
         write_image(tmp_path / f"{name}.png", weight > 0.5)
-    masks = find_masks(tmp_path, photographs)
+    names = [frame.name for frame in photographs.frames]
+    masks = find_masks(tmp_path, names)
     chosen = find_in_masks(masks, splat, photographs, cameras, 160, RENDERER)
     seen = torch.zeros(len(splat))
     for camera in cameras.values():

@@ -107,7 +107,7 @@ def test_several_masks_are_repaired_with_photographs(folder, tmp_path, monkeypat
     ("words", "sentence"),
     [
         (("--mask", "first.png", "second.png"), "2 masks and 1 target cameras"),
-        (("--mask", "nothing.png"), "marks nothing of its target"),
+        (("--mask", "nothing.png"), "nothing.png is black everywhere, and what masks show white"),
         (("--mask", "gone.png"), "gone.png"),
     ],
 )

@@ -142,7 +142,10 @@ def test_cameras_alone_let_targets_be_found(folder, tmp_path, monkeypatch):
             "There are 2 masks and 1 target cameras",
         ),
         (("splat.ply", "--target", "target.json", "--mask", "wide.png"), "aspect ratio of 64 × 64"),
-        (("splat.ply", "--target", "target.json", "--mask", "black.png"), "marks nothing"),
+        (
+            ("splat.ply", "--target", "target.json", "--mask", "black.png"),
+            "black.png is black everywhere",
+        ),
         (("photographs", "--target", "target.json", "--mask", "mask.png"), "Without a splat"),
         (("splat.ply", "--scene", "splat.ply"), "Two splats are named"),
         (("splat.ply", "--target", "3"), "'3' is no target: there are no photographs to name"),
@@ -179,8 +182,8 @@ def write_refused(folder: Path) -> None:
     write_cameras(folder / "object.json", [make_camera()])
     mask = torch.zeros((SIZE, SIZE), dtype=torch.bool)
     write_image(folder / "black.png", mask)
-    write_image(folder / "wide.png", torch.zeros((SIZE, 2 * SIZE)).bool())
     mask[20:30, 20:34] = True
+    write_image(folder / "wide.png", mask.repeat(1, 2))
     write_image(folder / "mask.png", mask)
     narrow = make_camera()
     narrow.K[[0, 1], [0, 1]] *= 2

@@ -29,6 +29,7 @@ from gscompleter.apps.warmup import compile_kernels
 from gscompleter.editing.cleaning import find_superfluous
 from gscompleter.editing.floaters import find_floaters
 from gscompleter.evaluation.metrics.image import compute_masked_psnr
+from gscompleter.evaluation.verdict.numbers import describe_measured
 from gscompleter.numerics.image_ops import compute_mask_fraction
 from gscompleter.render.device import choose_device
 from gscompleter.render.loading import load_renderer
@@ -201,7 +202,8 @@ def describe_cleaning(summary: Mapping[str, Any]) -> str:
 
     before = torch.tensor([row["psnr_before"] for row in summary["photographs"]])
     after = torch.tensor([row["psnr_after"] for row in summary["photographs"]])
+    unmasked = [1 - row["ignored"] for row in summary["photographs"]]
     return text + (
-        f"mean PSNR of the photographs {before.mean():.2f} dB before, {after.mean():.2f} dB after, "
-        f"worst change {(after - before).min():+.3f} dB"
+        f"mean PSNR of the photographs {before.mean():.2f} dB before, {after.mean():.2f} dB after"
+        f"{describe_measured(unmasked)}, worst change {(after - before).min():+.3f} dB"
     )

@@ -23,6 +23,7 @@ from gscompleter.data.file_names import FolderListings, list_endings
 from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.image import (
     QUARTER_TURNS,
+    leave_out_constant,
     read_colors_and_alpha,
     read_image_size,
     read_orientation,
@@ -63,6 +64,8 @@ class Frame:
     """Reads a depth map of any size: z-depth in scene units, 0 where unknown."""
     mask: Path | None = None
     """Mask image; its black pixels are ignored (`data/masks.py`)."""
+    has_inverted_mask: bool = False
+    """True if white pixels of the mask are ignored."""
     sensor: str | None = None
     """Name of the vehicle's camera, or None for a single camera."""
     laser_points: Callable[[], Float[np.ndarray, "n 3"]] | None = None
@@ -146,10 +149,14 @@ class Frame:
     ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None, int]:
         """Read the upright photograph: its colours, its alpha or None, and how it was turned.
 
-        The last is the EXIF orientation that was applied; 1 for the pixels as they are stored.
+        The last is the EXIF orientation that was applied; 1 for the pixels as they are stored. An
+        alpha that is the same everywhere in a file tells nothing.
         """
         stored = self.require_stored()
         colors, alpha = read_colors_and_alpha(stored, capitalize(self.title))
+        # Bytes may be a render of a splat, which is transparent where it is empty, even everywhere.
+        if alpha is not None and isinstance(stored, Path):
+            alpha = leave_out_constant(alpha)
         orientation = self.find_orientation(stored, colors.shape[1], colors.shape[0])
         colors = turn_upright(colors, orientation)
         alpha = None if alpha is None else turn_upright(alpha, orientation)

@@ -3,7 +3,7 @@
 Programs put them into a folder `masks` or beside the photographs. COLMAP calls the mask of x.jpg
 x.jpg.png, nerfstudio and others x.png, Metashape x_mask.png and RealityScan x.mask.png. Those that
 instant-ngp calls dynamic_mask_x.png are white where pixels are ignored. An alpha channel is a mask,
-too.
+too, unless it is the same everywhere.
 """
 
 from __future__ import annotations
@@ -97,18 +97,31 @@ def leave_out_masks(names: Collection[str]) -> list[str]:
     return [name for name in names if name.casefold() not in masks]
 
 
+def hides_white(path: Path, is_inverted: bool) -> bool:
+    """Return True if white pixels of a mask are ignored: by its name, or because it is inverted."""
+    return path.name.casefold().startswith(INVERTED) != is_inverted
+
+
+def read_ignored(path: Path, is_inverted: bool = False) -> Bool[np.ndarray, "h w"]:
+    """Read the pixels of a mask that are ignored in its photograph; `is_inverted` reads others."""
+    black = read_mask(path)
+    return ~black if hides_white(path, is_inverted) else black
+
+
 def load_mask(
-    path: Path, size: tuple[int, int], photograph: str, orientation: int = 1
+    path: Path,
+    size: tuple[int, int],
+    photograph: str,
+    orientation: int = 1,
+    is_inverted: bool = False,
 ) -> Bool[np.ndarray, "h w"]:
     """Read the ignored pixels of a mask at the `size` (width, height) of its upright photograph.
 
     A mask of another size is scaled if its aspect ratio is the same. `orientation` is how EXIF
     turned the photograph: a mask of the stored pixels is turned likewise. `photograph` is for the
-    error of any other mask.
+    error of any other mask. An inverted mask is white where pixels are ignored.
     """
-    ignored = read_mask(path)
-    if path.name.casefold().startswith(INVERTED):
-        ignored = ~ignored
+    ignored = read_ignored(path, is_inverted)
     # A mask drawn on the upright photograph has its shape; another may be of the stored pixels.
     is_stored = not has_same_aspect((ignored.shape[1], ignored.shape[0]), size)
     if is_stored and orientation != 1:
@@ -130,7 +143,7 @@ def find_masked(
     """Find the pixels of an upright photograph that its mask or its alpha hides; None if none."""
     masks = []
     if frame.mask is not None:
-        masks.append(load_mask(frame.mask, size, frame.title, orientation))
+        masks.append(load_mask(frame.mask, size, frame.title, orientation, frame.has_inverted_mask))
     if alpha is not None:
         masks.append(alpha < HALF_OPAQUE)
     hidden = np.logical_or.reduce(masks) if masks else None

@@ -102,6 +102,15 @@ class Photographs:
         """Load undistorted photographs with cameras, known depth and the detected vehicle."""
         return [self._load_view(number, resolution) for number in frames]
 
+    def list_masks(self) -> list[Path]:
+        """List the mask images that hide something, without alpha channels."""
+        return [f.mask for f in self.frames if f.mask is not None] if self.is_masked else []
+
+    def invert_masks(self) -> Photographs:
+        """Return a copy whose mask images are read the other way round; alpha stays as it is."""
+        frames = [replace(f, has_inverted_mask=not f.has_inverted_mask) for f in self.frames]
+        return replace(self, frames=tuple(frames))
+
     def describe_masks(self, frames: Sequence[int]) -> str | None:
         """Say which of some photographs have masks, or None if none has; reads no pixels."""
         if not self.is_masked:

@@ -12,6 +12,8 @@ import numpy as np
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.limits import check_planes, require
+from gscompleter.data.mask_checks import read_masks_as_asked, refuse_nothing_to_invert
+from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL, parse_camera_frame
 from gscompleter.system.errors import quote_value, require_path
@@ -29,15 +31,23 @@ def load_views(
     resolution: Resolution = None,
     near: float | None = None,
     far: float | None = None,
+    invert_masks: bool = False,
+    large_masks: bool = False,
 ) -> list[View]:
     """Load the photographs of a scene with their cameras, and true depth if available.
 
     Lens distortion is removed. If coordinates are so large that float32 would lose the baselines,
     cameras are relative to `open_photographs(scene).origin`.
+    Black pixels of masks and transparent ones are ignored; with `invert_masks` white ones of masks.
+    Masks that hide more than half of most photographs may be the other way round and raise an
+    InputError; `large_masks` takes them as they are.
     `frames` are counted by sorted names, all if None; `resolution` is height and width in pixels,
     or the most pixels of the longer side; `near` and `far` are z-depths in scene units, if known.
     """
+    reading = MaskReading(invert_masks, large_masks)
     photographs = open_photographs(scene, near=near, far=far)
+    refuse_nothing_to_invert(photographs.list_masks(), reading)
+    photographs = read_masks_as_asked(photographs, reading)
     chosen = range(len(photographs)) if frames is None else frames
     require(
         isinstance(chosen, (Sequence, np.ndarray)) and not isinstance(chosen, (str, bytes)),

@@ -35,6 +35,8 @@ class Case:
     far: float | None = None
     masks: bool = True
     """True if pixels that masks and alpha channels hide are ignored."""
+    invert_masks: bool = False
+    """True if white pixels of masks are ignored, not black ones."""
     ignore_moving: bool = False
     """True if pixels in boxes of moving objects are ignored."""
     ego_mask: bool = True
@@ -51,6 +53,7 @@ class Case:
         scene = open_photographs(self.scene, near=self.near, far=self.far)
         scene = scene if self.ego_mask else scene.keep_ego_vehicle()
         scene = scene if self.masks else scene.leave_out_masks()
+        scene = scene.invert_masks() if self.invert_masks else scene
         scene = scene.ignore_moving() if self.ignore_moving else scene
         return scene.views(frames, self.resolution)
 

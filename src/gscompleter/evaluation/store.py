@@ -154,9 +154,13 @@ def save_values(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def load_values(path: Path, device: torch.device | str) -> dict[str, Any]:
-    """Read what `save_values` wrote."""
-    saved = torch.load(path, map_location=device, weights_only=True)
-    return {k: Gaussians(**v) if k in GAUSSIANS and v else v for k, v in saved.items()}
+    """Read what `save_values` wrote, with Gaussians and tensors on a device."""
+    saved = torch.load(path, map_location="cpu", weights_only=True)
+    content = {k: Gaussians(**v) if k in GAUSSIANS and v else v for k, v in saved.items()}
+    return {
+        name: value.to(device) if isinstance(value, (Gaussians, Tensor)) else value
+        for name, value in content.items()
+    }
 
 
 def is_complete(path: Path) -> bool:

@@ -30,6 +30,12 @@ class CompleteOptions(CompletingOptions):
     mask: tuple[Path, ...] = ()
     """Images that mark what is wrong at the targets, white there: one for each target camera. What
     they show goes, is a hole whatever stands behind it, and is filled; `strip` puts it back."""
+    invert_masks: bool = False
+    """Read masks the other way round: those of `--mask`, of which black then goes, or without it
+    those of SCENE, of which white is then ignored."""
+    large_masks: bool = False
+    """Go on with masks that take away more than half of most images, or of the splat: they are
+    meant so."""
     auto: Annotated[int, Interval(ge=1, le=254)] | None = None
     """Most cameras to search for if no target is given; 4 if no number follows."""
     from_photographs_only: bool = False

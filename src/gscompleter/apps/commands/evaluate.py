@@ -17,6 +17,7 @@ from gscompleter.apps.commands.shared_options import (
     replace_by_scenes,
 )
 from gscompleter.config.generators import GeneratorOptions
+from gscompleter.data.mask_reading import MaskReading
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.jobs.engine_names import EngineName
 from gscompleter.system.process import import_without_collection
@@ -97,8 +98,12 @@ class EvaluateOptions(SynthesisOptions, EngineOptions):
     resolution: Size | None = None
     """Working size as in `complete`; by default that of the cases."""
     masks: bool = True
-    """Ignore the pixels that masks (black) or alpha channels (transparent) hide, in the methods and
-    in the scores."""
+    """Use also the pixels that masks (black) or alpha channels (transparent) hide, in the methods
+    and in the scores, instead of ignoring them."""
+    invert_masks: bool = False
+    """Read masks the other way round: white is ignored, not black."""
+    large_masks: bool = False
+    """Go on with masks that hide more than half of most photographs."""
     ignore_moving: bool = False
     """Ignore boxes of moving objects in the same way (Waymo, nuScenes)."""
     one_per_scene: bool = False
@@ -107,6 +112,11 @@ class EvaluateOptions(SynthesisOptions, EngineOptions):
     """Ignore what stays the same while the camera moves, such as the bonnet of its car."""
     limit: Annotated[int, Interval(ge=1)] | None = None
     """Most cases to run, over all shards."""
+
+    @property
+    def mask_reading(self) -> MaskReading:
+        """How masks are read."""
+        return MaskReading(self.invert_masks, self.large_masks)
 
     def check_overlap(self) -> None:
         """Refuse an output that is, holds or lies in an input."""

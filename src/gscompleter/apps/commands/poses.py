@@ -10,6 +10,7 @@ import tyro
 
 from gscompleter.apps.command_line.answers import print_answer
 from gscompleter.apps.commands.shared_options import ComputeOptions, NumFrames, WritingOptions
+from gscompleter.data.mask_reading import MaskReading
 from gscompleter.system.process import import_without_collection
 
 
@@ -25,6 +26,10 @@ class PosesOptions(ComputeOptions, WritingOptions):
     not changed."""
     frames: NumFrames = 40
     """Most frames of a video to take as photographs, sharp ones at even steps of the camera."""
+    invert_masks: bool = False
+    """Read the masks of the photographs the other way round: white is ignored, not black."""
+    large_masks: bool = False
+    """Go on with masks that hide more than half of most photographs."""
     out: Path
     """Output folder: upright copies in images, cameras and points in sparse/0."""
 
@@ -38,8 +43,11 @@ def run_poses(options: PosesOptions) -> None:
         from gscompleter.data.sfm.poses import find_poses
         from gscompleter.system.progress import show_progress
 
+    reading = MaskReading(options.invert_masks, options.large_masks)
     with show_progress(Console(stderr=True, quiet=options.quiet)):
-        poses = find_poses(options.photographs, options.out, options.overwrite, options.frames)
+        poses = find_poses(
+            options.photographs, options.out, options.overwrite, options.frames, reading
+        )
     sentence = (
         f"{poses.num_registered} of {poses.photographs} cameras and {poses.points:,} points, "
         f"mean error {poses.error:.2f} px"

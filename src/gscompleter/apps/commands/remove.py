@@ -33,7 +33,8 @@ class RemoveOptions(CompleteOptions):
     sphere: tuple[float, float, float, float] | None = None
     """Remove Gaussians inside of a sphere: x, y and z of its centre, and its radius."""
     mask: Path | None = None  # type: ignore[assignment]
-    """Remove what masks show: a folder of images named as photographs, white there."""
+    """Remove what masks show: a folder of images named as photographs, white there (or opaque, if
+    the object is cut out)."""
     select: Path | None = None
     """Remove the Gaussians of this file, a selection that another program saved."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = REMOVAL_CONFIG
@@ -46,7 +47,13 @@ class RemoveOptions(CompleteOptions):
 
     def make_scene_request(self) -> SceneRequest:
         """Make the request for the photographs, of which masks of the removal hide nothing."""
-        return replace(super().make_scene_request(), removal_masks=self.mask)
+        request = super().make_scene_request()
+        return replace(request, removal_masks=self.mask, removal_reading=self.mark_reading)
+
+    @property
+    def has_marks(self) -> bool:
+        """True if masks say what goes, which `--invert-masks` then turns."""
+        return self.mask is not None
 
 
 def run_remove(options: RemoveOptions) -> int:

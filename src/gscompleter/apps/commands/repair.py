@@ -30,6 +30,12 @@ class RepairOptions(CompletingOptions):
     """File with the camera of each mask, as of `--target`."""
     mask: tuple[Path, ...] = ()
     """Images of the splat from these cameras, in the same order: white where it is wrong."""
+    invert_masks: bool = False
+    """Read masks the other way round: those of `--mask`, of which black then goes, or without it
+    those of SCENE, of which white is then ignored."""
+    large_masks: bool = False
+    """Go on with masks that take away more than half of most images, or of the splat: they are
+    meant so."""
     strokes: Path | None = None
     """The strokes.json that `live` saved, in place of cameras and masks: its steps are done again,
     at its resolution and with its photographs unless others are named."""

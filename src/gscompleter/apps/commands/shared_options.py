@@ -15,6 +15,7 @@ from gscompleter.apps.inputs.scene_request import LONG_SIDE, PosesRequest, Scene
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Device, Seed, Settings
+from gscompleter.data.mask_reading import MaskReading
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.jobs.engine_names import EngineName
 
@@ -145,7 +146,11 @@ class SceneOptions(ComputeOptions, WritingOptions):
     no_given_depth: bool = False
     """Ignore the depth that SCENE holds: depth maps, laser sweeps and COLMAP's points."""
     masks: bool = True
-    """Ignore what masks (black) or alpha channels of SCENE hide."""
+    """Use also what masks (black) or alpha channels of SCENE hide, instead of ignoring it."""
+    invert_masks: bool = False
+    """Read the masks of SCENE the other way round: white is ignored, not black."""
+    large_masks: bool = False
+    """Go on with masks that hide more than half of most photographs: they are meant so."""
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
 
@@ -159,7 +164,22 @@ class SceneOptions(ComputeOptions, WritingOptions):
             self.far,
             uses_given_depth=not self.no_given_depth,
             uses_masks=self.masks,
+            masks=MaskReading(
+                self.invert_masks and not self.has_marks,
+                self.large_masks,
+                is_turned_by_option=not self.has_marks,
+            ),
         )
+
+    @property
+    def has_marks(self) -> bool:
+        """True if masks say what goes, which `--invert-masks` then turns."""
+        return False
+
+    @property
+    def mark_reading(self) -> MaskReading:
+        """How masks of what goes are read."""
+        return MaskReading(self.invert_masks, self.large_masks)
 
     def make_poses_request(self) -> PosesRequest:
         """Make the request for the cameras of photographs that have none; OUT keeps them."""
@@ -197,6 +217,11 @@ class CompletingOptions(SceneOptions, ModelOptions):
     def marks(self) -> tuple[Path, ...]:
         """Masks of what is wrong at the targets."""
         return ()
+
+    @property
+    def has_marks(self) -> bool:
+        """True if masks say what goes, which `--invert-masks` then turns."""
+        return bool(self.marks)
 
     @property
     def lacks_photographs(self) -> bool:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +11,7 @@ from rich.console import Console
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.completing.preparation import Prepared, prepare_completion
 from gscompleter.apps.inputs.hole_kinds import pair_masks, read_marks
+from gscompleter.data.mask_checks import check_selected_share, check_selecting_masks
 from gscompleter.editing.marking import find_marked
 from gscompleter.editing.removal import remove_gaussians
 from gscompleter.planning.remove import contain_nothing
@@ -25,19 +26,27 @@ class PreparedMarked(Prepared):
 
     def begin(self) -> Completion:
         """Initialize the context, and remove from it what the masks show."""
-        begun = super().begin()
-        scene = self.task.scene
+        task = self.task
+        scene = task.scene
         assert scene is not None
-        cameras = [begun.with_depth_range(camera) for camera in self.task.target_cameras]
+        # All photographs share one depth range.
+        known = task.views[0].camera
+        cameras = [replace(c, near=known.near, far=known.far) for c in task.target_cameras]
+        reading = self.options.mark_reading
+        # Before the context, so that wrong masks are refused without waiting for it.
         with stage("removing"):
-            marks = [read_marks(*pair) for pair in pair_masks(self.options.marks, cameras)]
+            pairs = pair_masks(self.options.marks, cameras)
+            marks = [read_marks(path, camera, reading) for path, camera in pairs]
             chosen = find_marked(scene, cameras, marks, self.completer.renderer)
+            check_selected_share(chosen.float().mean().item(), reading)
             if not chosen.any():
                 raise InputError(
                     "The masks show no Gaussian of the splat; mark what the images of the targets "
                     "show, or leave --mask out where nothing is to be seen.",
                     "mask",
                 )
+        begun = super().begin()
+        with stage("removing"):
             return remove_gaussians(begun, chosen, contain_nothing, self.completer.scenes)
 
     def describe_settings(self) -> dict[str, Any]:
@@ -50,6 +59,7 @@ def prepare_marked(options: CompleteOptions, console: Console) -> Prepared:
     if not options.marks:
         return prepare_completion(options, console)
     check_marks(options)
+    check_selecting_masks(options.marks, options.mark_reading, "the images of their cameras")
     ready = prepare_completion(options, console)
     refuse_completed(ready, options.scene)
     # Before anything is rendered or removed.

@@ -230,6 +230,12 @@ def check_photographs(options: CompleteOptions) -> CompleteOptions:
             raise InputError(
                 "There are no photographs to apply this to; name their folder as SCENE.", name
             )
+    if options.invert_masks and not options.has_marks:
+        raise InputError(
+            "There are no photographs whose masks could be read the other way round, and no --mask "
+            "is given; leave it out.",
+            "invert-masks",
+        )
     return replace(options, folder=None, scene=options.scene or options.folder)
 
 
@@ -327,6 +333,7 @@ def read_splat_alone(
         options.target,
         options.context,
         options.marks,
+        options.mark_reading,
         options.config.holes,
         options.holes,
         options.up,

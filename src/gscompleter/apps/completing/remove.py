@@ -16,6 +16,7 @@ from gscompleter.apps.completing.marking import refuse_completed
 from gscompleter.apps.completing.preparation import Prepared, prepare_completion
 from gscompleter.apps.inputs.removal import (
     Selection,
+    check_removal_masks,
     check_selection,
     choose_gaussians,
     find_in_region,
@@ -43,12 +44,14 @@ class PreparedRemoval(Prepared):
 
     def begin(self) -> Completion:
         """Initialize the context, and remove the selected Gaussians from it."""
-        begun = super().begin()
         completer = self.completer
+        # Before the context, so that a wrong selection is refused without waiting for it.
         with stage("removing"):
             chosen = choose_gaussians(
                 self.selection, self.task, self.opened, self.cameras, completer.renderer
             )
+        begun = super().begin()
+        with stage("removing"):
             # Gaussians that reach out of a box or the sphere are cut at its border. Those that a
             # mask or a file selects go as a whole.
             return remove_gaussians(begun, chosen, self.contains, completer.scenes)
@@ -73,6 +76,10 @@ def prepare_removal(options: RemoveOptions, console: Console) -> PreparedRemoval
     selection = make_selection(options)
     check_selection(selection)
     ready = prepare_completion(options, console, selection)
+    # Of photographs they were checked as soon as these were opened.
+    if options.mask is not None and options.lacks_photographs:
+        names = [frame.name for frame in ready.opened.photographs.frames]
+        check_removal_masks(options.mask, names, options.mark_reading)
 
     refuse_completed(ready, options.scene)
     explorer = PhotographPlanner(ready.completer)
@@ -88,4 +95,5 @@ def make_selection(options: RemoveOptions) -> Selection:
         options.mask,
         options.select,
         options.drop_nonfinite,
+        mask_reading=options.mark_reading,
     )

@@ -47,6 +47,8 @@ def describe_run(
             "far": options.far,
             "no_given_depth": options.no_given_depth,
             "masks": options.masks,
+            "invert_masks": options.invert_masks,
+            "large_masks": options.large_masks,
             "config": asdict(config),
         },
         "device": task.device.type,
@@ -83,15 +85,19 @@ def read_held_out(
     # Check views of a splat guard its completion, so they test less than photographs that nothing
     # has read.
     checks = {view.frame for view in task.check_views or ()}
-    held_out: list[HeldOut] = []
     frames = opened.held_out or select_closest(task.goals, others, MAX_HELD_OUT)
+    read: dict[int, View] = {}
     for frame in frames:
         # A photograph that cannot be read tests nothing; it is no input of this run.
         with suppress(InputError):
-            (view,) = opened.photographs.views([frame], opened.request.resolution)
-            # Its own camera is in the frame of the photographs.
-            view = View(view.image, others[frame], frame, ignore_mask=view.ignore_mask)
-            held_out.append(HeldOut(view.to(task.device), frame in checks))
+            (read[frame],) = opened.photographs.views([frame], opened.request.resolution)
+    held_out = []
+    for frame, view in read.items():
+        # Its own camera is in the frame of the photographs. The other one is on the device of the
+        # task, where the image has to be as well. Outside of `suppress`, which would hide that.
+        there = view.to(task.device)
+        placed = View(there.image, others[frame], frame, ignore_mask=there.ignore_mask)
+        held_out.append(HeldOut(placed, frame in checks))
     return held_out
 
 

@@ -96,7 +96,7 @@ def add_new_photographs(update: UpdateOptions, opened: Opened, console: Console)
     kept = update.out / POSES
     refuse_link(kept)
     photographs, placed = place_photographs(
-        update.photos, opened.photographs, kept, update.overwrite
+        update.photos, opened.photographs, kept, update.overwrite, opened.request.masks
     )
     print_lines(console, *placed.notes)
     photographs = replace(photographs, notes=(*photographs.notes, *placed.notes))
@@ -182,7 +182,8 @@ def measure_lacks(ready: Prepared) -> dict[int, float]:
             view = checks[frame]
         else:
             (view,) = opened.photographs.views([frame], CHECK_VIEW_SIZE)
-        view = replace(view, camera=cameras[frame]).to(task.device)
+        # A view refuses an image and a camera on two devices, and cameras are on that of the task.
+        view = replace(view.to(task.device), camera=cameras[frame])
         frames.append(frame)
         views.append(view)
         renders.append(ready.completer.renderer.render(scene, view.camera))

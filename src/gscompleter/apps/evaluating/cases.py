@@ -16,6 +16,7 @@ from gscompleter.apps.commands.shared_options import parse_resolution
 from gscompleter.apps.inputs.scene_request import LONG_SIDE
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.limits import check_planes
+from gscompleter.data.mask_checks import read_masks_as_asked
 from gscompleter.data.photographs import MAX_TRANSLATION, Photographs, Resolution
 from gscompleter.evaluation import protocols
 from gscompleter.evaluation.authors_loader import AuthorsLoader
@@ -43,11 +44,14 @@ def collect_tasks(
     # Cases of one scene stand together in a file, so that each scene is opened once for its notes.
     for scene, group in groupby(cases, lambda case: case.scene):
         own = [protocols.make_case_task(apply_options(case, options)) for case in group]
+        clip = None
         # A scene that cannot be opened fails later, and its row in the table has the reason.
         with suppress(InputError):
             clip = open_photographs(scene)
+        if clip is not None:
             notes += clip.notes
-            own = mark_masked(clip if options.masks else clip.leave_out_masks(), own, notes)
+            clip = clip if options.masks else clip.leave_out_masks()
+            own = mark_masked(read_masks_as_asked(clip, options.mask_reading), own, notes)
         tasks += own
     return tasks
 
@@ -74,6 +78,7 @@ def apply_options(case: Case, options: EvaluateOptions) -> Case:
         far=case.far if options.far is None else options.far,
         resolution=case.resolution if size is None else parse_resolution(size),
         masks=options.masks,
+        invert_masks=options.invert_masks,
         ignore_moving=options.ignore_moving,
         ego_mask=options.ego_mask,
     )
@@ -111,6 +116,7 @@ def iterate_tasks(
                 clip = clip.keep_ego_vehicle()
             if scores_all or not options.masks:
                 clip = clip.leave_out_masks()
+            clip = read_masks_as_asked(clip, options.mask_reading)
             if options.ignore_moving:
                 clip = clip.ignore_moving()
 

@@ -70,6 +70,11 @@ def score_methods(options: EvaluateOptions) -> Scored:
     notes: list[str] = []
     with show_progress(console), show_preparation("reading cases"):
         tasks = collect_tasks(options, skipped, notes)
+    if options.invert_masks and not any(task.has_masks for task in tasks):
+        raise InputError(
+            "No scene has masks that could be read the other way round; leave it out.",
+            "invert-masks",
+        )
     # Several clips can have the same note.
     for note in dict.fromkeys(notes):
         console.print(note, markup=False, soft_wrap=True)
@@ -115,6 +120,7 @@ def describe_source(options: EvaluateOptions, has_masks: bool = False) -> dict[s
         "protocols": list(options.protocol),
         "resolution": list(size) if isinstance(size, tuple) else size,
         **({"masks": True} if has_masks else {}),
+        **({"invert_masks": True} if has_masks and options.invert_masks else {}),
         **({"ignore_moving": True} if options.ignore_moving else {}),
         **({"one_per_scene": True} if options.one_per_scene else {}),
         **({} if options.ego_mask else {"ego_mask": False}),

@@ -16,6 +16,7 @@ from gscompleter.apps.inputs.removal import Selection, select_gaussians
 from gscompleter.apps.inputs.scene_request import LONG_SIDE, SceneRequest
 from gscompleter.config import HoleConfig
 from gscompleter.data.camera_files import NAME, has_camera_list
+from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photographs import (
     Photographs,
     Resolution,
@@ -60,6 +61,8 @@ class RenderRequest:
     """Numbers or names of the cameras to use; None to choose."""
     masks: tuple[Path, ...] = ()
     """Masks that mark what is wrong at each target, white there."""
+    mask_reading: MaskReading = MaskReading()
+    """How these are read."""
     holes: HoleConfig = HoleConfig()
     """Limits of holes; their kind is chosen by `kind`."""
     kind: Literal["auto", "all", "enclosed"] = "auto"

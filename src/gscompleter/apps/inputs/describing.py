@@ -107,6 +107,8 @@ def describe_masks(photographs: Photographs, task: CompletionTask) -> list[str]:
     if masks is None:
         return []
     most = max(compute_mask_fraction(view.ignore_mask) for view in task.views)
+    if most == 0:
+        return [f"Masks: {masks}; they hide nothing of the photographs in use."]
     return [
         f"Masks: {masks}; what they hide, up to {100 * most:.1f} % of a photograph, is neither "
         "reconstructed nor scored (--no-masks uses it)."

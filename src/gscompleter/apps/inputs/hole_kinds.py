@@ -14,12 +14,13 @@ from torch.nn.functional import interpolate
 
 from gscompleter.config import HoleConfig
 from gscompleter.data.cameras import has_same_aspect
+from gscompleter.data.mask_checks import read_selected
+from gscompleter.data.mask_reading import MaskReading
 from gscompleter.numerics.geometry import add_near_plane
 from gscompleter.render.protocols import Renderer
 from gscompleter.stages.enclosed_holes import keep_enclosed
 from gscompleter.stages.target_view import compute_hole_mask, explain_little_covered
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.image import read_mask
 from gscompleter.trust.lifted import is_lifted
 from gscompleter.types import Camera, Gaussians
 from gscompleter.virtual_capture.kind import is_object
@@ -89,27 +90,29 @@ def pair_masks(masks: Sequence[Path], targets: Sequence[Camera]) -> list[tuple[P
     return list(zip(masks, targets, strict=True)) if masks else []
 
 
-def read_marks(stored: Path | bytes, target: Camera, name: str = "") -> Bool[Tensor, "h w"]:
-    """Read the white pixels of a mask, or of its bytes, at the size of its target.
+def read_marks(
+    stored: Path | bytes, target: Camera, reading: MaskReading = MaskReading(), name: str = ""
+) -> Bool[Tensor, "h w"]:
+    """Read the white pixels of a mask, or the black ones if inverted, at the size of its target.
 
-    `name` is for errors of bytes.
+    `stored` is its file, or its bytes, of which `name` is for errors.
     """
-    white = ~read_mask(stored, name)
+    marked = read_selected(stored, reading, name)
     shown = name if isinstance(stored, bytes) else quote_value(stored)
-    size = white.shape[1], white.shape[0]
+    size = marked.shape[1], marked.shape[0]
     if not has_same_aspect(size, (target.width, target.height)):
         raise InputError(
             f"{shown} has {size[0]} × {size[1]} pixels, and its target has the aspect "
             f"ratio of {target.width} × {target.height}; paint it on the image of the target.",
             "mask",
         )
-    if not white.any() or white.all():
+    if not marked.any() or marked.all():
         raise InputError(
-            f"{shown} marks {'all' if white.all() else 'nothing'} of its target; paint "
-            "white what is wrong, and black what is right.",
+            f"{shown} marks {'all' if marked.all() else 'nothing'} of its target; "
+            "paint white what is wrong, and black what is right.",
             "mask",
         )
-    mask = torch.from_numpy(white).to(target.K.device)[None, None].float()
+    mask = torch.from_numpy(marked).to(target.K.device)[None, None].float()
     size_at_target = (target.height, target.width)
     # A pixel is marked if half of it is.
     return interpolate(mask, size=size_at_target, mode="area")[0, 0] >= 0.5

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
 
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.inputs.named_photographs import check_frame_numbers
+from gscompleter.apps.inputs.removal import check_removal_masks
 from gscompleter.apps.inputs.scene_request import LONG_SIDE, PosesRequest, SceneRequest
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.inputs.task import Opened
@@ -17,8 +19,11 @@ from gscompleter.data.camera_files import refuse_other_exports
 from gscompleter.data.formats import find_format, open_photographs, refuse_scenes_below
 from gscompleter.data.frame import FOLDERS
 from gscompleter.data.limits import check_planes
+from gscompleter.data.mask_checks import read_masks_as_asked, refuse_nothing_to_invert
+from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photographs import check_resolution
-from gscompleter.data.sfm.poses import find_poses, has_photographs
+from gscompleter.data.sfm.poses import find_poses, has_photographs, list_all_photographs
+from gscompleter.data.video import is_video
 from gscompleter.splats.alignment.training_size import find_training_size
 from gscompleter.splats.formats import has_splat_extension
 from gscompleter.system.errors import InputError, quote_value
@@ -49,20 +54,35 @@ def open_scene(
     check_planes(request.near, request.far)
     check_resolution(request.resolution)
 
+    if request.masks.is_inverted and not request.uses_masks:
+        raise InputError(
+            "--no-masks leaves out the masks that would be read the other way round; give one of "
+            "both.",
+            "invert-masks",
+        )
+
     # Photographs without cameras: COLMAP finds them once, and a later run reads them again.
     num_photographs = None
+    reading = request.masks
     if request.format is None and find_format(folder) is None and has_photographs(folder):
         # First all that can be refused at once, because the search takes minutes.
         refuse_other_exports(folder)
         refuse_scenes_below(folder)
         print_lines(console, *describe_cameras_above(folder))
         check_frame_numbers(folder, search.named, search.num_frames)
+        if request.removal_masks is not None and not is_video(folder):
+            names = list_all_photographs(folder)
+            check_removal_masks(request.removal_masks, names, request.removal_reading)
         check()
         # A folder of poses with a summary was written by us, and may be continued or replaced.
         kept = search.out / POSES
         refuse_link(kept)
         is_ours = search.overwrite or os.path.isfile(kept / SUMMARY_FILE)
-        poses = find_poses(folder, kept, is_ours, search.num_frames)
+        # Masks that are not used hide nothing, whatever they are.
+        searched = reading if request.uses_masks else replace(reading, may_be_large=True)
+        poses = find_poses(folder, kept, is_ours, search.num_frames, searched)
+        # The masks of the copies are black where something is hidden, and their masks were checked.
+        reading = MaskReading(may_be_large=True)
         print_lines(console, *poses.notes)
         folder = kept
         num_photographs = poses.photographs
@@ -72,7 +92,11 @@ def open_scene(
         photographs = photographs.leave_out_masks()
     # Masks of what is to be removed may lie in the scene, and are not those of what to ignore.
     if request.removal_masks is not None:
+        names = [frame.name for frame in photographs.frames]
+        check_removal_masks(request.removal_masks, names, request.removal_reading)
         photographs = photographs.leave_out_masks_in(request.removal_masks)
+    refuse_nothing_to_invert(photographs.list_masks(), reading)
+    photographs = read_masks_as_asked(photographs, reading)
     print_lines(console, *photographs.notes)
 
     assert photographs.format is not None

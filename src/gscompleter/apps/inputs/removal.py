@@ -14,6 +14,8 @@ from torch import Tensor
 
 from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.data.frame import ENDINGS, find_file
+from gscompleter.data.mask_checks import check_selected_share, check_selecting_masks
+from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.masks import load_mask
 from gscompleter.data.photographs import Photographs, Resolution, resize_mask
 from gscompleter.editing.removal import sum_in_mask
@@ -46,6 +48,8 @@ class Selection:
     """True to drop Gaussians of that file that contain NaN or infinity."""
     margin: float = 0.0
     """Distance by which boxes and the sphere reach farther than given, on every side."""
+    mask_reading: MaskReading = MaskReading()
+    """How masks are read."""
 
 
 def check_selection(selection: Selection) -> None:
@@ -98,9 +102,13 @@ def choose_gaussians(
     chosen = find_selected(selection, scene, task.origin)
     if selection.masks:
         photographs = opened.photographs
-        masks = find_masks(selection.masks, photographs)
+        masks = find_masks(selection.masks, [frame.name for frame in photographs.frames])
         resolution = opened.request.resolution
-        chosen |= find_in_masks(masks, scene, photographs, cameras, resolution, renderer)
+        shown = find_in_masks(
+            masks, scene, photographs, cameras, resolution, renderer, selection.mask_reading
+        )
+        check_selected_share(shown.float().mean().item(), selection.mask_reading)
+        chosen |= shown
     return refuse_nothing(chosen, scene, task.origin)
 
 
@@ -212,12 +220,17 @@ def find_in_boxes(
     return inside
 
 
-def find_masks(folder: Path, photographs: Photographs) -> dict[int, Path]:
-    """Find the masks that are named as photographs, by frame."""
+def check_removal_masks(folder: Path, names: Sequence[str], reading: MaskReading) -> None:
+    """Refuse masks of a removal that select nothing, or most of most photographs of these names."""
+    masks = list(find_masks(folder, names).values())
+    check_selecting_masks(masks, reading, "the photographs")
+
+
+def find_masks(folder: Path, names: Sequence[str]) -> dict[int, Path]:
+    """Find the masks that are named as photographs, by the number of the name."""
     masks = {}
-    for number, frame in enumerate(photographs.frames):
+    for number, name in enumerate(map(Path, names)):
         # Of a/b.jpg: a/b.jpg.png, a/b.png, b.jpg.png or b.png, as annotation programs name masks.
-        name = Path(frame.name)
         stems = (name, name.with_suffix(""), Path(name.name), Path(name.stem))
         path = find_file([folder], [f"{stem}{ending}" for stem in stems for ending in ENDINGS])
         if path is not None:
@@ -225,7 +238,7 @@ def find_masks(folder: Path, photographs: Photographs) -> dict[int, Path]:
     if not masks:
         raise InputError(
             f"{quote_value(folder)} has no mask that is named as a photograph, such as "
-            f"{quote_value(Path(photographs.frames[0].name).stem)}.png.",
+            f"{quote_value(Path(names[0]).stem)}.png.",
             "mask",
         )
     return masks
@@ -238,6 +251,7 @@ def find_in_masks(
     cameras: Mapping[int, Camera],
     resolution: Resolution,
     renderer: Renderer,
+    reading: MaskReading = MaskReading(),
 ) -> Bool[Tensor, "n"]:
     """Find Gaussians of which photographs show more inside of their masks than outside.
 
@@ -249,9 +263,10 @@ def find_in_masks(
     for number in track([number for number in masks if number in cameras], "masks"):
         frame = photographs.frame(number)
         size = frame.size()
-        # Masks of a scene hide what is black; here white is what goes.
-        white = ~load_mask(masks[number], size, frame.title, frame.find_turn())
-        mask = resize_mask(frame, white, size, resolution)
+        # Masks of a scene hide what is black; here white is what goes, unless it is inverted.
+        turn = frame.find_turn()
+        selected = ~load_mask(masks[number], size, frame.title, turn, reading.is_inverted)
+        mask = resize_mask(frame, selected, size, resolution)
         frozen = renderer.freeze(scene, cameras[number])
         sums += sum_in_mask(frozen, torch.from_numpy(mask).to(sums))
     return sums[:, 0] > sums[:, 1]

@@ -171,7 +171,8 @@ def choose_capture(
 
     # What is marked or removed is the hole, and need not be empty yet.
     if request.masks:
-        marks = [read_marks(*pair) for pair in pair_masks(request.masks, target_cameras)]
+        pairs = pair_masks(request.masks, target_cameras)
+        marks = [read_marks(path, camera, request.mask_reading) for path, camera in pairs]
         return capture, kind, marks
     if request.place is not None:
         return capture, kind, []

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+from gscompleter.data.mask_reading import MaskReading
+
 LONG_SIDE = 640
 """Default length of a photograph's longer side, in pixels."""
 
@@ -27,8 +29,12 @@ class SceneRequest:
     """True to read the depth that the scene holds."""
     uses_masks: bool = True
     """True to ignore what masks of the scene hide."""
+    masks: MaskReading = MaskReading()
+    """How these masks are read."""
     removal_masks: Path | None = None
     """Folder of masks that show what to remove; lying in the scene, they hide nothing."""
+    removal_reading: MaskReading = MaskReading()
+    """How masks of what to remove are read."""
 
 
 @dataclass(frozen=True)

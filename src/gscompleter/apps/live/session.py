@@ -202,7 +202,7 @@ def read_step_marks(step: Step, camera: Camera) -> Bool[Tensor, "h w"]:
     """Read the marks of a step at the size of its camera."""
     if step.mask is None:
         raise InputError(UNMARKED)
-    return read_marks(step.mask, camera, "The mask")
+    return read_marks(step.mask, camera, name="The mask")
 
 
 def undo_step(session: Session) -> Session:

@@ -26,6 +26,8 @@ from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.colmap import open_colmap
 from gscompleter.data.file_names import FolderListings
 from gscompleter.data.frame import MASKS, Frame
+from gscompleter.data.mask_checks import check_hiding_masks
+from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.masks import find_mask
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.sfm.poses import (
@@ -133,12 +135,17 @@ class Placed:
 
 
 def place_photographs(
-    folder: Path, photographs: Photographs, out: Path, overwrite: bool = False
+    folder: Path,
+    photographs: Photographs,
+    out: Path,
+    overwrite: bool = False,
+    reading: MaskReading = MaskReading(),
 ) -> tuple[Photographs, Placed]:
     """Find the cameras of new photographs, and add them to those of a scene.
 
     The result is written to `out`, from which a later run with the same photographs takes it.
-    Raises InputError if none can be placed.
+    `reading` is how masks of the new photographs are read. Raises InputError if none can be placed,
+    or if these masks hide most of them.
     """
     found = list_all_photographs(folder) if os.path.isdir(folder) else []
     known = {stored.resolve() for stored in map(find_stored_file, photographs.frames) if stored}
@@ -152,14 +159,19 @@ def place_photographs(
             "photos",
         )
 
+    listings = FolderListings()
+    masks = [find_mask(folder / name, name, listings) for name in names]
+    check_hiding_masks([mask for mask in masks if mask is not None], reading)
     identity = identify_input(folder, names, photographs)
+    if reading.is_inverted:
+        identity["inverted masks"] = True
     earlier = read_earlier(out, "placed", identity)
     if earlier is not None:
         placed = replace(Placed(**earlier), reused=True)
     else:
         require_pycolmap()
         with reserve_output(out, overwrite, COMMAND, RESULTS) as output, output.write() as draft:
-            placed = place_copies(folder, names, photographs, draft)
+            placed = place_copies(folder, names, photographs, draft, reading.is_inverted)
             content = {"placed": asdict(placed), "photographs": identity}
             (draft / SUMMARY_FILE).write_bytes(json.dumps(content, indent=1).encode())
     placed = replace(placed, skipped=len(found) - len(names))
@@ -187,13 +199,17 @@ def identify_input(folder: Path, names: Sequence[str], photographs: Photographs)
 
 
 def place_copies(
-    folder: Path, names: Sequence[str], photographs: Photographs, draft: Path
+    folder: Path,
+    names: Sequence[str],
+    photographs: Photographs,
+    draft: Path,
+    has_inverted_masks: bool = False,
 ) -> Placed:
     """Write `images` and `sparse/0` of the photographs that can be placed into `draft`."""
     with tempfile.TemporaryDirectory(dir=draft) as work:
         home = Path(work)
         known, sources = write_known(photographs, home)
-        new = write_new(folder, names, photographs, home)
+        new = write_new(folder, names, photographs, home, has_inverted_masks)
         job = {
             "images": str(home / IMAGES),
             "masks": str(home / MASKS),
@@ -288,7 +304,11 @@ def read_pinhole(view: View) -> Pinhole:
 
 
 def write_new(
-    folder: Path, names: Sequence[str], photographs: Photographs, home: Path
+    folder: Path,
+    names: Sequence[str],
+    photographs: Photographs,
+    home: Path,
+    has_inverted_masks: bool,
 ) -> list[NewCopy]:
     """Write copies of new photographs, undistorted if their lens is a known one."""
     lenses = collect_lenses(photographs)
@@ -296,7 +316,9 @@ def write_new(
     copies = []
     for name in track(names, "Reading new photographs"):
         key = read_lens_key(folder / name)
-        copies.append(write_copy(folder, name, key, lenses.get(key), home, listings))
+        copies.append(
+            write_copy(folder, name, key, lenses.get(key), home, listings, has_inverted_masks)
+        )
     return copies
 
 
@@ -325,6 +347,7 @@ def write_copy(
     known: Intrinsics | None,
     home: Path,
     listings: FolderListings,
+    has_inverted_mask: bool,
 ) -> NewCopy:
     """Write the copy of a new photograph, which is undistorted if its lens is `known`."""
     path = folder / name
@@ -333,7 +356,15 @@ def write_copy(
     width, height, lens = key
     guess = Intrinsics((width, height), (float(width), float(width)))
     mask = find_mask(path, name, listings)
-    frame = Frame(name, title, np.eye(4), known or guess, path, mask=mask)
+    frame = Frame(
+        name,
+        title,
+        np.eye(4),
+        known or guess,
+        path,
+        mask=mask,
+        has_inverted_mask=has_inverted_mask,
+    )
     (view,) = build_photographs(name, title, [frame]).views([0], MAX_SIDE)
 
     # Two photographs may differ in their endings alone.

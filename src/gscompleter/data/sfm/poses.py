@@ -30,6 +30,8 @@ from gscompleter.data.camera_files import refuse_other_exports
 from gscompleter.data.file_names import FolderListings
 from gscompleter.data.frame import DOWNSCALE_FACTORS, MASKS
 from gscompleter.data.limits import require
+from gscompleter.data.mask_checks import check_hiding_masks, refuse_nothing_to_invert
+from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.masks import MASK_FOLDERS, find_mask, leave_out_masks, load_mask
 from gscompleter.data.panorama import has_panoramas, split_panorama
 from gscompleter.data.video import NUM_FRAMES, extract_frames, is_video
@@ -39,6 +41,7 @@ from gscompleter.system.files.image import (
     HALF_OPAQUE,
     ORIENTATION,
     has_alpha,
+    leave_out_constant,
     open_image,
     read_colors_and_alpha,
     read_orientation,
@@ -158,11 +161,24 @@ class FoundPoses:
 
 
 def find_poses(
-    photographs: Path, out: Path, overwrite: bool = False, num_frames: int = NUM_FRAMES
+    photographs: Path,
+    out: Path,
+    overwrite: bool = False,
+    num_frames: int = NUM_FRAMES,
+    reading: MaskReading = MaskReading(),
 ) -> FoundPoses:
-    """Find the cameras of a folder of photographs or of a video's frames; write them to `out`."""
+    """Find the cameras of a folder of photographs or of a video's frames; write them to `out`.
+
+    Raises InputError if masks hide most of the photographs, unless `reading` allows that. The masks
+    that are written are black where something is hidden, however they are read.
+    """
+    masks = list_given_masks(photographs)
+    refuse_nothing_to_invert(masks, reading)
+    check_hiding_masks(masks, reading)
     # The same photographs in the same folder have the same cameras: minutes of work are reused.
     known = _identify_input(photographs, num_frames)
+    if reading.is_inverted:
+        known["inverted masks"] = []
     earlier = read_earlier(out, "poses", known)
     if earlier is not None:
         return replace(FoundPoses(**earlier), reused=True)
@@ -172,10 +188,19 @@ def find_poses(
         output.write() as folder,
         _open_images(photographs, num_frames, folder) as images,
     ):
-        poses = _run(images, folder, photographs)
+        poses = _run(images, folder, photographs, reading.is_inverted)
         content = {"poses": asdict(poses), "photographs": known}
         (folder / SUMMARY_FILE).write_bytes(json.dumps(content, indent=1).encode())
     return replace(poses, kept=" ".join(output.describe_others()))
+
+
+def list_given_masks(path: Path) -> list[Path]:
+    """List the masks of a folder of photographs; a video has none."""
+    if is_video(path):
+        return []
+    listings = FolderListings()
+    masks = (find_mask(path / name, name, listings) for name in list_all_photographs(path))
+    return [mask for mask in masks if mask is not None]
 
 
 def _identify_input(path: Path, num_frames: int) -> dict[str, list[int]]:
@@ -292,7 +317,7 @@ def is_own(folder: Path) -> bool:
     return not os.path.isfile(folder / SUMMARY_FILE)
 
 
-def _run(photographs: Path, folder: Path, given: Path) -> FoundPoses:
+def _run(photographs: Path, folder: Path, given: Path, has_inverted_masks: bool) -> FoundPoses:
     """Write `images` and `sparse/0` of photographs, made from what was `given`, into `folder`."""
     names = list_photograph_files(photographs)
     is_panoramic = has_panoramas([photographs / name for name in names])
@@ -300,7 +325,9 @@ def _run(photographs: Path, folder: Path, given: Path) -> FoundPoses:
     copies = [
         copy
         for name in track(names, "Turning photographs upright")
-        for copy in write_copies(photographs, name, folder, is_panoramic, listings)
+        for copy in write_copies(
+            photographs, name, folder, is_panoramic, listings, has_inverted_masks
+        )
     ]
     result = _map(copies, folder, is_panoramic)
     missing = [copy.source for copy in copies if copy.name not in result["registered"]]
@@ -338,7 +365,12 @@ def _describe_origin(given: Path, images: int, copies: int) -> str:
 
 
 def write_copies(
-    root: Path, source: str, folder: Path, is_panoramic: bool, listings: FolderListings
+    root: Path,
+    source: str,
+    folder: Path,
+    is_panoramic: bool,
+    listings: FolderListings,
+    has_inverted_mask: bool = False,
 ) -> list[UprightCopy]:
     """Write the upright copy of a photograph, or the views of a panorama, into `folder`/images.
 
@@ -347,9 +379,9 @@ def write_copies(
     """
     mask = find_mask(root / source, source, listings)
     if not is_panoramic:
-        return [write_upright(root, source, folder, mask)]
+        return [write_upright(root, source, folder, mask, has_inverted_mask)]
     copies = []
-    hidden = read_hidden(root / source, mask)
+    hidden = read_hidden(root / source, mask, has_inverted_mask)
     for number, (pixels, shade) in enumerate(split_panorama(root / source, hidden)):
         kind = f"view_{number}"
         name = Path(re.sub(SEPARATORS, "_", source)).with_suffix(".jpg")
@@ -363,7 +395,13 @@ def write_copies(
     return copies
 
 
-def write_upright(root: Path, source: str, folder: Path, mask: Path | None = None) -> UprightCopy:
+def write_upright(
+    root: Path,
+    source: str,
+    folder: Path,
+    mask: Path | None = None,
+    has_inverted_mask: bool = False,
+) -> UprightCopy:
     """Write an upright copy of the photograph `root`/`source` to the same place in `folder`/images.
 
     A small upright 8-bit JPEG or PNG is copied byte for byte; a format that COLMAP may not read
@@ -392,13 +430,15 @@ def write_upright(root: Path, source: str, folder: Path, mask: Path | None = Non
         written = "JPEG" if kind == "JPEG" else "PNG"
         copy.save(target, format=written, quality=QUALITY, subsampling=0)
 
-    hidden = read_hidden(path, mask)
+    hidden = read_hidden(path, mask, has_inverted_mask)
     is_masked = hidden is not None and _write_mask(folder, name, hidden, copy.size)
     diagonal = math.hypot(*copy.size)
     return UprightCopy(name, source, *copy.size, focal and focal * diagonal, lens, is_masked)
 
 
-def read_hidden(path: Path, mask: Path | None) -> Bool[np.ndarray, "h w"] | None:
+def read_hidden(
+    path: Path, mask: Path | None, has_inverted_mask: bool = False
+) -> Bool[np.ndarray, "h w"] | None:
     """Read what a mask or the alpha of a photograph hides, upright; None if it has neither."""
     if mask is None and not has_alpha(path):
         return None
@@ -407,10 +447,11 @@ def read_hidden(path: Path, mask: Path | None) -> Bool[np.ndarray, "h w"] | None
     # A mask is of the upright photograph, or is turned with it; alpha is stored with the pixels.
     hidden = np.zeros((size[1], size[0]), dtype=bool)
     if mask is not None:
-        hidden |= load_mask(mask, size, f"the photograph {quote_value(path)}", orientation)
-    if has_alpha(path):
-        _, alpha = read_colors_and_alpha(path)
-        assert alpha is not None
+        title = f"the photograph {quote_value(path)}"
+        hidden |= load_mask(mask, size, title, orientation, has_inverted_mask)
+    _, alpha = read_colors_and_alpha(path) if has_alpha(path) else (None, None)
+    alpha = None if alpha is None else leave_out_constant(alpha)
+    if alpha is not None:
         hidden |= turn_upright(alpha < HALF_OPAQUE, orientation)
     return hidden
 

@@ -13,6 +13,7 @@ from gscompleter.evaluation.metrics.coverage import RenderPair
 from gscompleter.evaluation.metrics.image import compute_masked_psnr, compute_masked_ssim
 from gscompleter.evaluation.metrics.unused_photographs import measure_likeness, shrink_view
 from gscompleter.evaluation.verdict.rows import HeldOutRow
+from gscompleter.numerics.image_ops import compute_mask_fraction
 from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
 from gscompleter.state import Completion
@@ -62,7 +63,9 @@ def score_held_out(
         with torch.no_grad():
             render = renderer.render(completion.source.rendered, small.camera)
         likeness = measure_likeness(render, small, used)
-        row = replace(row, is_check=photograph.is_check)
+        # Without what shows the removed, which is no mask of the user.
+        unmasked = 1 - compute_mask_fraction(photograph.view.ignore_mask)
+        row = replace(row, is_check=photograph.is_check, unmasked=unmasked)
         return row if likeness is None else replace(row, **asdict(likeness))
 
     map_views = get_view_map(completion.context.means, len(completion.context))

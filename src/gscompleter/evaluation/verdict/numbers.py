@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from statistics import fmean
+
+MIN_MASKED = 0.1
+"""Share of photographs that masks hide from which it is said beside their scores."""
 
 
 def average(values: Iterable[float | None]) -> float | None:
@@ -29,3 +32,14 @@ def format_change(before: float | None, after: float | None, digits: int = 2) ->
         return "–"
     # Adding 0.0 turns -0.0 into 0.0, so that no change is "+0.00" and never "-0.00".
     return f"{round(after - before, digits) + 0.0:+.{digits}f}"
+
+
+def describe_measured(unmasked: Sequence[float]) -> str:
+    """Say in a clause how much of each picture was measured, if masks hide much; empty if not.
+
+    `unmasked` are the shares that masks leave.
+    """
+    left = fmean(unmasked)
+    if left > 1 - MIN_MASKED:
+        return ""
+    return f", over the {format_percent(left, 0)} of the picture that masks leave"

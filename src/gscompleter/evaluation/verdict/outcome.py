@@ -10,7 +10,12 @@ from collections.abc import Sequence
 from statistics import median
 
 from gscompleter.evaluation.metrics.unused_photographs import shrink_view
-from gscompleter.evaluation.verdict.numbers import average, format_number, format_percent
+from gscompleter.evaluation.verdict.numbers import (
+    average,
+    describe_measured,
+    format_number,
+    format_percent,
+)
 from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow
 from gscompleter.reconstructors.features.consistency import count_consistent_matches
 from gscompleter.stages.target_view import NOTHING_TO_COMPLETE
@@ -111,9 +116,11 @@ def is_like(compared: Sequence[HeldOutRow]) -> bool:
 def describe_mismatch(compared: Sequence[HeldOutRow]) -> str:
     """Describe unused photographs that the scene does not resemble."""
     psnr = format_number(average(row.psnr_after for row in compared), 1)
+    measured = describe_measured([row.unmasked for row in compared])
     return (
         f"The scene did not reconstruct: seen from {name_unused(compared)}, it shows something "
-        f"else ({psnr} dB; holding up one of its own photographs would be as good). {ADVICE}"
+        f"else ({psnr} dB{measured}; holding up one of its own photographs would be as good). "
+        f"{ADVICE}"
     )
 
 
@@ -176,6 +183,7 @@ def describe_gain(work: str, held_out: Sequence[HeldOutRow]) -> str:
     before = average(row.psnr_before for row in rows) or 0.0
     after = average(row.psnr_after for row in rows) or 0.0
     scores = f"{format_number(before)} dB before, {format_number(after)} dB after"
+    scores += describe_measured([row.unmasked for row in rows])
     if after < before - MIN_LOSS:
         return f"{work}, but it matches {name_unused(rows)} worse than before: {scores}."
     return f"{work}; at {name_unused(rows)}, where it covers them: {scores}."

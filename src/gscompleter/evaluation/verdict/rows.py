@@ -35,6 +35,8 @@ class HeldOutRow(ScoreRow):
     """
 
     is_check: bool = False
+    unmasked: float = 1.0
+    """Share of the photograph that masks leave, which alone is scored."""
     covered_before: float = 0.0
     """Share of the valid pixels that the scene covers before the completion."""
     covered_after: float = 0.0

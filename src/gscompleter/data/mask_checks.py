@@ -1,0 +1,156 @@
+"""Checks that masks mean what their reader takes them for, before anything is computed with them.
+
+Programs do not agree what white means: COLMAP's masks are black where a photograph is ignored,
+those of segmentation programs are white on the thing that was clicked. Only their size tells them
+apart: what is ignored, removed or repaired is seldom more than half of what a camera sees.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from statistics import fmean
+
+import numpy as np
+from jaxtyping import Bool
+
+from gscompleter.data.mask_reading import MaskReading
+from gscompleter.data.masks import hides_white, read_ignored
+from gscompleter.data.photographs import Photographs
+from gscompleter.system.errors import InputError, join_names
+from gscompleter.system.files.image import read_mask
+
+MAX_TAKEN = 0.5
+"""Largest share, of its image or of the splat, that a mask takes away without being asked about."""
+MAX_READ = 16
+"""Most masks that are read for a check, at even steps of all."""
+MAX_NAMED = 2
+"""Masks or folders that a sentence names."""
+MAX_NAME_LENGTH = 50
+
+
+def are_probably_inverted(shares: Sequence[float]) -> bool:
+    """Decide whether masks are probably the other way round: most take away more than half.
+
+    Args:
+        shares: What each mask takes away, as a share of its image or of the splat.
+    """
+    large = [share for share in shares if share > MAX_TAKEN]
+    return 2 * len(large) > len(shares)
+
+
+def read_masks_as_asked(photographs: Photographs, reading: MaskReading) -> Photographs:
+    """Check the masks of photographs, and return the photographs with masks that are read so.
+
+    What an alpha channel hides is certain, so that neither the check nor the inversion is for it.
+    """
+    check_hiding_masks(photographs.list_masks(), reading)
+    return photographs.invert_masks() if reading.is_inverted else photographs
+
+
+def refuse_nothing_to_invert(masks: Sequence[Path], reading: MaskReading) -> None:
+    """Refuse to invert the masks of photographs where none is used."""
+    if reading.is_inverted and not masks:
+        raise InputError(
+            "No mask is used for the photographs that could be read the other way round (an alpha "
+            "channel always hides what is transparent); leave it out.",
+            "invert-masks",
+        )
+
+
+def check_hiding_masks(masks: Sequence[Path], reading: MaskReading) -> None:
+    """Refuse masks that hide all of all photographs, or more than half of most of them.
+
+    A mask that hides a whole photograph leaves it out, which tells nothing of the others.
+    """
+    if reading.may_be_large or not masks:
+        return
+    sampled = sample_evenly(masks)
+    ignored = [float(read_ignored(path, reading.is_inverted).mean()) for path in sampled]
+    shares = [share for share in ignored if share < 1.0]
+    places = name_masks(path.parent for path in masks)
+    color = "white" if hides_white(masks[0], reading.is_inverted) else "black"
+    if not shares:
+        raise InputError(
+            f"The masks of the photographs ({places}) are {color} everywhere, and what is {color} "
+            f"is ignored, so that nothing would be left; {name_ways_out(reading, hides=True)}"
+        )
+    if are_probably_inverted(shares):
+        raise InputError(
+            f"Masks hide {format_share(shares)} of the photographs ({places}), where what is "
+            f"{color} is ignored; {name_ways_out(reading, hides=True)}"
+        )
+
+
+def check_selecting_masks(masks: Sequence[Path], reading: MaskReading, images: str) -> None:
+    """Refuse masks of what goes that select nothing, or more than half of most of their images.
+
+    A mask that selects nothing is of an image that does not show the thing. `images` says of what
+    the masks are.
+    """
+    # Only where some say nothing are all of them read.
+    shares = measure_selected(sample_evenly(masks), reading) or measure_selected(masks, reading)
+    taken, left = ("black", "white") if reading.is_inverted else ("white", "black")
+    if not shares:
+        raise InputError(
+            f"{name_masks(masks)} {'is' if len(masks) == 1 else 'are'} {left} everywhere, and what "
+            f"masks show {taken} goes; paint {taken} what is to go.",
+            "mask",
+        )
+    if not reading.may_be_large and are_probably_inverted(shares):
+        raise InputError(
+            f"Masks ({name_masks(masks)}) select {format_share(shares)} of {images}, where what is "
+            f"{taken} goes; {name_ways_out(reading)}"
+        )
+
+
+def check_selected_share(share: float, reading: MaskReading) -> None:
+    """Refuse masks that select more than half of the Gaussians of a splat."""
+    if not reading.may_be_large and are_probably_inverted([share]):
+        taken = "black" if reading.is_inverted else "white"
+        raise InputError(
+            f"The masks select {format_share([share])} of the Gaussians of the splat, where what "
+            f"is {taken} goes; {name_ways_out(reading)}"
+        )
+
+
+def sample_evenly(masks: Sequence[Path]) -> list[Path]:
+    """Sample up to `MAX_READ` masks at even steps."""
+    steps = np.linspace(0, len(masks) - 1, min(len(masks), MAX_READ)).round().astype(int)
+    return [masks[step] for step in steps]
+
+
+def measure_selected(masks: Iterable[Path], reading: MaskReading) -> list[float]:
+    """Measure the shares that masks select of their images; without those that select nothing."""
+    shares = [float(read_selected(path, reading).mean()) for path in masks]
+    return [share for share in shares if share > 0.0]
+
+
+def read_selected(
+    stored: Path | bytes, reading: MaskReading, name: str = ""
+) -> Bool[np.ndarray, "h w"]:
+    """Read the pixels of a mask that say what goes: white ones, or black ones if inverted.
+
+    `name` is for errors of bytes.
+    """
+    black = read_mask(stored, name)
+    return black if reading.is_inverted else ~black
+
+
+def name_ways_out(reading: MaskReading, hides: bool = False) -> str:
+    """Name the options that turn masks, or take them as they are; `hides` for those of SCENE."""
+    turn = "leave --invert-masks out" if reading.is_inverted else "add --invert-masks"
+    if not reading.is_turned_by_option:
+        turn = "save them in the other colours"
+    rest = ", or --no-masks to use all pixels" if hides else ""
+    return f"if it is the other way round, {turn}; if it is meant so, add --large-masks{rest}."
+
+
+def name_masks(paths: Iterable[Path]) -> str:
+    """Name masks, or the folders of them."""
+    return join_names(list(dict.fromkeys(paths)), MAX_NAMED, MAX_NAME_LENGTH)
+
+
+def format_share(shares: Sequence[float]) -> str:
+    """Format the mean of shares as a percentage."""
+    return f"{100 * fmean(shares):.0f} %"
