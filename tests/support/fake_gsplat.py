@@ -195,9 +195,7 @@ def projection_ewa_3dgs_fused_fwd(
     return tuple(wrap(result) for result in results)
 
 
-def list_shapes(
-    covars: Tensor | None, quats: Tensor | None, scales: Tensor | None
-) -> list[Tensor]:
+def list_shapes(covars: Tensor | None, quats: Tensor | None, scales: Tensor | None) -> list[Tensor]:
     """List the values of covariances, or of quaternions and scales: only one of them is given."""
     given = check_inputs(covars=covars, quats=quats, scales=scales)
     shapes = [values for values in given if values is not None]
@@ -233,10 +231,8 @@ def projection_ewa_3dgs_fused_bwd(
     """Compute gradients of means and shapes; 0 for Gaussians outside."""
     assert not needs_viewmats
     shapes = list_shapes(covars, quats, scales)
-    centers, *cameras, radii_, _, _, v_means2d_, v_depths_, v_conics_, v_compensations_ = check_inputs(
-        means=means,
-        viewmats=viewmats,
-        Ks=Ks,
+    centers, *cameras = check_inputs(means=means, viewmats=viewmats, Ks=Ks)
+    radii_, _, _, *given = check_inputs(
         radii=radii,
         conics=conics,
         compensations=compensations,
@@ -254,7 +250,6 @@ def projection_ewa_3dgs_fused_bwd(
                 leaves = [values[seen].requires_grad_() for values in parameters]
                 camera = [part[number : number + 1] for part in cameras]
                 results = project(leaves[0], leaves[1:], *camera, width, height, eps2d)
-            given = [v_means2d_, v_depths_, v_conics_, v_compensations_]
             used = [part for part, v in zip(results, given, strict=True) if v is not None]
             incoming = [v[number : number + 1, seen] for v in given if v is not None]
             found = torch.autograd.grad(used, leaves, incoming)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -19,11 +20,8 @@ from gscompleter.reconstructors import (
     run_reconstructor,
 )
 from gscompleter.reconstructors.depth_predictors import give_prediction
-from gscompleter.reconstructors.features.depth_range import (
-    find_depth_range,
-    get_depth_range,
-    set_depth_range,
-)
+from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
+from gscompleter.reconstructors.features.given_range import find_depth_range
 from gscompleter.render.lod import build_proxy
 from gscompleter.render.protocols import Renderer
 from gscompleter.system.errors import InputError
@@ -105,8 +103,10 @@ def prepare_single(reconstructor: Reconstructor, views: Sequence[View]) -> list[
 def reconstruct_context(reconstructor: Reconstructor, views: Sequence[View]) -> InitialContext:
     """Reconstruct `G_ctx = Ψ(V_in)` from posed photographs (paper, Eq. 5)."""
     check_texture(views)
-    near, far = find_depth_range(views, get_trained_range(reconstructor))
-    views = set_depth_range(views, near, far)
+    found = find_depth_range(views, get_trained_range(reconstructor))
+    for note in found.notes:
+        logging.getLogger("gscompleter").warning("gscompleter: %s", note)
+    views = set_depth_range(views, found.near, found.far)
     reconstruction = run_reconstructor(reconstructor, views)
     source = ContextScene.whole(drop_ignored(reconstruction, views))
     # The scene has one exposure, which the photographs have to share from here on.
