@@ -99,13 +99,13 @@ def test_given_depths_outside_of_the_range_widen_it():
 def test_a_trained_network_keeps_its_range_and_the_user_is_told():
     trained = (1.0, 100.0)
     # The range of its authors, as their evaluation gives it
-    assert find_depth_range(see_room(*trained), trained) == DepthRange(*trained)
-    cut = find_depth_range(see_room(CUT, 100.0), trained)
+    assert find_depth_range(see_room(*trained), trained, keeps=True) == DepthRange(*trained)
+    cut = find_depth_range(see_room(CUT, 100.0), trained, keeps=True)
     assert (cut.near, cut.far) == (CUT, 100.0)
     assert cut.notes[0].endswith(": this model gets the range as it was given.")
     # Without a range the unit of the scene matters.
-    assert find_depth_range(see_room(None, None), trained) == DepthRange(*trained)
-    small = find_depth_range(see_room(None, None, 0.01), trained)
+    assert find_depth_range(see_room(None, None), trained, keeps=True) == DepthRange(*trained)
+    small = find_depth_range(see_room(None, None, 0.01), trained, keeps=True)
     assert (small.near, small.far) == trained
     (note,) = small.notes
     assert "this model was trained on 1 to 100: multiply the positions of the cameras by" in note

@@ -36,11 +36,12 @@ def test_what_stands_before_a_given_near_plane_gets_its_depth(caplog):
 
 
 @dataclass(frozen=True)
-class Trained:
-    """A Ψ that knows one range of depths and records what it is given."""
+class Recorder:
+    """A Ψ that records the ranges of depths that it is given."""
 
     ranges: list[tuple[float | None, float | None]]
-    depth_range: tuple[float, float] = (10.0, 1000.0)
+    depth_range: tuple[float, float] | None = (10.0, 1000.0)
+    keeps_range: bool = False
 
     def __call__(self, views: list[View]) -> Reconstruction:
         self.ranges.extend((view.camera.near, view.camera.far) for view in views)
@@ -54,7 +55,7 @@ def list_depths(views: list[View]) -> list[DepthMap]:
 
 @pytest.mark.parametrize("near", [None, 10.0, 3.0])
 def test_a_network_with_one_range_is_given_it_and_python_is_told(caplog, near):
-    psi = Trained([])
+    psi = Recorder([])
     reconstruct_context(psi, see_room(near, None if near is None else 1000.0))
     assert psi.ranges == [(near or 10.0, 1000.0)] * 2
     told = {
@@ -64,3 +65,11 @@ def test_a_network_with_one_range_is_given_it_and_python_is_told(caplog, near):
     }[near]
     assert told in caplog.text
     assert bool(told) == bool(caplog.text)
+
+
+@pytest.mark.parametrize("keeps", [False, True])
+def test_a_reconstructor_may_ask_for_the_range_that_was_given(caplog, keeps):
+    psi = Recorder([], depth_range=None, keeps_range=keeps)
+    reconstruct_context(psi, see_room(2.9, 20.0))
+    assert (psi.ranges[0][0] == 2.9) == keeps
+    assert ("gets the range as it was given" if keeps else "was widened to") in caplog.text

@@ -17,6 +17,7 @@ from gscompleter.reconstructors import (
     DepthAware,
     Reconstructor,
     get_trained_range,
+    keeps_given_range,
     run_reconstructor,
 )
 from gscompleter.reconstructors.depth_predictors import give_prediction
@@ -103,7 +104,8 @@ def prepare_single(reconstructor: Reconstructor, views: Sequence[View]) -> list[
 def reconstruct_context(reconstructor: Reconstructor, views: Sequence[View]) -> InitialContext:
     """Reconstruct `G_ctx = Ψ(V_in)` from posed photographs (paper, Eq. 5)."""
     check_texture(views)
-    found = find_depth_range(views, get_trained_range(reconstructor))
+    trained = get_trained_range(reconstructor)
+    found = find_depth_range(views, trained, keeps_given_range(reconstructor))
     for note in found.notes:
         logging.getLogger("gscompleter").warning("gscompleter: %s", note)
     views = set_depth_range(views, found.near, found.far)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from gscompleter.apps.inputs.task import CompletionTask
-from gscompleter.reconstructors import Reconstructor, get_trained_range
+from gscompleter.reconstructors import Reconstructor, get_trained_range, keeps_given_range
 from gscompleter.reconstructors.features.depth_range import set_depth_range
 from gscompleter.reconstructors.features.given_range import find_depth_range
 from gscompleter.render.protocols import Renderer
@@ -30,7 +30,7 @@ def apply_scene_range(
     # A published network has the depth range of its authors (decision 047), which takes the place
     # of a range estimated from features.
     trained = get_trained_range(reconstructor)
-    found = find_depth_range(task.views, trained)
+    found = find_depth_range(task.views, trained, keeps_given_range(reconstructor))
     camera = task.views[0].camera
     depths = dict(task.depths)
     for name, before, after in (

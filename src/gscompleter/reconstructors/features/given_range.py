@@ -81,23 +81,25 @@ class SeenDepths:
 
 
 def find_depth_range(
-    views: Sequence[View], trained: tuple[float, float] | None = None
+    views: Sequence[View], trained: tuple[float, float] | None = None, keeps: bool = False
 ) -> DepthRange:
     """Find near and far z-depth of a scene, in scene units, and say what contradicts them.
 
     They are those of the first camera; else those that Ψ was `trained` on; else those of matched
-    features. A Ψ that was not trained on any range gets a given one widened to what photographs
-    show. Raise InputError for an empty range.
+    features. A given one is widened to what photographs show, unless Ψ `keeps` it. Raise InputError
+    for an empty range.
     """
     known = (views[0].camera.near, views[0].camera.far)
     if trained is None:
         found = DepthRange(*get_depth_range(views))
-        return found if known == (None, None) else widen_range(views, found)
-    found = DepthRange(*get_depth_range(views, lambda _: trained))
-    if known == trained:
+    else:
+        found = DepthRange(*get_depth_range(views, lambda _: trained))
+        if None in known:
+            return replace(found, notes=describe_mismatch(views, found))
+    if known in ((None, None), trained):
         return found
-    if None in known:
-        return replace(found, notes=describe_mismatch(views, found))
+    if not keeps:
+        return widen_range(views, found)
     widened = widen_range(views, found, "this model gets the range as it was given")
     return replace(found, notes=widened.notes)
 
