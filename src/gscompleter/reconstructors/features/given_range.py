@@ -32,8 +32,10 @@ from gscompleter.system.errors import InputError
 from gscompleter.types import View
 
 MIN_MOTION = 1.0
-"""Motion, in pixels, of a feature between its depth and the end of the range, from which on it lies
-outside: what moves less is matched at that end all the same."""
+"""Motion, in pixels, of a feature between its depth and the far plane from which on it lies behind
+it: what moves less is matched at the plane all the same. There is no such limit at the near plane.
+Surfaces without features often stand before the nearest ones, and a plane just behind these costs
+0.7 dB."""
 NEIGHBOURHOOD = 0.1
 """Half the side of the square, in widths of the image, in which matches confirm each other."""
 SAME_DEPTH = math.log(1.25)
@@ -60,14 +62,12 @@ class SeenDepths:
     """What shows them, as the beginning of a sentence."""
     inverse: Float[np.ndarray, "n"]
     """Inverse z-depths, in 1 / scene unit."""
-    is_nearer: Bool[np.ndarray, "n"]
-    """True where a depth lies clearly before the near plane."""
     is_farther: Bool[np.ndarray, "n"]
     """True where a depth lies clearly behind the far plane."""
 
     def find_nearest(self, near: float) -> float | None:
         """Find the depth of the nearest 2 %; None if they do not lie before the near plane."""
-        if len(self.inverse) < MIN_MATCHES or self.is_nearer.mean() < SHARE_OUTSIDE:
+        if len(self.inverse) < MIN_MATCHES:
             return None
         nearest = 1 / float(np.quantile(self.inverse, 1 - SHARE_OUTSIDE))
         return nearest if nearest < near else None
@@ -153,12 +153,11 @@ def describe_mismatch(views: Sequence[View], trained: DepthRange) -> tuple[str, 
 def measure_features(views: Sequence[View], given: DepthRange) -> SeenDepths:
     """Measure the depths of matched features that others confirm; none without a baseline."""
     none = np.zeros(0)
-    inverses, nearer, farther = [none], [none > 0], [none > 0]
+    inverses, farther = [none], [none > 0]
     with suppress(InputError):
         images, unit = make_stereo_images(views)
         neighbours = find_neighbours(images) if len(images) > 1 else None
-        # Inverse depths are per widest baseline.
-        closest, remotest = unit / given.near, unit / given.far
+        remotest = unit / given.far  # inverse depths are per widest baseline
         for i, j in neighbours.pairs if neighbours else ():
             in_i, in_j = neighbours.matches[i, j]
             # Each match has a depth in either photograph of the pair.
@@ -167,21 +166,17 @@ def measure_features(views: Sequence[View], given: DepthRange) -> SeenDepths:
                 pixels, inverse = in_a[is_valid], inverse[is_valid]
                 is_confirmed = find_confirmed(pixels, inverse, images[a].size[1])
                 pixels, inverse = pixels[is_confirmed], inverse[is_confirmed]
-                pair = (images[a], images[b], pixels, inverse)
+                motion = measure_motion(images[a], images[b], pixels, inverse, remotest)
                 inverses.append(inverse / unit)
-                is_before = measure_motion(*pair, closest) > MIN_MOTION
-                is_behind = measure_motion(*pair, remotest) > MIN_MOTION
-                nearer.append((inverse > closest) & is_before)
-                farther.append((inverse < remotest) & is_behind)
-    return SeenDepths("Matched features", *map(np.concatenate, (inverses, nearer, farther)))
+                farther.append((inverse < remotest) & (motion > MIN_MOTION))
+    return SeenDepths("Matched features", np.concatenate(inverses), np.concatenate(farther))
 
 
 def measure_given(views: Sequence[View], given: DepthRange) -> SeenDepths:
     """Measure the depths that are given with the photographs."""
     known = [view.known_depths.cpu().double().numpy() for view in views]
     inverse = 1 / np.concatenate(known)
-    is_before, is_behind = inverse > 1 / given.near, inverse < 1 / given.far
-    return SeenDepths("Given depths", inverse, is_before, is_behind)
+    return SeenDepths("Given depths", inverse, inverse < 1 / given.far)
 
 
 def find_confirmed(
