@@ -47,6 +47,14 @@ class Lifter(Protocol):
 
 
 @runtime_checkable
+class NearPlaneFinder(Protocol):
+    """Interface of a Ψ that tells from its matches that surfaces stand before the near plane."""
+
+    def find_near_plane(self, views: Sequence[View], near: float, far: float) -> float:
+        """Find a near plane, in scene units, that no surface stands before; at most `near`."""
+
+
+@runtime_checkable
 class DepthAware(Protocol):
     """Interface of a Ψ that lets monocular depth support its stereo."""
 

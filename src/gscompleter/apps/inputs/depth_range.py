@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import replace
 
 from gscompleter.apps.inputs.task import CompletionTask
-from gscompleter.reconstructors import Reconstructor, get_trained_range, keeps_given_range
+from gscompleter.reconstructors import Reconstructor, get_trained_range
 from gscompleter.reconstructors.features.depth_range import set_depth_range
-from gscompleter.reconstructors.features.given_range import find_depth_range
 from gscompleter.render.protocols import Renderer
-from gscompleter.stages.context import find_splat_range
+from gscompleter.stages.context import find_scene_range, find_splat_range
 from gscompleter.types import Gaussians
 
 
@@ -30,7 +29,7 @@ def apply_scene_range(
     # A published network has the depth range of its authors (decision 047), which takes the place
     # of a range estimated from features.
     trained = get_trained_range(reconstructor)
-    found = find_depth_range(task.views, trained, keeps_given_range(reconstructor))
+    found = find_scene_range(reconstructor, task.views)
     camera = task.views[0].camera
     depths = dict(task.depths)
     for name, before, after in (
