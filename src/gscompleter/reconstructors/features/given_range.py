@@ -25,17 +25,12 @@ from gscompleter.reconstructors.features.depth_range import (
     get_depth_range,
     measure_feature_depths,
 )
-from gscompleter.reconstructors.features.matches import Pixels, measure_motion, triangulate
+from gscompleter.reconstructors.features.matches import Pixels, triangulate
 from gscompleter.reconstructors.features.neighbours import find_neighbours
 from gscompleter.reconstructors.features.stereo_image import make_stereo_images
 from gscompleter.system.errors import InputError
 from gscompleter.types import View
 
-MIN_MOTION = 1.0
-"""Motion, in pixels, of a feature between its depth and the far plane from which on it lies behind
-it: what moves less is matched at the plane all the same. There is no such limit at the near plane.
-Surfaces without features often stand before the nearest ones, and a plane just behind these costs
-0.7 dB."""
 NEIGHBOURHOOD = 0.1
 """Half the side of the square, in widths of the image, in which matches confirm each other."""
 SAME_DEPTH = math.log(1.25)
@@ -56,14 +51,12 @@ class DepthRange:
 
 @dataclass(frozen=True)
 class SeenDepths:
-    """Depths that photographs show, compared with a range."""
+    """Depths that photographs show."""
 
     source: str
     """What shows them, as the beginning of a sentence."""
     inverse: Float[np.ndarray, "n"]
     """Inverse z-depths, in 1 / scene unit."""
-    is_farther: Bool[np.ndarray, "n"]
-    """True where a depth lies clearly behind the far plane."""
 
     def find_nearest(self, near: float) -> float | None:
         """Find the depth of the nearest 2 %; None if they do not lie before the near plane."""
@@ -74,7 +67,7 @@ class SeenDepths:
 
     def find_farthest(self, far: float) -> float | None:
         """Find the depth of the farthest 2 %; None if they do not lie behind the far plane."""
-        if len(self.inverse) < MIN_MATCHES or self.is_farther.mean() < SHARE_OUTSIDE:
+        if len(self.inverse) < MIN_MATCHES:
             return None
         farthest = 1 / float(np.quantile(self.inverse, SHARE_OUTSIDE))
         return farthest if farthest > far else None
@@ -111,7 +104,7 @@ def widen_range(views: Sequence[View], given: DepthRange, outcome: str = "") -> 
     widened if it is empty.
     """
     near, far, notes = given.near, given.far, given.notes
-    for seen in (measure_features(views, given), measure_given(views, given)):
+    for seen in (measure_features(views), measure_given(views)):
         nearest, farthest = seen.find_nearest(near), seen.find_farthest(far)
         places = []
         if nearest is not None:
@@ -150,33 +143,28 @@ def describe_mismatch(views: Sequence[View], trained: DepthRange) -> tuple[str, 
     )
 
 
-def measure_features(views: Sequence[View], given: DepthRange) -> SeenDepths:
+def measure_features(views: Sequence[View]) -> SeenDepths:
     """Measure the depths of matched features that others confirm; none without a baseline."""
-    none = np.zeros(0)
-    inverses, farther = [none], [none > 0]
+    inverses = [np.zeros(0)]
     with suppress(InputError):
         images, unit = make_stereo_images(views)
         neighbours = find_neighbours(images) if len(images) > 1 else None
-        remotest = unit / given.far  # inverse depths are per widest baseline
         for i, j in neighbours.pairs if neighbours else ():
             in_i, in_j = neighbours.matches[i, j]
             # Each match has a depth in either photograph of the pair.
             for a, b, in_a, in_b in ((i, j, in_i, in_j), (j, i, in_j, in_i)):
                 inverse, is_valid = triangulate(images[a], images[b], in_a, in_b)
-                pixels, inverse = in_a[is_valid], inverse[is_valid]
-                is_confirmed = find_confirmed(pixels, inverse, images[a].size[1])
-                pixels, inverse = pixels[is_confirmed], inverse[is_confirmed]
-                motion = measure_motion(images[a], images[b], pixels, inverse, remotest)
-                inverses.append(inverse / unit)
-                farther.append((inverse < remotest) & (motion > MIN_MOTION))
-    return SeenDepths("Matched features", np.concatenate(inverses), np.concatenate(farther))
+                inverse = inverse[is_valid]
+                is_confirmed = find_confirmed(in_a[is_valid], inverse, images[a].size[1])
+                # They are per widest baseline.
+                inverses.append(inverse[is_confirmed] / unit)
+    return SeenDepths("Matched features", np.concatenate(inverses))
 
 
-def measure_given(views: Sequence[View], given: DepthRange) -> SeenDepths:
+def measure_given(views: Sequence[View]) -> SeenDepths:
     """Measure the depths that are given with the photographs."""
     known = [view.known_depths.cpu().double().numpy() for view in views]
-    inverse = 1 / np.concatenate(known)
-    return SeenDepths("Given depths", inverse, inverse < 1 / given.far)
+    return SeenDepths("Given depths", 1 / np.concatenate(known))
 
 
 def find_confirmed(

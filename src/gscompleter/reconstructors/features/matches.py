@@ -93,28 +93,6 @@ def triangulate(
     return inverse, ahead & (inverse > 0) & (error < MAX_ERROR) & (parallax > MIN_PARALLAX)
 
 
-def measure_motion(
-    reference: StereoImage,
-    source: StereoImage,
-    pixels: Pixels,
-    inverse: Float[np.ndarray, "m"],
-    other: float,
-) -> Float[np.ndarray, "m"]:
-    """Measure how far pixels move in the source between their inverse depths and another one.
-
-    Infinite for what lies behind the source at either.
-    """
-    transform = compute_source_from_reference(reference, source).astype(np.float64)
-    at_infinity = np.concatenate([pixels, np.ones((len(pixels), 1))], 1) @ transform[:, :3].T
-    places = []
-    for depths in (inverse[:, None], other):
-        points = at_infinity + depths * transform[:, 3]
-        z = np.where(points[:, 2:] > MIN_DEPTH, points[:, 2:], np.nan)
-        places.append(points[:, :2] / z)
-    moved = np.linalg.norm(places[0] - places[1], axis=1)
-    return np.where(np.isnan(moved), np.inf, moved)
-
-
 def fit_poses(
     reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
 ) -> Bool[np.ndarray, "n"]:
