@@ -20,7 +20,7 @@ from gscompleter.config import GapConfig
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.generators import GeneratorOutput
 from gscompleter.guards.free_space import respect_free_space
-from gscompleter.numerics.geometry import project
+from gscompleter.numerics.geometry import pad_camera, project, rotations_to_quats
 from gscompleter.render.cpu import CpuRenderer
 from gscompleter.render.reference import adapt_to_mode
 from gscompleter.stages.lift import lift_pair
@@ -28,7 +28,7 @@ from gscompleter.stages.register import apply_affine
 from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.state import Completion
 from gscompleter.system.timing import STAGES
-from gscompleter.types import Camera, Gaussians, View, merge
+from gscompleter.types import Camera, Gaussians, View, make_observed, merge
 from knowing_models import KnowingGenerator, KnowingReconstructor, knowing
 from parity import assert_close
 from scenes import Room, camera_at, gaussians_of, reconstruction_of, scaled, view_of
@@ -166,6 +166,35 @@ def test_a_target_is_widened_only_where_a_hole_reaches_its_edge():
         given = completer.observe(completion, target, view_of(Room(), wide))
         assert given.camera.padded.width == wide.width
         assert completer.advance(completion, target).targets[0].after.image.shape[0] == SIZE
+
+
+def test_a_hole_is_what_the_target_shows_whatever_its_padding():
+    """Beside the image stand Gaussians that are long in depth; a wider image draws them wider."""
+    completer = knowing(replace(CompleterConfig(), add_observed=False))
+    _, target = cameras()
+    whole = gaussians_of(view_of(Room(), pad_camera(target, 0.25).padded))
+    left_out = project(whole.means, target)[0][:, 0] < 8
+    # 20 % of the width outside of the image, in a column
+    y = torch.linspace(-0.6, 0.6, 7)
+    points = 2.0 * torch.stack([torch.full_like(y, -0.8), y, torch.ones_like(y)], dim=-1)
+    axes = target.c2w[:3, :3]
+    long = make_observed(
+        target.center + points @ axes.T,
+        rotations_to_quats(axes[None]).expand(7, 4),
+        torch.tensor([0.1, 0.3, 0.5]).expand(7, 3),
+        torch.full((7,), 0.9),
+        torch.zeros(7, 1, 3),
+    )
+    scene = merge([whole[~left_out], long])
+    shown = load_renderer("cpu").render(scene, target)
+
+    view = completer.observe(completer.begin(photographs(), scene), target)
+    assert view.camera.padded.width > SIZE
+    result = view.make_unchanged_result()
+    assert_close(result.before.alpha, shown.alpha, "alpha", 1e-5)
+    assert_close(result.before.image, shown.image, "image", 1e-5)
+    assert torch.equal(result.hole_mask, compute_hole_mask(shown.alpha))
+    assert 0.05 < result.hole_fraction < 0.08
 
 
 def test_targets_are_synthesized_together_where_the_generator_can():

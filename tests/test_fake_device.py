@@ -18,12 +18,13 @@ from fake_cuda import CUDA, Counts, FakeCudaTensor
 from fake_gsplat import WHEEL, fake_gsplat, find_gsplat
 from gscompleter import CompleterConfig, GSCompleter, load_renderer
 from gscompleter.config import GapConfig
+from gscompleter.numerics.geometry import pad_camera
 from gscompleter.render.device import Devices, choose_devices
 from gscompleter.render.gsplat import TILE_SIZE, CudaRenderer
 from gscompleter.system.timing import STAGES
 from gscompleter.types import View, merge
 from parity import assert_close
-from render_scenes import CAMERA, REFERENCE, SCENES, compute_gradients, in_dtype
+from render_scenes import CAMERA, REFERENCE, SCENES, beside, compute_gradients, in_dtype
 from scenes import Room, camera_at, gaussians_of, view_of
 
 pytestmark = [
@@ -126,6 +127,32 @@ def test_gsplat_draws_what_the_reference_draws(device, name):
     )
     for parameter, expected in compute_gradients(REFERENCE, exact, covered).items():
         assert_close(ours[parameter].cpu(), expected, f"gradient of {parameter}", 1e-4)
+
+
+@pytest.mark.parametrize("antialiased", [False, True], ids=["classic", "antialiased"])
+def test_gsplat_draws_in_a_padded_image_what_the_image_shows_that_it_pads(device, antialiased):
+    scene = replace(beside(CAMERA), is_antialiased=antialiased)
+    exact = in_dtype(scene, torch.float64)
+    pair = pad_camera(CAMERA, 0.25)
+    there = pair.padded.to("cuda")
+    drawn = CudaRenderer().render(scene.to("cuda"), there)
+    alone = CudaRenderer().render(scene.to("cuda"), CAMERA.to("cuda"))
+    assert_close(pair.crop(drawn.alpha).cpu(), alone.alpha.cpu(), "alpha", 1e-5)
+    assert_close(pair.crop(drawn.image).cpu(), alone.image.cpu(), "image", 1e-5)
+    truth = REFERENCE.render(exact, pair.padded)
+    assert_close(drawn.alpha.cpu(), truth.alpha, "alpha", 1e-5)
+    covered = truth.alpha > 0.05
+    ours = compute_gradients(CudaRenderer(), scene.to("cuda"), covered.to("cuda"), there)
+    for parameter, expected in compute_gradients(REFERENCE, exact, covered, pair.padded).items():
+        assert_close(ours[parameter].cpu(), expected, f"gradient of {parameter}", 1e-4)
+
+
+def test_a_padded_image_and_another_are_drawn_at_once(device):
+    scene = beside(CAMERA).to("cuda")
+    camera, other = pad_camera(CAMERA, 0.25).padded.to("cuda"), CAMERA.to("cuda")
+    first, second = CudaRenderer().render_together(scene, [camera, other])
+    for render, alone in ((first, camera), (second, other)):
+        assert torch.equal(render.alpha, CudaRenderer().render(scene, alone).alpha)
 
 
 def test_what_kernels_leave_unset_is_nan_and_is_not_read(device):

@@ -111,6 +111,10 @@ class Camera(Displayed, TensorDataclass):
     """Smallest z-depth of the scene, in scene units, or None if unknown."""
     far: float | None = None
     """Largest z-depth of the scene, in scene units, or None if unknown."""
+    padding: tuple[int, int] = (0, 0)
+    """Pixels, left and right each and above and below each, by which the image is larger than the
+    one that it pads. Both show the same Gaussians alike: renderers distort those beside the image
+    as in the smaller one."""
 
     owner: ClassVar[str] = "a camera"
     forms: ClassVar[dict[str, Form]] = {"c2w": (FLOATS, (4, 4)), "K": (FLOATS, (3, 3))}
@@ -120,6 +124,7 @@ class Camera(Displayed, TensorDataclass):
         check_tensors(self, self.owner, self.forms)
         defect = (
             _find_size_defect(self.width, self.height)
+            or _find_padding_defect(self.padding, self.width, self.height)
             or _find_planes_defect(self.near, self.far)
             or _find_pose_defect(self.c2w)
             or _find_intrinsics_defect(self.K, self.width, self.height)
@@ -193,6 +198,19 @@ def _find_size_defect(width: object, height: object) -> str | None:
     return None
 
 
+def _find_padding_defect(padding: object, width: int, height: int) -> str | None:
+    """Return a sentence part about padding that leaves no image within it, or None."""
+    is_pair = isinstance(padding, tuple) and len(padding) == 2
+    if not is_pair or not all(is_whole(pixels) and pixels >= 0 for pixels in padding):
+        return f"its padding is {describe(padding)}, and two numbers of pixels from 0 are needed"
+    if 2 * padding[0] >= width or 2 * padding[1] >= height:
+        return (
+            f"its padding of {padding[0]} and {padding[1]} pixels on each side leaves nothing of "
+            f"its image of {width} x {height} pixels"
+        )
+    return None
+
+
 def _find_planes_defect(near: float | None, far: float | None) -> str | None:
     """Return a sentence part about impossible depth planes, or None."""
     for name, plane in (("near", near), ("far", far)):
@@ -262,8 +280,21 @@ class PaddedCamera:
 
     def crop(self, image: Shaped[Tensor, "wide_h wide_w *c"]) -> Shaped[Tensor, "h w *c"]:
         """Cut the padding off an image [h, w, ...] of the padded camera."""
+        return image[self._inside]
+
+    def paste(
+        self, image: Shaped[Tensor, "h w *c"], wide: Shaped[Tensor, "wide_h wide_w *c"]
+    ) -> Shaped[Tensor, "wide_h wide_w *c"]:
+        """Put an image [h, w, ...] of the target in its place in one of the padded camera."""
+        both = wide.clone()
+        both[self._inside] = image
+        return both
+
+    @property
+    def _inside(self) -> tuple[slice, slice]:
+        """Rows and columns of the target in an image of the padded camera."""
         rows = slice(self.top, self.top + self.target.height)
-        return image[rows, self.left : self.left + self.target.width]
+        return rows, slice(self.left, self.left + self.target.width)
 
 
 @dataclass(frozen=True, repr=False)

@@ -252,6 +252,21 @@ def test_evaluate_tells_the_notes_of_what_it_opens_once(tmp_path):
         assert notes == [note]
 
 
+def test_a_near_plane_behind_what_the_photographs_show_is_told_once(
+    scene, tmp_path, monkeypatch, capsys
+):
+    """The nearer box stands at 2.2."""
+    out = tmp_path / "out"
+    more = ("--context", 0, 1, "--near", 2.9, "--far", 20)
+    assert run(monkeypatch, *complete(scene, out, *more)) == 0
+    told = " ".join(capsys.readouterr().err.split())
+    assert told.count("nearer than the near plane at 2.9: the depth range was widened to") == 1
+    depths = summary_of(out)["depth_range"]
+    assert depths["from"] == {"near": "features", "far": "given"}
+    assert depths["near"] < 2.0
+    assert depths["far"] == 20
+
+
 def test_a_splat_is_doubted_by_photographs_that_are_near_and_by_some_from_everywhere():
     """Half of the check views are near the target, the others spread over a long path."""
     path = {2 * n: camera_at(0.1 * n) for n in range(60)}

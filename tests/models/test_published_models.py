@@ -158,7 +158,7 @@ def test_a_scene_in_another_unit_than_the_network_was_trained_on_is_told(
     scene = photographed(tmp_path / "small", cameras, Room(unit=0.01))
     complete_room(monkeypatch, scene, tmp_path / "out", "mvsplat-re10k")
     told = " ".join(capsys.readouterr().err.split())
-    assert "this model was trained on 1 to 100 (metres); scale the cameras" in told
+    assert "this model was trained on 1 to 100: multiply the positions of the cameras by" in told
 
 
 def test_a_scene_in_metres_is_not_remarked_upon(rooms, recorded, tmp_path, monkeypatch, capsys):

@@ -13,8 +13,12 @@ from gscompleter.numerics.geometry import (
     measure_baseline,
     measure_rotation,
     multiply_quats,
+    pad_camera,
+    pad_like,
     project,
     quats_to_rotations,
+    remove_padding,
+    resize_camera,
     rotations_to_quats,
     sample,
     slerp_rotation,
@@ -125,3 +129,20 @@ def test_of_the_two_ways_to_turn_the_shorter_one_is_shared():
     turn = axis_angle_to_matrix(down, math.radians(270))
     expected = axis_angle_to_matrix(down, -math.radians(45))
     assert torch.allclose(slerp_rotation(turn, 0.5), expected, atol=1e-6)
+
+
+def test_a_padded_camera_knows_the_image_that_it_pads():
+    camera = camera_at(0.4, yaw=20, size=32)
+    pair = pad_camera(camera, 0.25)
+    assert (pair.padded.width, pair.padded.padding) == (48, (8, 8))
+    inner = remove_padding(pair.padded).target
+    assert torch.equal(inner.K, camera.K)
+    assert (inner.width, inner.height, inner.padding) == (32, 32, (0, 0))
+    # Padding of a padded image, and of one in another size
+    assert pad_like(pair.padded, pad_camera(camera, 0.5).padded).padded.padding == (16, 16)
+    for size in (5, 24, 96):
+        resized = resize_camera(pair.padded, size, size)
+        assert abs(resized.padding[0] - size / 6) < 1
+    image = torch.rand(48, 48, 3)
+    assert torch.equal(pair.crop(pair.paste(torch.ones(32, 32, 3), image)), torch.ones(32, 32, 3))
+    assert torch.equal(pair.paste(pair.crop(image), image), image)

@@ -9,12 +9,14 @@ import torch
 from fake_gsplat import find_package
 from gscompleter import CompleterConfig, GSCompleter, InputError, load_renderer
 from gscompleter.config import GapConfig
+from gscompleter.numerics.geometry import pad_camera
 from gscompleter.render.metal import MetalRenderer, explain_missing_metal
 from parity import assert_close
 from render_scenes import (
     CAMERA,
     REFERENCE,
     SCENES,
+    beside,
     compute_gradients,
     find_covered_pixels,
     in_dtype,
@@ -48,6 +50,20 @@ def test_the_twin_draws_what_the_reference_draws(twin, name):
     assert_close(drawn.image, truth.image, "image", ROUNDING)
     assert_close(drawn.alpha, truth.alpha, "alpha", ROUNDING)
     assert_close(drawn.depth * covered, truth.depth * covered, "depth", ROUNDING)
+
+
+@pytest.mark.parametrize("antialiased", [False, True], ids=["classic", "antialiased"])
+def test_the_twin_draws_in_a_padded_image_what_the_image_shows_that_it_pads(twin, antialiased):
+    scene = replace(beside(CAMERA), is_antialiased=antialiased)
+    pair = pad_camera(CAMERA, 0.25)
+    truth = REFERENCE.render(in_dtype(scene, torch.float64), CAMERA)
+    leaf = scene.opacities.clone().requires_grad_()
+    drawn = twin.render(replace(scene, opacities=leaf), pair.padded)
+    assert_close(pair.crop(drawn.image), truth.image, "image", ROUNDING)
+    assert_close(pair.crop(drawn.alpha), truth.alpha, "alpha", ROUNDING)
+    (gradient,) = torch.autograd.grad(drawn.alpha.sum(), leaf)
+    assert gradient.isfinite().all()
+    assert (gradient > 0).float().mean() > 0.5
 
 
 @pytest.mark.parametrize("name", ORDERED)

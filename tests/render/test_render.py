@@ -8,7 +8,7 @@ import torch
 
 import stand_in_gsplat
 from gscompleter import Gaussians, InputError, Render, load_renderer, merge
-from gscompleter.numerics.geometry import compute_z_depths, move_to_depths
+from gscompleter.numerics.geometry import compute_z_depths, move_to_depths, pad_camera
 from gscompleter.numerics.kernels import composite
 from gscompleter.render import device
 from gscompleter.render.cpu import CpuRenderer
@@ -21,6 +21,7 @@ from render_scenes import (
     PARAMETERS,
     REFERENCE,
     SCENES,
+    beside,
     compute_gradients,
     find_covered_pixels,
     in_dtype,
@@ -354,6 +355,49 @@ def test_composites_have_the_gradients_of_the_render_of_both(antialiased):
     covered = CPU.render(merge([context, new]), CAMERA).alpha > 0.05
     composites = compute_gradients(Composites(), new, covered)
     assert_same_gradients(composites, compute_gradients(Together(), new, covered))
+
+
+PADDED = pad_camera(CAMERA, 0.25)
+BESIDE = beside(CAMERA)
+
+
+def crop_render(render: Render) -> Render:
+    return Render(*(PADDED.crop(getattr(render, name)) for name in DRAWN))
+
+
+@MODES
+@pytest.mark.parametrize("renderer", [CPU, REFERENCE], ids=["cpu", "reference"])
+def test_a_padded_image_shows_what_the_image_does_that_it_pads(renderer, antialiased):
+    scene = replace(BESIDE, is_antialiased=antialiased)
+    truth = renderer.render(scene, CAMERA)
+    assert_same_render(crop_render(renderer.render(scene, PADDED.padded)), truth)
+    # The scene tells the two ways to clamp apart.
+    other = renderer.render(scene, replace(PADDED.padded, padding=(0, 0)))
+    assert (PADDED.crop(other.alpha) - truth.alpha).abs().max() > 0.1
+
+    # So do frozen scenes, with which additions are optimised.
+    context, new = scene[::2], scene[1::2]
+    frozen = renderer.freeze(context, PADDED.padded)
+    both = renderer.render(merge([context, new]), CAMERA)
+    depths = compute_z_depths(new.means, CAMERA)
+    assert_same_render(crop_render(frozen.extend(new).render), both)
+    assert_same_render(crop_render(frozen.composite(new)), both)
+    assert_same_render(crop_render(frozen.vary_opacities(new)(new.opacities)), both)
+    assert_same_render(crop_render(frozen.vary_depths(new)(depths)), both)
+
+
+@MODES
+def test_cpu_and_reference_draw_a_padded_image_alike_with_the_same_gradients(antialiased):
+    scene = replace(BESIDE, is_antialiased=antialiased)
+    exact = in_dtype(scene, torch.float64)
+    camera = PADDED.padded
+    truth = REFERENCE.render(exact, camera)
+    assert_same_render(CPU.render(scene, camera), truth)
+    covered = truth.alpha > 0.05
+    assert_same_gradients(
+        compute_gradients(CPU, scene, covered, camera),
+        compute_gradients(REFERENCE, exact, covered, camera),
+    )
 
 
 @pytest.mark.parametrize("unit", [0.001, 1000.0])

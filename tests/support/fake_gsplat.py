@@ -11,7 +11,7 @@ import importlib.util
 import math
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import Enum
 from pathlib import Path
@@ -125,18 +125,23 @@ def run_kernels(count: int = 1) -> Iterator[None]:
 
 def project(
     means: Tensor,
-    quats: Tensor,
-    scales: Tensor,
+    shapes: Sequence[Tensor],
     viewmats: Tensor,
     Ks: Tensor,
     width: int,
     height: int,
     eps2d: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Project Gaussians by gsplat's functions for torch: centres, depths, conics, compensations."""
+    """Project Gaussians by gsplat's functions for torch: centres, depths, conics, compensations.
+
+    `shapes` are upper triangles of covariances, or quaternions and scales.
+    """
     from gsplat.cuda._torch_impl import _fully_fused_projection, _quat_scale_to_covar_preci
 
-    covariances, _ = _quat_scale_to_covar_preci(quats, scales, True, False, triu=False)
+    if len(shapes) == 1:
+        covariances = shapes[0][:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].view(-1, 3, 3)
+    else:
+        covariances, _ = _quat_scale_to_covar_preci(*shapes, True, False, triu=False)
     _, means2d, depths, conics, compensations = _fully_fused_projection(
         means, covariances, viewmats, Ks, width, height, eps2d, calc_compensations=True
     )
@@ -145,9 +150,9 @@ def project(
 
 def projection_ewa_3dgs_fused_fwd(
     means: Tensor,
-    covars: None,
-    quats: Tensor,
-    scales: Tensor,
+    covars: Tensor | None,
+    quats: Tensor | None,
+    scales: Tensor | None,
     opacities: Tensor | None,
     viewmats: Tensor,
     Ks: Tensor,
@@ -161,14 +166,15 @@ def projection_ewa_3dgs_fused_fwd(
     camera_model: CameraModelType,
 ) -> tuple[Tensor | None, ...]:
     """Project Gaussians [n] into images [c]; rows of those outside are unset."""
-    assert covars is None
     assert camera_model is CameraModelType.PINHOLE
-    inputs = check_inputs(
-        means=means, quats=quats, scales=scales, viewmats=viewmats, Ks=Ks, opacities=opacities
+    shapes = list_shapes(covars, quats, scales)
+    centers, *cameras, own_opacities = check_inputs(
+        means=means, viewmats=viewmats, Ks=Ks, opacities=opacities
     )
     with run_kernels(1 + calc_compensations), torch.no_grad():
-        *parameters, own_opacities = inputs
-        means2d, depths, conics, compensations = project(*parameters, width, height, eps2d)
+        means2d, depths, conics, compensations = project(
+            centers, shapes, *cameras, width, height, eps2d
+        )
         determinants = conics[..., 0] * conics[..., 2] - conics[..., 1] ** 2
         deviations = (conics[..., [2, 0]] / determinants[..., None]).sqrt()
         reach = torch.full_like(depths, MAX_SIGMA)
@@ -189,6 +195,14 @@ def projection_ewa_3dgs_fused_fwd(
     return tuple(wrap(result) for result in results)
 
 
+def list_shapes(covars: Tensor | None, quats: Tensor | None, scales: Tensor | None) -> list[Tensor]:
+    """List the values of covariances, or of quaternions and scales: only one of them is given."""
+    given = check_inputs(covars=covars, quats=quats, scales=scales)
+    shapes = [values for values in given if values is not None]
+    assert len(shapes) == (1 if covars is not None else 2)
+    return shapes
+
+
 def wrap(values: Tensor | None) -> Tensor | None:
     """Put what a kernel computed on the device."""
     return None if values is None else FakeCudaTensor(values)
@@ -196,9 +210,9 @@ def wrap(values: Tensor | None) -> Tensor | None:
 
 def projection_ewa_3dgs_fused_bwd(
     means: Tensor,
-    covars: None,
-    quats: Tensor,
-    scales: Tensor,
+    covars: Tensor | None,
+    quats: Tensor | None,
+    scales: Tensor | None,
     viewmats: Tensor,
     Ks: Tensor,
     width: int,
@@ -214,14 +228,11 @@ def projection_ewa_3dgs_fused_bwd(
     v_compensations: Tensor | None,
     needs_viewmats: bool,
 ) -> tuple[Tensor | None, ...]:
-    """Compute gradients of means, quaternions and scales; 0 for Gaussians outside."""
+    """Compute gradients of means and shapes; 0 for Gaussians outside."""
     assert not needs_viewmats
-    *parameters, radii_, _, _, v_means2d_, v_depths_, v_conics_, v_compensations_ = check_inputs(
-        means=means,
-        quats=quats,
-        scales=scales,
-        viewmats=viewmats,
-        Ks=Ks,
+    shapes = list_shapes(covars, quats, scales)
+    centers, *cameras = check_inputs(means=means, viewmats=viewmats, Ks=Ks)
+    radii_, _, _, *given = check_inputs(
         radii=radii,
         conics=conics,
         compensations=compensations,
@@ -230,23 +241,24 @@ def projection_ewa_3dgs_fused_bwd(
         v_conics=v_conics,
         v_compensations=v_compensations,
     )
-    cameras = parameters[3:]
-    gradients = [torch.zeros_like(values) for values in parameters[:3]]
+    parameters = [centers, *shapes]
+    gradients = [torch.zeros_like(values) for values in parameters]
     with run_kernels(4):
         for number in range(len(cameras[0])):
             seen = (radii_[number] > 0).all(dim=-1).nonzero()[:, 0]
             with torch.enable_grad():
-                leaves = [values[seen].requires_grad_() for values in parameters[:3]]
+                leaves = [values[seen].requires_grad_() for values in parameters]
                 camera = [part[number : number + 1] for part in cameras]
-                results = project(*leaves, *camera, width, height, eps2d)
-            given = [v_means2d_, v_depths_, v_conics_, v_compensations_]
+                results = project(leaves[0], leaves[1:], *camera, width, height, eps2d)
             used = [part for part, v in zip(results, given, strict=True) if v is not None]
             incoming = [v[number : number + 1, seen] for v in given if v is not None]
             found = torch.autograd.grad(used, leaves, incoming)
             for gradient, part in zip(gradients, found, strict=True):
                 gradient.index_add_(0, seen, part)
-    v_means, v_quats, v_scales = (wrap(gradient) for gradient in gradients)
-    return v_means, None, v_quats, v_scales, None
+    v_means, *v_shapes = (wrap(gradient) for gradient in gradients)
+    if covars is not None:
+        return v_means, *v_shapes, None, None, None
+    return v_means, None, *v_shapes, None
 
 
 def intersect_tile(

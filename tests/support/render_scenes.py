@@ -5,7 +5,7 @@ from functools import cache
 
 import torch
 
-from gscompleter import Gaussians, load_renderer
+from gscompleter import Camera, Gaussians, load_renderer
 from scenes import Room, camera_at, gaussians_of, random_gaussians, view_of
 
 CAMERA = camera_at(size=48)
@@ -75,3 +75,23 @@ def compute_gradients(
     loss = (render.image * weight[..., :3]).sum() + (render.alpha * weight[..., 3]).sum()
     loss = loss + (render.depth * weight[..., 4] * covered).sum()
     return dict(zip(leaves, torch.autograd.grad(loss, list(leaves.values())), strict=True))
+
+
+def beside(camera: Camera) -> Gaussians:
+    """Make Gaussians that are long in depth, in the image of a camera and on all sides beside it.
+
+    A renderer that clamps their tangents elsewhere draws others.
+    """
+    gaussians = random_gaussians(60, seed=11, sh_degree=1)
+    depths = 2.0 + gaussians.means[:, 2].frac().abs()
+    # From the centre of the image to 60 % of its size beyond its border
+    tangents = torch.linspace(0.0, 1.1, 60)[:, None] * camera.width / camera.K.diagonal()[:2]
+    angles = 2.4 * torch.arange(60)
+    directions = torch.stack([angles.cos(), angles.sin()], dim=-1)
+    points = torch.cat([tangents * directions, torch.ones(60, 1)], dim=-1) * depths[:, None]
+    means = camera.center + points @ camera.c2w[:3, :3].T
+    long = gaussians.scales * torch.tensor([1.0, 1.0, 5.0])
+    turned = torch.nn.functional.normalize(
+        torch.tensor([1.0, 0.0, 0.0, 0.0]) + 0.1 * gaussians.quats, dim=-1
+    )
+    return replace(gaussians, means=means, scales=long, quats=turned)

@@ -116,8 +116,21 @@ def pad_pixels(camera: Camera, left: int, top: int) -> PaddedCamera:
     K = camera.K.clone()
     K[0, 2] += left
     K[1, 2] += top
-    wide = replace(camera, K=K, width=camera.width + 2 * left, height=camera.height + 2 * top)
+    padding = (camera.padding[0] + left, camera.padding[1] + top)
+    width, height = camera.width + 2 * left, camera.height + 2 * top
+    wide = replace(camera, K=K, width=width, height=height, padding=padding)
     return PaddedCamera(camera, wide, left, top)
+
+
+def remove_padding(camera: Camera) -> PaddedCamera:
+    """Return a camera with padding beside the one without it."""
+    left, top = camera.padding
+    K = camera.K.clone()
+    K[0, 2] -= left
+    K[1, 2] -= top
+    width, height = camera.width - 2 * left, camera.height - 2 * top
+    inner = replace(camera, K=K, width=width, height=height, padding=(0, 0))
+    return PaddedCamera(inner, camera, left, top)
 
 
 def pad_like(camera: Camera, padded: Camera) -> PaddedCamera:
@@ -247,8 +260,11 @@ def look_along(camera: Camera, direction: Float[Tensor, "3"], up: Float[Tensor, 
 
 def resize_camera(camera: Camera, width: int, height: int) -> Camera:
     """Change the image size of a camera, in pixels."""
-    scale = torch.tensor([width / camera.width, height / camera.height, 1.0]).to(camera.K)
-    return replace(camera, K=scale[:, None] * camera.K, width=width, height=height)
+    scales = (width / camera.width, height / camera.height)
+    K = torch.tensor([*scales, 1.0]).to(camera.K)[:, None] * camera.K
+    # Rounded down, so that something is left of the image within the padding.
+    left, top = (int(scale * pad) for scale, pad in zip(scales, camera.padding, strict=True))
+    return replace(camera, K=K, width=width, height=height, padding=(left, top))
 
 
 def select_spread_cameras(cameras: Sequence[Camera], count: int) -> list[int]:

@@ -29,7 +29,8 @@ class Reconstructor(Protocol):
     cameras, and all tensors are on the device of the view images.
 
     A Ψ that was trained on one depth range says so in an attribute `depth_range`, (near, far) in
-    scene units; cameras without a range get it instead of an estimate.
+    scene units; cameras without a range get it instead of an estimate. A range that is given is
+    widened to what features show, unless Ψ has that attribute or says `keeps_range = True`.
     """
 
     def __call__(self, views: Sequence[View]) -> Reconstruction:
@@ -43,6 +44,14 @@ class Lifter(Protocol):
 
     def lift(self, views: Sequence[View], pixel_mask: Bool[Tensor, "h w"]) -> Reconstruction:
         """Reconstruct `views`, with the Gaussians of `pixel_mask` in the first view only."""
+
+
+@runtime_checkable
+class NearPlaneFinder(Protocol):
+    """Interface of a Ψ that tells from its matches that surfaces stand before the near plane."""
+
+    def find_near_plane(self, views: Sequence[View], near: float, far: float) -> float:
+        """Find a near plane, in scene units, that no surface stands before; at most `near`."""
 
 
 @runtime_checkable
@@ -120,6 +129,15 @@ def get_trained_range(reconstructor: Reconstructor) -> tuple[float, float] | Non
     if not 0 < near < far:
         raise refusal
     return near, far
+
+
+def keeps_given_range(reconstructor: Reconstructor) -> bool:
+    """Return True if Ψ gets a given range of depths as it is, even if features contradict it.
+
+    Learned models do: their authors' evaluation gives them one range for all scenes.
+    """
+    is_trained = get_trained_range(reconstructor) is not None
+    return is_trained or bool(getattr(reconstructor, "keeps_range", False))
 
 
 def _check_depths(output: Reconstruction, views: Sequence[View]) -> None:

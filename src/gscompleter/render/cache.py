@@ -82,4 +82,4 @@ def make_camera_key(camera: Camera) -> Hashable:
     # Not the far plane, which no renderer uses.
     camera = camera.on_cpu
     numbers = (*camera.c2w.flatten().tolist(), *camera.K.flatten().tolist())
-    return (*numbers, camera.width, camera.height, camera.near_plane)
+    return (*numbers, camera.width, camera.height, *camera.padding, camera.near_plane)

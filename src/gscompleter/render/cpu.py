@@ -341,6 +341,7 @@ def make_pinhole(camera: Camera) -> CameraArrays:
         near=np.float32(max(camera.near_plane, 0.0)),
         width=camera.width,
         height=camera.height,
+        padding=camera.padding,
     )
 
 

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
 
 from gscompleter.render.device import choose_device
+from gscompleter.render.padding import compute_covariances
 from gscompleter.render.protocols import ColorErrors, ColorSums, OpacityRender
 from gscompleter.render.redraw import RedrawnScene, make_empty_render, set_colors
 from gscompleter.render.spherical_harmonics import evaluate_colors
@@ -101,6 +102,8 @@ def project_gaussians(
 ]:
     """Project at least one Gaussian into images of one size, with near planes at one depth.
 
+    An image with padding has to be the only one.
+
     Returns radii [c, n, 2] in pixels, which are 0 outside of the image, centres [c, n, 2], z-depths
     [c, n], inverse covariances [c, n, 3], and the factors [c, n] by which antialiasing lowers
     opacities. Gsplat's kernels take float32 alone.
@@ -108,11 +111,14 @@ def project_gaussians(
     from gsplat import fully_fused_projection
 
     cameras = [camera.to(gaussians.means.device) for camera in cameras]
+    # Covariances, or quaternions and scales in their place
+    shapes = (None, gaussians.quats.float(), gaussians.scales.float())
+    if cameras[0].padding != (0, 0):
+        (camera,) = cameras
+        shapes = (compute_covariances(gaussians, camera).float(), None, None)
     radii, means2d, depths, conics, antialiasing = fully_fused_projection(
         gaussians.means.float(),
-        None,  # covariances: quaternions and scales stand for them
-        gaussians.quats.float(),
-        gaussians.scales.float(),
+        *shapes,
         torch.stack([camera.viewmat for camera in cameras]).float(),
         torch.stack([camera.K for camera in cameras]).float(),
         cameras[0].width,
@@ -138,7 +144,8 @@ def project_and_bin(
     from gsplat import isect_offset_encode, isect_tiles
 
     # Not as parts of a larger image: how much a Gaussian outside is distorted depends on the size.
-    are_alike = len({(camera.width, camera.height, camera.near_plane) for camera in cameras}) == 1
+    forms = {(camera.width, camera.height, camera.near_plane, camera.padding) for camera in cameras}
+    are_alike = len(forms) == 1 and cameras[0].padding == (0, 0)
     groups = [cameras] if are_alike else [[camera] for camera in cameras]
     projected = [project_gaussians(gaussians, group) for group in groups]
     radii, means2d, depths, conics, antialiasing = (

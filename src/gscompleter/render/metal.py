@@ -15,7 +15,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.numerics.geometry import compute_z_depths
+from gscompleter.numerics.geometry import compute_z_depths, remove_padding
 from gscompleter.render.redraw import RedrawnScene, make_empty_render
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.system.errors import InputError
@@ -43,6 +43,21 @@ class MetalRenderer:
 
     def render(self, gaussians: Gaussians, camera: Camera) -> Render:
         """Render `gaussians` from `camera`."""
+        drawn = self._draw(gaussians, camera)
+        if camera.padding == (0, 0):
+            return drawn
+        # metal-gauss clamps tangents by the size of the image that it draws, and takes no
+        # covariances. So the image within the padding is drawn by itself and put in its place.
+        pair = remove_padding(camera)
+        inner = self._draw(gaussians, pair.target)
+        return Render(
+            pair.paste(inner.image, drawn.image),
+            pair.paste(inner.depth, drawn.depth),
+            pair.paste(inner.alpha, drawn.alpha),
+        )
+
+    def _draw(self, gaussians: Gaussians, camera: Camera) -> Render:
+        """Render with tangents that end beside the whole image."""
         home = gaussians.means.device
         if len(gaussians) == 0:
             return make_empty_render(camera, home)

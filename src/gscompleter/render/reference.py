@@ -11,14 +11,13 @@ from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
 from gscompleter.numerics.geometry import compute_z_depths, quats_to_rotations
+from gscompleter.render.padding import compute_tangent_limits
 from gscompleter.render.redraw import RedrawnScene
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.types import Camera, Gaussians, Render
 
 BLUR = 0.3
 """Low-pass of about a pixel, added to the 2D variances, in px²."""
-TANGENT_MARGIN = 0.15
-"""Border at which the perspective Jacobian is clamped, relative to the image size."""
 MIN_ALPHA = 1 / 255
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
@@ -89,7 +88,7 @@ def project_gaussians(gaussians: Gaussians, camera: Camera) -> ProjectedSplats:
     # EWA splatting (Zwicker et al. 2001): the covariance in the image, in px², is
     # J W R S Sᵀ Rᵀ Wᵀ Jᵀ, and `flat` is its factor J W R S [n, 2, 3].
     axes = quats_to_rotations(gaussians.quats) * gaussians.scales[:, None, :]
-    flat = compute_jacobians(points, K, camera.width, camera.height) @ camera_from_world @ axes
+    flat = compute_jacobians(points, camera) @ camera_from_world @ axes
     covariances = flat @ flat.transpose(1, 2) + BLUR * torch.eye(2, dtype=dtype, device=device)
     opacities = gaussians.opacities
     if gaussians.is_antialiased:
@@ -103,17 +102,16 @@ def project_gaussians(gaussians: Gaussians, camera: Camera) -> ProjectedSplats:
     )
 
 
-def compute_jacobians(
-    points: Float[Tensor, "n 3"], K: Float[Tensor, "3 3"], width: int, height: int
-) -> Float[Tensor, "n 2 3"]:
+def compute_jacobians(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tensor, "n 2 3"]:
     """Compute the Jacobian of the projection at points in the camera, with clamped tangents."""
-    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    K = camera.K.to(points)
+    fx, fy = K[0, 0], K[1, 1]
     x, y, z = points.unbind(-1)
     # Far outside the image the linearization would make huge splats; its tangents end at a margin.
-    margin_x = TANGENT_MARGIN * width
-    margin_y = TANGENT_MARGIN * height
-    tan_x = (x / z).clamp(-(cx + margin_x) / fx, (width - cx + margin_x) / fx)
-    tan_y = (y / z).clamp(-(cy + margin_y) / fy, (height - cy + margin_y) / fy)
+    size = (camera.width, camera.height)
+    limits_x, limits_y = compute_tangent_limits(K, size, camera.padding)
+    tan_x = (x / z).clamp(*limits_x)
+    tan_y = (y / z).clamp(*limits_y)
     zero = torch.zeros_like(z)
     rows = [
         torch.stack([fx / z, zero, -fx * tan_x / z], dim=-1),

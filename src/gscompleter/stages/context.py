@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -14,16 +15,15 @@ from gscompleter.config import LIFTED_MARGIN, CompleterConfig, get_named_config
 from gscompleter.numerics.geometry import add_near_plane, compute_z_depths, project_mask
 from gscompleter.reconstructors import (
     DepthAware,
+    NearPlaneFinder,
     Reconstructor,
     get_trained_range,
+    keeps_given_range,
     run_reconstructor,
 )
 from gscompleter.reconstructors.depth_predictors import give_prediction
-from gscompleter.reconstructors.features.depth_range import (
-    find_depth_range,
-    get_depth_range,
-    set_depth_range,
-)
+from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
+from gscompleter.reconstructors.features.given_range import DepthRange, find_depth_range
 from gscompleter.render.lod import build_proxy
 from gscompleter.render.protocols import Renderer
 from gscompleter.system.errors import InputError
@@ -110,13 +110,32 @@ def prepare_single(reconstructor: Reconstructor, views: Sequence[View]) -> list[
 def reconstruct_context(reconstructor: Reconstructor, views: Sequence[View]) -> InitialContext:
     """Reconstruct `G_ctx = Ψ(V_in)` from posed photographs (paper, Eq. 5)."""
     check_texture(views)
-    near, far = find_depth_range(views, get_trained_range(reconstructor))
-    views = set_depth_range(views, near, far)
+    found = find_scene_range(reconstructor, views)
+    for note in found.notes:
+        logging.getLogger("gscompleter").warning("gscompleter: %s", note)
+    views = set_depth_range(views, found.near, found.far)
     reconstruction = run_reconstructor(reconstructor, views)
     source = ContextScene.whole(drop_ignored(reconstruction, views))
     # The scene has one exposure, which the photographs have to share from here on.
     gains = reconstruction.exposure_gains
     return InitialContext(source, normalize_exposures(views, gains), gains)
+
+
+def find_scene_range(reconstructor: Reconstructor, views: Sequence[View]) -> DepthRange:
+    """Find near and far z-depth of the photographs from which Ψ reconstructs the scene."""
+    keeps = keeps_given_range(reconstructor)
+    found = find_depth_range(views, get_trained_range(reconstructor), keeps)
+    if keeps or not isinstance(reconstructor, NearPlaneFinder):
+        return found
+    near = reconstructor.find_near_plane(views, found.near, found.far)
+    notes = found.notes
+    if near < found.near == views[0].camera.near:
+        note = (
+            f"Surfaces of the photographs stand nearer than the near plane at {found.near:.3g}: "
+            f"the depth range was widened to {near:.2g} to {found.far:.3g}."
+        )
+        notes = (*notes, note)
+    return DepthRange(near, found.far, notes)
 
 
 def check_texture(views: Sequence[View]) -> None:

@@ -140,7 +140,8 @@ class SceneOptions(ComputeOptions, WritingOptions):
     splat was trained at if that is smaller."""
     near: float | None = None
     """Smallest depth in the scene, in the unit of its cameras; if not given, that of the data or of
-    the model's authors, or else estimated."""
+    the model's authors, or else estimated. It is brought forward, and a line says so, if the
+    photographs show nearer surfaces."""
     far: float | None = None
     """Largest depth in the scene, in the unit of its cameras; if not given, as for near."""
     no_given_depth: bool = False

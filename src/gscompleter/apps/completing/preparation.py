@@ -19,7 +19,6 @@ from gscompleter.apps.inputs.captures import RenderRequest
 from gscompleter.apps.inputs.depth_range import (
     apply_scene_range,
     apply_splat_range,
-    describe_range_mismatch,
 )
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.inputs.memory import check_scene
@@ -175,11 +174,12 @@ def load_models(
 
     # The depth range is counted as a part of the context stage, whose seconds it is added to.
     with show_preparation("depth range"), record_seconds() as seconds, timed_stage("context"):
+        notes: tuple[str, ...] = ()
         if task.scene is None:
-            task = apply_scene_range(task, reconstructor)
+            task, notes = apply_scene_range(task, reconstructor)
         else:
             task = apply_splat_range(task, task.scene, completer.renderer)
-    print_lines(console, *describe_range_mismatch(task, reconstructor))
+    print_lines(console, *notes)
 
     cameras = collect_cameras(opened, task)
     return Prepared(options, opened, task, ViewPlanner(completer), cameras, seconds)

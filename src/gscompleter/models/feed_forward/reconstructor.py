@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 
@@ -35,6 +36,8 @@ class FeedForward:
     """Near and far z-depth for cameras without a range, in scene units: those of the authors'
     evaluation. The networks sweep planes in this range and were trained on no other. If None, the
     range is estimated from matched features."""
+
+    keeps_range: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         check_precision(self.device, self.dtype)

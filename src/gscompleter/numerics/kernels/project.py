@@ -10,6 +10,7 @@ from gscompleter.numerics.kernels.simd import MIN_ALPHA
 
 BLUR = np.float32(0.3)
 TANGENT_MARGIN = np.float32(0.15)
+"""Border at which the Jacobian is clamped, relative to the image size."""
 
 X, Y, U, V, W, DEPTH, RED, GREEN, BLUE = range(9)
 """Columns of the splats, see `simd.py`."""
@@ -33,6 +34,8 @@ class CameraArrays(NamedTuple):
     """Smallest z that is rendered."""
     width: int
     height: int
+    padding: tuple[int, int]
+    """See `gscompleter.types.Camera`."""
 
 
 class GaussianArrays(NamedTuple):
@@ -123,9 +126,14 @@ def _scale_columns(a, scales, i):
 
 @njit(fastmath={"contract"}, error_model="numpy")
 def _compute_tangent_limits(pinhole):
-    """Compute the range of x/z and of y/z at which the Jacobian is evaluated."""
+    """Compute the range of x/z and of y/z at which the Jacobian is evaluated.
+
+    It is that of the image without its padding.
+    """
     fx, fy, cx, cy = pinhole.intrinsics
-    width, height = np.float32(pinhole.width), np.float32(pinhole.height)
+    left, top = pinhole.padding
+    cx, cy = cx - np.float32(left), cy - np.float32(top)
+    width, height = np.float32(pinhole.width - 2 * left), np.float32(pinhole.height - 2 * top)
     margin_x, margin_y = TANGENT_MARGIN * width, TANGENT_MARGIN * height
     return (
         -(cx + margin_x) / fx,

@@ -17,6 +17,8 @@ MIN_MATCHES = 12
 """Fewest triangulated features for an estimate."""
 MARGINS = (0.5, 4.0)
 """Near and far over the depths of the nearest and farthest features."""
+SHARE_OUTSIDE = 0.02
+"""Share of the features before the nearest and behind the farthest depth: they may be wrong."""
 
 
 def estimate_depth_range(views: Sequence[View]) -> tuple[float, float]:
@@ -27,7 +29,8 @@ def estimate_depth_range(views: Sequence[View]) -> tuple[float, float]:
     the given depths take the place of matches.
     """
     if len(views) == 1 and len(views[0].known_depths):
-        low, high = np.quantile(views[0].known_depths.cpu(), [0.02, 0.98]).tolist()
+        shares = [SHARE_OUTSIDE, 1 - SHARE_OUTSIDE]
+        low, high = np.quantile(views[0].known_depths.cpu(), shares).tolist()
         return MARGINS[0] * low, MARGINS[1] * high
     images, unit = make_stereo_images(views)
     neighbours = find_neighbours(images)
@@ -64,7 +67,7 @@ def measure_extreme_depths(
     if len(inverse) < MIN_MATCHES:
         return None
     # The nearest depth is the largest inverse depth.
-    low, high = np.quantile(inverse, [0.02, 0.98]).tolist()
+    low, high = np.quantile(inverse, [SHARE_OUTSIDE, 1 - SHARE_OUTSIDE]).tolist()
     return 1 / high, 1 / low
 
 
@@ -85,17 +88,6 @@ def get_depth_range(
             "than far."
         )
     return near, far
-
-
-def find_depth_range(
-    views: Sequence[View], trained: tuple[float, float] | None
-) -> tuple[float, float]:
-    """Find near and far z-depth of a scene, in scene units.
-
-    They are those of the first camera; else those that the model was `trained` on; else those of
-    matched features. Raise InputError for an empty range.
-    """
-    return get_depth_range(views, estimate_depth_range if trained is None else lambda _: trained)
 
 
 def set_depth_range(views: Sequence[View], near: float, far: float) -> list[View]:

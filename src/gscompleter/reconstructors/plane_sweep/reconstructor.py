@@ -25,6 +25,7 @@ from gscompleter.reconstructors.features.stereo_image import StereoImage
 from gscompleter.reconstructors.plane_sweep.fusion import DepthLayer
 from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
 from gscompleter.reconstructors.plane_sweep.given_depth import add_given, measure_nothing
+from gscompleter.reconstructors.plane_sweep.near_plane import find_near_plane
 from gscompleter.reconstructors.plane_sweep.predicted_depth import add_prediction
 from gscompleter.reconstructors.plane_sweep.rig import Rig, build_rig
 from gscompleter.reconstructors.plane_sweep.sky_mask import find_skies, find_sky, transfer_sky
@@ -60,6 +61,10 @@ class PlaneSweep(Splatter):
         layers = self.compute_layers(rig, views)
         depths = make_depth_maps(layers, rig.unit, views)
         return self.build_scene(views, depths, layers, rig.transforms)
+
+    def find_near_plane(self, views: Sequence[View], near: float, far: float) -> float:
+        """Find a near plane that no surface of the photographs stands before; at most `near`."""
+        return near if len(views) == 1 else find_near_plane(views, near, far)
 
     def lift(self, views: Sequence[View], pixel_mask: Bool[Tensor, "h w"]) -> Reconstruction:
         """Lift the pixels of `pixel_mask` in the first view, a synthesized image.

@@ -115,6 +115,11 @@ class Measurement:
     confidence: Map
     """Like `weight`, but 0 for depths taken from surrounding pixels."""
 
+    @property
+    def inverse(self) -> Map:
+        """Inverse depths of the planes."""
+        return compute_inverse_depth(self.planes, self.index)
+
     def resize_to(self, size: tuple[int, int]) -> Measurement:
         """Upsample to `size` if the image was halved."""
         if self.index.shape == size:
