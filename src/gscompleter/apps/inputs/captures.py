@@ -129,9 +129,10 @@ def find_cameras_alone(scene: Gaussians, renderer: Renderer, request: RenderRequ
         return find_standing_cameras(scene, renderer, request)
     if camera is None:
         raise InputError(
-            "The file of the splat does not tell where to stand or what is missing; name a camera "
-            "with --target (`gscompleter view` saves one), mark what is wrong with --mask, or give "
-            "its own cameras with --cameras or its photographs as SCENE."
+            "The file of the splat does not tell where to stand or what is missing; let cameras "
+            "and holes be searched for with --auto, name a camera with --target (`gscompleter "
+            "view` saves one), mark what is wrong with --mask, or give its own cameras with "
+            "--cameras or its photographs as SCENE."
         )
     ranged = add_near_plane(camera, scene.means)
     seen = renderer.render(scene, ranged).depth_map()

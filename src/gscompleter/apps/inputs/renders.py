@@ -159,8 +159,9 @@ def choose_capture(
         capture = search_around_place(scene, known.origin, renderer, request)
     elif not targets:
         capture = find_cameras_alone(scene, renderer, request)
-    around = target_cameras if capture is None else target_cameras or capture.cameras
-    kind = choose_kind(request.kind, scene, around, renderer)
+    # Cameras that were found say nothing: they are chosen for images that the splat fills.
+    named = [] if path is None or capture is None else capture.cameras
+    kind = choose_kind(request.kind, scene, [*target_cameras, *named], renderer)
 
     # What is marked or removed is the hole, and need not be empty yet.
     if request.masks:
