@@ -155,9 +155,7 @@ def is_ground(scene: Gaussians, extent: Extent, renderer: Renderer) -> bool:
     return covered[top:bottom, left:right].float().mean().item() >= MIN_GROUND
 
 
-def measure_around(
-    scene: Gaussians, camera: Camera, extent: Extent, renderer: Renderer
-) -> float:
+def measure_around(scene: Gaussians, camera: Camera, extent: Extent, renderer: Renderer) -> float:
     """Measure the share of all directions in which a splat surrounds a camera."""
     shares = []
     center = camera.center.to(scene.means)

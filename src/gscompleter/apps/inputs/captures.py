@@ -20,6 +20,7 @@ from gscompleter.data.photographs import (
     Photographs,
     Resolution,
 )
+from gscompleter.data.scene import load_cameras
 from gscompleter.numerics.geometry import add_near_plane, is_same_camera
 from gscompleter.render.protocols import Renderer
 from gscompleter.system.errors import InputError, quote_value
@@ -30,11 +31,10 @@ from gscompleter.virtual_capture.pixel_aligned import (
     move_beside,
 )
 from gscompleter.virtual_capture.standpoints import choose_cameras_around_place, find_standpoints
+from gscompleter.virtual_capture.upward import Upward, find_upward
 
 MAX_AROUND = 12
 """Most cameras around all targets together: each takes the memory of a frozen scene."""
-USUAL_UP = (0.0, -1.0, 0.0)
-"""Upward direction of most files: the cameras of photographs point y down."""
 MIN_FOUND_COVERED = 0.9
 """Least share of its image in which a camera that was found sees the splat."""
 NUM_STANDPOINTS = 6
@@ -64,15 +64,19 @@ class RenderRequest:
     kind: Literal["auto", "all", "enclosed"] = "auto"
     """Kind of holes; `auto` takes those that an object encloses, and all in a scene."""
     up: tuple[float, float, float] | None = None
-    """Upward direction of a splat whose cameras are found; None for that of most files, -y."""
+    """Upward direction of a splat whose cameras are found, in the axes of its file; None to find
+    it."""
     place: Selection | None = None
     """Gaussians to be removed, around which cameras are found; None to complete the splat."""
     takes_standpoints: bool = False
     """True to stand anywhere if nothing tells where the cameras were."""
 
-    def make_up(self, scene: Gaussians) -> Float[Tensor, "3"]:
-        """Make the upward direction, in the axes of the file, on the device of the scene."""
-        return scene.means.new_tensor(self.up or USUAL_UP)
+    def find_up(self, scene: Gaussians, renderer: Renderer) -> Upward:
+        """Find the upward direction, for which the cameras beside the splat are read as well."""
+        splat = self.reading.folder
+        beside = find_cameras_beside(splat)
+        cameras = [] if beside is None else load_cameras(beside, self.reading.resolution)
+        return find_upward(splat, scene, renderer, self.up, cameras)
 
 
 @dataclass(frozen=True)
@@ -88,6 +92,8 @@ class Capture:
     """Clause that says which cameras they are."""
     more: str
     """Clause on what else could be given; empty if the user named the cameras."""
+    upward: Upward | None = None
+    """What is up for them; None for cameras that are not placed by it."""
 
 
 def find_cameras_beside(splat: Path) -> Path | None:
@@ -123,10 +129,10 @@ def find_cameras_alone(scene: Gaussians, renderer: Renderer, request: RenderRequ
     # Two photographs are the fewest, so that no image had more pixels than half of the Gaussians.
     side = max(MIN_FOUND_SIDE, round((len(scene) / 2) ** 0.5))
     sides = (side,) if resolution is None else (side, *np.ravel(resolution).tolist())
-    up = request.make_up(scene)
-    camera = find_pixel_camera(scene, up, min(sides))
+    upward = request.find_up(scene, renderer)
+    camera = find_pixel_camera(scene, upward.direction, min(sides))
     if camera is None and request.takes_standpoints:
-        return find_standing_cameras(scene, renderer, request)
+        return find_standing_cameras(scene, renderer, upward, request)
     if camera is None:
         raise InputError(
             "The file of the splat does not tell where to stand or what is missing; let cameras "
@@ -149,20 +155,22 @@ def find_cameras_alone(scene: Gaussians, renderer: Renderer, request: RenderRequ
         for moved in move_beside(camera, depth)
     ]
     where = "cameras that follow from the sizes of its Gaussians"
-    return name_capture(cameras, "pixels", where)
+    return name_capture(cameras, "pixels", where, upward)
 
 
-def find_standing_cameras(scene: Gaussians, renderer: Renderer, request: RenderRequest) -> Capture:
+def find_standing_cameras(
+    scene: Gaussians, renderer: Renderer, upward: Upward, request: RenderRequest
+) -> Capture:
     """Find cameras from which a trained splat looks like a photograph."""
-    up = request.make_up(scene)
     side = choose_side(request.reading.resolution)
-    cameras = find_standpoints(scene, up, side, renderer, NUM_STANDPOINTS)
+    cameras = find_standpoints(scene, upward.direction, side, renderer, NUM_STANDPOINTS)
     if not cameras:
         raise InputError(
             "There is no place from which the splat looks like a photograph; name its cameras with "
             "--cameras, or which way is up with --up."
         )
-    return name_capture(cameras, "standpoints", "cameras from which it looks like a photograph")
+    where = "cameras from which it looks like a photograph"
+    return name_capture(cameras, "standpoints", where, upward)
 
 
 def search_around_place(
@@ -174,15 +182,15 @@ def search_around_place(
     """Search for cameras around what is to be removed."""
     assert request.place is not None
     chosen = select_gaussians(request.place, scene, origin)
-    up = request.make_up(scene)
+    upward = request.find_up(scene, renderer)
     side = choose_side(request.reading.resolution)
-    cameras = choose_cameras_around_place(scene, chosen, up, side, renderer)
+    cameras = choose_cameras_around_place(scene, chosen, upward.direction, side, renderer)
     if not cameras:
         raise InputError(
             "No camera around what is to be removed sees it unhidden; name cameras with --cameras, "
             "or which way is up with --up."
         )
-    return name_capture(cameras, "place", "cameras around what is removed")
+    return name_capture(cameras, "place", "cameras around what is removed", upward)
 
 
 def choose_side(resolution: Resolution) -> int:
@@ -215,10 +223,12 @@ def search_around(
     return name_capture(cameras, "targets", "cameras that were found around the targets")
 
 
-def name_capture(cameras: Sequence[Camera], source: str, where: str) -> Capture:
+def name_capture(
+    cameras: Sequence[Camera], source: str, where: str, upward: Upward | None = None
+) -> Capture:
     """Name cameras that were found."""
     names = [f"render {number}" for number in range(1, len(cameras) + 1)]
-    return Capture(cameras, names, source, where, "; --cameras names others")
+    return Capture(cameras, names, source, where, "; --cameras names others", upward)
 
 
 def describe_capture(capture: Capture, num_chosen: int) -> str:

@@ -58,6 +58,7 @@ from gscompleter.system.files.image import convert_to_pixels
 from gscompleter.system.memory import check_memory
 from gscompleter.types import Camera, Gaussians, View
 from gscompleter.virtual_capture.render_views import render_views
+from gscompleter.virtual_capture.upward import require_direction
 
 FORMAT = "renders"
 """Format of photographs that are renders of the splat."""
@@ -113,6 +114,7 @@ def open_renders(
         chosen = choose_context(photographs, targets, reading.resolution, has_splat=True)
     chosen = chosen or tuple(range(len(capture.cameras)))
     notes = [describe_capture(capture, len(chosen))]
+    notes += [] if capture.upward is None else capture.upward.describe()
     if kind == "enclosed" and not request.masks:
         notes.append(OBJECT_NOTE)
 
@@ -199,8 +201,8 @@ def check_words(request: RenderRequest, path: Path | None) -> None:
             "The cameras that are given have an upward direction of their own; leave --up out.",
             "up",
         )
-    if request.up is not None and not any(request.up):
-        raise InputError("The upward direction is three numbers that are not all zero.", "up")
+    if request.up is not None:
+        require_direction(request.up)
     if path is not None:
         return
     if request.context is not None:
