@@ -436,7 +436,9 @@ def test_a_page_is_saved_once(packed, tmp_path, monkeypatch, capsys):
     save_ply(tmp_path / "a.ply", room_exhibit().after)
     asked = ("view", tmp_path / "a.ply", "--save", tmp_path / "page.html")
     assert run(monkeypatch, *asked) == 0
-    assert capsys.readouterr().out == f"{tmp_path / 'page.html'}\n"
+    upward, page = capsys.readouterr().out.splitlines()
+    assert upward.startswith("Up is -y, as in most files")
+    assert page == str(tmp_path / "page.html")
     first = (tmp_path / "page.html").read_bytes()
     assert run(monkeypatch, *asked) == 2
     assert "--overwrite" in capsys.readouterr().err

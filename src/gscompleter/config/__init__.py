@@ -457,10 +457,10 @@ class CompleterConfig(Settings):
 
         Only holes that it encloses are completed, and nothing is added outside of its hull.
         """
-        # First in the list: the others judge what it leaves.
+        # Last in the list: `free-space` moves candidates.
         others = tuple(name for name in self.guards if name != "hull")
         holes = replace(self.holes, kind="enclosed")
-        return replace(self, guards=("hull", *others), holes=holes)
+        return replace(self, guards=(*others, "hull"), holes=holes)
 
     def without_guard(self, name: GuardName) -> CompleterConfig:
         """Return the same settings without one guard."""

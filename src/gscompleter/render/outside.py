@@ -12,7 +12,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from gscompleter.config.settings import COVERED
-from gscompleter.numerics.geometry import look_along, project_mask
+from gscompleter.numerics.geometry import look_along, project_mask, quats_to_rotations
 from gscompleter.numerics.image_ops import dilate, is_enclosed, label_regions
 from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, thin_gaussians
 from gscompleter.render.protocols import Renderer
@@ -21,6 +21,17 @@ from gscompleter.types import Camera, Gaussians, Render
 
 CORE = (0.02, 0.98)
 """Quantiles of the coordinates, weighted by opacity, between which the extent lies."""
+NUM_SAMPLES = 2000
+"""Means that are compared."""
+SEED = 0
+NUM_TURNS = 300
+"""Random boxes that are tried."""
+NUM_BEST = 6
+"""Boxes that are kept from round to round."""
+NUM_STEPS = 40
+"""Random turns of each of them."""
+REACHES = (0.15, 0.05, 0.02, 0.007)
+"""Standard deviations of half of these turns in each round, in radians."""
 DISTANCE = 4.0
 """Distance of the cameras from the middle, in radii of the extent: twice its diagonal."""
 FIELD = 2.0
@@ -33,11 +44,13 @@ SLACK = 1
 
 @dataclass(frozen=True)
 class Extent:
-    """The box in which a splat lies, without its outliers; aligned with the axes of the file."""
+    """The smallest box in which a splat lies, without its outliers."""
 
     center: Float[Tensor, "3"]
     half: Float[Tensor, "3"]
     """Half of the sides of the box, in scene units."""
+    axes: Float[Tensor, "3 3"]
+    """Unit directions of its sides, in rows."""
 
     @property
     def radius(self) -> float:
@@ -66,16 +79,42 @@ class OutsideView:
 
 
 def measure_extent(scene: Gaussians) -> Extent:
-    """Measure the extent of a splat, in which each Gaussian counts by its opacity."""
-    weights = scene.opacities.double()
-    sides = []
-    for values in scene.means.unbind(1):
-        order = values.argsort()
-        sums = weights[order].cumsum(0)
-        places = torch.searchsorted(sums, sums.new_tensor(CORE) * sums[-1])
-        sides.append(values[order][places.clamp_max(len(values) - 1)])
-    low, high = torch.stack(sides, dim=1)
-    return Extent((low + high) / 2, (high - low) / 2)
+    """Measure the extent of a splat, in which each Gaussian counts by its opacity.
+
+    The axes of a file may have any direction in its scene. Of the boxes that are turned at random,
+    and of the best of them turned a little, the smallest lies along walls and floor.
+    """
+    points = sample_by_opacity(scene)
+    generator = torch.Generator().manual_seed(SEED)
+    draws = torch.randn((NUM_TURNS, 4), generator=generator)
+    turns = torch.cat([torch.eye(3)[None], quats_to_rotations(draws)])
+    for reach in REACHES:
+        best = turns[measure_volumes(points, turns).topk(NUM_BEST, largest=False).indices]
+        steps = reach * torch.randn((NUM_BEST, NUM_STEPS, 4), generator=generator)
+        steps[..., 0] = 1.0
+        turned = quats_to_rotations(steps) @ best[:, None]
+        turns = torch.cat([best, turned.reshape(-1, 3, 3)])
+    axes = turns[measure_volumes(points, turns).argmin()]
+    low, high = (points @ axes.T).quantile(torch.tensor(CORE), dim=0)
+    extent = Extent((low + high) / 2 @ axes, (high - low) / 2, axes)
+    return Extent(*(value.to(scene.means) for value in vars(extent).values()))
+
+
+def sample_by_opacity(scene: Gaussians) -> Float[Tensor, "n 3"]:
+    """Sample means on the CPU, each as often as its opacity says."""
+    sums = scene.opacities.double().cpu().cumsum(0)
+    steps = (torch.arange(NUM_SAMPLES) + 0.5) / NUM_SAMPLES * sums[-1]
+    rows = torch.searchsorted(sums, steps).clamp_max(len(scene) - 1)
+    return scene.means.cpu()[rows]
+
+
+def measure_volumes(
+    points: Float[Tensor, "n 3"], turns: Float[Tensor, "t 3 3"]
+) -> Float[Tensor, "t"]:
+    """Measure the volume of the box that holds points, along each triple of axes."""
+    turned = torch.einsum("tij,nj->tni", turns, points)
+    low, high = turned.quantile(torch.tensor(CORE), dim=1)
+    return (high - low).prod(dim=1)
 
 
 def list_directions() -> Float[Tensor, "12 3"]:
