@@ -48,6 +48,7 @@ LOSSES = {
     "filter": "the Gaussians of these pixels do not lie in the hole",
     "free-space": "additions would occlude what cameras see through to (free-space)",
     "removal": "nothing was removed there (removal)",
+    "hull": "additions would lie outside of the object (hull)",
     "refine": "the photographs beside the target contradict the additions (refinement)",
     "image-agreement": "the image contradicts the photographs (image-agreement)",
     "depth-agreement": "the depths contradict the scene (depth-agreement)",

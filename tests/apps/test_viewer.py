@@ -60,18 +60,7 @@ from gscompleter.system.files.image import write_image
 from gscompleter.types import Gaussians, merge
 from pose_files import CAMERAS, NAMES, write_colmap_binary, write_photographs
 from scenes import camera_at
-from viewer_pages import LEFT, SIDE, TARGET, room_exhibit, room_from
-
-NONE = Libraries({}, {})
-"""A page without libraries renders nothing, which only a browser would notice."""
-
-
-def content_of(page: bytes) -> dict:
-    """Read the content that the page has for its program."""
-    found = re.findall(
-        r'<script type="application/json" id="content">(.*?)</script>', page.decode(), re.S
-    )
-    return json.loads(found[0])
+from viewer_pages import LEFT, NONE, SIDE, TARGET, content_of, room_exhibit, room_from
 
 
 def gaussians_in(page: bytes, layer: str, folder: Path) -> Gaussians:
@@ -436,7 +425,9 @@ def test_a_page_is_saved_once(packed, tmp_path, monkeypatch, capsys):
     save_ply(tmp_path / "a.ply", room_exhibit().after)
     asked = ("view", tmp_path / "a.ply", "--save", tmp_path / "page.html")
     assert run(monkeypatch, *asked) == 0
-    assert capsys.readouterr().out == f"{tmp_path / 'page.html'}\n"
+    upward, page = capsys.readouterr().out.splitlines()
+    assert upward.startswith("Up is -y, as in most files")
+    assert page == str(tmp_path / "page.html")
     first = (tmp_path / "page.html").read_bytes()
     assert run(monkeypatch, *asked) == 2
     assert "--overwrite" in capsys.readouterr().err

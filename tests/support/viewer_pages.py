@@ -2,18 +2,31 @@
 
 from __future__ import annotations
 
+import json
+import re
 from dataclasses import replace
 
 import torch
 
 from gscompleter.apps.viewer.exhibit import ViewerCamera, ViewerContent
+from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.types import Camera, Gaussians, merge
 from scenes import Room, camera_at, gaussians_of, view_of
 
+NONE = Libraries({}, {})
+"""A page without libraries renders nothing, which only a browser would notice."""
 SIDE = 64
 """Image size of the cameras in pixels, small enough for software rendering."""
 LEFT = camera_at(x=-0.3, yaw=-7, size=SIDE)
 """Camera that observes the room."""
+
+
+def content_of(page: bytes) -> dict:
+    """Read the content that the page has for its program."""
+    found = re.findall(
+        r'<script type="application/json" id="content">(.*?)</script>', page.decode(), re.S
+    )
+    return json.loads(found[0])
 
 
 def off_centre(camera: Camera) -> Camera:

@@ -5,10 +5,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gscompleter.render.loading import load_renderer
 from gscompleter.trust.lifted import measure_core
 from gscompleter.types import merge
-from gscompleter.virtual_capture.kind import is_object
 from gscompleter.virtual_capture.pixel_aligned import (
     find_pixel_camera,
     move_beside,
@@ -41,13 +39,3 @@ def test_small_moves_keep_the_view():
     for other in others:
         assert torch.equal(other.c2w[:3, :3], camera.c2w[:3, :3])
         assert 0.1 < (other.center - camera.center).norm() < 0.6
-
-
-def test_an_object_is_told_by_what_is_around_it():
-    renderer = load_renderer("cpu")
-    inside = [camera_at(yaw=angle, size=SIZE, focal=0.3) for angle in (0, 90, 180, 270)]
-    room = merge([gaussians_of(view_of(Room(), camera)) for camera in inside])
-    cameras = [camera_at(size=SIZE), camera_at(0.3, yaw=40, size=SIZE)]
-    assert not is_object(room, cameras, renderer)
-    box = room[(room.means - torch.tensor([-0.1, 0.9, 2.6])).norm(dim=1) < 1.0]
-    assert is_object(box, cameras, renderer)

@@ -303,9 +303,10 @@ GUARDS = {
     "psnr": "gscompleter.guards.psnr:PsnrGuard",
     "contribution": "gscompleter.guards.contribution:Contribution",
     "removal": "gscompleter.editing.removal_guard:Removal",
+    "hull": "gscompleter.guards.hull:Hull",
 }
 """Module and class of each guard, imported when a preset names it."""
-USUAL_GUARDS = tuple(name for name in GUARDS if name != "removal")
+USUAL_GUARDS = tuple(name for name in GUARDS if name not in ("removal", "hull"))
 REMOVAL_ALPHA = 0.85
 """`holes.max_alpha` after a removal."""
 REMOVAL_RADIUS = 0.05
@@ -460,6 +461,16 @@ class CompleterConfig(Settings):
         """
         removal = self.for_removal()
         return replace(removal, holes=replace(removal.holes, forces_removed=True))
+
+    def for_object(self) -> CompleterConfig:
+        """Return the same settings for an object that stands on nothing.
+
+        Only holes that it encloses are completed, and nothing is added outside of its hull.
+        """
+        # Last in the list: `free-space` moves candidates.
+        others = tuple(name for name in self.guards if name != "hull")
+        holes = replace(self.holes, kind="enclosed")
+        return replace(self, guards=(*others, "hull"), holes=holes)
 
     def without_guard(self, name: GuardName) -> CompleterConfig:
         """Return the same settings without one guard."""

@@ -204,11 +204,12 @@ class CompletingOptions(SceneOptions, ModelOptions):
     take the place of photographs. If not given, a cameras.json beside the splat, or cameras that
     are found around the targets."""
     up: tuple[float, float, float] | None = None
-    """Upward direction of a splat without photographs whose cameras are found by the sizes of its
-    Gaussians: x, y and z in its file. If not given, -y."""
+    """Upward direction of a splat whose cameras are found: x, y and z in its file (in the axes of a
+    .ply). If not given, what its file or the cameras beside it say, else its floor, else -y."""
     holes: Literal["auto", "all", "enclosed"] = "auto"
     """Holes to fill: all that is empty, or only what the splat encloses, as in an object that
-    stands on nothing. `auto` tells an object without photographs by what its cameras see around."""
+    stands on nothing, outside of which nothing is added. `auto` tells an object without photographs
+    by what is around it."""
     no_recolor: bool = False
     """Keep the colours of the splat, too; Gaussians are only added."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()

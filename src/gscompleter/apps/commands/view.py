@@ -29,6 +29,9 @@ class ViewOptions(WritingOptions):
     COLMAP model; in the coordinates of the photographs if A is an output folder, else of A."""
     resolution: tuple[int, int] | None = None
     """Image size (height and width) of cameras whose file has none."""
+    up: tuple[float, float, float] | None = None
+    """Upward direction of the page: x, y and z in the file of A (in the axes of a .ply). If not
+    given, that of most cameras; without any, what the file says, else its floor, else -y."""
     save: Path | None = None
     """Write the page to this file instead of serving it."""
     port: Port = 0

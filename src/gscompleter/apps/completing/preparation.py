@@ -351,6 +351,8 @@ def read_splat_alone(
 def with_holes(options: CompleteOptions, kind: Literal["all", "enclosed"]) -> CompleteOptions:
     """Return the options with the kind of holes."""
     config = options.config
+    if kind == "enclosed":
+        return replace(options, config=config.for_object())
     return replace(options, config=replace(config, holes=replace(config.holes, kind=kind)))
 
 

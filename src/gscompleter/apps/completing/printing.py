@@ -86,7 +86,9 @@ def describe_result(summary: CompletionSummary, options: CompleteOptions) -> Ite
     share = "Trusted" if summary.settings["config"]["trust"] == "photometric" else "Coverage"
     before = format_percent(summary.coverage.before)
     after = format_percent(summary.coverage.after)
-    yield f"{share} around the {summary.scene.images}: {before} before, {after} after."
+    # Around an object nothing is missing, so that more of an image that shows it is no gain.
+    if summary.settings["config"]["holes"]["kind"] != "enclosed":
+        yield f"{share} around the {summary.scene.images}: {before} before, {after} after."
 
     rows = select_testing(summary.held_out)
     if rows:

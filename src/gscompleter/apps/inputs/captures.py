@@ -21,6 +21,7 @@ from gscompleter.data.photographs import (
     Photographs,
     Resolution,
 )
+from gscompleter.data.scene import load_cameras
 from gscompleter.numerics.geometry import add_near_plane, is_same_camera
 from gscompleter.render.protocols import Renderer
 from gscompleter.system.errors import InputError, quote_value
@@ -31,12 +32,11 @@ from gscompleter.virtual_capture.pixel_aligned import (
     move_beside,
 )
 from gscompleter.virtual_capture.standpoints import choose_cameras_around_place, find_standpoints
+from gscompleter.virtual_capture.upward import Upward, find_upward
 from gscompleter.virtual_capture.witnesses import MAX_WITNESSES
 
 MAX_AROUND = 12
 """Most cameras around all targets together: each takes the memory of a frozen scene."""
-USUAL_UP = (0.0, -1.0, 0.0)
-"""Upward direction of most files: the cameras of photographs point y down."""
 MIN_FOUND_COVERED = 0.9
 """Least share of its image in which a camera that was found sees the splat."""
 NUM_STANDPOINTS = 6
@@ -68,15 +68,19 @@ class RenderRequest:
     kind: Literal["auto", "all", "enclosed"] = "auto"
     """Kind of holes; `auto` takes those that an object encloses, and all in a scene."""
     up: tuple[float, float, float] | None = None
-    """Upward direction of a splat whose cameras are found; None for that of most files, -y."""
+    """Upward direction of a splat whose cameras are found, in the axes of its file; None to find
+    it."""
     place: Selection | None = None
     """Gaussians to be removed, around which cameras are found; None to complete the splat."""
     takes_standpoints: bool = False
     """True to stand anywhere if nothing tells where the cameras were."""
 
-    def make_up(self, scene: Gaussians) -> Float[Tensor, "3"]:
-        """Make the upward direction, in the axes of the file, on the device of the scene."""
-        return scene.means.new_tensor(self.up or USUAL_UP)
+    def find_up(self, scene: Gaussians, renderer: Renderer) -> Upward:
+        """Find the upward direction, for which the cameras beside the splat are read as well."""
+        splat = self.reading.folder
+        beside = find_cameras_beside(splat)
+        cameras = [] if beside is None else load_cameras(beside, self.reading.resolution)
+        return find_upward(splat, scene, renderer, self.up, cameras)
 
 
 @dataclass(frozen=True)
@@ -92,6 +96,8 @@ class Capture:
     """Clause that says which cameras they are."""
     more: str
     """Clause on what else could be given; empty if the user named the cameras."""
+    upward: Upward | None = None
+    """What is up for them; None for cameras that are not placed by it."""
     others: Sequence[Camera] = ()
     """Further cameras from which the splat looks well, and at which it is not rendered."""
 
@@ -129,15 +135,16 @@ def find_cameras_alone(scene: Gaussians, renderer: Renderer, request: RenderRequ
     # Two photographs are the fewest, so that no image had more pixels than half of the Gaussians.
     side = max(MIN_FOUND_SIDE, round((len(scene) / 2) ** 0.5))
     sides = (side,) if resolution is None else (side, *np.ravel(resolution).tolist())
-    up = request.make_up(scene)
-    camera = find_pixel_camera(scene, up, min(sides))
+    upward = request.find_up(scene, renderer)
+    camera = find_pixel_camera(scene, upward.direction, min(sides))
     if camera is None and request.takes_standpoints:
-        return find_standing_cameras(scene, renderer, request)
+        return find_standing_cameras(scene, renderer, upward, request)
     if camera is None:
         raise InputError(
-            "The file of the splat does not tell where to stand or what is missing; name a camera "
-            "with --target (`gscompleter view` saves one), mark what is wrong with --mask, or give "
-            "its own cameras with --cameras or its photographs as SCENE."
+            "The file of the splat does not tell where to stand or what is missing; let cameras "
+            "and holes be searched for with --auto, name a camera with --target (`gscompleter "
+            "view` saves one), mark what is wrong with --mask, or give its own cameras with "
+            "--cameras or its photographs as SCENE."
         )
     ranged = add_near_plane(camera, scene.means)
     seen = renderer.render(scene, ranged).depth_map()
@@ -154,14 +161,15 @@ def find_cameras_alone(scene: Gaussians, renderer: Renderer, request: RenderRequ
         for moved in move_beside(camera, depth)
     ]
     where = "cameras that follow from the sizes of its Gaussians"
-    return name_capture(cameras, "pixels", where)
+    return name_capture(cameras, "pixels", where, upward)
 
 
-def find_standing_cameras(scene: Gaussians, renderer: Renderer, request: RenderRequest) -> Capture:
+def find_standing_cameras(
+    scene: Gaussians, renderer: Renderer, upward: Upward, request: RenderRequest
+) -> Capture:
     """Find cameras from which a trained splat looks like a photograph."""
-    up = request.make_up(scene)
     side = choose_side(request.reading.resolution)
-    cameras = find_standpoints(scene, up, side, renderer, MAX_WITNESSES)
+    cameras = find_standpoints(scene, upward.direction, side, renderer, MAX_WITNESSES)
     if not cameras:
         raise InputError(
             "There is no place from which the splat looks like a photograph; name its cameras with "
@@ -169,7 +177,8 @@ def find_standing_cameras(scene: Gaussians, renderer: Renderer, request: RenderR
         )
     best = cameras[:NUM_STANDPOINTS]
     where = "cameras from which it looks like a photograph"
-    return replace(name_capture(best, "standpoints", where), others=cameras[NUM_STANDPOINTS:])
+    found = name_capture(best, "standpoints", where, upward)
+    return replace(found, others=cameras[NUM_STANDPOINTS:])
 
 
 def search_around_place(
@@ -181,15 +190,15 @@ def search_around_place(
     """Search for cameras around what is to be removed."""
     assert request.place is not None
     chosen = select_gaussians(request.place, scene, origin)
-    up = request.make_up(scene)
+    upward = request.find_up(scene, renderer)
     side = choose_side(request.reading.resolution)
-    cameras = choose_cameras_around_place(scene, chosen, up, side, renderer)
+    cameras = choose_cameras_around_place(scene, chosen, upward.direction, side, renderer)
     if not cameras:
         raise InputError(
             "No camera around what is to be removed sees it unhidden; name cameras with --cameras, "
             "or which way is up with --up."
         )
-    return name_capture(cameras, "place", "cameras around what is removed")
+    return name_capture(cameras, "place", "cameras around what is removed", upward)
 
 
 def choose_side(resolution: Resolution) -> int:
@@ -222,10 +231,12 @@ def search_around(
     return name_capture(cameras, "targets", "cameras that were found around the targets")
 
 
-def name_capture(cameras: Sequence[Camera], source: str, where: str) -> Capture:
+def name_capture(
+    cameras: Sequence[Camera], source: str, where: str, upward: Upward | None = None
+) -> Capture:
     """Name cameras that were found."""
     names = [f"render {number}" for number in range(1, len(cameras) + 1)]
-    return Capture(cameras, names, source, where, "; --cameras names others")
+    return Capture(cameras, names, source, where, "; --cameras names others", upward)
 
 
 def describe_capture(capture: Capture, num_chosen: int) -> str:

@@ -35,19 +35,22 @@ NOTHING_ENCLOSED = (
     "stays empty; mark what is wrong with --mask, or fill all that is empty with --holes all."
 )
 OBJECT_NOTE = (
-    "The splat is an object on nothing: only holes that it encloses are filled (--holes all fills "
-    "what is around it, too)."
+    "The splat is an object on nothing: only holes that it encloses are filled, and nothing is "
+    "added outside of its hull (--holes all fills what is around it, too)."
 )
 
 
 def choose_kind(
-    kind: str, scene: Gaussians, cameras: Sequence[Camera], renderer: Renderer
+    kind: str, scene: Gaussians, given: Sequence[Camera], renderer: Renderer
 ) -> HoleKind:
-    """Choose what a hole is: of an object on nothing, only what it encloses."""
+    """Choose what a hole is: of an object on nothing, only what it encloses.
+
+    `given` are the cameras that the user named, none that was found.
+    """
     if kind == "enclosed" or (
         kind == "auto"
         and not is_lifted(scene)
-        and is_object(scene, [camera.to(scene.means.device) for camera in cameras], renderer)
+        and is_object(scene, renderer, [camera.to(scene.means.device) for camera in given])
     ):
         return "enclosed"
     return "all"

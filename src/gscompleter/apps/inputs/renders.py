@@ -58,6 +58,7 @@ from gscompleter.system.files.image import convert_to_pixels
 from gscompleter.system.memory import check_memory
 from gscompleter.types import Camera, Gaussians, View
 from gscompleter.virtual_capture.render_views import render_views
+from gscompleter.virtual_capture.upward import estimate_axis_up, require_direction
 from gscompleter.virtual_capture.witnesses import choose_witnesses
 
 FORMAT = "renders"
@@ -114,6 +115,7 @@ def open_renders(
         chosen = choose_context(photographs, targets, reading.resolution, has_splat=True)
     chosen = chosen or tuple(range(len(capture.cameras)))
     notes = [describe_capture(capture, len(chosen))]
+    notes += [] if capture.upward is None else capture.upward.describe()
     if kind == "enclosed" and not request.masks:
         notes.append(OBJECT_NOTE)
 
@@ -121,7 +123,12 @@ def open_renders(
     # Cameras of a file that are not rendered know the splat as well as those that are.
     unused = [camera for number, camera in enumerate(capture.cameras) if number not in chosen]
     others = [camera.to(device) for camera in (*unused, *capture.others)]
-    up = request.make_up(scene)
+    if capture.upward is None:
+        # Cameras that somebody named stand upright.
+        named = [*cameras.values(), *(target.camera.to(device) for target in targets)]
+        up = estimate_axis_up(named)
+    else:
+        up = capture.upward.direction
     witnesses = choose_witnesses(scene, list(cameras.values()), others, up, renderer)
     check_images([*cameras.values(), *(target.camera for target in targets)])
     opened = Opened(
@@ -166,8 +173,9 @@ def choose_capture(
         capture = search_around_place(scene, known.origin, renderer, request)
     elif not targets:
         capture = find_cameras_alone(scene, renderer, request)
-    around = target_cameras if capture is None else target_cameras or capture.cameras
-    kind = choose_kind(request.kind, scene, around, renderer)
+    # Cameras that were found say nothing: they are chosen for images that the splat fills.
+    named = [] if path is None or capture is None else capture.cameras
+    kind = choose_kind(request.kind, scene, [*target_cameras, *named], renderer)
 
     # What is marked or removed is the hole, and need not be empty yet.
     if request.masks:
@@ -206,8 +214,8 @@ def check_words(request: RenderRequest, path: Path | None) -> None:
             "The cameras that are given have an upward direction of their own; leave --up out.",
             "up",
         )
-    if request.up is not None and not any(request.up):
-        raise InputError("The upward direction is three numbers that are not all zero.", "up")
+    if request.up is not None:
+        require_direction(request.up)
     if path is not None:
         return
     if request.context is not None:

@@ -32,7 +32,7 @@ from gscompleter.types import Camera
 
 WELCOME = "Fly to a hole and press “Complete here”, or paint over what is wrong and press “Repair”."
 BUSY = "The last request is still running; press the button again when it is done."
-NO_HOLE = "No large hole is left around the photographs."
+NO_HOLE = "No large hole is left around the cameras."
 NAMES = {
     "complete": "Completing",
     "fill": "Filling",

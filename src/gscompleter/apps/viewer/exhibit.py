@@ -60,6 +60,8 @@ class ViewerContent:
     """The other state, or None to show one only."""
     cameras: tuple[ViewerCamera, ...] = ()
     notes: tuple[str, ...] = ()
+    up: tuple[float, float, float] | None = None
+    """Upward direction in the frame of the scene; None for that of most cameras."""
     transform: Float[np.ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     """Similarity from the frame of further cameras to that of the scene."""
     origin: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))

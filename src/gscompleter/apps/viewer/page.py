@@ -20,11 +20,13 @@ from typing import Any
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from gscompleter.apps.viewer.exhibit import ViewerCamera, ViewerContent
 from gscompleter.apps.viewer.packages import Libraries
-from gscompleter.numerics.geometry import embed_cameras, is_inside, project
+from gscompleter.numerics.geometry import embed_cameras, is_inside, look_along, project
 from gscompleter.splats.spz import BLOCK, encode_spz_blocks
+from gscompleter.splats.upward import USUAL, Direction
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import encode_text
 from gscompleter.types import Camera, Gaussians
@@ -140,7 +142,8 @@ def make_page_parts(
     order = torch.cat([layers["observed"], layers["generated"]])
     order = order[:: max(1, len(order) // MAX_LANDMARKS)].to(after.means.device)
     landmarks = frame.normalize(after[order]).means.double().cpu()
-    cameras = viewer_content.cameras or (make_overview(viewer_content.after),)
+    up = viewer_content.up
+    cameras = viewer_content.cameras or (make_overview(viewer_content.after, up or USUAL),)
     content = {
         "title": viewer_content.title,
         "frame": {"centre": frame.centre.tolist(), "unit": frame.unit},
@@ -149,6 +152,7 @@ def make_page_parts(
         "antialiased": {name: scene.is_antialiased for name, scene in scenes.items()},
         "path": plan_path([camera.camera for camera in cameras]),
         "live": is_live,
+        "up": None if up is None else turn_to_page(up),
         "shots": [describe_camera(camera, frame, landmarks) for camera in cameras],
         **vars(libraries),
     }
@@ -184,15 +188,26 @@ def make_scripts(sources: dict[str, bytes]) -> Iterator[bytes]:
             separator = b"\n"
 
 
-def make_overview(scene: Gaussians) -> ViewerCamera:
-    """Make a camera that sees the scene, for a page without any other."""
+def make_overview(scene: Gaussians, up: Direction) -> ViewerCamera:
+    """Make a camera that sees the scene from aside, for a page without any other."""
     means = scene.means.cpu()
     centre = means.median(dim=0).values
     distance = OVERVIEW_DISTANCE * (means - centre).norm(dim=1).median()
+    upward = normalize(torch.tensor(up), dim=0)
+    # Along z, as photographs look if y is down; or along y if z is up.
+    aside = torch.eye(3)[2 if upward[2].abs() < upward.abs().amax() else 1]
+    forward = aside - upward * (aside @ upward)
     c2w = torch.eye(4)
-    c2w[:3, 3] = centre - distance * torch.tensor([0.0, 0.0, 1.0])
+    c2w[:3, 3] = centre - distance * normalize(forward, dim=0)
     K = torch.tensor([[550.0, 0.0, 320.0], [0.0, 550.0, 240.0], [0.0, 0.0, 1.0]])
-    return ViewerCamera("overview", "Overview", Camera(c2w, K, 640, 480), has_frame=False)
+    camera = look_along(Camera(c2w, K, 640, 480), forward, upward)
+    return ViewerCamera("overview", "Overview", camera, has_frame=False)
+
+
+def turn_to_page(direction: Direction) -> list[float]:
+    """Turn a direction of the scene to the axes of the page."""
+    x, y, z = direction
+    return [x, -y, -z]
 
 
 def describe_camera(

@@ -6,10 +6,14 @@ import os
 import webbrowser
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from http.server import ThreadingHTTPServer
+from pathlib import Path
 
 from gscompleter.apps.command_line.answers import print_answer, print_json
 from gscompleter.apps.commands.view import ViewOptions
+from gscompleter.apps.inputs.captures import find_cameras_beside
+from gscompleter.apps.report.schema import find_completed
 from gscompleter.apps.viewer import packages
 from gscompleter.apps.viewer.exhibit import (
     ViewerContent,
@@ -19,11 +23,15 @@ from gscompleter.apps.viewer.exhibit import (
 )
 from gscompleter.apps.viewer.http import HTML, PageHandler, PageServer
 from gscompleter.apps.viewer.page import make_page_parts
+from gscompleter.data.scene import load_cameras
+from gscompleter.render.loading import load_renderer
 from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.sog import META
+from gscompleter.splats.upward import Direction
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_file import reserve_file
 from gscompleter.system.files.writing import SUMMARY_FILE, replace_file
+from gscompleter.virtual_capture.upward import find_upward, require_direction
 
 ADDRESS = "127.0.0.1"
 HOST_NAMES = (ADDRESS, "localhost")
@@ -86,9 +94,24 @@ def load_content(options: ViewOptions) -> ViewerContent:
     else:
         content = load_viewer_files(scene, None, options.drop_nonfinite)
 
-    if options.cameras is None:
+    if options.cameras is not None:
+        content = add_file_cameras(content, options.cameras, options.resolution)
+    is_completion = (scene / SUMMARY_FILE).is_file()
+    return set_upward(content, options.up, find_completed(scene) if is_completion else scene)
+
+
+def set_upward(content: ViewerContent, up: Direction | None, path: Path) -> ViewerContent:
+    """Set what is up on the page, which the cameras show otherwise; a note says what was found."""
+    if up is not None:
+        require_direction(up)
+        return replace(content, up=up)
+    if content.cameras:
         return content
-    return add_file_cameras(content, options.cameras, options.resolution)
+    beside = find_cameras_beside(path)
+    cameras = [] if beside is None else load_cameras(beside)
+    upward = find_upward(path, content.after, load_renderer("cpu"), cameras=cameras)
+    x, y, z = upward.direction.tolist()
+    return replace(content, up=(x, y, z), notes=(*content.notes, *upward.describe()))
 
 
 def make_page_server(page: bytes, port: int = 0) -> ThreadingHTTPServer:

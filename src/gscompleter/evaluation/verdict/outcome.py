@@ -51,7 +51,8 @@ ADVICE = (
     "Usual reasons: wrong poses or focal lengths of the cameras, things that moved, or photographs "
     "with too little in common."
 )
-NO_TARGET = "no large hole was found around the photographs"
+NO_TARGET = "no large hole was found around its cameras"
+NOTHING_ENCLOSED = "the splat is an object on nothing, and no hole was found that it encloses"
 NOTHING_LACKS = "Nothing was gained, because photographs show nothing that the splat lacks."
 REJECTED = "the generated image contradicts the photographs"
 NOTHING_LEFT = "no Gaussian that was generated lies in the hole"
@@ -129,7 +130,8 @@ def explain_no_gain(completion: Completion) -> str:
     place = " in place of what was removed" if completion.source.gone_mask.any() else ""
     results = completion.targets
     if not results:
-        return f"Nothing was gained{place}, because {NO_TARGET}."
+        is_object = completion.config.holes.kind == "enclosed"
+        return f"Nothing was gained{place}, because {NOTHING_ENCLOSED if is_object else NO_TARGET}."
     # Several targets may have failed for one reason, which is said once.
     causes = Counter(make_clause(find_cause(result)) for result in results)
     if len(results) == 1:

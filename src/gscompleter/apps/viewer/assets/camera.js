@@ -20,8 +20,9 @@ function step(by) {
 
 const axis = (x, y, z) => new THREE.Vector3(x, y, z).applyQuaternion(state.turn);
 
-/* What is up for most cameras. */
+/* What is up: as the page was told, or for most cameras. */
 function upOfAll() {
+  if (content.up) return new THREE.Vector3(...content.up).normalize();
   const up = new THREE.Vector3();
   for (const shot of content.shots) up.add(new THREE.Vector3(shot.pose[1], shot.pose[5], shot.pose[9]));
   return up.lengthSq() > 0 ? up.normalize() : new THREE.Vector3(0, 1, 0);

@@ -1,0 +1,24 @@
+"""Hull guard (not in the paper): nothing is added outside of an object that stands on nothing."""
+
+from __future__ import annotations
+
+from gscompleter.guards import Guard
+from gscompleter.render.outside import find_in_hull, look_from_outside
+from gscompleter.stages.target_view import TargetView
+from gscompleter.types import Gaussians
+
+SIDE = 192
+"""Width and height of the silhouettes, in pixels."""
+
+
+class Hull(Guard):
+    """Add nothing outside of the visual hull of the scene as it was given (decision 080)."""
+
+    name = "hull"
+
+    def place(self, candidates: Gaussians, view: TargetView) -> Gaussians:
+        """Keep candidates that lie in the silhouettes of the scene from all sides."""
+        # Also with what was removed from it, whose place may be filled.
+        given = view.state.source.gaussians
+        silhouettes = look_from_outside(given, view.scenes.renderer, SIDE)
+        return candidates[find_in_hull(candidates, silhouettes)]
