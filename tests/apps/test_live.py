@@ -865,6 +865,7 @@ def test_a_saved_session_is_replayed_to_the_same_bytes(
     strokes = json.loads((saved / "strokes.json").read_text())
     assert strokes["resolution"] == [SIZE, SIZE]
     assert strokes["context"] == [0, 1]
+    assert (strokes["program"], strokes["format"]) == ("gscompleter", 1)
     actions = ["repair", "complete", "remove", "fill", "remove"]
     assert [frame["action"] for frame in strokes["frames"]] == actions
     assert strokes["frames"][4]["box"] == list(CRATE)
