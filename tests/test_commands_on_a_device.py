@@ -133,6 +133,7 @@ def test_holes_of_a_splat_alone_are_completed(room, tmp_path, monkeypatch):
     check_result(tmp_path / "out", 10)
 
 
+@pytest.mark.slow
 def test_what_a_mask_marks_in_a_splat_alone_is_completed(room, tmp_path, monkeypatch):
     words = ("complete", room / "splat.ply", "--target", room / "aside.json")
     mask = ("--mask", room / "mask.png")

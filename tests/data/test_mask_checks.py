@@ -96,6 +96,8 @@ def test_masks_of_some_photographs_tell_and_black_ones_only_leave_theirs_out(tmp
         load_views(few, [2, 3])
     right = write_masked(tmp_path / "right", [black, paint(~upper_quarter())])
     assert load_views(right, [1])[0].ignore_mask.float().mean() == 0.25
+    one_black = write_masked(tmp_path / "one", [black])
+    assert load_views(one_black, [1])[0].ignore_mask is None
     all_black = write_masked(tmp_path / "black", [black] * 4)
     with pytest.raises(InputError, match=r"masks of the photographs .* are black everywhere, and"):
         load_views(all_black)
@@ -146,7 +148,7 @@ def test_what_goes_is_seldom_most_of_the_images_or_of_the_splat(tmp_path):
 def test_masks_of_another_option_are_not_turned_by_this_one(tmp_path):
     mask = save(tmp_path / "masks/a.png", paint(upper_quarter()))
     with pytest.raises(InputError, match="save them in the other colours; if it is meant so"):
-        check_hiding_masks([mask], MaskReading(is_turned_by_option=False))
+        check_hiding_masks([mask], MaskReading(is_turned_by_option=False), 1)
 
 
 @pytest.mark.parametrize("brightness", [20, 128, 255])

@@ -44,7 +44,7 @@ def read_masks_as_asked(photographs: Photographs, reading: MaskReading) -> Photo
 
     What an alpha channel hides is certain, so that neither the check nor the inversion is for it.
     """
-    check_hiding_masks(photographs.list_masks(), reading)
+    check_hiding_masks(photographs.list_masks(), reading, len(photographs))
     return photographs.invert_masks() if reading.is_inverted else photographs
 
 
@@ -58,8 +58,8 @@ def refuse_nothing_to_invert(masks: Sequence[Path], reading: MaskReading) -> Non
         )
 
 
-def check_hiding_masks(masks: Sequence[Path], reading: MaskReading) -> None:
-    """Refuse masks that hide all of all photographs, or more than half of most of them.
+def check_hiding_masks(masks: Sequence[Path], reading: MaskReading, num_photographs: int) -> None:
+    """Refuse masks that hide all of all photographs, or more than half of most of theirs.
 
     A mask that hides a whole photograph leaves it out, which tells nothing of the others.
     """
@@ -70,6 +70,8 @@ def check_hiding_masks(masks: Sequence[Path], reading: MaskReading) -> None:
     shares = [share for share in ignored if share < 1.0]
     places = name_masks(path.parent for path in masks)
     color = "white" if hides_white(masks[0], reading.is_inverted) else "black"
+    if not shares and len(masks) < num_photographs:
+        return
     if not shares:
         raise InputError(
             f"The masks of the photographs ({places}) are {color} everywhere, and what is {color} "

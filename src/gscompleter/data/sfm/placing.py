@@ -38,6 +38,7 @@ from gscompleter.data.sfm.poses import (
     SEPARATORS,
     identify_files,
     list_all_photographs,
+    list_given_masks,
     read_earlier,
     read_focal,
     read_lens,
@@ -159,9 +160,7 @@ def place_photographs(
             "photos",
         )
 
-    listings = FolderListings()
-    masks = [find_mask(folder / name, name, listings) for name in names]
-    check_hiding_masks([mask for mask in masks if mask is not None], reading)
+    check_hiding_masks(list_given_masks(folder, names), reading, len(names))
     identity = identify_input(folder, names, photographs)
     if reading.is_inverted:
         identity["inverted masks"] = True

@@ -172,9 +172,10 @@ def find_poses(
     Raises InputError if masks hide most of the photographs, unless `reading` allows that. The masks
     that are written are black where something is hidden, however they are read.
     """
-    masks = list_given_masks(photographs)
+    names = [] if is_video(photographs) else list_all_photographs(photographs)
+    masks = list_given_masks(photographs, names)
     refuse_nothing_to_invert(masks, reading)
-    check_hiding_masks(masks, reading)
+    check_hiding_masks(masks, reading, len(names))
     # The same photographs in the same folder have the same cameras: minutes of work are reused.
     known = _identify_input(photographs, num_frames)
     if reading.is_inverted:
@@ -194,12 +195,10 @@ def find_poses(
     return replace(poses, kept=" ".join(output.describe_others()))
 
 
-def list_given_masks(path: Path) -> list[Path]:
-    """List the masks of a folder of photographs; a video has none."""
-    if is_video(path):
-        return []
+def list_given_masks(folder: Path, names: Sequence[str]) -> list[Path]:
+    """List the masks of photographs in a folder."""
     listings = FolderListings()
-    masks = (find_mask(path / name, name, listings) for name in list_all_photographs(path))
+    masks = (find_mask(folder / name, name, listings) for name in names)
     return [mask for mask in masks if mask is not None]
 
 
