@@ -112,6 +112,7 @@ def project_gaussians(
 
     cameras = [camera.to(gaussians.means.device) for camera in cameras]
     # Covariances, or quaternions and scales in their place
+    shapes: tuple[Tensor | None, ...]
     shapes = (None, gaussians.quats.float(), gaussians.scales.float())
     if cameras[0].padding != (0, 0):
         (camera,) = cameras

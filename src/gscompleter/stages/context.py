@@ -124,6 +124,7 @@ def reconstruct_context(reconstructor: Reconstructor, views: Sequence[View]) -> 
 def find_scene_range(reconstructor: Reconstructor, views: Sequence[View]) -> DepthRange:
     """Find near and far z-depth of the photographs from which Ψ reconstructs the scene."""
     keeps = keeps_given_range(reconstructor)
+    views = [view.to("cpu") for view in views]  # copied from a GPU once for all that follows
     found = find_depth_range(views, get_trained_range(reconstructor), keeps)
     if keeps or not isinstance(reconstructor, NearPlaneFinder):
         return found

@@ -146,10 +146,12 @@ def describe_mismatch(views: Sequence[View], trained: DepthRange) -> tuple[str, 
 def measure_features(views: Sequence[View]) -> SeenDepths:
     """Measure the depths of matched features that others confirm; none without a baseline."""
     inverses = [np.zeros(0)]
+    if len(views) < 2:
+        return SeenDepths("Matched features", inverses[0])
     with suppress(InputError):
         images, unit = make_stereo_images(views)
-        neighbours = find_neighbours(images) if len(images) > 1 else None
-        for i, j in neighbours.pairs if neighbours else ():
+        neighbours = find_neighbours(images)
+        for i, j in neighbours.pairs:
             in_i, in_j = neighbours.matches[i, j]
             # Each match has a depth in either photograph of the pair.
             for a, b, in_a, in_b in ((i, j, in_i, in_j), (j, i, in_j, in_i)):
