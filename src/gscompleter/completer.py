@@ -180,6 +180,7 @@ class GSCompleter:
                 Trust(),
                 is_given=scene is not None,
                 seed=self.seed,
+                context_notes=context.notes,
                 models=self.name_models(),
             )
             # Guards measure the scene as it was given, so before anything changes.
@@ -263,6 +264,7 @@ class GSCompleter:
                 registered=moved.gaussians if self.keep_registered else None,
                 num_recolored=recolored.count,
                 synthesis_notes=image.notes,
+                lift_notes=lifted.notes,
                 painter=image.painter,
                 rejection=rejection,
             )

@@ -603,6 +603,8 @@ class Reconstruction:
     """Row-major pixel of that view, or None if the model is not pixel-aligned."""
     exposure_gains: Float[Tensor, "v 3"] | None = None
     """Exposure gain per channel of each view relative to the Gaussians, or None."""
+    notes: tuple[str, ...] = ()
+    """Sentences for the user, such as on a depth that was not used."""
 
     owner: ClassVar[str] = "a reconstruction"
     forms: ClassVar[dict[str, Form]] = {
@@ -657,6 +659,8 @@ class Lift:
     anchor_depth: DepthMap
     pixel_index: Int[Tensor, "n"] | None
     """Row-major pixel of the reference that each Gaussian comes from, or None if unknown."""
+    notes: tuple[str, ...] = ()
+    """Sentences of Ψ for the user."""
 
 
 @dataclass(frozen=True)

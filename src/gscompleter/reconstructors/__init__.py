@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from gscompleter.numerics.value_checks import check_gaussians
+from gscompleter.numerics.value_checks import check_gaussians, check_notes
 from gscompleter.reconstructors.depth_predictors import DepthPredictor, load_depth_predictor
 from gscompleter.reconstructors.own_models import load_own_model
 from gscompleter.system.errors import InputError, quote_value
@@ -99,6 +99,7 @@ def check_reconstruction(output: object, views: Sequence[View]) -> None:
     _check_depths(output, views)
     _check_pixels(output, views)
     _check_gains(output, views)
+    check_notes(output.notes, "reconstructor")
 
 
 def get_trained_range(reconstructor: Reconstructor) -> tuple[float, float] | None:

@@ -44,6 +44,8 @@ class InitialContext:
     """Context photographs, then check photographs, in the exposure of the context."""
     exposure_gains: Float[Tensor, "v 3"] | None = None
     """Exposure gain per channel of each original photograph relative to the context, or None."""
+    notes: tuple[str, ...] = ()
+    """Sentences of Ψ for the user."""
 
 
 def choose_config(
@@ -111,7 +113,8 @@ def reconstruct_context(reconstructor: Reconstructor, views: Sequence[View]) -> 
     source = ContextScene.whole(drop_ignored(reconstruction, views))
     # The scene has one exposure, which the photographs have to share from here on.
     gains = reconstruction.exposure_gains
-    return InitialContext(source, normalize_exposures(views, gains), gains)
+    normalized = normalize_exposures(views, gains)
+    return InitialContext(source, normalized, gains, reconstruction.notes)
 
 
 def check_texture(views: Sequence[View]) -> None:

@@ -25,7 +25,11 @@ from gscompleter.reconstructors.features.stereo_image import StereoImage
 from gscompleter.reconstructors.plane_sweep.fusion import DepthLayer
 from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
 from gscompleter.reconstructors.plane_sweep.given_depth import add_given, measure_nothing
-from gscompleter.reconstructors.plane_sweep.predicted_depth import add_prediction
+from gscompleter.reconstructors.plane_sweep.predicted_depth import (
+    Supported,
+    add_prediction,
+    describe_support,
+)
 from gscompleter.reconstructors.plane_sweep.rig import Rig, build_rig
 from gscompleter.reconstructors.plane_sweep.sky_mask import find_skies, find_sky, transfer_sky
 from gscompleter.reconstructors.plane_sweep.surfaces import ITERATIONS, fit_surfaces
@@ -42,6 +46,8 @@ LIFT_ITERATIONS = ITERATIONS // 2
 MIN_HALVED_LIFT = 320.0
 """Shortest side, in pixels, from which a synthesized image and its anchor are matched at half size,
 which takes an eighth of the time. Photographs never are: of five it would cost 0.4 dB."""
+MAX_LOSS = 0.05
+"""Largest loss of a photograph, in dB, that predicted depth may cause."""
 
 
 @dataclass(frozen=True)
@@ -51,15 +57,33 @@ class PlaneSweep(Splatter):
     name: ClassVar[str] = "plane-sweep"
 
     predict_depth: DepthPredictor = predict_nothing
-    """Monocular depth, used where stereo measures nothing."""
+    """Monocular depth, used where stereo measures nothing and confirms it elsewhere."""
 
     def __call__(self, views: Sequence[View]) -> Reconstruction:
         """Reconstruct the scene and the depth of every pixel."""
         views = set_depth_range(views, *get_depth_range(views))
         rig = build_rig(views)
-        layers = self.compute_layers(rig, views)
-        depths = make_depth_maps(layers, rig.unit, views)
-        return self.build_scene(views, depths, layers, rig.transforms)
+        measured, skies = measure_views(rig, views)
+        plain = self.build(rig, views, complete_layers(rig, measured, measured, skies))
+        parts = self.support(rig, views, measured, skies)
+        if not any(part.share for part in parts):
+            return replace(plain, notes=describe_support(parts, name_views(views)))
+
+        # Surfaces that are right do not hide what another photograph shows.
+        observed = [part.measured for part in parts]
+        supported = self.build(rig, views, complete_layers(rig, observed, measured, skies))
+        losses = self.measure_losses(views, plain, supported)
+        worst = max(range(len(views)), key=losses.__getitem__)
+        if losses[worst] <= MAX_LOSS:
+            return replace(supported, notes=describe_support(parts, name_views(views)))
+        refusal = (
+            f"with it {name_views(views)[worst]} would be reproduced {losses[worst]:.2f} dB worse"
+        )
+        parts = [
+            Supported(m, refusal=refusal if part.share else part.refusal)
+            for m, part in zip(measured, parts, strict=True)
+        ]
+        return replace(plain, notes=describe_support(parts, name_views(views)))
 
     def lift(self, views: Sequence[View], pixel_mask: Bool[Tensor, "h w"]) -> Reconstruction:
         """Lift the pixels of `pixel_mask` in the first view, a synthesized image.
@@ -75,17 +99,19 @@ class PlaneSweep(Splatter):
         rig = build_rig(views)
         first, second = match_views(rig, views, MIN_HALVED_LIFT)
         first = add_given(first, rig.images[0])
-        first = add_prediction(first, predict_depth(self.predict_depth, views[0]))
 
         # The sky is found in the photograph and carried over by direction; the synthesized image
         # only has to be even there.
         sky_of_second = find_sky(rig.images[1], second)
         sky_of_first = transfer_sky(rig, sky_of_second)
+        # What the additions do to the photographs is the business of the guards.
+        (part,) = self.support(rig, views[:1], [first], [sky_of_first])
         layers = [
-            make_layer(rig.images[0], first.exclude(sky_of_first), LIFT_ITERATIONS),
+            make_layer(rig.images[0], part.measured.exclude(sky_of_first), LIFT_ITERATIONS),
             make_layer(rig.images[1], second.exclude(sky_of_second), 0),
         ]
-        return self.lift_pixels(views, make_depth_maps(layers, rig.unit, views), pixel_mask)
+        lifted = self.lift_pixels(views, make_depth_maps(layers, rig.unit, views), pixel_mask)
+        return replace(lifted, notes=describe_support([part], ["the synthesized image"]))
 
     def lift_in_place(
         self, image: View, anchor: View, pixel_mask: Bool[Tensor, "h w"]
@@ -108,22 +134,93 @@ class PlaneSweep(Splatter):
 
     def compute_layers(self, rig: Rig, views: Sequence[View]) -> list[DepthLayer]:
         """Compute the completed inverse depth of each view."""
-        measured = [
-            add_given(measurement, image)
-            for measurement, image in zip(match_views(rig, views), rig.images, strict=True)
-        ]
-        # The sky is judged by measurements alone, before predictions fill its pixels. Surfaces are
-        # fitted without it, as its matches are arbitrary, and it gets its depth afterwards.
-        skies = find_skies(rig, measured)
-        observed = [
-            add_prediction(measurement, predict_depth(self.predict_depth, view)).exclude(sky)
-            for measurement, view, sky in zip(measured, views, skies, strict=True)
-        ]
-        surfaces = map_in_parallel(make_layer, rig.images, observed)
+        measured, skies = measure_views(rig, views)
+        parts = self.support(rig, views, measured, skies)
+        return complete_layers(rig, [part.measured for part in parts], measured, skies)
+
+    def support(
+        self,
+        rig: Rig,
+        views: Sequence[View],
+        measured: Sequence[Measurement],
+        skies: Sequence[Mask],
+    ) -> list[Supported]:
+        """Predict the depth of each view, and add it to what is measured if it stands the test."""
+        if self.predict_depth is predict_nothing:
+            return [Supported(measurement) for measurement in measured]
+        predictions = [predict_depth(self.predict_depth, view) for view in views]
+        images = [image.image for image in rig.images[: len(views)]]
+        return map_in_parallel(add_prediction, measured, predictions, images, skies)
+
+    def build(
+        self, rig: Rig, views: Sequence[View], layers: Sequence[DepthLayer]
+    ) -> Reconstruction:
+        """Build the Gaussians of completed depths, and fit them to the photographs."""
+        depths = make_depth_maps(layers, rig.unit, views)
+        return self.build_scene(views, depths, layers, rig.transforms)
+
+    def measure_losses(
+        self, views: Sequence[View], before: Reconstruction, after: Reconstruction
+    ) -> list[float]:
+        """Measure by how much a second reconstruction reproduces each photograph worse, in dB."""
+        before_errors, after_errors = (
+            [
+                self.measure_error(view, scene, number)
+                for number, view in enumerate(views)
+            ]
+            for scene in (before, after)
+        )
         return [
-            add_sky(surface, measurement, sky)
-            for surface, measurement, sky in zip(surfaces, measured, skies, strict=True)
+            10 * math.log10(max(after, 1e-12) / max(before, 1e-12))
+            for before, after in zip(before_errors, after_errors, strict=True)
         ]
+
+    def measure_error(self, view: View, scene: Reconstruction, number: int) -> float:
+        """Measure the mean squared colour error of a photograph, apart from ignored pixels."""
+        seen = view.to("cpu")
+        image = self.renderer.render(scene.gaussians.to("cpu"), seen.camera).image
+        if scene.exposure_gains is not None:
+            image = image * scene.exposure_gains[number].cpu()
+        error = (image - seen.image)[seen.valid_mask].double().square()
+        return float(error.mean()) if error.numel() else 0.0
+
+
+def measure_views(rig: Rig, views: Sequence[View]) -> tuple[list[Measurement], list[Mask]]:
+    """Measure the depth of each view, by stereo or as it is given, and find its sky.
+
+    The sky is judged by measurements alone, before predictions fill its pixels.
+    """
+    measured = [
+        add_given(measurement, image)
+        for measurement, image in zip(match_views(rig, views), rig.images, strict=True)
+    ]
+    return measured, find_skies(rig, measured)
+
+
+def complete_layers(
+    rig: Rig,
+    observed: Sequence[Measurement],
+    measured: Sequence[Measurement],
+    skies: Sequence[Mask],
+) -> list[DepthLayer]:
+    """Complete the inverse depth of each view by surfaces through what is `observed`.
+
+    They are fitted without the sky, as its matches are arbitrary, and it gets its depth afterwards.
+    """
+    without_sky = [part.exclude(sky) for part, sky in zip(observed, skies, strict=True)]
+    surfaces = map_in_parallel(make_layer, rig.images, without_sky)
+    return [
+        add_sky(surface, measurement, sky)
+        for surface, measurement, sky in zip(surfaces, measured, skies, strict=True)
+    ]
+
+
+def name_views(views: Sequence[View]) -> list[str]:
+    """Name photographs by their frames, or by their places if they have none."""
+    return [
+        f"photograph {number if view.frame is None else view.frame}"
+        for number, view in enumerate(views)
+    ]
 
 
 def match_views(
