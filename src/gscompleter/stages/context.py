@@ -113,8 +113,17 @@ def reconstruct_context(reconstructor: Reconstructor, views: Sequence[View]) -> 
     source = ContextScene.whole(drop_ignored(reconstruction, views))
     # The scene has one exposure, which the photographs have to share from here on.
     gains = reconstruction.exposure_gains
-    normalized = normalize_exposures(views, gains)
+    normalized = normalize_exposures(drop_contradicted(views, reconstruction), gains)
     return InitialContext(source, normalized, gains, reconstruction.notes)
+
+
+def drop_contradicted(views: Sequence[View], reconstruction: Reconstruction) -> list[View]:
+    """Leave out given depth that the photographs contradict, so that no stage reads it."""
+    wrong = reconstruction.contradicted_depths
+    return [
+        replace(view, given_depth=None) if number in wrong else view
+        for number, view in enumerate(views)
+    ]
 
 
 def check_texture(views: Sequence[View]) -> None:

@@ -153,7 +153,8 @@ def write_report(
     (folder / RECORD_FILE).write_bytes(json.dumps(asdict(record)).encode() + b"\n")
     coverage = {"coverage": asdict(compute_coverage(around))} if around else {}
     left = {} if removal is None else {"removal": asdict(removal.row)}
-    counts = {**count_changes(completion), **left, "seconds": dict(completion.seconds)}
+    notes = {"context_notes": completion.context_notes} if completion.context_notes else {}
+    counts = {**count_changes(completion), **notes, **left, "seconds": dict(completion.seconds)}
     summary = {
         "version": __version__,
         "outcome": scores.pop("outcome"),

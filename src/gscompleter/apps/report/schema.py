@@ -181,6 +181,8 @@ class CompletionSummary:
     """None if nothing was removed that a photograph shows."""
     new_photographs: int | None = None
     """Photographs that a splat was not trained on; None if the scene was reconstructed."""
+    context_notes: tuple[str, ...] = ()
+    """Sentences of the reconstructor about the context."""
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ a smooth field bring the one to the other, and what is left to test is the shape
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -49,7 +50,7 @@ class BlockErrors:
     """Mean absolute errors of the logarithm of depth in hidden blocks of stereo."""
 
     supported: float
-    """With the anchored depth in the blocks."""
+    """With the anchored depth in the blocks; infinite if it cannot be anchored."""
     continued: float
     """With the surfaces continued from around the blocks."""
 
@@ -62,12 +63,10 @@ class BlockErrors:
 def anchor_depth(guess: Map, measured: Measurement, anchors: Mask) -> Map | None:
     """Bring inverse depths, 0 where unknown, to the measured ones at the pixels of `anchors`.
 
-    RANSAC fits scale and shift; the ratio that is left is interpolated smoothly. None if there are
-    too few anchors, or if no positive scale fits.
+    RANSAC fits scale and shift; the ratio that is left is interpolated smoothly. None if no
+    positive scale fits: far things would be near, or nothing would be nearer than anything else.
     """
     places = np.flatnonzero(anchors)
-    if len(places) < MIN_PIXELS:
-        return None
     sample = places[:: -(-len(places) // MAX_PIXELS)]
     inverse = compute_inverse_depth(measured.planes, measured.index)
     x = torch.from_numpy(guess.ravel()[sample]).double()
@@ -124,9 +123,12 @@ def compare_in_hidden_blocks(
     for part in range(NUM_PARTS):
         hidden = parts == part
         tested = sure & hidden
-        anchored = anchor_depth(guess, measured, sure & ~hidden)
-        if not tested.any() or anchored is None:
+        anchors = sure & ~hidden
+        if not tested.any() or anchors.sum() < MIN_PIXELS:
             continue
+        anchored = anchor_depth(guess, measured, anchors)
+        if anchored is None:
+            return BlockErrors(math.inf, 0.0)
         rest = measured.exclude(hidden)
         for errors, observed in (
             (continued, rest),
@@ -144,9 +146,10 @@ def compare_in_hidden_blocks(
 
 
 def divide_into_blocks(empty: Mask) -> Int[np.ndarray, "h w"]:
-    """Number the pixels by the part that their block belongs to; no two of a part share a side.
+    """Divide the pixels into blocks, and number the part that each block belongs to.
 
-    Blocks are about as wide as what is `empty`: the wider it is, the less is known by continuing.
+    No two blocks of a part share a side. They are about as wide as what is `empty`: the wider that
+    is, the less is known by continuing.
     """
     # The distance from the border of a square is a sixth of its side in the mean. What lies beyond
     # the image is not known either.

@@ -1,4 +1,4 @@
-"""Depth that a network predicts from one image, as a weak observation where stereo measures nothing.
+"""Depth that a network predicts of an image, as a weak observation where stereo measures nothing.
 
 It has to earn its place: it must tell hidden blocks of stereo better than the surfaces that are
 continued without it (`hidden_blocks`), and no photograph may be reproduced worse with it.
@@ -6,8 +6,8 @@ continued without it (`hidden_blocks`), and no photograph may be reproduced wors
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,13 +19,10 @@ from gscompleter.reconstructors.plane_sweep.hidden_blocks import (
 )
 from gscompleter.reconstructors.plane_sweep.surfaces import Image
 from gscompleter.reconstructors.plane_sweep.sweep import Mask, Measurement
-from gscompleter.system.errors import join_names
 from gscompleter.types import DepthMap
 
 MAX_RATIO = 0.95
 """Largest error in hidden blocks with the prediction, relative to that without it."""
-MAX_NAMED = 8
-"""Most images that a sentence names."""
 UNTESTED = "stereo measures too little there to test it"
 CONTRADICTED = "continued surfaces tell hidden blocks of stereo as well as it does, or better"
 
@@ -39,6 +36,10 @@ class Supported:
     """Share of the pixels that the prediction supports."""
     refusal: str = ""
     """Why it is not used; empty if it is used, or if it says nothing."""
+
+    def refuse(self, reason: str) -> Supported:
+        """Return a copy without the prediction, if it was used."""
+        return replace(self, share=0.0, refusal=reason) if self.share else self
 
 
 def add_prediction(
@@ -66,22 +67,24 @@ def add_prediction(
     return Supported(support(full, anchored, known), share)
 
 
-def describe_support(parts: Sequence[Supported], names: Sequence[str]) -> tuple[str, ...]:
-    """Write one line on where predictions are used, and where not and why; none without any."""
+def describe_support(
+    parts: Sequence[Supported], name_images: Callable[[Sequence[int]], str]
+) -> tuple[str, ...]:
+    """Write one line on where predictions are used, and where not and why; none without any.
+
+    `name_images` names images by their indices.
+    """
     sentences = []
-    used = [(part, name) for part, name in zip(parts, names, strict=True) if part.share]
+    used = [number for number, part in enumerate(parts) if part.share]
     if used:
-        most = max(part.share for part, _ in used)
+        most = max(part.share for part in parts)
         sentences.append(
-            f"The predicted depth is used in {join_names([name for _, name in used], MAX_NAMED)} "
-            f"where stereo measures nothing, at up to {most:.1%} of the pixels."
+            f"The predicted depth is used in {name_images(used)}, where stereo measures nothing "
+            f"(up to {most:.1%} of the pixels)."
         )
     for reason in dict.fromkeys(part.refusal for part in parts if part.refusal):
-        refused = [
-            name for part, name in zip(parts, names, strict=True) if part.refusal == reason
-        ]
+        refused = [number for number, part in enumerate(parts) if part.refusal == reason]
         sentences.append(
-            f"The predicted depth is not used in {join_names(refused, MAX_NAMED)}, because "
-            f"{reason}."
+            f"The predicted depth is not used in {name_images(refused)}, because {reason}."
         )
     return (" ".join(sentences),) if sentences else ()

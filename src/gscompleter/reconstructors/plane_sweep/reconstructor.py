@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -24,7 +25,12 @@ from gscompleter.reconstructors.features.depth_range import get_depth_range, set
 from gscompleter.reconstructors.features.stereo_image import StereoImage
 from gscompleter.reconstructors.plane_sweep.fusion import DepthLayer
 from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
-from gscompleter.reconstructors.plane_sweep.given_depth import add_given, measure_nothing
+from gscompleter.reconstructors.plane_sweep.given_depth import (
+    add_given,
+    contradicts_stereo,
+    is_dense,
+    measure_nothing,
+)
 from gscompleter.reconstructors.plane_sweep.predicted_depth import (
     Supported,
     add_prediction,
@@ -39,6 +45,7 @@ from gscompleter.reconstructors.plane_sweep.sweep import (
     compute_inverse_depth,
     measure_depths,
 )
+from gscompleter.system.errors import join_names
 from gscompleter.types import DepthMap, Reconstruction, View
 
 LIFT_ITERATIONS = ITERATIONS // 2
@@ -48,6 +55,8 @@ MIN_HALVED_LIFT = 320.0
 which takes an eighth of the time. Photographs never are: of five it would cost 0.4 dB."""
 MAX_LOSS = 0.05
 """Largest loss of a photograph, in dB, that predicted depth may cause."""
+MAX_NAMED = 8
+"""Most photographs that a line names."""
 
 
 @dataclass(frozen=True)
@@ -63,27 +72,32 @@ class PlaneSweep(Splatter):
         """Reconstruct the scene and the depth of every pixel."""
         views = set_depth_range(views, *get_depth_range(views))
         rig = build_rig(views)
+        contradicted = find_contradicted(rig, views)
+        rig = rig.drop_given(contradicted)
+        name = partial(name_photographs, views)
         measured, skies = measure_views(rig, views)
-        plain = self.build(rig, views, complete_layers(rig, measured, measured, skies))
         parts = self.support(rig, views, measured, skies)
-        if not any(part.share for part in parts):
-            return replace(plain, notes=describe_support(parts, name_views(views)))
-
-        # Surfaces that are right do not hide what another photograph shows.
-        observed = [part.measured for part in parts]
-        supported = self.build(rig, views, complete_layers(rig, observed, measured, skies))
-        losses = self.measure_losses(views, plain, supported)
-        worst = max(range(len(views)), key=losses.__getitem__)
-        if losses[worst] <= MAX_LOSS:
-            return replace(supported, notes=describe_support(parts, name_views(views)))
-        refusal = (
-            f"with it {name_views(views)[worst]} would be reproduced {losses[worst]:.2f} dB worse"
-        )
-        parts = [
-            Supported(m, refusal=refusal if part.share else part.refusal)
-            for m, part in zip(measured, parts, strict=True)
-        ]
-        return replace(plain, notes=describe_support(parts, name_views(views)))
+        scene = self.build(rig, views, complete_layers(rig, measured, measured, skies))
+        if any(part.share for part in parts):
+            observed = [part.measured for part in parts]
+            supported = self.build(rig, views, complete_layers(rig, observed, measured, skies))
+            # Surfaces that are right do not hide what another photograph shows.
+            losses = self.measure_losses(views, scene, supported)
+            worst = max(range(len(views)), key=losses.__getitem__)
+            if losses[worst] > MAX_LOSS:
+                loss = f"{name([worst])} would be reproduced {losses[worst]:.2f} dB worse with it"
+                parts = [part.refuse(loss) for part in parts]
+            else:
+                scene = supported
+        notes = describe_support(parts, name)
+        wrong = [number for number, is_wrong in enumerate(contradicted) if is_wrong]
+        if wrong:
+            notes = (
+                f"The given depth is not used in {name(wrong)}, because its surfaces contradict "
+                "what stereo measures there; depth that a network predicts belongs to --depth.",
+                *notes,
+            )
+        return replace(scene, contradicted_depths=tuple(wrong), notes=notes)
 
     def lift(self, views: Sequence[View], pixel_mask: Bool[Tensor, "h w"]) -> Reconstruction:
         """Lift the pixels of `pixel_mask` in the first view, a synthesized image.
@@ -111,7 +125,7 @@ class PlaneSweep(Splatter):
             make_layer(rig.images[1], second.exclude(sky_of_second), 0),
         ]
         lifted = self.lift_pixels(views, make_depth_maps(layers, rig.unit, views), pixel_mask)
-        return replace(lifted, notes=describe_support([part], ["the synthesized image"]))
+        return replace(lifted, notes=describe_support([part], lambda _: "the synthesized image"))
 
     def lift_in_place(
         self, image: View, anchor: View, pixel_mask: Bool[Tensor, "h w"]
@@ -134,6 +148,7 @@ class PlaneSweep(Splatter):
 
     def compute_layers(self, rig: Rig, views: Sequence[View]) -> list[DepthLayer]:
         """Compute the completed inverse depth of each view."""
+        rig = rig.drop_given(find_contradicted(rig, views))
         measured, skies = measure_views(rig, views)
         parts = self.support(rig, views, measured, skies)
         return complete_layers(rig, [part.measured for part in parts], measured, skies)
@@ -164,10 +179,7 @@ class PlaneSweep(Splatter):
     ) -> list[float]:
         """Measure by how much a second reconstruction reproduces each photograph worse, in dB."""
         before_errors, after_errors = (
-            [
-                self.measure_error(view, scene, number)
-                for number, view in enumerate(views)
-            ]
+            [self.measure_error(view, scene, number) for number, view in enumerate(views)]
             for scene in (before, after)
         )
         return [
@@ -183,6 +195,15 @@ class PlaneSweep(Splatter):
             image = image * scene.exposure_gains[number].cpu()
         error = (image - seen.image)[seen.valid_mask].double().square()
         return float(error.mean()) if error.numel() else 0.0
+
+
+def find_contradicted(rig: Rig, views: Sequence[View]) -> list[bool]:
+    """Find the views whose stereo clearly contradicts their given depth."""
+    # A single photograph has no stereo.
+    if len(views) == 1 or not any(is_dense(image) for image in rig.images):
+        return [False] * len(views)
+    stereo = match_views(rig.drop_given([True] * len(views)), views)
+    return map_in_parallel(contradicts_stereo, rig.images, stereo)
 
 
 def measure_views(rig: Rig, views: Sequence[View]) -> tuple[list[Measurement], list[Mask]]:
@@ -215,12 +236,13 @@ def complete_layers(
     ]
 
 
-def name_views(views: Sequence[View]) -> list[str]:
-    """Name photographs by their frames, or by their places if they have none."""
-    return [
-        f"photograph {number if view.frame is None else view.frame}"
-        for number, view in enumerate(views)
+def name_photographs(views: Sequence[View], numbers: Sequence[int]) -> str:
+    """Name views by their frames, or by their places if they have none."""
+    frames = [views[number].frame for number in numbers]
+    named = [
+        number if frame is None else frame for number, frame in zip(numbers, frames, strict=True)
     ]
+    return f"photograph{'s' if len(named) > 1 else ''} {join_names(named, MAX_NAMED)}"
 
 
 def match_views(
