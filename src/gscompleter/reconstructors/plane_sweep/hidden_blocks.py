@@ -30,6 +30,9 @@ MIN_CONFIDENCE = 0.5
 """Confidence from which a measured pixel anchors depth and tests it."""
 MIN_PIXELS = 200
 """Fewest such pixels, for an anchor and for a test."""
+MIN_SURE_SHARE = 0.25
+"""Smallest share of such pixels for a test. With less, as in a room of blank walls, a third of what
+stereo is sure of is wrong, and true depth would contradict it."""
 MAX_PIXELS = 8192
 """Most pixels of the affine fit, evenly spaced among all."""
 WEIGHT = np.float32(0.1)
@@ -116,6 +119,8 @@ def compare_in_hidden_blocks(
 
     known = guess > 0
     sure = known & (measured.confidence >= MIN_CONFIDENCE)
+    if sure.sum() < MIN_SURE_SHARE * known.sum():
+        return None
     truth = compute_inverse_depth(measured.planes, measured.index)
     parts = divide_into_blocks(measured.weight == 0)
     supported = []
