@@ -176,8 +176,7 @@ def check_depths(depths: object, views: Sequence[View]) -> None:
 
 def check_notes(notes: object, model: str) -> None:
     """Raise InputError unless the notes of a model, such as the "generator", are sentences."""
-    is_listed = isinstance(notes, (tuple, list))
-    if not is_listed or not all(isinstance(note, str) for note in notes):
+    if not isinstance(notes, (tuple, list)) or not all(isinstance(note, str) for note in notes):
         raise InputError(
             f"The notes of the {model} have to be a tuple of sentences, and are {describe(notes)}."
         )

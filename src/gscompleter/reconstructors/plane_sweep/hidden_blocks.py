@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Int
+from jaxtyping import Float32, Int
 
 from gscompleter.numerics.image_ops import push_pull
 from gscompleter.numerics.robust import fit_line_ransac
@@ -45,7 +45,8 @@ MIN_BLOCK, MAX_BLOCK = 1 / 8, 1 / 3
 MAX_ERROR = 0.5
 """Largest absolute error of a logarithm of depth that counts; a blunder says no more than that."""
 TEST_SIDE = 256
-"""Shortest side, in pixels, from which a test takes every second pixel, or fewer."""
+"""Shorter side of an image, in pixels, up to twice which a test takes every pixel; of larger ones it
+takes every n-th."""
 
 
 @dataclass(frozen=True)
@@ -123,8 +124,8 @@ def compare_in_hidden_blocks(
         return None
     truth = compute_inverse_depth(measured.planes, measured.index)
     parts = divide_into_blocks(measured.weight == 0)
-    supported = []
-    continued = []
+    supported: list[Float32[np.ndarray, "_"]] = []
+    continued: list[Float32[np.ndarray, "_"]] = []
     for part in range(NUM_PARTS):
         hidden = parts == part
         tested = sure & hidden
@@ -142,7 +143,7 @@ def compare_in_hidden_blocks(
             index = fit_surfaces(observed.index, observed.weight, image, iterations)
             found = compute_inverse_depth(measured.planes, index)
             errors.append(np.minimum(np.abs(np.log(found / truth))[tested], MAX_ERROR))
-    if sum(map(len, supported)) < MIN_PIXELS:
+    if sum(len(errors) for errors in supported) < MIN_PIXELS:
         return None
     return BlockErrors(
         float(np.concatenate(supported).mean(dtype=np.float64)),
