@@ -45,8 +45,8 @@ MIN_BLOCK, MAX_BLOCK = 1 / 8, 1 / 3
 MAX_ERROR = 0.5
 """Largest absolute error of a logarithm of depth that counts; a blunder says no more than that."""
 TEST_SIDE = 256
-"""Shorter side of an image, in pixels, up to twice which a test takes every pixel; of larger ones it
-takes every n-th."""
+"""Shorter side, in pixels, that a test needs: it takes every n-th pixel of an image n times as
+large."""
 
 
 @dataclass(frozen=True)
