@@ -100,6 +100,8 @@ def with_depth(change: Callable[[DepthMap], DepthMap]):
         (with_part("exposure_gains", lambda g: g * math.nan), "three positive float32 numbers"),
         (with_part("exposure_gains", lambda g: g[:1]), "have to be 2 rows"),
         (with_part("exposure_gains", lambda g: g[:, 0]), "exposure_gains of a reconstruction"),
+        (with_part("notes", lambda notes: "a sentence"), "have to be a tuple of sentences"),
+        (with_part("contradicted_depths", lambda numbers: (2,)), "indices of its 2 views"),
         (with_depth(lambda d: replace(d, depth=-d.depth)), "Depth map 0 .* not positive"),
         (with_depth(lambda d: replace(d, depth=d.depth * math.nan)), "Depth map 0 .* is NaN"),
         (with_depth(lambda d: DepthMap(d.depth[1:], d.valid[1:])), "one of the same size"),

@@ -180,6 +180,7 @@ class GSCompleter:
                 Trust(),
                 is_given=scene is not None,
                 seed=self.seed,
+                context_notes=context.notes,
                 models=self.name_models(),
             )
             # Guards measure the scene as it was given, so before anything changes.
@@ -264,6 +265,7 @@ class GSCompleter:
                 num_outside=count_outside(added, target) if state.is_given else 0,
                 num_recolored=recolored.count,
                 synthesis_notes=image.notes,
+                lift_notes=lifted.notes,
                 painter=image.painter,
                 rejection=rejection,
             )

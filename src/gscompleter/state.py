@@ -150,6 +150,8 @@ class TargetResult(Displayed):
     """Number of rendered context Gaussians that got new colours."""
     synthesis_notes: tuple[str, ...] = ()
     """Sentences of the generator about its image."""
+    lift_notes: tuple[str, ...] = ()
+    """Sentences of Ψ about the depth of that image."""
     painter: str = ""
     """Who painted the image elsewhere; empty if Φ synthesized it."""
     unfilled: Unfilled = Unfilled()
@@ -181,7 +183,7 @@ class TargetResult(Displayed):
         """Sentences about fallbacks and rejections, for a reader of the results."""
         if self.skip_reason:
             return (self.skip_reason,)
-        notes = [*self.synthesis_notes]
+        notes = [*self.synthesis_notes, *self.lift_notes]
         if self.anchor_fallback:
             notes.append("Every view is turned too far; the least-turned one is the anchor.")
         if self.affine.is_refitted_at_target:
@@ -238,6 +240,8 @@ class Completion(Displayed):
     """True if the context is a scene that was given, and Ψ did not reconstruct it."""
     seed: int = 0
     """Seed of all random numbers."""
+    context_notes: tuple[str, ...] = ()
+    """Sentences of Ψ about the context."""
     models: Mapping[str, str] = field(default_factory=dict)
     """Names of the `reconstructor`, its `depth` and the `generator`, for those who read files."""
 

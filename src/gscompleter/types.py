@@ -634,6 +634,10 @@ class Reconstruction:
     """Row-major pixel of that view, or None if the model is not pixel-aligned."""
     exposure_gains: Float[Tensor, "v 3"] | None = None
     """Exposure gain per channel of each view relative to the Gaussians, or None."""
+    contradicted_depths: tuple[int, ...] = ()
+    """Indices of the views whose given depth the photographs contradict; it is not used."""
+    notes: tuple[str, ...] = ()
+    """Sentences for the user, such as on a depth that is not used."""
 
     owner: ClassVar[str] = "a reconstruction"
     forms: ClassVar[dict[str, Form]] = {
@@ -688,6 +692,8 @@ class Lift:
     anchor_depth: DepthMap
     pixel_index: Int[Tensor, "n"] | None
     """Row-major pixel of the reference that each Gaussian comes from, or None if unknown."""
+    notes: tuple[str, ...] = ()
+    """Sentences of Ψ for the user."""
 
 
 @dataclass(frozen=True)

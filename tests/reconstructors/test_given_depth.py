@@ -74,6 +74,27 @@ def test_blocks_of_depth_halve_the_error_between_them():
     assert errors[1] < 0.5 * errors[0]
 
 
+def test_given_depth_that_stereo_contradicts_is_left_out_and_a_line_says_so():
+    views = [view_of(Room(), camera_at(x, size=96), number) for number, x in enumerate((-0.2, 0.2))]
+    rows, columns = torch.linspace(0, 12, 96)[:, None], torch.linspace(0, 18, 96)
+    waves = 2.5 + rows.sin() * columns.cos()
+    plain = PlaneSweep()([replace(view, depth=None) for view in views])
+    wrong = [replace(view, depth=None, given_depth=waves) for view in views]
+    misled = PlaneSweep()([give(views[0]), wrong[1]])
+    assert misled.contradicted_depths == (1,)
+    assert misled.notes[0].startswith("The given depth is not used in photograph 1, because")
+    assert torch.equal(PlaneSweep()(wrong).gaussians.means, plain.gaussians.means)
+
+    # What the reconstructor refuses, no stage after it uses.
+    state = GSCompleter().begin(wrong)
+    assert state.context_notes == PlaneSweep()(wrong).notes
+    assert all(view.given_depth is None for view in state.views)
+
+    right = PlaneSweep()([give(view) for view in views])
+    assert right.contradicted_depths == ()
+    assert right.notes == ()
+
+
 def test_no_depth_both_constrains_and_scores():
     view = view_of(Room(), camera_at(size=SIZE))
     half = torch.arange(SIZE) < SIZE // 2

@@ -1,27 +1,40 @@
-"""Monocular depth helps stereo where that measures nothing, and nowhere else."""
+"""Monocular depth helps stereo where that measures nothing, if stereo confirms it elsewhere."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from gscompleter import InputError, load_reconstructor
+from gscompleter import GSCompleter, InputError, load_reconstructor
+from gscompleter.apps.report.plain_words import list_notes
+from gscompleter.apps.report.schema import read_summary
 from gscompleter.reconstructors import RECONSTRUCTORS
 from gscompleter.reconstructors.depth_predictors import predict_nothing
 from gscompleter.reconstructors.from_depth import FromDepth
-from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.reconstructors.plane_sweep.predicted_depth import WEIGHT, add_prediction
+from gscompleter.reconstructors.plane_sweep import PlaneSweep, reconstructor
+from gscompleter.reconstructors.plane_sweep.hidden_blocks import WEIGHT
+from gscompleter.reconstructors.plane_sweep.predicted_depth import (
+    CONTRADICTED,
+    UNTESTED,
+    add_prediction,
+)
 from gscompleter.reconstructors.plane_sweep.sweep import Measurement
-from gscompleter.types import DepthMap
+from gscompleter.types import DepthMap, Reconstruction, View
 from scenes import Room, camera_at, view_of
 
+SIZE = 96
 PLANES = np.linspace(0.1, 1.3, 61, dtype=np.float32)
-RNG = np.random.default_rng(0)
-INVERSE = RNG.uniform(0.2, 1.2, (40, 50)).astype(np.float32)
-INDEX = (INVERSE - PLANES[0]) / (PLANES[1] - PLANES[0])
-KNOWN = (RNG.random(INVERSE.shape) < 0.5).astype(np.float32)
-FOUND = Measurement(PLANES, INDEX * KNOWN, KNOWN, KNOWN)
+Y, X = np.indices((SIZE, SIZE)) / SIZE
+TRUE = view_of(Room(), camera_at(size=SIZE)).depth.numpy()
+KNOWN = np.float32((X > 0.3) | (Y > 0.6))
+"""Stereo measures all but the upper left corner."""
+FOUND = Measurement(PLANES, KNOWN * (1 / TRUE - PLANES[0]) / (PLANES[1] - PLANES[0]), KNOWN, KNOWN)
+GREY = np.full((SIZE, SIZE, 3), 0.5, np.float32)
+NO_SKY = np.zeros((SIZE, SIZE), bool)
+WAVES = (2.5 + np.sin(12 * Y) * np.cos(18 * X)).astype(np.float32)
+"""Depth of no room."""
 
 
 def predict(inverse) -> DepthMap:
@@ -57,34 +70,123 @@ def test_a_depth_model_answers_for_every_view():
         FromDepth(model=lambda views: [depth])(views)
 
 
-def test_a_prediction_is_aligned_and_fills_what_is_not_measured():
-    wrong = np.where(RNG.random(INVERSE.shape) < 0.2, 3.0, 0.4 * INVERSE + 0.3)
-    guided = add_prediction(FOUND, predict(wrong.astype(np.float32)))
-    right = wrong < 3
-    assert np.abs(guided.index - INDEX)[right].max() < 0.05
-    assert np.array_equal(guided.index[KNOWN > 0], FOUND.index[KNOWN > 0])
-    assert np.array_equal(guided.weight, np.where(KNOWN > 0, KNOWN, WEIGHT))
-    assert np.array_equal(guided.confidence, KNOWN)
+def photographs(blank_from: float = 4.5) -> list[View]:
+    """Take two photographs of a room whose far wall is blank, where stereo measures nothing."""
+    views = [view_of(Room(), camera_at(x, size=SIZE), n) for n, x in enumerate((-0.2, 0.2))]
+    return [
+        replace(v, image=torch.where((v.depth > blank_from)[..., None], 0.5, v.image))
+        for v in views
+    ]
 
 
-def test_a_prediction_that_does_not_fit_changes_nothing():
-    upside_down = add_prediction(FOUND, predict(1.5 - INVERSE))
-    assert np.array_equal(upside_down.weight, FOUND.weight)
-    unmeasured = replace(FOUND, confidence=np.zeros_like(KNOWN))
-    assert add_prediction(unmeasured, predict(INVERSE)) is unmeasured
+def reconstruct(depth_of=None) -> Reconstruction:
+    """Reconstruct them with predicted depths by frame."""
+    if depth_of is None:
+        return PlaneSweep()(photographs())
+    return PlaneSweep(predict_depth=lambda v: predict(1 / depth_of(v).numpy()))(photographs())
+
+
+def test_a_prediction_is_anchored_and_fills_what_is_not_measured():
+    # An affine function of inverse depth, and an error that varies slowly over the image.
+    inverse = ((0.4 / TRUE + 0.1) * (1 + 0.1 * X)).astype(np.float32)
+    part = add_prediction(FOUND, predict(inverse), GREY, NO_SKY)
+    empty = KNOWN == 0
+    found = 1 / (PLANES[0] + part.measured.index * (PLANES[1] - PLANES[0]))
+    assert np.abs(found / TRUE - 1)[empty].mean() < 0.04
+    assert np.array_equal(part.measured.index[~empty], FOUND.index[~empty])
+    assert np.array_equal(part.measured.weight, np.where(empty, WEIGHT, 1))
+    assert np.array_equal(part.measured.confidence, KNOWN)
+    assert part.share == pytest.approx(empty.mean())
+    # The sky has no depth to predict.
+    assert add_prediction(FOUND, predict(inverse), GREY, empty).measured is FOUND
+
+
+@pytest.mark.parametrize(
+    "inverse",
+    [1 / WAVES, 1.5 - 1 / TRUE, np.full_like(TRUE, 0.5)],
+    ids=["waves", "inverted", "flat"],
+)
+def test_a_prediction_that_stereo_contradicts_changes_nothing(inverse):
+    part = add_prediction(FOUND, predict(inverse), GREY, NO_SKY)
+    assert part.measured is FOUND
+    assert part.refusal == CONTRADICTED
+
+
+def test_a_prediction_that_nothing_tests_changes_nothing():
+    hardly = np.where(Y < 0.2, KNOWN, 0).astype(np.float32)
+    little = replace(FOUND, weight=hardly, confidence=hardly)
+    part = add_prediction(little, predict(1 / TRUE), GREY, NO_SKY)
+    assert part.measured is little
+    assert part.refusal == UNTESTED
     nothing = predict_nothing(view_of(Room(), camera_at(size=40)))
     assert not nothing.valid.any()
 
 
 def test_true_depth_helps_at_a_blank_wall():
-    views = [view_of(Room(), camera_at(x, size=96)) for x in (-0.2, 0.2)]
-    blank = [torch.where((v.depth > 2.9)[..., None], 0.5, v.image) for v in views]
-    views = [replace(v, image=image) for v, image in zip(views, blank, strict=True)]
+    views = photographs()
     errors = []
     for psi in (PlaneSweep(), PlaneSweep(predict_depth=lambda v: predict((1 / v.depth).numpy()))):
         pairs = zip(psi.estimate_depths(views), views, strict=True)
         errors.append(np.mean([((d.depth - v.depth).abs() / v.depth).mean() for d, v in pairs]))
-    assert errors[1] < 0.7 * errors[0]
+    assert errors[1] < 0.85 * errors[0]
+
+
+def test_a_wrong_prediction_changes_no_bit_and_a_line_says_so():
+    plain = reconstruct()
+    misled = reconstruct(lambda v: torch.from_numpy(WAVES))
+    assert torch.equal(misled.gaussians.means, plain.gaussians.means)
+    assert torch.equal(misled.gaussians.sh, plain.gaussians.sh)
+    assert misled.notes == (
+        f"The predicted depth is not used in photographs 0, 1, because {CONTRADICTED}.",
+    )
+    assert plain.notes == ()
+
+
+def test_a_true_prediction_is_used_and_a_line_says_where():
+    (note,) = reconstruct(lambda v: 3 * v.depth).notes
+    assert re.match(
+        r"The predicted depth is used in photographs 0, 1, where stereo measures nothing", note
+    )
+
+
+def test_a_prediction_with_which_a_photograph_loses_is_refused(monkeypatch):
+    plain = reconstruct()
+    # The true depth costs nothing here, so that the limit has to be lower.
+    monkeypatch.setattr(reconstructor, "MAX_LOSS", -100.0)
+    refused = reconstruct(lambda v: v.depth)
+    assert torch.equal(refused.gaussians.means, plain.gaussians.means)
+    assert re.fullmatch(
+        r"The predicted depth is not used in photographs 0, 1, because photograph [01] would be "
+        r"reproduced -?\d.\d\d dB worse with it\.",
+        refused.notes[0],
+    )
+
+
+def test_losses_are_those_of_each_photograph():
+    views = photographs()
+    plain = PlaneSweep()(views)
+    # Without the Gaussians of the right half of photograph 1, photograph 0 loses less.
+    gone = (plain.view_index == 1) & (plain.pixel_index % SIZE > SIZE // 2)
+    lacking = replace(plain, gaussians=plain.gaussians[~gone])
+    losses = PlaneSweep().measure_losses(views, plain, lacking)
+    assert losses[1] > losses[0]
+    assert losses[1] > 1
+    assert PlaneSweep().measure_losses(views, plain, plain) == [0, 0]
+
+
+def test_notes_reach_the_completion_and_its_summary(tmp_path):
+    psi = PlaneSweep(
+        predict_depth=lambda v: predict(1 / WAVES[: v.camera.height, : v.camera.width])
+    )
+    views = [replace(view, depth=None) for view in photographs()]
+    done = GSCompleter(reconstructor=psi).begin(views)
+    assert done.context_notes == (
+        f"The predicted depth is not used in photographs 0, 1, because {CONTRADICTED}.",
+    )
+    done.save(tmp_path / "out")
+    summary = read_summary(tmp_path / "out")
+    assert summary.context_notes == done.context_notes
+    assert done.context_notes[0] in list_notes(summary)
 
 
 def test_a_reconstructor_that_uses_no_depth_refuses_it(monkeypatch):

@@ -174,6 +174,14 @@ def check_depths(depths: object, views: Sequence[View]) -> None:
         check_depth(depth, view)
 
 
+def check_notes(notes: object, model: str) -> None:
+    """Raise InputError unless the notes of a model, such as the "generator", are sentences."""
+    if not isinstance(notes, (tuple, list)) or not all(isinstance(note, str) for note in notes):
+        raise InputError(
+            f"The notes of the {model} have to be a tuple of sentences, and are {describe(notes)}."
+        )
+
+
 def check_depth(depth: object, view: View) -> None:
     """Raise InputError unless this is a depth map of the size of a view, above 0 where it is valid.
 

@@ -12,12 +12,12 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
-from gscompleter.numerics.value_checks import check_gaussians
+from gscompleter.numerics.value_checks import check_gaussians, check_notes
 from gscompleter.reconstructors.depth_predictors import DepthPredictor, load_depth_predictor
 from gscompleter.reconstructors.own_models import load_own_model
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.plugins import is_in_file, load_plugins
-from gscompleter.system.tensor_checks import describe, iterate_tensors, name_dtype
+from gscompleter.system.tensor_checks import describe, is_whole, iterate_tensors, name_dtype
 from gscompleter.types import Reconstruction, View
 
 
@@ -106,8 +106,10 @@ def check_reconstruction(output: object, views: Sequence[View]) -> None:
             "return zeros in `generated`."
         )
     _check_depths(output, views)
+    _check_contradicted(output, views)
     _check_pixels(output, views)
     _check_gains(output, views)
+    check_notes(output.notes, "reconstructor")
 
 
 def get_trained_range(reconstructor: Reconstructor) -> tuple[float, float] | None:
@@ -164,6 +166,16 @@ def _check_depths(output: Reconstruction, views: Sequence[View]) -> None:
                 f"Depth map {number} of the reconstruction is NaN, infinite or not positive where "
                 "it is valid; mark such pixels as invalid."
             )
+
+
+def _check_contradicted(output: Reconstruction, views: Sequence[View]) -> None:
+    wrong = output.contradicted_depths
+    is_listed = isinstance(wrong, (tuple, list))
+    if not is_listed or not all(is_whole(n) and 0 <= n < len(views) for n in wrong):
+        raise InputError(
+            f"The contradicted_depths of the reconstruction have to be indices of its "
+            f"{len(views)} views, counted from 0, and are {describe(wrong)}."
+        )
 
 
 def _check_pixels(output: Reconstruction, views: Sequence[View]) -> None:

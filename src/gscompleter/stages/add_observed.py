@@ -115,7 +115,8 @@ def add_observed(
             break
         reconstructed.update(chosen)
         photos = [Evidence(views[i], frozen[i], lacks[i]) for i in chosen]
-        part = reconstruct_lacking(reconstructor, photos, state, rng)
+        part, notes = reconstruct_lacking(reconstructor, photos, state, rng)
+        state = replace(state, context_notes=(*state.context_notes, *notes))
         part = fit_to_photographs(part, frozen, state)
         # What was found and could not be added would be found again.
         if len(part) == 0:
@@ -194,8 +195,11 @@ def reconstruct_lacking(
     photos: Sequence[Evidence],
     state: Completion,
     rng: torch.Generator,
-) -> Gaussians:
-    """Reconstruct photographs and keep the Gaussians of what the scene lacks, registered to it."""
+) -> tuple[Gaussians, tuple[str, ...]]:
+    """Reconstruct photographs and keep the Gaussians of what the scene lacks, registered to it.
+
+    Returns the sentences of Ψ, too.
+    """
     views = []
     for photo in photos:
         known = photo.view.valid_mask & ~photo.lack.mask
@@ -228,12 +232,13 @@ def reconstruct_lacking(
     part = merge(parts)
     # No more harmonics than the scene has, whose file has no place for them. The fit of colours
     # that follows makes up for them.
-    return replace(
+    added = replace(
         part,
         sh=part.sh[:, : state.context.sh.shape[1]],
         generated=torch.full_like(part.generated, NEW_PHOTO_ID),
         encoded=None,
     )
+    return added, reconstruction.notes
 
 
 def select_pixels(

@@ -45,6 +45,8 @@ class InitialContext:
     """Context photographs, then check photographs, in the exposure of the context."""
     exposure_gains: Float[Tensor, "v 3"] | None = None
     """Exposure gain per channel of each original photograph relative to the context, or None."""
+    notes: tuple[str, ...] = ()
+    """Sentences of Ψ for the user."""
 
 
 def choose_config(
@@ -118,7 +120,17 @@ def reconstruct_context(reconstructor: Reconstructor, views: Sequence[View]) -> 
     source = ContextScene.whole(drop_ignored(reconstruction, views))
     # The scene has one exposure, which the photographs have to share from here on.
     gains = reconstruction.exposure_gains
-    return InitialContext(source, normalize_exposures(views, gains), gains)
+    normalized = normalize_exposures(drop_contradicted(views, reconstruction), gains)
+    return InitialContext(source, normalized, gains, reconstruction.notes)
+
+
+def drop_contradicted(views: Sequence[View], reconstruction: Reconstruction) -> list[View]:
+    """Leave out given depth that the photographs contradict, so that no stage reads it."""
+    wrong = reconstruction.contradicted_depths
+    return [
+        replace(view, given_depth=None) if number in wrong else view
+        for number, view in enumerate(views)
+    ]
 
 
 def find_scene_range(reconstructor: Reconstructor, views: Sequence[View]) -> DepthRange:

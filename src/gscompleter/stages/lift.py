@@ -38,9 +38,10 @@ def lift_pair(
     # A Ψ that is not pixel-aligned names no pixels to select by.
     if pair.view_index is None or pair.pixel_index is None:
         seen = is_inside(*project(pair.gaussians.means, reference.camera), reference.camera)
-        return Lift(pair.gaussians[seen], reference_depth, anchor_depth, None)
+        return Lift(pair.gaussians[seen], reference_depth, anchor_depth, None, pair.notes)
     own = pair.view_index == 0
     if pixel_mask is not None:
         # The anchor may have another size, so that its pixel indices are replaced by 0.
         own &= pixel_mask.flatten()[pair.pixel_index.where(own, 0)]
-    return Lift(pair.gaussians[own], reference_depth, anchor_depth, pair.pixel_index[own])
+    pixels = pair.pixel_index[own]
+    return Lift(pair.gaussians[own], reference_depth, anchor_depth, pixels, pair.notes)

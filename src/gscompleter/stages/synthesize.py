@@ -16,7 +16,7 @@ from gscompleter.generators import (
     ImageFunction,
     as_generator,
 )
-from gscompleter.numerics.value_checks import check_colors
+from gscompleter.numerics.value_checks import check_colors, check_notes
 from gscompleter.stages.select_anchor import find_nearest_view
 from gscompleter.system.errors import InputError
 from gscompleter.system.tensor_checks import describe, iterate_tensors
@@ -110,13 +110,7 @@ def convert_output(output: object, target: Camera) -> GeneratedView:
             f"{target.K.device}; move it."
         )
     check_colors(image, "The image of the generator")
-    if not isinstance(output.notes, (tuple, list)) or not all(
-        isinstance(note, str) for note in output.notes
-    ):
-        raise InputError(
-            f"The notes of the generator have to be a tuple of sentences, and are "
-            f"{describe(output.notes)}."
-        )
+    check_notes(output.notes, "generator")
     for name in ("is_inconsistent", "is_photograph"):
         if not isinstance(getattr(output, name), bool):
             raise InputError(

@@ -158,7 +158,8 @@ def write_report(
     left = {} if removal is None else {"removal": asdict(removal.row)}
     kept = measure_kept(completion, testing, renderer)
     left |= {} if kept is None else {"kept": asdict(kept)}
-    counts = {**count_changes(completion), **left, "seconds": dict(completion.seconds)}
+    notes = {"context_notes": completion.context_notes} if completion.context_notes else {}
+    counts = {**count_changes(completion), **notes, **left, "seconds": dict(completion.seconds)}
     summary = {
         "version": __version__,
         "outcome": scores.pop("outcome"),

@@ -73,6 +73,7 @@ def list_notes(summary: CompletionSummary) -> Iterator[str]:
         yield describe_kept(summary.kept)
     else:
         yield from list_photograph_notes(summary)
+    yield from summary.context_notes
     if scene.renders_from is None and summary.settings.get("context") is None:
         yield f"{scene.used} of {scene.photographs} photographs were chosen as the context."
     if summary.settings.get("uses_target_photographs"):

@@ -195,6 +195,8 @@ class CompletionSummary:
     """What cameras that decided nothing still see of a splat without photographs."""
     new_photographs: int | None = None
     """Photographs that a splat was not trained on; None if the scene was reconstructed."""
+    context_notes: tuple[str, ...] = ()
+    """Sentences of the reconstructor about the context."""
 
 
 @dataclass(frozen=True)

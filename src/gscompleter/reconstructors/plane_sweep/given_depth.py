@@ -1,4 +1,9 @@
-"""Depth that is given with a photograph, as a measurement instead of stereo."""
+"""Depth that is given with a photograph, as a measurement instead of stereo.
+
+A sensor is truer than stereo, whose level errors of the poses shift: with the right depth of
+hololens_room its photographs 0 and 3 are reproduced 5 dB worse, and the target 5 dB better. So it
+is refused only if the shape of its surfaces clearly contradicts stereo, as that of a network does.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +12,37 @@ from dataclasses import replace
 import numpy as np
 
 from gscompleter.reconstructors.features.stereo_image import StereoImage
+from gscompleter.reconstructors.plane_sweep.hidden_blocks import compare_in_hidden_blocks
 from gscompleter.reconstructors.plane_sweep.sweep import (
     MAX_PLANES,
     Measurement,
     compute_plane_index,
 )
+
+MIN_TESTED_SHARE = 0.1
+"""Smallest share of the pixels with given depth that is tested: fewer are points that were
+triangulated from the photographs, or a laser's."""
+MAX_RATIO = 1.2
+"""Largest error in hidden blocks of stereo with the given depth, relative to that without it. In 16
+photographs of three scenes it is at most 1.11 with the depth of the sensor, and at least 1.2 in 15
+with that of a small network."""
+
+
+def is_dense(image: StereoImage) -> bool:
+    """Return True if the given depth of an image is dense enough for a test."""
+    return float((image.given > 0).mean()) >= MIN_TESTED_SHARE
+
+
+def contradicts_stereo(image: StereoImage, stereo: Measurement) -> bool:
+    """Return True if given depth tells hidden blocks of stereo clearly worse than continuing them.
+
+    `stereo` is measured without it.
+    """
+    if not is_dense(image):
+        return False
+    errors = compare_in_hidden_blocks(image.given, stereo.resize_to(image.size), image.image)
+    # Where stereo measures too little, the given depth is believed.
+    return errors is not None and errors.ratio > MAX_RATIO
 
 
 def add_given(measured: Measurement, image: StereoImage) -> Measurement:

@@ -1,55 +1,90 @@
-"""Depth that a monocular network predicts, as an observation where stereo measures nothing."""
+"""Depth that a network predicts of an image, as a weak observation where stereo measures nothing.
+
+It has to earn its place: it must tell hidden blocks of stereo better than the surfaces that are
+continued without it (`hidden_blocks`), and no photograph may be reproduced worse with it.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-import torch
 
-from gscompleter.numerics.robust import find_affine_inliers, fit_line_ransac
-from gscompleter.reconstructors.plane_sweep.sweep import (
-    Measurement,
-    compute_inverse_depth,
-    compute_plane_index,
+from gscompleter.reconstructors.plane_sweep.hidden_blocks import (
+    MIN_CONFIDENCE,
+    anchor_depth,
+    compare_in_hidden_blocks,
+    support,
 )
+from gscompleter.reconstructors.plane_sweep.surfaces import Image
+from gscompleter.reconstructors.plane_sweep.sweep import Mask, Measurement
 from gscompleter.types import DepthMap
 
-MIN_CONFIDENCE = 0.5
-"""Confidence from which a measured pixel takes part in the alignment."""
-MIN_PIXELS = 200
-"""Fewest pixels for an alignment; with fewer, nothing of the prediction is used."""
-MAX_PIXELS = 8192
-"""Most pixels of an alignment, evenly spaced among all."""
-MIN_INLIERS = 0.3
-"""Smallest share of pixels that a used prediction fits."""
-WEIGHT = np.float32(0.1)
-"""Weight of a predicted pixel in the surface fit; a confident measurement has 1."""
+MAX_RATIO = 0.95
+"""Largest error in hidden blocks with the prediction, relative to that without it."""
+UNTESTED = "stereo measures too little there to test it"
+CONTRADICTED = "continued surfaces tell hidden blocks of stereo as well as it does, or better"
 
 
-def add_prediction(measured: Measurement, predicted: DepthMap) -> Measurement:
-    """Use predicted depth where stereo measured nothing, aligned to the confident pixels.
+@dataclass(frozen=True)
+class Supported:
+    """What is observed of an image with its prediction, or without it."""
 
-    RANSAC fits one affine function of inverse depth, up to which monocular depth is right.
+    measured: Measurement
+    share: float = 0.0
+    """Share of the pixels that the prediction supports."""
+    refusal: str = ""
+    """Why it is not used; empty if it is used, or if it says nothing."""
+
+    def refuse(self, reason: str) -> Supported:
+        """Return a copy without the prediction, if it was used."""
+        return replace(self, share=0.0, refusal=reason) if self.share else self
+
+
+def add_prediction(
+    measured: Measurement, predicted: DepthMap, image: Image, sky: Mask
+) -> Supported:
+    """Use predicted depth where stereo measured nothing, if stereo confirms it elsewhere.
+
+    The sky has no depth to predict, and its stereo is arbitrary.
     """
-    valid = predicted.valid.cpu().numpy()
-    full = measured.resize_to(valid.shape)
-    guess = np.where(valid, 1 / predicted.depth.cpu().numpy().clip(1e-9), 0)
-    sure = np.flatnonzero(valid & (full.confidence >= MIN_CONFIDENCE))
-    if len(sure) < MIN_PIXELS:
-        return measured
+    known = predicted.valid.cpu().numpy() & ~sky
+    full = measured.resize_to(known.shape)
+    share = float((known & (full.weight == 0)).mean())
+    if share == 0:
+        return Supported(measured)
 
-    # Inverse depths of every n-th confident pixel: x predicted, y measured.
-    sample = sure[:: -(-len(sure) // MAX_PIXELS)]
-    inverse_measured = compute_inverse_depth(full.planes, full.index)
-    x = torch.from_numpy(guess.ravel()[sample]).double()
-    y = torch.from_numpy(inverse_measured.ravel()[sample]).double()
-    scale, shift = fit_line_ransac(x, y, torch.Generator().manual_seed(0))
-    if find_affine_inliers(x, y, scale, shift).double().mean() < MIN_INLIERS:
-        return measured
+    guess = np.where(known, 1 / predicted.depth.cpu().numpy().clip(1e-9), 0).astype(np.float32)
+    errors = compare_in_hidden_blocks(guess, full, image)
+    if errors is None:
+        return Supported(measured, refusal=UNTESTED)
+    if errors.ratio > MAX_RATIO:
+        return Supported(measured, refusal=CONTRADICTED)
+    anchored = anchor_depth(guess, full, known & (full.confidence >= MIN_CONFIDENCE))
+    if anchored is None:
+        return Supported(measured, refusal=CONTRADICTED)
+    return Supported(support(full, anchored, known), share)
 
-    # At most twice as far as the far plane; the shift may bring inverse depths to 0 and below.
-    inverse = np.maximum(scale * guess + shift, full.planes[0] / 2).astype(np.float32)
-    empty = valid & (full.weight == 0)
-    index = np.where(empty, compute_plane_index(full.planes, inverse), full.index)
-    return replace(full, index=index, weight=np.where(empty, WEIGHT, full.weight))
+
+def describe_support(
+    parts: Sequence[Supported], name_images: Callable[[Sequence[int]], str]
+) -> tuple[str, ...]:
+    """Write one line on where predictions are used, and where not and why; none without any.
+
+    `name_images` names images by their indices.
+    """
+    sentences = []
+    used = [number for number, part in enumerate(parts) if part.share]
+    if used:
+        most = max(part.share for part in parts)
+        sentences.append(
+            f"The predicted depth is used in {name_images(used)}, where stereo measures nothing "
+            f"(up to {most:.1%} of the pixels)."
+        )
+    for reason in dict.fromkeys(part.refusal for part in parts if part.refusal):
+        refused = [number for number, part in enumerate(parts) if part.refusal == reason]
+        sentences.append(
+            f"The predicted depth is not used in {name_images(refused)}, because {reason}."
+        )
+    return (" ".join(sentences),) if sentences else ()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
@@ -24,9 +25,18 @@ from gscompleter.reconstructors.features.depth_range import get_depth_range, set
 from gscompleter.reconstructors.features.stereo_image import StereoImage
 from gscompleter.reconstructors.plane_sweep.fusion import DepthLayer
 from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
-from gscompleter.reconstructors.plane_sweep.given_depth import add_given, measure_nothing
+from gscompleter.reconstructors.plane_sweep.given_depth import (
+    add_given,
+    contradicts_stereo,
+    is_dense,
+    measure_nothing,
+)
 from gscompleter.reconstructors.plane_sweep.near_plane import find_near_plane
-from gscompleter.reconstructors.plane_sweep.predicted_depth import add_prediction
+from gscompleter.reconstructors.plane_sweep.predicted_depth import (
+    Supported,
+    add_prediction,
+    describe_support,
+)
 from gscompleter.reconstructors.plane_sweep.rig import Rig, build_rig
 from gscompleter.reconstructors.plane_sweep.sky_mask import find_skies, find_sky, transfer_sky
 from gscompleter.reconstructors.plane_sweep.surfaces import ITERATIONS, fit_surfaces
@@ -36,6 +46,7 @@ from gscompleter.reconstructors.plane_sweep.sweep import (
     compute_inverse_depth,
     measure_depths,
 )
+from gscompleter.system.errors import join_names
 from gscompleter.types import DepthMap, Reconstruction, View
 
 LIFT_ITERATIONS = ITERATIONS // 2
@@ -43,6 +54,10 @@ LIFT_ITERATIONS = ITERATIONS // 2
 MIN_HALVED_LIFT = 320.0
 """Shortest side, in pixels, from which a synthesized image and its anchor are matched at half size,
 which takes an eighth of the time. Photographs never are: of five it would cost 0.4 dB."""
+MAX_LOSS = 0.05
+"""Largest loss of a photograph, in dB, that predicted depth may cause."""
+MAX_NAMED = 8
+"""Most photographs that a line names."""
 
 
 @dataclass(frozen=True)
@@ -52,15 +67,38 @@ class PlaneSweep(Splatter):
     name: ClassVar[str] = "plane-sweep"
 
     predict_depth: DepthPredictor = predict_nothing
-    """Monocular depth, used where stereo measures nothing."""
+    """Monocular depth, used where stereo measures nothing and confirms it elsewhere."""
 
     def __call__(self, views: Sequence[View]) -> Reconstruction:
         """Reconstruct the scene and the depth of every pixel."""
         views = set_depth_range(views, *get_depth_range(views))
         rig = build_rig(views)
-        layers = self.compute_layers(rig, views)
-        depths = make_depth_maps(layers, rig.unit, views)
-        return self.build_scene(views, depths, layers, rig.transforms)
+        contradicted = find_contradicted(rig, views)
+        rig = rig.drop_given(contradicted)
+        name = partial(name_photographs, views)
+        measured, skies = measure_views(rig, views)
+        parts = self.support(rig, views, measured, skies)
+        scene = self.build(rig, views, complete_layers(rig, measured, measured, skies))
+        if any(part.share for part in parts):
+            observed = [part.measured for part in parts]
+            supported = self.build(rig, views, complete_layers(rig, observed, measured, skies))
+            # Surfaces that are right do not hide what another photograph shows.
+            losses = self.measure_losses(views, scene, supported)
+            worst = max(range(len(views)), key=losses.__getitem__)
+            if losses[worst] > MAX_LOSS:
+                loss = f"{name([worst])} would be reproduced {losses[worst]:.2f} dB worse with it"
+                parts = [part.refuse(loss) for part in parts]
+            else:
+                scene = supported
+        notes = describe_support(parts, name)
+        wrong = [number for number, is_wrong in enumerate(contradicted) if is_wrong]
+        if wrong:
+            notes = (
+                f"The given depth is not used in {name(wrong)}, because its surfaces contradict "
+                "what stereo measures there; depth that a network predicts belongs to --depth.",
+                *notes,
+            )
+        return replace(scene, contradicted_depths=tuple(wrong), notes=notes)
 
     def find_near_plane(self, views: Sequence[View], near: float, far: float) -> float:
         """Find a near plane that no surface of the photographs stands before; at most `near`."""
@@ -80,17 +118,19 @@ class PlaneSweep(Splatter):
         rig = build_rig(views)
         first, second = match_views(rig, views, MIN_HALVED_LIFT)
         first = add_given(first, rig.images[0])
-        first = add_prediction(first, predict_depth(self.predict_depth, views[0]))
 
         # The sky is found in the photograph and carried over by direction; the synthesized image
         # only has to be even there.
         sky_of_second = find_sky(rig.images[1], second)
         sky_of_first = transfer_sky(rig, sky_of_second)
+        # What the additions do to the photographs is the business of the guards.
+        (part,) = self.support(rig, views[:1], [first], [sky_of_first])
         layers = [
-            make_layer(rig.images[0], first.exclude(sky_of_first), LIFT_ITERATIONS),
+            make_layer(rig.images[0], part.measured.exclude(sky_of_first), LIFT_ITERATIONS),
             make_layer(rig.images[1], second.exclude(sky_of_second), 0),
         ]
-        return self.lift_pixels(views, make_depth_maps(layers, rig.unit, views), pixel_mask)
+        lifted = self.lift_pixels(views, make_depth_maps(layers, rig.unit, views), pixel_mask)
+        return replace(lifted, notes=describe_support([part], lambda _: "the synthesized image"))
 
     def lift_in_place(
         self, image: View, anchor: View, pixel_mask: Bool[Tensor, "h w"]
@@ -113,22 +153,101 @@ class PlaneSweep(Splatter):
 
     def compute_layers(self, rig: Rig, views: Sequence[View]) -> list[DepthLayer]:
         """Compute the completed inverse depth of each view."""
-        measured = [
-            add_given(measurement, image)
-            for measurement, image in zip(match_views(rig, views), rig.images, strict=True)
-        ]
-        # The sky is judged by measurements alone, before predictions fill its pixels. Surfaces are
-        # fitted without it, as its matches are arbitrary, and it gets its depth afterwards.
-        skies = find_skies(rig, measured)
-        observed = [
-            add_prediction(measurement, predict_depth(self.predict_depth, view)).exclude(sky)
-            for measurement, view, sky in zip(measured, views, skies, strict=True)
-        ]
-        surfaces = map_in_parallel(make_layer, rig.images, observed)
+        rig = rig.drop_given(find_contradicted(rig, views))
+        measured, skies = measure_views(rig, views)
+        parts = self.support(rig, views, measured, skies)
+        return complete_layers(rig, [part.measured for part in parts], measured, skies)
+
+    def support(
+        self,
+        rig: Rig,
+        views: Sequence[View],
+        measured: Sequence[Measurement],
+        skies: Sequence[Mask],
+    ) -> list[Supported]:
+        """Predict the depth of each view, and add it to what is measured if it stands the test."""
+        if self.predict_depth is predict_nothing:
+            return [Supported(measurement) for measurement in measured]
+        predictions = [predict_depth(self.predict_depth, view) for view in views]
+        images = [image.image for image in rig.images[: len(views)]]
+        return map_in_parallel(add_prediction, measured, predictions, images, skies)
+
+    def build(
+        self, rig: Rig, views: Sequence[View], layers: Sequence[DepthLayer]
+    ) -> Reconstruction:
+        """Build the Gaussians of completed depths, and fit them to the photographs."""
+        depths = make_depth_maps(layers, rig.unit, views)
+        return self.build_scene(views, depths, layers, rig.transforms)
+
+    def measure_losses(
+        self, views: Sequence[View], before: Reconstruction, after: Reconstruction
+    ) -> list[float]:
+        """Measure by how much a second reconstruction reproduces each photograph worse, in dB."""
+        before_errors, after_errors = (
+            [self.measure_error(view, scene, number) for number, view in enumerate(views)]
+            for scene in (before, after)
+        )
         return [
-            add_sky(surface, measurement, sky)
-            for surface, measurement, sky in zip(surfaces, measured, skies, strict=True)
+            10 * math.log10(max(after, 1e-12) / max(before, 1e-12))
+            for before, after in zip(before_errors, after_errors, strict=True)
         ]
+
+    def measure_error(self, view: View, scene: Reconstruction, number: int) -> float:
+        """Measure the mean squared colour error of a photograph, apart from ignored pixels."""
+        seen = view.to("cpu")
+        image = self.renderer.render(scene.gaussians.to("cpu"), seen.camera).image
+        if scene.exposure_gains is not None:
+            image = image * scene.exposure_gains[number].cpu()
+        error = (image - seen.image)[seen.valid_mask].double().square()
+        return float(error.mean()) if error.numel() else 0.0
+
+
+def find_contradicted(rig: Rig, views: Sequence[View]) -> list[bool]:
+    """Find the views whose stereo clearly contradicts their given depth."""
+    # A single photograph has no stereo.
+    if len(views) == 1 or not any(is_dense(image) for image in rig.images):
+        return [False] * len(views)
+    stereo = match_views(rig.drop_given([True] * len(views)), views)
+    return map_in_parallel(contradicts_stereo, rig.images, stereo)
+
+
+def measure_views(rig: Rig, views: Sequence[View]) -> tuple[list[Measurement], list[Mask]]:
+    """Measure the depth of each view, by stereo or as it is given, and find its sky.
+
+    The sky is judged by measurements alone, before predictions fill its pixels.
+    """
+    measured = [
+        add_given(measurement, image)
+        for measurement, image in zip(match_views(rig, views), rig.images, strict=True)
+    ]
+    return measured, find_skies(rig, measured)
+
+
+def complete_layers(
+    rig: Rig,
+    observed: Sequence[Measurement],
+    measured: Sequence[Measurement],
+    skies: Sequence[Mask],
+) -> list[DepthLayer]:
+    """Complete the inverse depth of each view by surfaces through what is `observed`.
+
+    They are fitted without the sky, as its matches are arbitrary, and it gets its depth afterwards.
+    """
+    without_sky = [part.exclude(sky) for part, sky in zip(observed, skies, strict=True)]
+    surfaces = map_in_parallel(make_layer, rig.images, without_sky)
+    return [
+        add_sky(surface, measurement, sky)
+        for surface, measurement, sky in zip(surfaces, measured, skies, strict=True)
+    ]
+
+
+def name_photographs(views: Sequence[View], numbers: Sequence[int]) -> str:
+    """Name views by their frames, or by their places if they have none."""
+    frames = [views[number].frame for number in numbers]
+    named = [
+        number if frame is None else frame for number, frame in zip(numbers, frames, strict=True)
+    ]
+    return f"photograph{'s' if len(named) > 1 else ''} {join_names(named, MAX_NAMED)}"
 
 
 def match_views(

@@ -51,6 +51,16 @@ class Rig:
         transforms = {pair: halve_transform(t) for pair, t in self.transforms.items()}
         return replace(self, images=[halve_image(i) for i in self.images], transforms=transforms)
 
+    def drop_given(self, dropped: Sequence[bool]) -> Rig:
+        """Leave out the given depth of the images that are True in `dropped`."""
+        return replace(
+            self,
+            images=[
+                replace(image, given=np.zeros_like(image.given)) if is_dropped else image
+                for image, is_dropped in zip(self.images, dropped, strict=True)
+            ],
+        )
+
 
 def build_rig(views: Sequence[View]) -> Rig:
     """Relate the views by their poses, corrected to fit the feature matches."""
