@@ -200,8 +200,11 @@ def _find_size_defect(width: object, height: object) -> str | None:
 
 def _find_padding_defect(padding: object, width: int, height: int) -> str | None:
     """Return a sentence part about padding that leaves no image within it, or None."""
-    is_pair = isinstance(padding, tuple) and len(padding) == 2
-    if not is_pair or not all(is_whole(pixels) and pixels >= 0 for pixels in padding):
+    if not (
+        isinstance(padding, tuple)
+        and len(padding) == 2
+        and all(is_whole(pixels) and pixels >= 0 for pixels in padding)
+    ):
         return f"its padding is {describe(padding)}, and two numbers of pixels from 0 are needed"
     if 2 * padding[0] >= width or 2 * padding[1] >= height:
         return (
