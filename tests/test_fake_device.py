@@ -43,10 +43,10 @@ CONFIGS = {
 SIZE = 24
 """Sides of the photographs in pixels. The counts hardly depend on them."""
 MOST_WAITS = {
-    "default": {"context": 127, "generate": 40, "lift": 41, "register": 15, "integrate": 30},
+    "default": {"context": 135, "generate": 40, "lift": 41, "register": 15, "integrate": 30},
     # Closing thin gaps asks all guards once more, and here `psnr` in several rounds.
-    "with gaps": {"context": 127, "generate": 40, "lift": 41, "register": 15, "integrate": 110},
-    "paper": {"context": 72, "generate": 42, "lift": 54, "register": 60, "integrate": 10},
+    "with gaps": {"context": 135, "generate": 40, "lift": 41, "register": 15, "integrate": 110},
+    "paper": {"context": 80, "generate": 42, "lift": 54, "register": 60, "integrate": 10},
 }
 """Waits of the host in each stage of a completion of two photographs (docs/performance.md)."""
 
