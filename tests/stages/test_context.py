@@ -20,6 +20,7 @@ def see_room(near: float | None, far: float | None) -> list[View]:
 
 
 def test_what_stands_before_a_given_near_plane_gets_its_depth(caplog):
+    caplog.set_level("WARNING", logger="gscompleter")
     """With the near plane believed, the front of the box stands at more than twice its depth."""
     context = reconstruct_context(load_reconstructor("plane-sweep"), see_room(2.9, 20.0))
     assert "nearer than the near plane at 2.9" in caplog.text
@@ -55,6 +56,7 @@ def list_depths(views: list[View]) -> list[DepthMap]:
 
 @pytest.mark.parametrize("near", [None, 10.0, 3.0])
 def test_a_network_with_one_range_is_given_it_and_python_is_told(caplog, near):
+    caplog.set_level("WARNING", logger="gscompleter")
     psi = Recorder([])
     reconstruct_context(psi, see_room(near, None if near is None else 1000.0))
     assert psi.ranges == [(near or 10.0, 1000.0)] * 2
@@ -69,6 +71,7 @@ def test_a_network_with_one_range_is_given_it_and_python_is_told(caplog, near):
 
 @pytest.mark.parametrize("keeps", [False, True])
 def test_a_reconstructor_may_ask_for_the_range_that_was_given(caplog, keeps):
+    caplog.set_level("WARNING", logger="gscompleter")
     psi = Recorder([], depth_range=None, keeps_range=keeps)
     reconstruct_context(psi, see_room(2.9, 20.0))
     assert (psi.ranges[0][0] == 2.9) == keeps

@@ -1,16 +1,19 @@
 """Witnesses of a splat: cameras from which additions must not hide what it shows."""
 
+import math
 from dataclasses import replace
 
 import pytest
 import torch
 
-from gscompleter.numerics.geometry import is_same_camera, resize_camera
+from gscompleter.numerics.geometry import compute_field_of_view, resize_camera
 from gscompleter.render.loading import load_renderer
 from gscompleter.types import Camera, Gaussians, merge
 from gscompleter.virtual_capture.witnesses import (
     MAX_WITNESSES,
     SIDE,
+    WIDE,
+    Witnesses,
     choose_witnesses,
     divide_witnesses,
     find_witnesses,
@@ -36,6 +39,11 @@ def trained() -> Gaussians:
     return replace(room, scales=torch.full_like(room.scales, 0.08))
 
 
+def places_of(witnesses: Witnesses) -> set[tuple[float, ...]]:
+    found = (*witnesses.guarding, *witnesses.testing)
+    return {tuple(camera.center.tolist()) for camera in found}
+
+
 def path_of(count: int) -> list[Camera]:
     return [camera_at(0.02 * number, size=SIZE) for number in range(count)]
 
@@ -45,12 +53,15 @@ def test_every_fourth_tests_and_the_others_guard():
     witnesses = divide_witnesses(cameras)
     assert witnesses.testing == (cameras[3], cameras[7])
     assert len(witnesses.guarding) == 6
+    # Those that guard look around.
+    for guard in witnesses.guarding:
+        assert math.degrees(max(compute_field_of_view(guard))) == pytest.approx(WIDE)
 
 
 def test_cameras_of_a_file_are_witnesses_and_of_many_those_that_are_spread(trained):
     known = path_of(20)
     witnesses = choose_witnesses(trained, [], known, UP, RENDERER)
-    assert {*witnesses.guarding, *witnesses.testing} == {*known}
+    assert places_of(witnesses) == {tuple(camera.center.tolist()) for camera in known}
     many = choose_witnesses(trained, [], path_of(200), UP, RENDERER)
     assert len(many.guarding) + len(many.testing) == MAX_WITNESSES
 
@@ -59,7 +70,7 @@ def test_with_few_known_cameras_others_are_found_all_over_the_splat(trained):
     (known,) = path_of(1)
     witnesses = choose_witnesses(trained, [], [known], UP, RENDERER)
     found = [*witnesses.guarding, *witnesses.testing]
-    assert known in found
+    assert tuple(known.center.tolist()) in places_of(witnesses)
     assert len(found) > 12
     # They look at all sides of the room.
     directions = torch.stack([camera.forward for camera in found])
@@ -72,7 +83,7 @@ def test_renders_are_no_witnesses_of_themselves(trained):
     witnesses = choose_witnesses(trained, [resize_camera(first, 64, 64)], [], UP, RENDERER)
     found = [*witnesses.guarding, *witnesses.testing]
     assert len(found) == len(others)
-    assert not any(is_same_camera(first, camera) for camera in found)
+    assert tuple(first.center.tolist()) not in places_of(witnesses)
 
 
 def test_witnesses_of_a_lifted_splat_stand_beside_its_camera():

@@ -48,9 +48,9 @@ class Extent:
 
     center: Float[Tensor, "3"]
     half: Float[Tensor, "3"]
-    """Half of the sides of the box, in scene units."""
+    """Half of the sides of the box, in scene units; the shortest first."""
     axes: Float[Tensor, "3 3"]
-    """Unit directions of its sides, in rows."""
+    """Unit directions of its sides, in rows, in the same order."""
 
     @property
     def radius(self) -> float:
@@ -96,6 +96,9 @@ def measure_extent(scene: Gaussians) -> Extent:
         turns = torch.cat([best, turned.reshape(-1, 3, 3)])
     axes = turns[measure_volumes(points, turns).argmin()]
     low, high = (points @ axes.T).quantile(torch.tensor(CORE), dim=0)
+    # In one order, so that what follows is the same whatever the axes of the file are.
+    order = (high - low).argsort()
+    low, high, axes = low[order], high[order], axes[order]
     extent = Extent((low + high) / 2 @ axes, (high - low) / 2, axes)
     return Extent(*(value.to(scene.means) for value in vars(extent).values()))
 
@@ -127,7 +130,7 @@ def list_directions() -> Float[Tensor, "12 3"]:
 
 
 def look_from_outside(scene: Gaussians, renderer: Renderer, side: int) -> list[OutsideView]:
-    """Render a splat from twelve directions, at twice its extent.
+    """Render a splat from twelve directions about its box, at twice its extent.
 
     Images have `side` pixels along each side, and show twice the extent, too: around an object they
     are empty at their borders.
@@ -141,7 +144,8 @@ def look_from_outside(scene: Gaussians, renderer: Renderer, side: int) -> list[O
         camera = place_camera(center, -direction, half, side, NEAR * extent.radius)
         return OutsideView(camera, renderer.render(small, camera))
 
-    directions = list_directions().to(extent.center)
+    # Along the sides of the box, not along the axes of the file, which may be turned.
+    directions = list_directions().to(extent.center) @ extent.axes
     return list(get_view_map(scene.means)(look, directions))
 
 

@@ -23,7 +23,8 @@ KEY = "provenance"
 """Name of the record in JSON and in OpenUSD."""
 MAX_TEXT = 100
 """Longest name or licence, in characters; readers of .ply bound the length of a line."""
-ADVICE = "export the file again, or drop the record (`gscompleter convert --plain`)"
+DROP = "drop the record (`gscompleter convert --plain`)"
+ADVICE = f"export the file again, or {DROP}"
 _LINE = re.compile(rb"^comment (gscompleter-provenance/\d+) (.*?)\r?\n", re.MULTILINE)
 
 
@@ -98,7 +99,7 @@ def parse_provenance(table: object, name: str) -> Provenance:
         if later is not None:
             raise InputError(
                 f"{name} was written by a later version of gscompleter ({quote_value(schema)}, and "
-                f"{SCHEMA} is read); update it, or drop the record (`gscompleter convert --plain`)."
+                f"{SCHEMA} is read); update gscompleter, or {DROP}."
             )
         raise InputError(
             f"{name} says who made it by the schema {quote_value(str(schema))}, and {SCHEMA} is "

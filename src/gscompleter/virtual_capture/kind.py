@@ -39,9 +39,9 @@ CONE = 60.0
 """Largest angle, in degrees, from the outward direction that such a look shows."""
 LOOK_SIDE = 16
 """Width and height of a look, in pixels."""
-MAX_BOUNDED = 0.5
-"""Largest mean share of these looks that ends on an object. It was 0.00 to 0.48 for objects,
-0.54 to 0.87 for rooms and streets (decision 080)."""
+MAX_BOUNDED = 0.48
+"""Largest mean share of these looks that ends on an object. It was 0.00 to 0.46 for objects, and
+0.50 to 0.87 for rooms and streets (decision 080)."""
 MIN_OPEN = 0.05
 """Least share of the points that has to be seen from outside. Of a closed box nearly none is."""
 MAX_FLATNESS = 0.3
@@ -133,11 +133,11 @@ def weigh_directions(camera: Camera, min_cosine: float) -> Float[Tensor, "h w"]:
 
 def is_ground(scene: Gaussians, extent: Extent, renderer: Renderer) -> bool:
     """Tell open ground: it is flat, and seen along its shortest side it fills the extent."""
-    (shortest, middle, longest), order = extent.half.sort()
+    shortest, middle, longest = extent.half
     if shortest > MAX_FLATNESS * middle:
         return False
     small = thin_gaussians(scene, MAX_PREVIEW_GAUSSIANS)
-    axis = extent.axes[order[0]]
+    axis = extent.axes[0]
     # From so far that lines of sight are nearly parallel.
     distance = 20 * extent.radius
     camera = place_camera(
@@ -151,8 +151,8 @@ def is_ground(scene: Gaussians, extent: Extent, renderer: Renderer) -> bool:
     # Points all over the extent, as the camera sees them.
     steps = torch.linspace(-1, 1, SIDE).to(extent.half)
     level = torch.zeros((SIDE, SIDE, 3)).to(extent.half)
-    level[..., order[1]] = middle * steps
-    level[..., order[2]] = longest * steps[:, None]
+    level[..., 1] = middle * steps
+    level[..., 2] = longest * steps[:, None]
     pixels, _ = project(extent.center + level.reshape(-1, 3) @ extent.axes, camera)
     return sample(covered[..., None].float(), pixels).mean().item() >= MIN_GROUND
 
