@@ -122,6 +122,7 @@ def test_marks_stop_a_repair(command, kind, sentence, home, monkeypatch, capsys,
     assert sentence in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_inverted_masks_remove_and_repair_what_right_ones_do(home, monkeypatch, tmp_path):
     monkeypatch.chdir(home)
     near = ("--near", 0.5, "--far", 20, "--quiet")

@@ -60,6 +60,7 @@ def test_a_refusal_without_a_camera_names_the_search(folder, tmp_path, monkeypat
     assert "--auto" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_cameras_that_are_found_stand_upright_on_the_floor(folder, tmp_path, monkeypatch, capsys):
     words = ("complete", folder / "room.ply", "--auto", 1, "--resolution", 64, "--dry-run")
     assert run(monkeypatch, *words, "--out", tmp_path / "found") == 0

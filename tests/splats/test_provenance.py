@@ -131,7 +131,7 @@ def test_a_splat_in_another_format_keeps_its_record_when_it_is_completed(tmp_pat
         (f'{SCHEMA} {{"tool": "x"}}', "is damaged"),
         (
             "gscompleter-provenance/2 {}",
-            r"later version of gscompleter \(gscompleter-provenance/2, and .* is read\); update it",
+            r"later version of gscompleter \(gscompleter-provenance/2, and .* is read\); update",
         ),
     ],
 )
