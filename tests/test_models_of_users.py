@@ -92,6 +92,7 @@ def with_depth(change: Callable[[DepthMap], DepthMap]):
         (with_part("depths", lambda d: None), "tuple of one DepthMap per view"),
         (with_part("depths", lambda d: (d[0].depth, d[1].depth)), "tuple of one DepthMap"),
         (with_part("gaussians", lambda g: g.means), "gaussians of a reconstruction have to be"),
+        (with_part("gaussians", type), "gaussians of a reconstruction have to be"),
         (with_part("pixel_index", lambda p: p + 10**6), "views or pixels that there are not"),
         (with_part("view_index", lambda v: v - 1), "views or pixels that there are not"),
         (with_part("pixel_index", lambda p: p.float()), "pixel_index of a reconstruction"),

@@ -86,7 +86,8 @@ def iterate_tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
     elif isinstance(value, tuple):
         for i, item in enumerate(value):
             yield from iterate_tensors(item, f"{name}[{i}]")
-    elif is_dataclass(value):
+    # A class in place of its value has the fields, but no values in them.
+    elif is_dataclass(value) and not isinstance(value, type):
         for field in fields(value):
             yield from iterate_tensors(getattr(value, field.name), f"{name}.{field.name}")
 
