@@ -117,7 +117,8 @@ def pad_pixels(camera: Camera, left: int, top: int) -> PaddedCamera:
     K[0, 2] += left
     K[1, 2] += top
     padding = (camera.padding[0] + left, camera.padding[1] + top)
-    width, height = camera.width + 2 * left, camera.height + 2 * top
+    width = camera.width + 2 * left
+    height = camera.height + 2 * top
     wide = replace(camera, K=K, width=width, height=height, padding=padding)
     return PaddedCamera(camera, wide, left, top)
 
@@ -128,7 +129,8 @@ def remove_padding(camera: Camera) -> PaddedCamera:
     K = camera.K.clone()
     K[0, 2] -= left
     K[1, 2] -= top
-    width, height = camera.width - 2 * left, camera.height - 2 * top
+    width = camera.width - 2 * left
+    height = camera.height - 2 * top
     inner = replace(camera, K=K, width=width, height=height, padding=(0, 0))
     return PaddedCamera(inner, camera, left, top)
 

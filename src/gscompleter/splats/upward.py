@@ -1,4 +1,4 @@
-"""What is up in a splat, as far as its file says so."""
+"""Upward direction of a splat, as far as its file states it."""
 
 from __future__ import annotations
 

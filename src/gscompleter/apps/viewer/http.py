@@ -1,4 +1,4 @@
-"""What both servers of the page share: bounds of requests, answers, silence about who leaves."""
+"""Bounds of requests, answers, and silence about who leaves, for both servers of the page."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a completion keeps of the splat that was given, seen from cameras that decided nothing."""
+"""Measure of what a completion keeps of a given splat, seen from cameras that decided nothing."""
 
 from __future__ import annotations
 

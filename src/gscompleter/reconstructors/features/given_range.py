@@ -103,7 +103,9 @@ def widen_range(views: Sequence[View], given: DepthRange, outcome: str = "") -> 
     With few of them the range is believed. `outcome` is the end of the sentence; that the range was
     widened if it is empty.
     """
-    near, far, notes = given.near, given.far, given.notes
+    near = given.near
+    far = given.far
+    notes = given.notes
     for seen in (measure_features(views), measure_given(views)):
         nearest, farthest = seen.find_nearest(near), seen.find_farthest(far)
         places = []
