@@ -47,6 +47,18 @@ def test_up_is_away_from_the_floor(name, frame, plain):
     assert torch.equal(upward.direction, FRAMES[frame] @ torch.tensor([0.0, -1.0, 0.0]))
 
 
+@pytest.mark.parametrize("frame", FRAMES)
+def test_a_floor_that_was_seen_in_part_is_one_if_no_other_side_comes_near(frame):
+    ground = garden()
+    corner = ground[ground.means[:, 0] + ground.means[:, 2] < -1.0]
+    up = FRAMES[frame] @ torch.tensor([0.0, -1.0, 0.0])
+    assert find_floor(turn(corner, FRAMES[frame])) == tuple(up.tolist())
+    # Half of a street: the wall of its houses is as large as the ground.
+    half = street()
+    half = half[half.means[:, 0] + 0.3 * half.means[:, 2] < 2.5]
+    assert find_floor(turn(half, FRAMES[frame])) is None
+
+
 def test_a_table_is_no_floor_and_without_one_it_is_as_in_most_files(plain):
     assert find_floor(table()) == (0.0, 1.0, 0.0)
     for scene in (table(), chair()):
