@@ -39,7 +39,8 @@ def make_z_up_room() -> Gaussians:
 def test_nothing_is_added_to_an_object_whose_cameras_are_found(
     folder, tmp_path, monkeypatch, capsys
 ):
-    words = ("complete", folder / "chair.ply", "--auto", 1, "--resolution", 96)
+    # A splat without anything goes on by itself.
+    words = ("complete", folder / "chair.ply", "--resolution", 96)
     assert run(monkeypatch, *words, "--out", tmp_path / "out") == 0
     said = capsys.readouterr()
     assert "The splat is an object on nothing" in said.err
@@ -52,12 +53,6 @@ def test_nothing_is_added_to_an_object_whose_cameras_are_found(
     assert summary["gaussians"]["added"] == 0
     assert summary["settings"]["config"]["guards"][-1] == "hull"
     assert "to cover it would be no gain" in (tmp_path / "out/report.html").read_text()
-
-
-def test_a_refusal_without_a_camera_names_the_search(folder, tmp_path, monkeypatch, capsys):
-    words = ("complete", folder / "chair.ply", "--out", tmp_path / "out")
-    assert run(monkeypatch, *words) == 2
-    assert "--auto" in capsys.readouterr().err
 
 
 @pytest.mark.slow

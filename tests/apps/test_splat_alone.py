@@ -131,7 +131,7 @@ def test_cameras_alone_let_targets_be_found(folder, tmp_path, monkeypatch):
     ("words", "sentence"),
     [
         ((), "Nothing is named that is to be completed"),
-        (("--scene", "fog.ply"), "does not tell where to stand or what is missing"),
+        (("--scene", "fog.ply"), "There is no place from which the splat looks like a photograph"),
         (("splat.ply", "--up", "0", "0", "0"), "three numbers that are not all zero"),
         (("splat.ply", "--up", "0", "1", "0", "--target", "target.json"), "leave --up out"),
         (("photographs", "--up", "0", "1", "0"), "photographs of SCENE tell what is up"),

@@ -23,6 +23,11 @@ from gscompleter.apps.inputs.describing import describe_opening, print_lines
 from gscompleter.apps.inputs.named_photographs import check_context
 from gscompleter.apps.inputs.reading import read_photographs
 from gscompleter.apps.inputs.splat import locate_splat, move_to_splat
+from gscompleter.apps.inputs.taken_out import (
+    describe_taken_out,
+    find_taken_out,
+    hide_taken_out,
+)
 from gscompleter.apps.inputs.task import InputSplatFile
 from gscompleter.apps.report.completion import save_changed, save_completed_splat
 from gscompleter.apps.warmup import compile_kernels
@@ -34,6 +39,7 @@ from gscompleter.numerics.image_ops import compute_mask_fraction
 from gscompleter.render.device import choose_device
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
+from gscompleter.splats.edits import EDITS, EditDraft, record_edit
 from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import load_splat
 from gscompleter.system.errors import InputError, quote_value
@@ -45,7 +51,7 @@ from gscompleter.types import Gaussians, View
 
 PHOTOGRAPH_OPTIONS = ("context", "format", "near", "far")
 COMMAND = "clean"
-RESULTS = (COMPLETED_FILE, REMOVED_FILE, SUMMARY_FILE)
+RESULTS = (COMPLETED_FILE, REMOVED_FILE, SUMMARY_FILE, *EDITS)
 """Files that it may write."""
 
 
@@ -95,6 +101,14 @@ def clean_splat(options: CleanOptions) -> None:
                     cleaning.given[:0],
                     cleaning.splat_file,
                 )
+                record_edit(
+                    folder,
+                    EditDraft(COMMAND),
+                    len(cleaning.given),
+                    0,
+                    cleaning.splat_file.path,
+                    has_record=False,
+                )
             elif cleaning.removed.any():
                 save_changed(folder, cleaning.given, cleaning.removed, cleaning.splat_file)
             (folder / SUMMARY_FILE).write_bytes(json.dumps(summary, indent=2).encode() + b"\n")
@@ -125,6 +139,10 @@ def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
     given = task.scene
     assert given is not None
     task = apply_splat_range(task, given, renderer)
+
+    print_lines(console, *describe_taken_out(options.scene, options.forget_edits))
+    if not options.forget_edits:
+        task = hide_taken_out(task, find_taken_out(task, renderer))
 
     plan = f"compared with {len(task.views)} photographs on {device}"
     plan += f", written to {quote_value(options.out)}"

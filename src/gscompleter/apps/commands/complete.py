@@ -95,12 +95,6 @@ class CompleteOptions(CompletingOptions):
         return self.mask
 
     @property
-    def stands_anywhere(self) -> bool:
-        """True to complete a trained splat of which neither cameras nor targets are known."""
-        # It is seldom of use, so that the search has to be asked for.
-        return self.auto is not None
-
-    @property
     def max_targets(self) -> int:
         """Number of targets to search for."""
         if self.from_photographs_only:

@@ -154,6 +154,9 @@ class SceneOptions(ComputeOptions, WritingOptions):
     """Go on with masks that hide more than half of most photographs: they are meant so."""
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
+    forget_edits: bool = False
+    """Use photographs also where they show what earlier commands removed from the splat, or what
+    was marked there as wrong, so that it may come back."""
 
     def make_scene_request(self) -> SceneRequest:
         """Make the request for the photographs."""

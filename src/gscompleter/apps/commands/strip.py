@@ -7,39 +7,62 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
+from annotated_types import Interval
 
 from gscompleter.apps.command_line.answers import print_answer
 from gscompleter.apps.commands.shared_options import WritingOptions, list_inputs
+from gscompleter.system.errors import InputError
 from gscompleter.system.files.overlap import refuse_input_file
-from gscompleter.system.files.writing import REMOVED_FILE
+from gscompleter.system.files.writing import EDITS_FILE, REMOVED_FILE
 from gscompleter.system.process import import_without_collection
 
 
 @dataclass(frozen=True, kw_only=True)
 class StripOptions(WritingOptions):
-    """Undo a completion: remove what was generated and put the originals back."""
+    """Undo edits: remove what was generated, and put back what was removed or recoloured.
+
+    Without --last or --edit, all edits are undone, and the scene is as it was given.
+    """
 
     completed: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="COMPLETED")]
-    """Completed scene. Gaussians of a removed.ply beside it are put back."""
+    """Completed scene, with edits.json, removed.ply and edits/ of its results beside it."""
+    last: bool = False
+    """Undo the last edit alone."""
+    edit: Annotated[int, Interval(ge=1)] | None = None
+    """Undo this edit alone, by its number in edits.json, from 1."""
     out: Path
-    """File for the original scene."""
+    """File for the scene without these edits."""
 
     def check_overlap(self) -> None:
         """Refuse to write over an input."""
-        # The originals beside the completed scene are read, too.
-        originals = self.completed.with_name(REMOVED_FILE)
-        refuse_input_file(self.out, [*list_inputs(self), originals])
+        # What lies beside the completed scene is read, too.
+        folder = self.completed.parent
+        beside = [folder / name for name in (REMOVED_FILE, EDITS_FILE)]
+        refuse_input_file(self.out, [*list_inputs(self), *beside])
 
 
 def run_strip(options: StripOptions) -> None:
     """Write the original scene and print the number of Gaussians."""
     # Imported here, so that help pages do not wait for torch.
+    if options.last and options.edit is not None:
+        raise InputError("--last and --edit both name an edit; leave one of them out.", "edit")
     with import_without_collection():
+        from gscompleter.splats.edits import read_edits
+        from gscompleter.splats.foreign import resolve_splat
         from gscompleter.splats.formats import reserve_splat
-        from gscompleter.splats.layout import strip
+        from gscompleter.splats.undo import strip_edits
 
     with reserve_splat(options.out, options.overwrite):
-        num_given, num_generated = strip(options.completed, options.out)
-    content = {"out": str(options.out), "gaussians": num_given, "generated_removed": num_generated}
-    line = f"{num_given:,} Gaussians, {num_generated:,} generated ones removed: {options.out}"
-    print_answer(options, content, [line])
+        numbers = None if options.edit is None else [options.edit]
+        if options.last:
+            numbers = [max(len(read_edits(resolve_splat(options.completed)).edits), 1)]
+        undone = strip_edits(options.completed, options.out, numbers)
+    content = {
+        "out": str(options.out),
+        "gaussians": undone.kept,
+        "generated_removed": undone.dropped,
+        "is_same_file": undone.is_same_file,
+    }
+    line = f"{undone.kept:,} Gaussians, {undone.dropped:,} generated ones removed: {options.out}"
+    same = ["The file is the one before this edit, byte for byte."] if undone.is_same_file else []
+    print_answer(options, content, [line, *same])

@@ -40,11 +40,12 @@ from gscompleter.apps.report.page import write_completion_page
 from gscompleter.apps.report.results import COMMAND, RESULTS
 from gscompleter.apps.report.schema import read_summary
 from gscompleter.completer import check_target_ids
-from gscompleter.data.scene import write_cameras
+from gscompleter.data.scene import describe_camera, write_cameras
 from gscompleter.editing.removal import restore_surroundings
 from gscompleter.evaluation.metrics.coverage import render_pairs, sample_held_out_cameras
 from gscompleter.numerics.kernels.parallel import run_in_background
 from gscompleter.splats.alignment.similarity import transform_camera_exactly
+from gscompleter.splats.edits import EditDraft
 from gscompleter.state import Completion
 from gscompleter.system.errors import print_error, quote_value
 from gscompleter.system.files.output_folder import reserve_output
@@ -55,6 +56,10 @@ from gscompleter.system.progress import show_progress, stage
 from gscompleter.system.timing import add_seconds
 from gscompleter.types import Camera
 
+REGIONS = ("box", "box_rotation", "sphere", "margin")
+"""Settings of a place."""
+NAMED_FILES = ("mask", "select", "images", "photos")
+"""Settings that name files."""
 Prepare = Callable[[Any, Console], Prepared]
 """Opens the input of a command, whose options it takes, and loads the models."""
 
@@ -212,8 +217,13 @@ def describe_models(options: CompleteOptions) -> str:
     return f"{options.reconstructor} and images of {quote_value(painter)}"
 
 
-def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[str, Any]:
-    """Write all results but the targets and the video, and return the summary."""
+def write_done(
+    folder: Path, ready: Prepared, completion: Completion, command: str | None = None
+) -> dict[str, Any]:
+    """Write all results but the targets and the video, and return the summary.
+
+    `command` is that of the record of edits, if it is not that of `ready`.
+    """
     options = ready.options
     task = ready.task
     renderer = ready.completer.renderer
@@ -243,10 +253,43 @@ def write_done(folder: Path, ready: Prepared, completion: Completion) -> dict[st
             has_searched=not options.from_photographs_only,
             run=describe_maker(options, task, completion),
             testing=[completion.with_depth_range(camera) for camera in task.witnesses.testing],
+            edit=EditDraft(command or ready.command, describe_edit(ready)),
         )
     write_render_cameras(folder, ready)
     write_completion_page(folder)
     return summary
+
+
+def describe_edit(ready: Prepared) -> dict[str, Any]:
+    """Describe what was done for the record of edits: places, cameras, masks, photographs, models.
+
+    Paths are without their folders, which tell about the machine.
+    """
+    files = ready.opened.files
+    settings = ready.describe_settings()
+    # Those of a place are numbers, in the coordinates of the splat's file.
+    place = {name: settings[name] for name in REGIONS if settings.get(name)}
+    named = {name: settings[name] for name in NAMED_FILES if settings.get(name)}
+    back = np.linalg.inv(ready.task.frame)
+    cameras = [
+        describe_camera(transform_camera_exactly(target.camera, back))
+        for target in ready.task.targets
+    ]
+    return {
+        **place,
+        **{name: strip_folders(value) for name, value in named.items()},
+        "cameras": cameras,
+        "photographs": [files.get(frame) for frame in ready.task.context_frames],
+        "reconstructor": strip_folders(ready.options.reconstructor),
+        "generator": strip_folders(ready.options.synthesis.generator),
+    }
+
+
+def strip_folders(value: str | Sequence[str]) -> str | list[str]:
+    """Strip the folders of a path, or of several."""
+    if isinstance(value, str):
+        return Path(value).name
+    return [Path(path).name for path in value]
 
 
 def complete_targets(ready: Prepared) -> tuple[Completion, Prepared]:

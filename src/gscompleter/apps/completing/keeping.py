@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from gscompleter.apps.report.schema import find_completed
+from gscompleter.splats.edits import rename_edited
 from gscompleter.splats.formats import convert_splat
 from gscompleter.splats.layout import is_same_scene
 from gscompleter.system.files.output_folder import read_listing
@@ -28,6 +29,7 @@ def keep_small(
     if suffix != COMPLETED_FILE.removeprefix("completed"):
         convert_splat(folder / COMPLETED_FILE, folder / f"completed{suffix}")
         (folder / COMPLETED_FILE).unlink()
+        rename_edited(folder, folder / f"completed{suffix}")
     context = None
     if given is not None and is_same_scene(given, folder / CONTEXT_FILE):
         (folder / CONTEXT_FILE).unlink()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -16,7 +15,7 @@ from gscompleter.editing.marking import find_marked
 from gscompleter.editing.removal import remove_gaussians
 from gscompleter.planning.remove import contain_nothing
 from gscompleter.state import Completion
-from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.errors import InputError
 from gscompleter.system.progress import stage
 
 
@@ -49,6 +48,11 @@ class PreparedMarked(Prepared):
         with stage("removing"):
             return remove_gaussians(begun, chosen, contain_nothing, self.completer.scenes)
 
+    @property
+    def command(self) -> str:
+        """The command, for the record of edits."""
+        return "repair"
+
     def describe_settings(self) -> dict[str, Any]:
         """Describe the settings, with the masks."""
         return {**super().describe_settings(), "mask": [str(path) for path in self.options.marks]}
@@ -61,7 +65,6 @@ def prepare_marked(options: CompleteOptions, console: Console) -> Prepared:
     check_marks(options)
     check_selecting_masks(options.marks, options.mark_reading, "the images of their cameras")
     ready = prepare_completion(options, console)
-    refuse_completed(ready, options.scene)
     # Before anything is rendered or removed.
     pair_masks(options.marks, ready.task.target_cameras)
     return PreparedMarked(**vars(ready))
@@ -77,13 +80,4 @@ def check_marks(options: CompleteOptions) -> None:
         raise InputError(
             "A mask is painted on the image of a target; name the camera of each with --target.",
             "mask",
-        )
-
-
-def refuse_completed(ready: Prepared, path: Path | None) -> None:
-    """Refuse a splat that was completed before: `strip` cannot undo two runs that remove."""
-    if ready.task.scene is not None and bool((ready.task.scene.generated > 0).any()):
-        raise InputError(
-            f"{quote_value(path or ready.options.scene)} was completed before, and removed.ply "
-            "keeps what one run removed; strip it first, and remove everything at once."
         )

@@ -29,6 +29,11 @@ from gscompleter.apps.inputs.removal import Selection
 from gscompleter.apps.inputs.renders import open_renders
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.inputs.splat import add_check_views, locate_splat, move_to_splat
+from gscompleter.apps.inputs.taken_out import (
+    describe_taken_out,
+    find_taken_out,
+    hide_taken_out,
+)
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened, Target
 from gscompleter.apps.warmup import SPLAT_PART, compile_kernels
 from gscompleter.completer import GSCompleter
@@ -78,6 +83,11 @@ class Prepared:
         begun = self.completer.begin(task.views, task.scene, task.check_views, task.target_cameras)
         guarding = tuple(begun.with_depth_range(camera) for camera in task.witnesses.guarding)
         return replace(begun, free_space_cameras=guarding)
+
+    @property
+    def command(self) -> str:
+        """The command, for the record of edits."""
+        return "update" if self.options.from_photographs_only else "complete"
 
     # `PreparedRemoval` adds the selection to them.
     def describe_settings(self) -> dict[str, Any]:
@@ -179,6 +189,11 @@ def load_models(
             task, notes = apply_scene_range(task, reconstructor)
         else:
             task = apply_splat_range(task, task.scene, completer.renderer)
+            assert task.splat_file is not None
+            if opened.renders_from is None:
+                notes = describe_taken_out(task.splat_file.path, options.forget_edits)
+                if not options.forget_edits:
+                    task = hide_taken_out(task, find_taken_out(task, completer.renderer))
     print_lines(console, *notes)
 
     cameras = collect_cameras(opened, task)
@@ -338,7 +353,6 @@ def read_splat_alone(
         options.holes,
         options.up,
         place,
-        options.stands_anywhere,
     )
     with show_preparation("choosing cameras"):
         renderer = load_renderer(device)

@@ -12,7 +12,6 @@ from rich.console import Console
 from torch import Tensor
 
 from gscompleter.apps.commands.remove import RemoveOptions
-from gscompleter.apps.completing.marking import refuse_completed
 from gscompleter.apps.completing.preparation import Prepared, prepare_completion
 from gscompleter.apps.inputs.removal import (
     Selection,
@@ -62,6 +61,11 @@ class PreparedRemoval(Prepared):
         origin = torch.from_numpy(self.task.origin).to(points.device)
         return find_in_region(points.double() + origin, self.selection)
 
+    @property
+    def command(self) -> str:
+        """The command, for the record of edits."""
+        return "remove"
+
     def describe_settings(self) -> dict[str, Any]:
         """Describe the settings, with the selection."""
         selection = {name: getattr(self.options, name) for name in SELECTIONS}
@@ -81,7 +85,6 @@ def prepare_removal(options: RemoveOptions, console: Console) -> PreparedRemoval
         names = [frame.name for frame in ready.opened.photographs.frames]
         check_removal_masks(options.mask, names, options.mark_reading)
 
-    refuse_completed(ready, options.scene)
     explorer = PhotographPlanner(ready.completer)
     return PreparedRemoval(**{**vars(ready), "explorer": explorer})
 

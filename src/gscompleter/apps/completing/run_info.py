@@ -97,6 +97,8 @@ def read_held_out(
         # task, where the image has to be as well. Outside of `suppress`, which would hide that.
         there = view.to(task.device)
         placed = View(there.image, others[frame], frame, ignore_mask=there.ignore_mask)
+        if task.taken_out is not None:
+            placed = task.taken_out.hide(placed)
         held_out.append(HeldOut(placed, frame in checks))
     return held_out
 

@@ -27,6 +27,7 @@ from gscompleter.apps.inputs.named_photographs import find_context
 from gscompleter.apps.inputs.reading import make_task
 from gscompleter.apps.inputs.selection import CHECK_VIEW_SIZE, collect_usable_cameras
 from gscompleter.apps.inputs.splat import add_check_views
+from gscompleter.apps.inputs.taken_out import hide_taken_out
 from gscompleter.apps.inputs.task import Opened
 from gscompleter.config import CompleterConfig
 from gscompleter.data.formats import find_format
@@ -160,6 +161,7 @@ def choose_evidence(ready: Prepared, new: Sequence[int]) -> Prepared:
     )
     assert task.scene is not None
     task = apply_splat_range(task, task.scene, ready.completer.renderer)
+    task = hide_taken_out(task, task.taken_out)
     return replace(ready, task=task, cameras=collect_cameras(opened, task))
 
 
@@ -184,6 +186,8 @@ def measure_lacks(ready: Prepared) -> dict[int, float]:
             (view,) = opened.photographs.views([frame], CHECK_VIEW_SIZE)
         # A view refuses an image and a camera on two devices, and cameras are on that of the task.
         view = replace(view.to(task.device), camera=cameras[frame])
+        if task.taken_out is not None:
+            view = task.taken_out.hide(view)
         frames.append(frame)
         views.append(view)
         renders.append(ready.completer.renderer.render(scene, view.camera))

@@ -72,8 +72,6 @@ class RenderRequest:
     it."""
     place: Selection | None = None
     """Gaussians to be removed, around which cameras are found; None to complete the splat."""
-    takes_standpoints: bool = False
-    """True to stand anywhere if nothing tells where the cameras were."""
 
     def find_up(self, scene: Gaussians, renderer: Renderer) -> Upward:
         """Find the upward direction, for which the cameras beside the splat are read as well."""
@@ -137,15 +135,8 @@ def find_cameras_alone(scene: Gaussians, renderer: Renderer, request: RenderRequ
     sides = (side,) if resolution is None else (side, *np.ravel(resolution).tolist())
     upward = request.find_up(scene, renderer)
     camera = find_pixel_camera(scene, upward.direction, min(sides))
-    if camera is None and request.takes_standpoints:
-        return find_standing_cameras(scene, renderer, upward, request)
     if camera is None:
-        raise InputError(
-            "The file of the splat does not tell where to stand or what is missing; let cameras "
-            "and holes be searched for with --auto, name a camera with --target (`gscompleter "
-            "view` saves one), mark what is wrong with --mask, or give its own cameras with "
-            "--cameras or its photographs as SCENE."
-        )
+        return find_standing_cameras(scene, renderer, upward, request)
     ranged = add_near_plane(camera, scene.means)
     seen = renderer.render(scene, ranged).depth_map()
     covered = seen.valid.float().mean().item()

@@ -145,7 +145,7 @@ def open_renders(
         origin,
         find_depth_sources(reading),
         scene=scene,
-        splat_file=splat_file,
+        splat_file=replace(splat_file, origin=origin),
         frame_description="the frame of the splat",
         witnesses=witnesses,
     )

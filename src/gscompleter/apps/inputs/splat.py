@@ -11,6 +11,7 @@ from gscompleter.apps.inputs.selection import (
     collect_usable_cameras,
     select_near_and_far,
 )
+from gscompleter.apps.inputs.taken_out import load_taken_out
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened
 from gscompleter.data.local_origin import (
     choose_scene_origin,
@@ -24,7 +25,7 @@ from gscompleter.splats.alignment.trainer_frames import InputSplat
 from gscompleter.splats.formats import detect_splat_format
 from gscompleter.splats.ply import find_finite_rows
 from gscompleter.system.errors import InputError
-from gscompleter.types import Gaussians
+from gscompleter.types import Gaussians, merge
 
 MAX_CHECK_VIEWS = 40
 """Most photographs that check a splat."""
@@ -51,8 +52,13 @@ def move_to_splat(
     origin = choose_scene_origin(scene, photographs.origin)
     scene = shift_to_origin(origin, scene, task.cameras).to(task.device)
 
+    # Photographs still show what was taken out, so they are compared with the splat as it was.
+    splat_file = replace(splat_file, origin=origin)
+    taken_out = load_taken_out(splat_file)
+    whole = scene if taken_out is None else merge([scene, taken_out.to(task.device)])
+
     # A trainer may have moved and scaled the cameras before it trained the splat.
-    splat = InputSplat(splat_file.path, scene, origin, opened.request.folder)
+    splat = InputSplat(splat_file.path, whole, origin, opened.request.folder)
     alignment = align_splat(
         splat, photographs, task.context_frames, load_renderer(task.device.type)
     )

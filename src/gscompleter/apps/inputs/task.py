@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +14,7 @@ from torch import Tensor
 from gscompleter.apps.inputs.scene_request import SceneRequest
 from gscompleter.data.photograph_names import name_target
 from gscompleter.data.photographs import Photographs
+from gscompleter.editing.taken_out import TakenOut
 from gscompleter.generators.painted import Painting
 from gscompleter.types import Camera, Gaussians, View
 from gscompleter.virtual_capture.witnesses import Witnesses
@@ -61,6 +62,8 @@ class InputSplatFile:
     """Mask of the Gaussians in the file that form the context; None for all."""
     file_order: Int64[Tensor, "n"] | None = None
     """Index among these of each Gaussian of the context; None for the order of the file."""
+    origin: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    """Origin of the context in the coordinates of the file."""
 
 
 @dataclass(frozen=True)
@@ -123,6 +126,9 @@ class CompletionTask:
     """Sentences about the unit of the given depth."""
     witnesses: Witnesses = Witnesses()
     """Further cameras from which a splat without photographs looks well."""
+    taken_out: TakenOut | None = None
+    """What earlier edits took out of the input splat, which the photographs do not show any more;
+    None for nothing."""
 
     @property
     def device(self) -> torch.device:

@@ -157,7 +157,7 @@ def write_session(folder: Path, ready: Prepared, session: Session) -> dict[str, 
     """Write the results of `complete` and the steps of a session, and return the summary."""
     targets = [Target(result.target) for result in session.latest.targets]
     with_targets = replace(ready, task=replace(ready.task, targets=targets))
-    summary = write_done(folder, with_targets, session.latest)
+    summary = write_done(folder, with_targets, session.latest, "live")
     if session.cameras:
         write_cameras(folder / TARGETS_FILE, session.cameras)
     # Cameras that were found are found again.

@@ -31,10 +31,6 @@ from gscompleter.types import Camera
 
 NOTHING_MARKED = "The marks show no Gaussian; paint over what the picture shows."
 EMPTY_BOX = "The box contains nothing; drag it, or make it larger."
-COMPLETED_BEFORE = (
-    "The splat was completed before, and removed.ply keeps what one run removed; strip it first, "
-    "and remove everything at once."
-)
 
 Numbers = tuple[float, ...]
 
@@ -155,8 +151,6 @@ def remove_chosen(
     """
     if not any(bool(mask.any()) for mask in (context, *added)):
         raise InputError(nothing)
-    if bool((state.context.generated > 0).any()):
-        raise InputError(COMPLETED_BEFORE)
 
     # What is removed from the context is marked, so that its hole may be filled. What was added is
     # simply taken out.

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -52,6 +51,7 @@ from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.reconstructors.features.consistency import measure_pose_errors
 from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
+from gscompleter.splats.edits import EditDraft, record_edit
 from gscompleter.splats.layout import save_like, save_removed
 from gscompleter.splats.ply import save_parts, save_ply
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, RunRecord
@@ -122,6 +122,7 @@ def write_report(
     has_searched: bool = True,
     run: RunRecord | None = None,
     testing: Sequence[Camera] = (),
+    edit: EditDraft | None = None,
 ) -> dict[str, Any]:
     """Write the scenes, `images/`, `report.json` and `summary.json`; return the summary.
 
@@ -129,6 +130,7 @@ def write_report(
     views whose coverage is measured. `files` are those of the photographs by frame. `has_searched`
     is False if targets were neither named nor searched for. `run` is what the files say about who
     made them. `testing` are cameras that decided nothing, at which what is kept is measured.
+    `edit` is the command for `edits.json`.
     """
     at_targets = [
         render_before_after(completion, result.target, renderer) for result in completion.targets
@@ -142,7 +144,7 @@ def write_report(
     if not completion.targets:
         photos = [photo.view for photo in completion.photos]
         shown = [*photos, *(photograph.view for photograph in held_out)]
-    write_scenes(folder, completion, input_splat, run)
+    write_scenes(folder, completion, input_splat, run, edit or EditDraft("complete"))
     around = render_around()
     name_view = "ignored" if run_info.get("scene", {}).get("renders_from") is None else "render"
     write_pictures(folder / IMAGES, completion, targets, at_targets, name_view)
@@ -355,14 +357,17 @@ def write_scenes(
     folder: Path,
     completion: Completion,
     input_splat: InputSplatFile | None,
-    run: RunRecord | None = None,
+    run: RunRecord | None,
+    edit: EditDraft,
 ) -> None:
-    """Write the three scenes, and the originals of recoloured Gaussians of an input splat.
+    """Write the three scenes, the originals of changed Gaussians, and `edits.json`.
 
     `run` is what the completed scene and the additions say about who made them.
     """
     made_by = NOTHING_KNOWN if run is None else Provenance((run,))
     added = completion.added
+    changed = completion.recolored_mask | completion.source.gone_mask
+    generated = merge([completion.recolored, added])
     if input_splat is None:
         order = torch.arange(len(completion.context))
         parts = [(part, torch.arange(len(part))) for part in (completion.kept_context, added)]
@@ -372,24 +377,33 @@ def write_scenes(
     else:
         # In the layout and the order of the user's file, so that what was kept is kept bit by bit.
         order = find_file_order(completion.context, input_splat)
-        generated = merge([completion.recolored, added])
         completed = partial(
-            save_completed_splat,
-            folder,
-            completion.context,
-            completion.recolored_mask | completion.source.gone_mask,
-            generated,
-            input_splat,
-            run,
+            save_completed_splat, folder, completion.context, changed, generated, input_splat, run
         )
     # The context has labels if it was completed before.
     has_labels = bool((completion.context.generated > 0).any())
+    if input_splat is None and completion.source.gone_mask.any():
+        rows = completion.source.gone_mask.nonzero()[:, 0].cpu()
+        save_removed(
+            folder / REMOVED_FILE, completion.context[completion.source.gone_mask].to("cpu"), rows
+        )
     writing = [
         completed,
         partial(save_parts, folder / CONTEXT_FILE, [(completion.context, order)], has_labels),
         partial(save_ply, folder / GENERATED_FILE, added, provenance=True, made_by=made_by),
     ]
     map_in_parallel(lambda write: write(), writing)
+    record_edit(
+        folder,
+        replace(edit, labels=None if run is None else run.labels, seed=completion.seed),
+        len(completion.context),
+        len(generated) if input_splat is not None else len(added),
+        None if input_splat is None else input_splat.path,
+        has_record=run is not None,
+        # Without the file of the given scene, recoloured rows stand where their originals were.
+        can_be_undone=input_splat is not None or not completion.recolored_mask.any().item(),
+        taken_out=completion.source.removed,
+    )
 
 
 def find_file_order(context: Gaussians, input_splat: InputSplatFile) -> Int64[Tensor, "n"]:
@@ -411,16 +425,11 @@ def save_completed_splat(
     """Write `completed.ply` in the layout of the input splat, and the originals of the changed.
 
     `changed` marks the Gaussians of the context that were recoloured or removed. Recoloured ones
-    stand among the generated ones, after all that kept its bits. The originals of an earlier run
-    are kept with those that it recoloured.
+    stand among the generated ones, after all that kept its bits.
     """
     kept = input_splat.context_mask
     order = find_file_order(context, input_splat)
-    # A splat that was completed before has its originals beside it; they stay valid with it.
-    earlier = input_splat.path.with_name(REMOVED_FILE)
     if not changed.any():
-        if bool((context.generated > 0).any()) and earlier.is_file():
-            shutil.copyfile(earlier, folder / REMOVED_FILE)
         save_like(folder / COMPLETED_FILE, context, generated, input_splat.path, kept, order, run)
         return
     save_changed(folder, context, changed, input_splat)

@@ -39,6 +39,7 @@ from gscompleter.evaluation.verdict.judge import hold_out
 from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
+from gscompleter.splats.edits import EDITS, EditDraft
 from gscompleter.splats.formats import load_splat
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
@@ -62,6 +63,7 @@ RESULTS = (
     RENDERS_FILE,
     *(REPORT_FILE, RECORD_FILE, SUMMARY_FILE, VIDEO_FILE, "images/target*.png"),
     *("images/photograph*.png", "images/context*.png", "images/removal*.png"),
+    *EDITS,
 )
 """Globs of the files that a completion may write."""
 FORMAT = "python"
@@ -169,6 +171,7 @@ def write_result(folder: Path, judged: Judged, splat_file: InputSplatFile | None
         partial(render_pairs, completion, aside, judged.renderer),
         judged.held_out,
         run=describe_python_run(completion, None if splat_file is None else splat_file.path),
+        edit=EditDraft("remove" if len(completion.source.removed) else "complete"),
     )
     if completion.targets:
         write_cameras(folder / TARGETS_FILE, [result.target for result in completion.targets])
@@ -220,11 +223,5 @@ def find_splat_file(path: Path, completion: Completion) -> InputSplatFile:
         raise InputError(
             f"{quote_value(path)} holds another scene than the one that was completed; name its "
             "own file, or none."
-        )
-    # As the command `remove`: `strip` cannot undo two runs of which one removes.
-    if bool(completion.source.gone_mask.any()) and bool((context.generated > 0).any()):
-        raise InputError(
-            f"{quote_value(path)} was completed before, and {REMOVED_FILE} keeps what one run "
-            "removed; strip it first, or save without naming it."
         )
     return locate_splat(path, drop_nonfinite=False)

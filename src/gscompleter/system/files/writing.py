@@ -33,6 +33,8 @@ COMPLETED_FILES = (COMPLETED_FILE, "completed.spz", "completed.sog")
 """Files of the scene after its completion, of which there is one."""
 REMOVED_FILE = "removed.ply"
 """Originals of changed and removed Gaussians of a given scene, beside the completed one."""
+EDITS_FILE = "edits.json"
+"""What commands did to the scene, in their order."""
 
 ACCESS_LIST = "system.posix_acl_access"
 """Attribute of a file that lists further users who may read or write it."""

@@ -1,0 +1,94 @@
+"""What earlier edits of a splat took out of it, as the record beside its file says."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Target
+from gscompleter.editing.taken_out import TakenOut
+from gscompleter.render.protocols import Renderer
+from gscompleter.splats.edits import read_edits
+from gscompleter.splats.formats import load_splat, read_provenance
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.writing import EDITS_FILE
+from gscompleter.types import Gaussians, merge
+
+
+def load_taken_out(splat_file: InputSplatFile) -> Gaussians | None:
+    """Load what earlier edits took out of a splat, without colours by direction.
+
+    It is relative to the origin of the splat. None if nothing was taken out.
+    """
+    edits = read_edits(splat_file.path)
+    names = [edit.taken_out for edit in edits.edits if edit.taken_out is not None]
+    if not names:
+        return None
+    parts = [load_splat(edits.find(name)) for name in names]
+    gaussians = merge([replace(part, sh=part.sh[:, :1]) for part in parts])
+    # Files have their own coordinates, and the splat of a task is relative to its origin.
+    means = gaussians.means.double() - torch.from_numpy(splat_file.origin)
+    return replace(gaussians, means=means.float())
+
+
+def find_taken_out(task: CompletionTask, renderer: Renderer) -> TakenOut | None:
+    """Find what earlier edits took out of the splat of a task; None if nothing was."""
+    assert task.scene is not None
+    assert task.splat_file is not None
+    gaussians = load_taken_out(task.splat_file)
+    return None if gaussians is None else TakenOut(gaussians.to(task.device), task.scene, renderer)
+
+
+def describe_taken_out(path: Path, forgets: bool) -> tuple[str, ...]:
+    """Write the lines on what earlier edits of a splat took out of it."""
+    edits = read_edits(path)
+    count = sum(edit.taken_out is not None for edit in edits.edits)
+    if not edits and (runs := count_runs(path)):
+        return (
+            f"{quote_value(path)} was edited {runs} times, and there is no {EDITS_FILE} beside it. "
+            "What was removed is not known, so that photographs may bring it back.",
+        )
+    if not count:
+        return ()
+    removals = "1 removal" if count == 1 else f"{count} removals"
+    if forgets:
+        return (f"{removals} of this splat forgotten: photographs may bring back what went.",)
+    is_kept = "is" if count == 1 else "are"
+    return (
+        f"{removals} of this splat {is_kept} kept: photographs are ignored where they show what "
+        "went (--forget-edits uses them).",
+    )
+
+
+def count_runs(path: Path) -> int:
+    """Count the runs that a splat names as its makers; 0 if its record is damaged."""
+    with suppress(InputError):
+        return len(read_provenance(path).runs)
+    return 0
+
+
+def hide_taken_out(task: CompletionTask, taken_out: TakenOut | None) -> CompletionTask:
+    """Hide what was taken out in all photographs of a task."""
+    if taken_out is None:
+        return task
+    return replace(
+        task,
+        views=[taken_out.hide(view) for view in task.views],
+        check_views=[taken_out.hide(view) for view in task.check_views or ()],
+        targets=[hide_in_target(target, taken_out) for target in task.targets],
+        taken_out=taken_out,
+    )
+
+
+def hide_in_target(target: Target, taken_out: TakenOut) -> Target:
+    """Leave out the pixels of the photograph of a target that show it, where it scores."""
+    if target.photograph is None:
+        return target
+    mask = taken_out.find(target.camera.to(taken_out.scene.means.device))
+    mask = mask.to(target.photograph.device)
+    if target.ignore_mask is not None:
+        mask = mask | target.ignore_mask
+    return replace(target, ignore_mask=mask)

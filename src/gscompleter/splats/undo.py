@@ -1,0 +1,266 @@
+"""Taking edits off a splat, one by one: each earlier state comes back row by row.
+
+A row is known by a key: the number of the edit that appended it, 0 for the splat at first, and its
+place among these. Every edit keeps rows in their order and appends others, so that the keys of each
+state ascend. Without some of the edits, the splat has the rows that none of the others left out.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Int64
+from numpy import ndarray
+
+from gscompleter.splats.edits import Edit, Edits, read_edits
+from gscompleter.splats.foreign import resolve_splat
+from gscompleter.splats.formats import get_writer
+from gscompleter.splats.layout import iterate_rows, strip
+from gscompleter.splats.ply import (
+    LABEL_COLUMN,
+    has_mode_comment,
+    iterate_blocks,
+    read_scene,
+    save_ply,
+)
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.ply import PlyFile, write_ply_file
+from gscompleter.system.files.reading import hash_file
+from gscompleter.system.files.writing import EDITS_FILE
+
+Keys = Int64[ndarray, "_n"]
+"""Number of the edit that appended each row, and its place among these in the lower 40 bits."""
+PLACE_BITS = 40
+_LABELS = re.compile(
+    rb"^property\s+\w+\s+generated\s*?\n((?:comment gscompleter-provenance/[^\n]*\n)*)", re.M
+)
+"""The line of the labels, with the comments of runs that follow it."""
+
+
+@dataclass(frozen=True)
+class Originals:
+    """Rows that edits left out."""
+
+    keys: Keys
+    """Key of each row, ascending."""
+    scenes: Sequence[PlyFile]
+    places: Int64[ndarray, "n 2"]
+    """Number of the scene of each row, and the row in it."""
+
+
+@dataclass(frozen=True)
+class Undone:
+    """What was written, and what was left out."""
+
+    kept: int
+    """Gaussians that were written."""
+    dropped: int
+    """Gaussians that the edits had added."""
+    is_same_file: bool = False
+    """True if the file is known to be byte for byte the one before these edits."""
+
+
+def strip_edits(path: Path, out: Path, numbers: Collection[int] | None = None) -> Undone:
+    """Write a splat without some of its edits, which are numbered from 1; None for all of them.
+
+    A splat with a single edit, or without a record, is stripped by its labels.
+    """
+    path = resolve_splat(path)
+    edits = read_edits(path)
+    if numbers is None and (len(edits.edits) <= 1 or not can_undo(edits, 1)):
+        return Undone(*strip(path, out))
+    return undo_edits(path, edits, numbers or range(1, len(edits.edits) + 1), out)
+
+
+def can_undo(edits: Edits, first: int) -> bool:
+    """Return True if the rows of all states from an edit on are known."""
+    return edits.is_unchanged and all(edit.can_be_undone for edit in edits.edits[first - 1 :])
+
+
+def undo_edits(path: Path, edits: Edits, numbers: Collection[int], out: Path) -> Undone:
+    """Write a splat without some of its edits, which are numbered from 1."""
+    check_undone(path, edits, numbers, out)
+    layout = read_scene(path)
+    all_edits = edits.edits
+    states, left_out = compute_keys(path, edits)
+    if len(states[-1]) != len(layout.rows):
+        raise InputError(
+            f"{quote_value(path)} has {len(layout.rows):,} Gaussians, and by edits.json beside it "
+            f"{len(states[-1]):,}; fetch both files again."
+        )
+
+    remaining = [index for index in range(len(all_edits)) if index + 1 not in numbers]
+    appended = [make_keys(0, all_edits[0].rows)]
+    appended += [make_keys(index + 1, all_edits[index].added) for index in remaining]
+    gone = [left_out[index].keys for index in remaining]
+    keys = np.setdiff1d(np.concatenate(appended), np.concatenate(gone) if gone else keys_of_none())
+    originals = join_originals(left_out)
+
+    had_labels = all_edits[0].had_labels
+    header, dtype = make_header(layout, all_edits, remaining, had_labels)
+
+    def generate_blocks() -> Iterator[ndarray]:
+        for block in iterate_blocks(len(keys)):
+            yield copy_rows(layout, states[-1], originals, keys[block], dtype)
+
+    write_ply_file(out, header, len(keys), generate_blocks(), layout.trailer)
+    # The first edits alone are a state that was a file once.
+    is_state = remaining == list(range(len(remaining)))
+    earlier = all_edits[len(remaining)].given if is_state else None
+    dropped = len(np.setdiff1d(states[-1], keys, assume_unique=True))
+    return Undone(len(keys), dropped, earlier is not None and hash_file(out) == earlier)
+
+
+def check_undone(path: Path, edits: Edits, numbers: Collection[int], out: Path) -> None:
+    """Refuse edits that there are not, or whose rows are not known."""
+    count = len(edits.edits)
+    if not edits:
+        raise InputError(
+            f"There is no {EDITS_FILE} beside {quote_value(path)}, which lists its edits; leave "
+            "--last and --edit out."
+        )
+    for number in numbers:
+        if not 1 <= number <= count:
+            raise InputError(
+                f"There is no edit {number} of {quote_value(path)}, whose edits are numbered from "
+                f"1 to {count}.",
+                "edit",
+            )
+    first = min(numbers)
+    if not can_undo(edits, first):
+        raise InputError(
+            f"{quote_value(path)} was changed by another program after edit {first}, so that it "
+            "cannot be taken off alone; leave --last and --edit out."
+        )
+    if get_writer(out) is not save_ply:
+        raise InputError("An earlier state is a .ply; name such a file.", "out")
+
+
+def keys_of_none() -> Keys:
+    """Return no keys."""
+    return np.empty(0, np.int64)
+
+
+def make_keys(number: int, count: int) -> Keys:
+    """Make the keys of the rows that an edit appended."""
+    return (np.int64(number) << PLACE_BITS) + np.arange(count, dtype=np.int64)
+
+
+def compute_keys(path: Path, edits: Edits) -> tuple[list[Keys], list[Originals]]:
+    """Compute the keys of the rows of all states, and of those that each edit left out."""
+    states = [make_keys(0, edits.edits[0].rows)]
+    left_out = []
+    for number, edit in enumerate(edits.edits, start=1):
+        before = states[-1]
+        if len(before) != edit.rows:
+            raise InputError(
+                f"By edits.json beside {quote_value(path)}, edit {number} began with "
+                f"{edit.rows:,} Gaussians, and there were {len(before):,}; fetch it again."
+            )
+        gone = read_originals(edits, edit, before)
+        left_out.append(gone)
+        kept = np.setdiff1d(before, gone.keys, assume_unique=True)
+        states.append(np.concatenate([kept, make_keys(number, edit.added)]))
+    return states, left_out
+
+
+def read_originals(edits: Edits, edit: Edit, before: Keys) -> Originals:
+    """Read the rows that an edit left out of a state."""
+    none = np.empty((0, 2), np.int64)
+    if edit.originals is None:
+        return Originals(keys_of_none(), (), none)
+    path = edits.find(edit.originals)
+    scene = read_scene(path)
+    places = scene.trailer.view("<u4").astype(np.int64)
+    is_ordered = bool((np.diff(places, append=len(before)) > 0).all())
+    if len(places) != len(scene.rows) or not is_ordered:
+        raise InputError(
+            f"{quote_value(path)} does not say where its Gaussians belong; fetch it again."
+        )
+    rows = np.stack([np.zeros_like(places), np.arange(len(places))], axis=1)
+    return Originals(before[places], (scene,), rows)
+
+
+def join_originals(parts: Sequence[Originals]) -> Originals:
+    """Join the rows that several edits left out."""
+    scenes: list[PlyFile] = []
+    places = []
+    for part in parts:
+        places.append(part.places + np.array([len(scenes), 0]))
+        scenes += part.scenes
+    keys = np.concatenate([part.keys for part in parts])
+    order = keys.argsort()
+    return Originals(keys[order], scenes, np.concatenate(places)[order])
+
+
+def make_header(
+    layout: PlyFile, edits: Sequence[Edit], remaining: Sequence[int], had_labels: str | None
+) -> tuple[bytes, np.dtype]:
+    """Make header and type of rows without the comments of the edits that are taken off.
+
+    Without any edit, the labels are what they were at first.
+    """
+    found = _LABELS.search(layout.header)
+    names = layout.rows.dtype.descr
+    if found is None:
+        return layout.header, layout.rows.dtype
+    if not remaining and had_labels is None:
+        header = layout.header[: found.start()] + layout.header[found.end() :]
+        return header, np.dtype([column for column in names if column[0] != LABEL_COLUMN])
+
+    comments = found[1].splitlines(keepends=True)
+    count_at_first = len(comments) - sum(edit.records for edit in edits)
+    kept = comments[:count_at_first]
+    start = count_at_first
+    for index, edit in enumerate(edits):
+        if index in remaining:
+            kept += comments[start : start + edit.records]
+        start += edit.records
+    line = layout.header[found.start() : found.start(1)]
+    dtype = layout.rows.dtype
+    if not remaining and had_labels == "uchar":
+        line = line.replace(b" float ", b" uchar ")
+        dtype = np.dtype([(c[0], "u1") if c[0] == LABEL_COLUMN else c for c in names])
+    header = layout.header[: found.start()] + line + b"".join(kept) + layout.header[found.end() :]
+    return header, dtype
+
+
+def copy_rows(
+    layout: PlyFile, final: Keys, originals: Originals, keys: Keys, dtype: np.dtype
+) -> ndarray:
+    """Copy rows by their keys, from the splat or from what was left out of it."""
+    rows = np.zeros(len(keys), dtype)
+    places = np.searchsorted(final, keys).clip(max=len(final) - 1)
+    is_there = final[places] == keys
+    for block, copied in iterate_rows(layout, places[is_there]):
+        fill_columns(rows, np.flatnonzero(is_there)[block], copied)
+    missing = np.flatnonzero(~is_there)
+    found = originals.places[np.searchsorted(originals.keys, keys[missing])]
+    for number, scene in enumerate(originals.scenes):
+        chosen = found[:, 0] == number
+        if chosen.any():
+            check_columns(scene, layout)
+            fill_columns(rows, missing[chosen], scene.rows[found[chosen, 1]])
+    return rows
+
+
+def fill_columns(rows: ndarray, places: Int64[ndarray, "k"], values: ndarray) -> None:
+    """Fill rows at places; a row without labels has 0."""
+    for name in rows.dtype.names or ():
+        if name in (values.dtype.names or ()):
+            rows[name][places] = values[name]
+
+
+def check_columns(scene: PlyFile, layout: PlyFile) -> None:
+    """Refuse originals that have other columns, as those of a splat of a lower degree."""
+    columns = [set(file.rows.dtype.names or ()) - {LABEL_COLUMN} for file in (scene, layout)]
+    is_same_mode = has_mode_comment(scene.header) == has_mode_comment(layout.header)
+    if columns[0] != columns[1] or not is_same_mode:
+        raise InputError(
+            "An edit changed the properties of the splat, such as the degree of its harmonics, so "
+            "that edits cannot be taken off one by one; leave --last and --edit out."
+        )
