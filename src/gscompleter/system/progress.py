@@ -84,7 +84,7 @@ class Display:
         if not self.has_bars and line != self._line:
             self._line = line
             self._line_time = time.monotonic()
-            self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+            self._console.print(line, soft_wrap=True)
 
 
 class NotebookDisplay(Display):
@@ -123,9 +123,11 @@ class NotebookDisplay(Display):
 
 def draw_bars(running: Progress) -> dict[str, str]:
     """Draw the bars as HTML, and as text for notebooks that show none."""
-    from rich.console import Console
+    from gscompleter.system.console import make_console
 
-    drawing = Console(record=True, file=io.StringIO(), width=NOTEBOOK_WIDTH, force_jupyter=False)
+    drawing = make_console(
+        record=True, file=io.StringIO(), width=NOTEBOOK_WIDTH, force_jupyter=False
+    )
     drawing.print(running.get_renderable())
     html = drawing.export_html(
         inline_styles=True, clear=False, code_format='<pre style="margin:0">{code}</pre>'
@@ -201,9 +203,9 @@ def show_in_notebook() -> Iterator[None]:
     if _display.get() is not None or not is_notebook():
         yield
         return
-    from rich.console import Console
+    from gscompleter.system.console import make_console
 
-    display = NotebookDisplay(Console(file=io.StringIO(), force_jupyter=False))
+    display = NotebookDisplay(make_console(file=io.StringIO(), force_jupyter=False))
     token = _display.set(display)
     try:
         yield
@@ -217,9 +219,9 @@ def is_notebook() -> bool:
     # A process that has not imported IPython is none, and need not import rich to ask.
     if "IPython" not in sys.modules:
         return False
-    from rich.console import Console
+    from gscompleter.system.console import make_console
 
-    return Console().is_jupyter
+    return make_console().is_jupyter
 
 
 def stage(name: str) -> AbstractContextManager[object]:

@@ -21,6 +21,7 @@ from gscompleter.apps.batch.rows import parse_row
 from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.command_line.exit_codes import choose_exit_code
 from gscompleter.apps.commands.batch import BatchOptions
+from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, join_names, print_error, quote_value
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.jobs.jobs import (
@@ -47,7 +48,7 @@ def complete_batch(options: BatchOptions) -> int:
     if re.match(r"\w\w+:/", str(options.out)):
         raise InputError(f"{quote_value(options.out)} is an address; name a folder.", "out")
     number, count = parse_shard(options.shard, os.environ)
-    console = Console(stderr=True, quiet=options.quiet, highlight=False)
+    console = make_console(stderr=True, quiet=options.quiet)
     with show_progress(console):
         with show_preparation("reading the manifest"):
             common = parse_pairs(options.each, "each")
@@ -71,7 +72,7 @@ def complete_batch(options: BatchOptions) -> int:
         # A folder of scenes can hold the results of earlier runs, which are no input.
         if results := list_results(options.manifest, options.out):
             names = join_names([path.name for path in results], MAX_NAMED_FAILURES)
-            console.print(f"Left out, as results and no scenes: {names}.", markup=False)
+            console.print(f"Left out, as results and no scenes: {names}.", soft_wrap=True)
 
         perform = partial(perform_job, out=out, retries=options.retries)
         ended = run_jobs(left, perform, partial(has_row, out=out), engine, options.retries)
@@ -88,7 +89,7 @@ def complete_batch(options: BatchOptions) -> int:
             failures.append(f"{row['job']}: {row['reason']}")
     print_failures(console, failures, len(share))
     sentence = f"{summarize_rows(out, share, left)} All results: {options.out}/index.html"
-    console.print(sentence, markup=False, soft_wrap=True)
+    console.print(sentence, soft_wrap=True)
     if options.json:
         rows = [row for job in share if (row := read_row(job, out)) is not None]
         print_json({"out": str(options.out), "failed": len(failures), "rows": rows})
@@ -104,7 +105,7 @@ def print_failures(console: Console, failures: Sequence[str], num_cases: int) ->
         counted = f"{len(failures)} of {num_cases} cases failed"
         print_error(f"{counted}; the first: {failures[0]}")
     for failure in failures[:MAX_NAMED_FAILURES]:
-        console.print(f"Failed: {failure}", markup=False, soft_wrap=True)
+        console.print(f"Failed: {failure}", soft_wrap=True)
     if len(failures) > MAX_NAMED_FAILURES:
         console.print(f"... and {len(failures) - MAX_NAMED_FAILURES} more failed.")
 

@@ -42,14 +42,13 @@ def run_convert(options: ConvertOptions) -> None:
     """Convert A to B, and print the number of Gaussians."""
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
-        from rich.console import Console
-
         from gscompleter.splats.formats import convert_splat, reserve_splat
+        from gscompleter.system.console import make_console
         from gscompleter.system.progress import show_preparation, show_progress
 
     with (
         reserve_splat(options.out, options.overwrite),
-        show_progress(Console(stderr=True, quiet=options.quiet)),
+        show_progress(make_console(stderr=True, quiet=options.quiet)),
         show_preparation("converting"),
     ):
         count, num_generated, note = convert_splat(

@@ -26,9 +26,8 @@ def run_tables(options: TablesOptions) -> None:
     """Write the tables of an evaluation, and print them."""
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
-        from rich.console import Console
-
         from gscompleter.apps.evaluating.tables import write_and_print_tables
+        from gscompleter.system.console import make_console
         from gscompleter.system.progress import show_progress
-    with show_progress(Console(stderr=True, quiet=options.quiet)):
+    with show_progress(make_console(stderr=True, quiet=options.quiet)):
         write_and_print_tables(options.out, options.quiet, options.fid, as_json=options.json)

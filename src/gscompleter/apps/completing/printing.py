@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from gscompleter.apps.command_line.answers import print_json
@@ -22,6 +21,7 @@ from gscompleter.apps.report.plain_words import group_target_notes, list_notes, 
 from gscompleter.apps.report.schema import CompletionSummary, find_completed, read_summary
 from gscompleter.evaluation.verdict.numbers import average, format_number, format_percent
 from gscompleter.evaluation.verdict.outcome import name_unused, select_testing
+from gscompleter.system.console import make_console
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.writing import SUMMARY_FILE, TARGETS_FILE
 
@@ -39,9 +39,9 @@ def answer_completion(
 
 def print_completion(options: CompleteOptions) -> None:
     """Print the scores per camera, the notes, and the location of the results."""
-    console = Console(highlight=False)
+    console = make_console()
     summary = read_summary(options.out)
-    console.print(summary.outcome.headline, markup=False, soft_wrap=True)
+    console.print(summary.outcome.headline, soft_wrap=True)
     console.print(make_score_table(summary))
 
     # What holds for several targets is said once, before the notes of each. If nothing was gained,
@@ -54,7 +54,7 @@ def print_completion(options: CompleteOptions) -> None:
                 sentences.append(f"{name}: {' '.join(notes)}")
     sentences += describe_result(summary, options)
     for sentence in sentences:
-        console.print(sentence, markup=False, soft_wrap=True)
+        console.print(sentence, soft_wrap=True)
 
 
 def make_score_table(summary: CompletionSummary) -> Table:
@@ -127,7 +127,7 @@ def print_plan(
     options: CompleteOptions, opened: Opened, targets: Sequence[Target], holes: Sequence[float]
 ) -> None:
     """Print the targets and their holes."""
-    console = Console(highlight=False)
+    console = make_console()
     if not targets:
         console.print("No camera has much to gain; there is nothing to complete.")
         return
@@ -146,7 +146,7 @@ def print_plan(
 
 def print_export(options: CompleteOptions, lines: Sequence[str]) -> None:
     """Print what was exported, and how to go on."""
-    console = Console(highlight=False)
+    console = make_console()
     folder = options.results
     holes = read_holes(folder)
     table = Table("image", "hole", box=None)
@@ -164,4 +164,4 @@ def print_export(options: CompleteOptions, lines: Sequence[str]) -> None:
         f"{' and '.join(replaced)}.",
     ]
     for sentence in sentences:
-        console.print(sentence, markup=False, soft_wrap=True)
+        console.print(sentence, soft_wrap=True)

@@ -158,4 +158,4 @@ def find_cases_file(path: Path) -> Path:
 def print_skipped(skipped: Sequence[SkippedScene], console: Console) -> None:
     """Print the skipped clips with the reasons."""
     for clip in skipped:
-        console.print(f"Skipped {clip.name}: {clip.reason}.")
+        console.print(f"Skipped {clip.name}: {clip.reason}.", soft_wrap=True)
