@@ -33,7 +33,7 @@ PURPOSES = {
     "diffusion": "--generator pe-field and diffusers-inpaint",
     "onnx": "--generator migan and lama",
     "poses": "photographs whose cameras are not known",
-    "browser": "the picture of the viewer (examples/04_picture_of_the_viewer.py)",
+    "browser": "the picture of the viewer in the documentation",
     "film": "videos as SCENE, and complete --video",
     "ray": "batch --engine ray",
     "slurm": "batch --engine submitit",

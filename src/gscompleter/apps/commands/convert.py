@@ -21,6 +21,8 @@ class ConvertOptions(WritingOptions):
     Formats are .ply, .compressed.ply, .spz, .splat, .sog, .glb (KHR_gaussian_splatting), and
     .usda, .usdc and .usdz (OpenUSD, with usd-core). It also reads .ksplat, the folder of a .sog,
     and .glb with a .spz inside.
+
+    Example: gscompleter convert splat.ply splat.spz
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="A")]

@@ -19,6 +19,8 @@ class PosesOptions(ComputeOptions, WritingOptions):
     """Find the cameras of photographs with COLMAP, and write a COLMAP folder.
 
     A second run with the same photographs or video keeps the result.
+
+    Example: gscompleter poses photographs --out cameras
     """
 
     photographs: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTOS")]

@@ -17,7 +17,10 @@ from gscompleter.system.process import import_without_collection
 
 @dataclass(frozen=True, kw_only=True)
 class StripOptions(WritingOptions):
-    """Undo a completion: remove what was generated and put the originals back."""
+    """Undo a completion: remove what was generated and put the originals back.
+
+    Example: gscompleter strip result/completed.ply --out given.ply
+    """
 
     completed: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="COMPLETED")]
     """Completed scene. Gaussians of a removed.ply beside it are put back."""

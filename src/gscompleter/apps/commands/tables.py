@@ -14,7 +14,10 @@ from gscompleter.system.process import import_without_collection
 
 @dataclass(frozen=True, kw_only=True)
 class TablesOptions(Options):
-    """Print and write the tables of an evaluation, finished or not."""
+    """Print and write the tables of an evaluation, finished or not.
+
+    Example: gscompleter tables scores
+    """
 
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Output folder of `evaluate`; the tables are written there."""

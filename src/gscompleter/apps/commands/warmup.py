@@ -15,6 +15,8 @@ class WarmupOptions(ComputeOptions):
     """Compile all kernels for this processor and its GPU into the caches of numba and torch.
 
     NUMBA_CACHE_DIR and TORCH_EXTENSIONS_DIR name these folders.
+
+    Example: gscompleter warmup
     """
 
 

@@ -51,7 +51,12 @@ from gscompleter.system.progress import show_preparation
 from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.types import Camera, Gaussians
 
-PHOTOGRAPH_OPTIONS = {"format": None, "frames": 40, "masks": True, "from_photographs_only": False}
+PHOTOGRAPH_OPTIONS = {
+    "format": None,
+    "frames": 40,
+    "no_masks": False,
+    "from_photographs_only": False,
+}
 """Options that only photographs can follow, with their defaults."""
 
 

@@ -13,9 +13,8 @@ from typing import Any
 from gscompleter.apps.bench.report import describe_machine
 from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.command_line.exit_codes import choose_exit_code
-from gscompleter.apps.commands.evaluate import AUTO, EvaluateOptions
+from gscompleter.apps.commands.evaluate import AUTO, EvaluateOptions, PresetGeneratorOptions
 from gscompleter.apps.evaluating.scoring import Scored, run_methods, score_methods
-from gscompleter.config.generators import GeneratorOptions
 from gscompleter.evaluation.claims import HEAD, tabulate_claims
 from gscompleter.evaluation.figures import draw_figure
 from gscompleter.evaluation.methods import expand_methods
@@ -293,7 +292,7 @@ def make_run(
     # Settings belong to the generator that was chosen, so that of the table has its defaults.
     synthesis = options.synthesis
     if spec.generator and spec.generator != synthesis.generator:
-        synthesis = GeneratorOptions(spec.generator)
+        synthesis = PresetGeneratorOptions(spec.generator)
     one_per_scene = options.one_per_scene or spec.one_per_scene
     model = options.reconstructor[number]
 

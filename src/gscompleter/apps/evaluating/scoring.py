@@ -122,7 +122,7 @@ def describe_source(options: EvaluateOptions, has_masks: bool = False) -> dict[s
         **({"invert_masks": True} if has_masks and options.invert_masks else {}),
         **({"ignore_moving": True} if options.ignore_moving else {}),
         **({"one_per_scene": True} if options.one_per_scene else {}),
-        **({} if options.ego_mask else {"ego_mask": False}),
+        **({"ego_mask": False} if options.no_ego_mask else {}),
         **({} if loader is None else {"loader": asdict(loader)}),
         **({} if options.near is None else {"near": options.near}),
         **({} if options.far is None else {"far": options.far}),
