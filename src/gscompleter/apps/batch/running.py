@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -38,6 +38,8 @@ from gscompleter.system.jobs.jobs import (
 )
 from gscompleter.system.progress import show_preparation, show_progress, track
 
+OUTCOMES = {"nothing-gained": "nothing gained"}
+"""Words for outcomes of jobs that did not fail, where they are not `completed`."""
 MAX_NAMED_FAILURES = 5
 """Most failures that the terminal names."""
 
@@ -76,8 +78,12 @@ def complete_batch(options: BatchOptions) -> int:
 
         perform = partial(perform_job, out=out, retries=options.retries)
         ended = run_jobs(left, perform, partial(has_row, out=out), engine, options.retries)
-        for _ in track(ended, "completing", len(left)):
-            pass
+        counted = track(ended, "completing", len(left), has_lines=False)
+        for number, job in enumerate(counted, start=1):
+            state = read_row(job, out)
+            console.print(
+                f"{number} of {len(left)}: {job.name}, {describe_state(state)}", soft_wrap=True
+            )
         with show_preparation("table"):
             write_batch_results(out, jobs)
 
@@ -94,6 +100,15 @@ def complete_batch(options: BatchOptions) -> int:
         rows = [row for job in share if (row := read_row(job, out)) is not None]
         print_json({"out": str(options.out), "failed": len(failures), "rows": rows})
     return choose_exit_code(len(failures), len(share))
+
+
+def describe_state(row: Mapping[str, Any] | None) -> str:
+    """Describe in a word or two how a job ended."""
+    if row is None:
+        return "not known"
+    if row["state"] == "failed":
+        return "failed"
+    return OUTCOMES.get(str(row.get("outcome")), "completed")
 
 
 def print_failures(console: Console, failures: Sequence[str], num_cases: int) -> None:
@@ -173,6 +188,8 @@ def complete_job(job: Job, jobs: Path) -> dict[str, Any]:
 
     files = [path for path in (jobs / job.name).rglob("*") if path.is_file()]
     return {
+        "outcome": outcome["status"],
+        "headline": outcome["headline"],
         **average_scores(summary),
         "seconds": time.monotonic() - start,
         "cpu_seconds": time.process_time() - cpu_start,
