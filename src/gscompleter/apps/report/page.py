@@ -27,9 +27,9 @@ from PIL import Image
 from gscompleter import __version__
 from gscompleter.apps.report.plain_words import (
     describe_alignment,
-    group_target_notes,
-    list_notes,
-    list_shared_notes,
+    group_target_warnings,
+    list_facts,
+    list_warnings,
 )
 from gscompleter.apps.report.schema import SCORES, CompletionSummary, read_record, read_summary
 from gscompleter.data.formats import SCENE_FORMATS
@@ -148,10 +148,10 @@ def write_completion_page(folder: Path) -> None:
 def render_completion_page(folder: Path) -> str:
     """Render the page of the completion in `folder`."""
     summary = read_summary(folder)
-    # Notes that only one target has; those of several stand above.
-    groups = group_target_notes(summary.targets)
-    own_notes = [
-        row.notes if len(groups.get(row.notes, ())) == 1 else () for row in summary.targets
+    # Warnings that only one target has; those of several stand above.
+    groups = group_target_warnings(summary.targets)
+    own_warnings = [
+        row.warnings if len(groups.get(row.warnings, ())) == 1 else () for row in summary.targets
     ]
 
     path = summary.scene.splat or str(summary.settings.get("folder") or "")
@@ -163,8 +163,9 @@ def render_completion_page(folder: Path) -> str:
             "summary": summary,
             "record": read_record(folder, summary),
             "gallery": open_gallery(folder / "images"),
-            "notes": [*summary.scene.notes, *list_shared_notes(summary), *list_notes(summary)],
-            "own_notes": own_notes,
+            "warnings": list(list_warnings(summary)),
+            "facts": list_facts(summary),
+            "own_warnings": own_warnings,
             "photographs": list_photographs(summary),
             "describe_alignment": describe_alignment,
             "unit": find_length_unit(summary),
