@@ -10,7 +10,9 @@ TORCH_CPU_INDEX ?= https://download.pytorch.org/whl/cpu
 NVIDIA := $(shell command -v nvidia-smi 2>/dev/null)
 NVCC := $(shell command -v nvcc 2>/dev/null || ls "$$CUDA_HOME/bin/nvcc" 2>/dev/null)
 GPU := $(and $(NVIDIA),$(NVCC))
-TORCH_INDEX := $(if $(GPU),,--extra-index-url $(TORCH_CPU_INDEX))
+# --index-url, not --extra-index-url: where that index is out of reach, pip would take the build for CUDA
+# from the other one without a word.
+TORCH_INDEX := $(if $(GPU),,--index-url $(TORCH_CPU_INDEX))
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 
 # Not installed, as most tests are about machines without them: tests of the code for GPUs read the
@@ -151,7 +153,8 @@ $(VENV)/installed: pyproject.toml | $(VENV)/torch
 	touch $@
 
 $(VENV)/installed-evaluation: pyproject.toml | $(VENV)/torch
-	$(PIP) --retries 1 $(TORCH_INDEX) $(TORCH) -e '.[evaluation]'
+	$(PIP) --retries 1 $(TORCH_INDEX) $(TORCH) torchvision  # that of the same index
+	$(PIP) -e '.[evaluation]'
 	touch $@ $(VENV)/installed
 
 $(VENV)/installed-test: pyproject.toml | $(VENV)/torch

@@ -224,6 +224,8 @@ def as_definitions(help_text: str) -> str:
             parts.append("\n")
         elif text.startswith("usage: "):
             parts.append(f"```text\n{text.removeprefix('usage: ')}\n```\n")
+        elif text.startswith("Example: "):
+            parts.append(f"Example: `{text.removeprefix('Example: ')}`\n")
         elif indent == 1 and text.endswith(("options", "arguments")):
             parts.append(f"\n**{text}**\n")
         elif indent == 2 and (term.startswith("-") or term.isupper()):

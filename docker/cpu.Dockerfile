@@ -8,7 +8,7 @@ ENV NUMBA_CACHE_DIR=/var/cache/gscompleter/kernels \
     GSCOMPLETER_HOME=/var/cache/gscompleter \
     PIP_NO_CACHE_DIR=1
 COPY dist/*.whl /tmp/
-RUN pip install torch torchvision --extra-index-url https://download.pytorch.org/whl/cpu \
+RUN pip install torch torchvision --index-url https://download.pytorch.org/whl/cpu \
     && pip install "gscompleter[evaluation,film,models,poses] @ file://$(ls /tmp/*.whl)" \
     && rm /tmp/*.whl
 RUN gscompleter warmup && chmod -R a+rwX /var/cache/gscompleter && gscompleter doctor

@@ -221,7 +221,7 @@ def test_targets_are_synthesized_together_where_the_generator_can():
                 assert_close(seen.alpha, renderer.render(scene, view.camera).alpha, "alpha")
     assert [result.notes[:1] for result in together.targets] == [
         ("One of 1.",),
-        ("The target is a context view: nothing to complete.",),
+        ("The scene is known at this camera already: nothing to complete.",),
         ("One of 2.",),
         ("One of 2.",),
         ("One of 1.",),

@@ -43,19 +43,19 @@ AFFINE_NOTES = {
 """Sentence about each estimator of the depth correction; empty for the usual one."""
 NOTHING_ADDED = "Nothing of it was added."
 LOSSES = {
-    "lift": "nothing was lifted there",
-    "register": "registration moved the Gaussians away",
-    "filter": "the Gaussians of these pixels do not lie in the hole",
-    "free-space": "additions would occlude what cameras see through to (free-space)",
-    "removal": "nothing was removed there (removal)",
-    "hull": "additions would lie outside of the object (hull)",
-    "refine": "the photographs beside the target contradict the additions (refinement)",
-    "image-agreement": "the image contradicts the photographs (image-agreement)",
-    "depth-agreement": "the depths contradict the scene (depth-agreement)",
-    "psnr": "additions there make photographs worse (psnr)",
-    "contribution": "additions there are hardly visible (contribution)",
+    "lift": "no depth was found for it",
+    "register": "what was made for it did not fit there",
+    "filter": "what was made for it lies beside the hole",
+    "free-space": "a filling would hide what other cameras see through it",
+    "removal": "nothing was removed there",
+    "hull": "a filling would lie outside of the object",
+    "refine": "the photographs beside it contradict a filling",
+    "image-agreement": "the generated image contradicts the photographs",
+    "depth-agreement": "its depths contradict the scene",
+    "psnr": "a filling would make given photographs worse",
+    "contribution": "a filling would hardly be seen",
 }
-"""Reason why each step leaves pixels of a hole empty."""
+"""Reason why each step leaves a part of a hole empty, as a clause for people."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +92,8 @@ class Unfilled:
 
     MAX_SHARE: ClassVar[float] = 0.005
     """Largest share of the mask that is not worth a word."""
+    LARGE_SHARE: ClassVar[float] = 0.1
+    """Share of the mask from which on a person should look at what stays empty."""
 
     share: float = 0.0
     """Share of the pixels of the mask."""
@@ -102,20 +104,18 @@ class Unfilled:
     image; its padding has coordinates below 0 and beyond its size."""
 
     def describe(self) -> str:
-        """Write the sentence for the report; empty if the hole is filled."""
+        """Write the sentence for people; empty if the hole is filled.
+
+        `lost_by` and `regions` have the details, for the report.
+        """
         if self.share <= self.MAX_SHARE:
             return ""
-        largest_first = sorted(self.lost_by.items(), key=lambda step_and_share: -step_and_share[1])
-        reasons = " and ".join(
-            f"{LOSSES.get(step, step)}, {share:.1%}" for step, share in largest_first
-        )
-        boxes = "; ".join(
-            f"x {left} to {right}, y {top} to {bottom}" for left, top, right, bottom in self.regions
-        )
-        return (
-            f"{self.share:.1%} of the hole (with its seam and padding) stays empty, because "
-            f"{reasons}; the largest parts: {boxes} (pixels)."
-        )
+        # One reason is enough: the others seldom leave as much.
+        steps = sorted(self.lost_by, key=lambda step: -self.lost_by[step])
+        reason = LOSSES.get(steps[0], f"the step {steps[0]} left it out") if steps else ""
+        mostly = "mostly " if len(steps) > 1 else ""
+        because = f", {mostly}because {reason}" if reason else ""
+        return f"{max(1, round(100 * self.share))} % of the hole stays empty{because}."
 
 
 @dataclass(frozen=True, repr=False)
@@ -197,6 +197,17 @@ class TargetResult(Displayed):
         notes.append(self.unfilled.describe())
         notes.append(self.describe_outside())
         return tuple(filter(None, notes))
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Those of the notes that ask for a look at the result."""
+        if self.skip_reason:
+            return ()
+        found = [self.rejection.reason or " ".join(self.synthesis_notes), NOTHING_ADDED]
+        found = found if self.rejection.guard else []
+        if self.unfilled.share >= self.unfilled.LARGE_SHARE:
+            found.append(self.unfilled.describe())
+        return tuple(filter(None, found))
 
     def describe_outside(self) -> str:
         """Write a sentence if far more was added outside of the image than in its hole."""

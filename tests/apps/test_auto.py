@@ -146,9 +146,7 @@ def test_of_a_splat_the_trusted_share_is_said_and_written(
     coverage = summary_of(out)["coverage"]
     assert set(coverage) == {"before", "after", "cameras"}
     shares = f"{100 * coverage['before']:.1f} % before, {100 * coverage['after']:.1f} % after."
-    sentence = f"Trusted around the photographs: {shares}"
-    assert sentence in " ".join(capsys.readouterr().out.split())
-    assert sentence in (out / "report.html").read_text()
+    assert f"Trusted around the photographs: {shares}" in (out / "report.html").read_text()
 
 
 def test_a_dry_run_shows_what_named_targets_would_cost(scene, tmp_path, monkeypatch):

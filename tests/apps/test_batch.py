@@ -4,6 +4,7 @@ import errno
 import json
 import multiprocessing
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -24,6 +25,7 @@ from gscompleter import InputError
 from gscompleter.apps.batch import engine as batch_engine
 from gscompleter.apps.batch.manifest import list_results, read_manifest
 from gscompleter.apps.batch.rows import parse_row
+from gscompleter.apps.report.page import render_batch_page
 from gscompleter.system.errors import FullDiskError, OutputError, WorkerError
 from gscompleter.system.files.writing import replace_file
 from gscompleter.system.jobs import jobs as batch
@@ -535,3 +537,70 @@ def test_a_simulation_counts_what_it_replays():
     assert hard.repeated > 20
     assert hard.given_up > 0
     assert hard.busy < 0.8
+
+
+@pytest.fixture
+def broken_scenes(tmp_path) -> Path:
+    """Return scenes whose photographs are missing, damaged, and of both kinds."""
+    scenes = tmp_path / "scenes"
+    for name, missing, damaged in (
+        ("gone", (0, 1, 2), ()),
+        ("cut", (), (0, 1, 2)),
+        ("both", (0,), (1, 2)),
+    ):
+        folder = photographed(scenes / name, [camera_at(x, size=32) for x in (-0.2, 0.0, 0.2)])
+        for number in missing:
+            (folder / f"{number}.png").unlink()
+        for number in damaged:
+            (folder / f"{number}.png").write_bytes(b"no image")
+    return scenes
+
+
+def test_a_job_says_what_is_wrong_with_its_photographs_and_each_is_counted(
+    broken_scenes, tmp_path, monkeypatch, capsys
+):
+    monkeypatch.setattr(batch_engine, "open_local", open_here)
+    out = tmp_path / "out"
+    assert run(monkeypatch, "batch", broken_scenes, "--out", out) == 1
+    reasons = {p.stem: json.loads(p.read_text())["reason"] for p in (out / "rows").iterdir()}
+    of_all = "None of the 3 photographs of the context can be used: "
+    assert reasons["gone"].startswith(f"{of_all}3 are missing (0.png); copy")
+    assert reasons["cut"].startswith(f"{of_all}3 cannot be read (The image ")
+    assert reasons["both"].startswith(f"{of_all}1 is missing (0.png) and 2 cannot be read (The ")
+    lines = capsys.readouterr().err.splitlines()
+    counted = [line for line in lines if " of 3: " in line]
+    assert [line.split(":")[0] for line in counted] == [f"{n} of 3" for n in (1, 2, 3)]
+    assert all(line.endswith(", failed") for line in counted)
+
+
+def test_the_page_of_a_batch_leads_with_outcomes_and_not_with_seconds(tmp_path):
+    """Rows of an earlier version have no outcomes and no unused photographs."""
+    scores = {"targets": 1, "hole_fraction": 0.1, "coverage_before": 0.8, "coverage_after": 0.9}
+    cost = {"attempts": 1, "seconds": 43.27, "cpu_seconds": 50.0, "added": 5}
+    done = {"state": "done", **scores, **cost, "psnr_before": None, "psnr_after": None}
+    rows = [
+        {**done, "job": "old"},
+        {
+            **done,
+            "job": "room",
+            "outcome": "completed",
+            "headline": "The scene is completed; it gained.",
+            "unused_before": 20.0,
+            "unused_after": 23.0,
+        },
+        {**done, "job": "wall", "outcome": "nothing-gained", "headline": "Nothing was gained."},
+        {"job": "gone", "state": "failed", "reason": "3 are missing."},
+    ]
+    page = render_batch_page(tmp_path, rows)
+    header = page[page.index("<header>") : page.index("</header>")]
+    facts = re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", header)
+    assert facts == [
+        ("completed", "2"),
+        ("nothing gained", "1"),
+        ("failed", "1"),
+        ("median gain at unused photographs", "3.0 dB"),
+    ]
+    assert "The scene is completed; it gained." in page
+    assert "20.0 → 23.0" in page
+    assert "43.27" not in page
+    assert "A job took 43 s (median)" in page

@@ -27,6 +27,8 @@ from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import GeneratorSettings
 from gscompleter.data.scene import write_cameras
 from gscompleter.models.settings import DiffusersInpaintSettings, PEFieldSettings
+from gscompleter.numerics.image_ops import dilate
+from gscompleter.system.files.image import read_pixels
 from scenes import camera_at
 
 SIZE = 64
@@ -137,8 +139,8 @@ def test_photographs_that_were_not_used_are_scored(scene, tmp_path, monkeypatch,
         assert row["psnr_after"] >= target["psnr_after"]
         assert row["psnr_after"] > row["psnr_before"] + 1
     said = capsys.readouterr().out
-    assert "the 8 nearest unused photographs, where it covers them: " in said
-    assert "Covered of the 8 nearest unused photographs: " in said
+    assert "the 8 nearest unused photographs gain " in said
+    assert " dB where it covers them (" in said
     page = (out / "report.html").read_text()
     assert "At held-out photographs" in page
     assert ">mean<" in page
@@ -184,7 +186,9 @@ def test_a_target_that_is_a_context_frame_says_there_is_nothing_to_complete(
 ):
     assert run(monkeypatch, *complete(scene, tmp_path / "out", target=(1,))) == 0
     said = capsys.readouterr().out
-    assert said.startswith("Nothing was gained, because the target is a context view.\n")
+    assert said.startswith(
+        "Nothing was gained, because the scene is known at this camera already.\n"
+    )
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["gaussians"]["added"] == 0
 
@@ -193,10 +197,17 @@ def test_the_oracle_looks_at_the_photograph_and_says_so(scene, tmp_path, monkeyp
     out = tmp_path / "out"
     assert run(monkeypatch, *complete(scene, out, "--generator", "oracle", "--quiet")) == 0
     assert json.loads((out / "summary.json").read_text())["settings"]["uses_target_photographs"]
-    images = out / "images"
-    assert (images / "target1_reference.png").read_bytes() == (
-        images / "target1_truth.png"
-    ).read_bytes()
+    shown = {
+        name: read_pixels(out / "images" / f"target1_{name}.png")
+        for name in ("reference", "truth", "before", "hole_mask")
+    }
+    # Outside of the hole with its seam, the picture of Φ was not used, and is not shown.
+    is_hole = shown["hole_mask"][..., 0] > 0
+    near = dilate(torch.from_numpy(is_hole), CompleterConfig().holes.dilation).numpy()
+    assert is_hole.any()
+    assert not near.all()
+    assert (shown["reference"][near] == shown["truth"][near]).all()
+    assert (shown["reference"][~near] == shown["before"][~near]).all()
 
 
 def broken_scene(scene: Path, folder: Path, change) -> Path:

@@ -151,7 +151,7 @@ def test_too_few_photographs_beside_the_targets_are_refused(scene, tmp_path, mon
     assert ("1 context view was given, and stereo needs at least 2;") in capsys.readouterr().err
     assert run(monkeypatch, *words, 4) == 2
     assert (
-        "The context needs photographs, and without the targets none can be used;"
+        "The context needs photographs, and without the targets none is left;"
     ) in capsys.readouterr().err
 
 

@@ -1,6 +1,7 @@
 """`complete --scene`: what photographs show and a splat lacks comes from them."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 
 from command import run
 from gscompleter import load_ply, save_ply
+from gscompleter.evaluation.verdict.outcome import round_count
 from gscompleter.state import NEW_PHOTO_ID
 from scenes import camera_at, photographed, room_without_a_box
 
@@ -51,8 +53,11 @@ def test_the_generator_invents_only_what_no_photograph_shows(
     (target,) = summary["targets"]
     assert target["psnr_after"] > target["psnr_before"] + 3
     said = capsys.readouterr().out
-    assert f"{counts['from_photographs']:,} of the added Gaussians come from photographs" in said
+    assert re.search(r" photographs? gains? [\d.]+ dB; ", said.splitlines()[0])
+    assert f"{round_count(counts['from_photographs'])} Gaussians from photographs, " in said
     assert "The splat reproduces all photographs" not in said
+    told = f"{counts['from_photographs']:,} of the added Gaussians come from photographs"
+    assert (out / "report.html").read_text().count(told) == 1
     generated = load_ply(out / "completed.ply").generated
     assert int((generated == NEW_PHOTO_ID).sum()) >= counts["from_photographs"]
 

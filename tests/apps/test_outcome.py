@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import random
+import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,10 +14,13 @@ import pytest
 import gscompleter as gsc
 from command import run
 from gscompleter.apps.batch.running import complete_job
-from gscompleter.apps.report.plain_words import list_shared_notes
+from gscompleter.apps.completing.printing import print_completion
+from gscompleter.apps.report.page import render_completion_page
+from gscompleter.apps.report.plain_words import list_facts, list_notes, list_shared_warnings
 from gscompleter.apps.report.schema import read_summary
-from gscompleter.evaluation.verdict.outcome import describe_gain, is_like, make_clause
-from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow
+from gscompleter.cli import parse_command
+from gscompleter.evaluation.verdict.outcome import describe_gain, is_like, make_clause, round_count
+from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow, ScoreRow
 from gscompleter.system.errors import InputError
 from gscompleter.system.jobs.jobs import Job
 from scenes import camera_at, photographed
@@ -63,7 +68,10 @@ def test_a_scene_that_unused_photographs_confirm_is_a_success(scene, tmp_path, m
     said, outcome = capsys.readouterr().out, outcome_of(out)
     assert outcome["status"] == "completed"
     assert said.startswith(outcome["headline"])
-    assert "the 3 nearest unused photographs, where it covers them: " in outcome["headline"]
+    assert "the 3 nearest unused photographs gain " in outcome["headline"]
+    assert re.search(
+        r" dB where it covers them \(.*\); [\d,]+ Gaussians invented\.$", said.split("\n")[0]
+    )
     for row in json.loads((out / "summary.json").read_text())["held_out"]:
         assert row["above_photograph"] > 2
         assert 0.3 < row["covered_before"] <= row["covered_after"] <= 1
@@ -133,28 +141,31 @@ def test_the_reason_for_no_gain_is_the_first_line_and_is_said_once(
     said, outcome = capsys.readouterr().out, outcome_of(out)
     assert outcome == {
         "status": "nothing-gained",
-        "headline": ("Nothing was gained, because the target is a context view (3 of 3 targets)."),
+        "headline": (
+            "Nothing was gained, because the scene is known at this camera already "
+            "(3 of 3 targets)."
+        ),
     }
     assert said.startswith(outcome["headline"])
-    assert said.count("context view") == 1
+    assert said.count("known at this camera") == 1
     page = (out / "report.html").read_text()
     assert page.index(outcome["headline"]) < page.index("<h1>")
-    assert page.count("The target is a context view") == 0
+    assert page.count("The scene is known at this camera") == 0
     assert page.count("Nothing was added here.") == 3
 
 
-def test_notes_of_several_targets_are_said_once(completed_room):
+def test_warnings_of_several_targets_are_said_once(completed_room):
     summary = read_summary(completed_room)
     (row,) = summary.targets
-    noted = replace(row, notes=("It rained.", "It was dark."))
-    other = replace(row, notes=("It rained.",))
+    noted = replace(row, warnings=("It rained.", "It was dark."))
+    other = replace(row, warnings=("It rained.",))
     three = replace(summary, targets=(noted, other, noted))
-    assert list(list_shared_notes(three)) == ["Targets 1 and 3: It rained. It was dark."]
+    assert list(list_shared_warnings(three)) == ["Targets 1 and 3: It rained. It was dark."]
     all_three = replace(summary, targets=(other, other, other))
-    assert list(list_shared_notes(all_three)) == ["All 3 targets: It rained."]
-    assert list(list_shared_notes(replace(summary, targets=(noted, other)))) == []
+    assert list(list_shared_warnings(all_three)) == ["All 3 targets: It rained."]
+    assert list(list_shared_warnings(replace(summary, targets=(noted, other)))) == []
     nothing = OutcomeRow("nothing-gained", "Nothing was gained, because it rained.")
-    assert list(list_shared_notes(replace(all_three, outcome=nothing))) == []
+    assert list(list_shared_warnings(replace(all_three, outcome=nothing))) == []
 
 
 def held_out(above_photograph: float, above_color: float) -> HeldOutRow:
@@ -179,7 +190,11 @@ def test_a_scene_is_more_like_unused_photographs_than_used_ones_are(rows, expect
 @pytest.mark.parametrize(
     ("before", "after", "ending"),
     [
-        (20.0, 21.0, "the unused photograph 5, where it covers them: 20.00 dB before, 21.00 dB"),
+        (
+            20.0,
+            21.0,
+            "the unused photograph 5 gains 1.0 dB where it covers them (20.00 dB",
+        ),
         (20.0, 19.0, "but it matches the unused photograph 5 worse than before: 20.00 dB"),
     ],
 )
@@ -189,7 +204,7 @@ def test_a_loss_at_unused_photographs_is_in_the_headline(before, after, ending):
     checked = replace(row, is_check=True, psnr_before=after + 9)
     assert ending in describe_gain("It is done", [row, checked])  # it took part
     assert "the checking photograph 5" in describe_gain("It is done", [checked])
-    assert describe_gain("It is done", []) == "It is done; no unused photograph could test it."
+    assert describe_gain("It is done", []) == "It is done; no unused photograph could test it"
 
 
 def test_sentences_become_clauses():
@@ -197,3 +212,77 @@ def test_sentences_become_clauses():
         "the target sees no hole of the scene"
     )
     assert make_clause("Only 3% agree.") == "only 3% agree"
+
+
+def context_row(before: float | None, after: float | None) -> ScoreRow:
+    return ScoreRow(1, before, after, None, None)
+
+
+def test_a_splat_gains_at_its_photographs_where_no_other_one_tests_it():
+    """Photographs that stay as they were do not dilute it, and renders gain nothing."""
+    context = [context_row(20.0, 26.0), context_row(21.0, 25.0), context_row(30.0, 30.1)]
+    assert describe_gain("Done", [], context) == "Done: 2 photographs gain 5.0 dB"
+    assert describe_gain("Done", [], context[:1]) == "Done: 1 photograph gains 6.0 dB"
+    renders = [context_row(float("inf"), 40.0), context_row(None, None), context_row(50.0, 45.0)]
+    assert describe_gain("Done", [], renders) == "Done; no unused photograph could test it"
+    checked = replace(held_out(3.0, 5.0), psnr_before=20.0, psnr_after=20.0, is_check=True)
+    assert "2 photographs gain 5.0 dB" in describe_gain("Done", [checked], context)
+    unused = replace(checked, is_check=False)
+    assert "the unused photograph 5 gains 0.0 dB" in describe_gain("Done", [unused], context)
+
+
+@pytest.mark.parametrize(
+    ("count", "text"),
+    [(0, "0"), (7, "7"), (163, "160"), (9_412, "9,400"), (1_249_999, "1,200,000")],
+)
+def test_a_number_of_gaussians_has_two_digits_that_count(count, text):
+    assert round_count(count) == text
+
+
+def test_facts_are_no_warnings_and_each_is_said_once(completed_room):
+    """The first lines of a usual completion ask a person to do nothing."""
+    summary = read_summary(completed_room)
+    assert [note for note in list_notes(summary) if note.is_warning] == []
+    (row,) = summary.targets
+    noted = replace(row, notes=("It rained.", "It was dark."), warnings=("It was dark.",))
+    opened = replace(summary.scene, notes=("2 photographs are missing.",))
+    facts = list_facts(replace(summary, targets=(noted,), scene=opened))
+    assert facts[0] == ("opening", "2 photographs are missing.")
+    assert ("target 1", "It rained.") in facts
+    assert all(text != "It was dark." for _, text in facts)
+    texts = [text for _, text in facts]
+    assert len(texts) == len(set(texts))
+
+
+def test_bad_poses_are_a_warning_that_says_what_to_do(completed_room):
+    summary = read_summary(completed_room)
+    rows = tuple(replace(row, pose_error=7.0) for row in summary.context)
+    (note,) = [note for note in list_notes(replace(summary, context=rows)) if note.is_warning]
+    assert "by up to 7.0 pixels" in note.text
+    assert "gscompleter poses" in note.text
+
+
+def test_the_terminal_has_no_facts_and_the_page_folds_them(
+    completed_room, tmp_path, capsys, monkeypatch
+):
+    out = Path(shutil.copytree(completed_room, tmp_path / "out"))
+    summary = json.loads((out / "summary.json").read_text())
+    summary["targets"][0]["notes"] = ["It rained."]
+    summary["scene"]["notes"] = ["2 photographs are missing."]
+    summary["context"][0]["given_depth"] = 0.1
+    (out / "summary.json").write_text(json.dumps(summary))
+    monkeypatch.setenv("COLUMNS", "300")
+    print_completion(parse_command(["complete", "room", "--out", str(out)]))
+    said = capsys.readouterr().out.splitlines()
+    assert said[0] == summary["outcome"]["headline"]
+    # The headline, the head of the table and its three rows, and the results.
+    assert [line.split()[0] for line in said[-3:]] == ["Added", "The", "Report:"]
+    assert len(said) == 8
+
+    page = render_completion_page(out)
+    header = page[page.index("<header>") : page.index("</header>")]
+    folded = header[header.index('<details id="facts">') :]
+    assert folded.rstrip().endswith("</details>")
+    for text in ("It rained.", "2 photographs are missing.", "depth, which decides"):
+        assert page.count(text) == folded.count(text) == 1
+    assert 'class="notes"' not in header

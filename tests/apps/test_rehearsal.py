@@ -165,3 +165,22 @@ def test_after_a_warmup_a_completion_compiles_nothing(tmp_path):
     command = [sys.executable, "-c", COMPLETE, str(TESTS / "support")]
     life = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
     assert life.stdout == "0\n"
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--generator", "pe-field", "--generator-steps", -3), "(--generator-steps)"),
+        (("--depth", "no-such-depth"), "There is no depth 'no-such-depth'"),
+        (("--generator", "no.py:phi"), "no.py"),
+        (("--reconstructor", "mvsplat-re10k", "--weights", "no.ckpt"), "no.ckpt"),
+    ],
+)
+def test_what_is_wrong_with_a_model_is_told_before_kernels_are_compiled(
+    room, rehearsed, tmp_path, monkeypatch, capsys, words, sentence
+):
+    out = tmp_path / "out"
+    named = ("complete", room, "--context", 0, 1, "--target", 2, "--out", out)
+    assert run(monkeypatch, *named, *words) == 2
+    assert sentence in capsys.readouterr().err
+    assert rehearsed == []

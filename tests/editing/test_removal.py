@@ -96,7 +96,10 @@ def test_nothing_is_added_outside_of_the_hole(removed):
 
 def test_a_masked_photograph_can_be_a_target(begun, removed):
     before, after = (COMPLETER.advance(state, CAMERAS[1]) for state in (begun, removed))
-    assert before.targets[0].skip_reason == "The target is a context view: nothing to complete."
+    assert (
+        before.targets[0].skip_reason
+        == "The scene is known at this camera already: nothing to complete."
+    )
     assert len(after.targets[0].added) > 0
     assert after.targets[0].hole_fraction > 0.02
 

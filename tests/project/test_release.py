@@ -298,3 +298,45 @@ def test_a_tag_has_to_be_that_of_the_version():
     for tag in (__version__, "v99"):
         with pytest.raises(SystemExit, match="tag that one"):
             link_readme.check_tag(tag, source)
+
+
+# ------------------------------------------------------------------- what pages say of installing
+
+
+def list_install_lines() -> list[tuple[str, str]]:
+    """List the lines of pages, workflows, images, the Makefile and the program, with files."""
+    named = ["README.md", "llms.txt", "Makefile", *("docs/install.md", "docs/index.md")]
+    files = [ROOT / name for name in named]
+    files += [*(ROOT / "docker").glob("*.Dockerfile"), *(ROOT / ".github").rglob("*.yml")]
+    files += [*(ROOT / "src").rglob("*.py")]
+    return [(path.name, line) for path in files for line in path.read_text("utf-8").splitlines()]
+
+
+def test_the_cpu_build_of_torch_comes_from_its_index_alone():
+    """With a further index pip takes the build for CUDA in silence where that one fails."""
+    lines = list_install_lines()
+    assert [
+        (name, line)
+        for name, line in lines
+        if "--extra-index-url" in line and ("pip install" in line or ":=" in line)
+    ] == []
+    from_cpu = {
+        name for name, line in lines if re.search(r"--index-url \S*(whl/cpu|CPU_INDEX)", line)
+    }
+    assert {"README.md", "install.md", "llms.txt", "Makefile", "cpu.Dockerfile"} <= from_cpu
+
+
+def test_the_first_install_line_serves_the_first_command_and_names_the_wheel():
+    """README's first use is photographs or a video, and the name is on no index yet."""
+    for page in ("README.md", "docs/install.md", "llms.txt"):
+        text = (ROOT / page).read_text("utf-8")
+        wheels = re.findall(r"gscompleter-([\d.]+)-py3-none-any\.whl\[([\w,]+)\]", text)
+        assert wheels == [(__version__, "poses,film")], page
+        assert "pip install '.[poses,film]'" in text, page
+        assert not re.search(r"pip install gscompleter(?!\[)", text), page
+
+
+def test_doctor_says_how_the_cpu_build_is_installed(monkeypatch):
+    monkeypatch.setattr("torch.version.cuda", "13.0")
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    assert "torch --index-url https://" in describe_build(Requirement("torch"), "2.13.0")

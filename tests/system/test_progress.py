@@ -7,6 +7,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from functools import partial
 
 import pytest
@@ -188,3 +189,32 @@ def test_on_a_terminal_there_is_a_line_with_a_bar(room, tmp_path):
     assert "\x1b[?25l" in said
     assert "target 1 of 1" in said
     assert "━" in said
+
+
+def test_a_stage_of_a_log_is_never_silent_for_long(monkeypatch):
+    """Also the steps inside of a stage are told then, which have no lines else."""
+    monkeypatch.setattr(progress, "LOG_SECONDS", 0.05)
+    console = Console(file=io.StringIO(), width=200)
+    with show_progress(console), stage("clean"):
+        time.sleep(0.3)
+        for _ in track(range(3), "photographs"):
+            time.sleep(0.1)
+    lines = written(console).splitlines()
+    assert lines[0] == "clean"
+    assert lines.count("clean (0 s)") >= 2
+    assert any(re.fullmatch(r"clean: photographs [123] of 3 \(0 s\)", line) for line in lines)
+
+
+def test_a_log_says_nothing_after_the_last_stage(monkeypatch):
+    monkeypatch.setattr(progress, "LOG_SECONDS", 0.02)
+    console = Console(file=io.StringIO(), width=200)
+    with show_progress(console):
+        with stage("clean"):
+            pass
+        time.sleep(0.1)
+        # Counted steps have a line as each ends, and the wait for the next one has none.
+        for _ in track(range(1), "scenes"):
+            time.sleep(0.1)
+    time.sleep(0.1)
+    assert written(console).splitlines()[:2] == ["clean", "scenes 1 of 1"]
+    assert set(written(console).splitlines()) == {"clean", "scenes 1 of 1"}

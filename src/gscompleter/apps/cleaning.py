@@ -42,6 +42,7 @@ from gscompleter.render.protocols import Renderer
 from gscompleter.splats.edits import EDITS, EditDraft, record_edit
 from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import load_splat
+from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.files.writing import COMPLETED_FILE, REMOVED_FILE, SUMMARY_FILE
@@ -75,7 +76,7 @@ class Cleaning:
 def clean_splat(options: CleanOptions) -> None:
     """Clean the splat, write the result, and print a summary."""
     options = replace(options, scene=resolve_splat(options.scene))
-    console = Console(stderr=True, quiet=options.quiet)
+    console = make_console(stderr=True, quiet=options.quiet)
     clean = clean_alone if options.folder is None else clean_by_photographs
     with (
         show_progress(console),

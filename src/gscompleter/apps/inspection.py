@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import torch
 from jaxtyping import Float, UInt8
-from rich.console import Console
 from rich.table import Table
 from torch import Tensor
 
@@ -32,6 +31,7 @@ from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import decode_splat, detect_splat_format, read_provenance
 from gscompleter.splats.provenance import ModelRecord, RunRecord
 from gscompleter.state import NEW_PHOTO_ID
+from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import COMPLETED_FILE, SUMMARY_FILE
 from gscompleter.types import Camera, Gaussians, sh_from_rgb
@@ -235,7 +235,7 @@ def print_inspection(found: Inspection, as_json: bool) -> None:
     if as_json:
         print(json.dumps(asdict(found), indent=2))
         return
-    console = Console(highlight=False, markup=False)
+    console = make_console()
     console.print(found.file, soft_wrap=True)
     for title, text in describe_splat(found):
         console.print(f"  {title:12} {text}", soft_wrap=True)

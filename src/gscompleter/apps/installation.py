@@ -33,7 +33,7 @@ PURPOSES = {
     "diffusion": "--generator pe-field and diffusers-inpaint",
     "onnx": "--generator migan and lama",
     "poses": "photographs whose cameras are not known",
-    "browser": "the picture of the viewer (examples/04_picture_of_the_viewer.py)",
+    "browser": "the picture of the viewer in the documentation",
     "film": "videos as SCENE, and complete --video",
     "ray": "batch --engine ray",
     "slurm": "batch --engine submitit",
@@ -44,6 +44,8 @@ PURPOSES = {
 }
 """Purpose of each extra, without those for developers (`test-core`, `test`, `dev`, `docs`)."""
 
+CPU_BUILD = "--index-url https://download.pytorch.org/whl/cpu"
+"""Option of pip for the CPU build of torch; as a further index pip may pass over it in silence."""
 TEST_SIZE = 16
 """Width and height, in pixels, of the picture that each renderer draws."""
 MIN_TEST_ALPHA = 0.5
@@ -121,7 +123,10 @@ def describe_build(requirement: Requirement, version: str) -> str:
     """Describe an installed package; torch with the libraries of CUDA says so where no GPU is."""
     if requirement.name != "torch" or not torch.version.cuda or torch.cuda.is_available():
         return version
-    return f"{version} (built for CUDA, and there is no GPU: its CPU build is gigabytes smaller)"
+    return (
+        f"{version} (built for CUDA, and there is no GPU; gigabytes smaller is the CPU build: pip "
+        f"install --force-reinstall torch {CPU_BUILD})"
+    )
 
 
 def inspect_renderer(name: str) -> Found:

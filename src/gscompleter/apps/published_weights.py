@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 
 from gscompleter.models.weights.fetching import (
@@ -18,6 +17,7 @@ from gscompleter.models.weights.fetching import (
     is_hub_installed,
 )
 from gscompleter.models.weights.published import PUBLISHED, PublishedWeights
+from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, quote_value
 
 KINDS = {
@@ -73,7 +73,7 @@ def print_models(cached: Sequence[tuple[PublishedWeights, Path | None]]) -> None
         table.add_row(*format_model_cells(weights, path))
     # In a file or a pipe rows are not wrapped, so that a line has a model.
     width = None if sys.stdout.isatty() else 1000
-    Console(width=width, markup=False, highlight=False).print(table)
+    make_console(width=width).print(table)
 
     # Models of one repository share a caution, which is printed once after all their names.
     print("\n(!) Whether commercial use is allowed is unclear:")

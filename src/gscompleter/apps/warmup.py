@@ -36,9 +36,14 @@ WALL_DEPTH = 2.0
 """Depth of the wall, in baselines."""
 
 
+def list_missing(names: Collection[str]) -> list[str]:
+    """List those of some parts whose kernels are not compiled."""
+    return [name for name in PARTS if name in names and not is_compiled(name)]
+
+
 def compile_kernels(names: Collection[str]) -> float | None:
     """Compile the missing kernels of these parts; return the seconds, or None if there are none."""
-    missing = [name for name in PARTS if name in names and not is_compiled(name)]
+    missing = list_missing(names)
     # Without a cache each kernel is compiled when it is used, and a rehearsal gains nothing.
     if not missing or get_cache_folder() is None:
         return None

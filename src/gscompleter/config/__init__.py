@@ -30,7 +30,7 @@ class SynthesisConfig(Settings):
     correct_color: bool = True
     """Match the colours of the synthesized image to those of the photographs (not in the paper)."""
     source_depth: Literal["context", "monocular", "moge-2-large"] = "context"
-    """Default of `--generator-depth`: rendered from the scene, or by a network; `moge-2-large` is
+    """Default of `complete --generator-depth`: rendered, or by a network; `moge-2-large` is
     that of PE-Field's authors (paper)."""
 
 

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from annotated_types import Len
 
-from gscompleter.config.settings import Settings
+from gscompleter.config.settings import Settings, validate
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.plugins import is_in_file, load_plugins
 
@@ -66,9 +66,9 @@ class GeneratorOptions(Settings):
 
     generator: str = "warp-inpaint"
     """Model that synthesizes the image at a target: warp-inpaint (warped photographs, holes filled
-    by patches), oracle (the real photograph), painted (by --images), pe-field (the paper's),
-    diffusers-inpaint, one of the other models that docs/generators.md lists, or a function of yours
-    as file.py:function."""
+    by patches), oracle (the real photograph), painted (by `complete --images`), pe-field (the
+    paper's), diffusers-inpaint, one of the other models that docs/generators.md lists, or a
+    function of yours as file.py:function."""
     generator_weights: str | None = None
     """Weights, by default those published: a folder saved by diffusers, USER/NAME or
     USER/NAME@COMMIT on the Hugging Face hub for pe-field and diffusers-inpaint (which has no
@@ -90,7 +90,7 @@ class GeneratorOptions(Settings):
     """Text prompt of diffusers-inpaint (a photograph)."""
 
     def make_settings(self) -> GeneratorSettings:
-        """Return the settings, or raise InputError if one is unknown to the generator."""
+        """Return the settings; raise InputError if one is unknown to the generator or wrong."""
         kind = get_settings_class(self.generator)
 
         # None and False are the defaults of the options: the generator then has its own.
@@ -109,7 +109,7 @@ class GeneratorOptions(Settings):
                     f"choose {' or '.join(knowing)}.",
                     PREFIX + setting,
                 )
-        return kind(**settings)
+        return validate(kind(**settings), PREFIX)
 
     def describe(self) -> dict[str, Any]:
         """Describe the generator for `summary.json`."""

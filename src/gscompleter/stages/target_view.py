@@ -174,12 +174,12 @@ class TargetView:
         if self.refusal:
             return self.refusal
         unsure = self.camera.crop(self.holes | (self.distrust > 0))
-        # At a context view, Φ could only return the photograph. That is no reason where its pixels
-        # are ignored, since nothing is known of them.
+        # At a context view, which of a splat alone is a render, Φ could only return its image. That
+        # is no reason where its pixels are ignored, since nothing is known of them.
         target = self.camera.target
         same = [view for view in self.state.views if is_same_camera(target, view.camera)]
         if any(not (unsure & ~view.valid_mask).any() for view in same):
-            return f"The target is a context view{NOTHING_TO_COMPLETE}"
+            return f"The scene is known at this camera already{NOTHING_TO_COMPLETE}"
         if not unsure.any():
             return f"The target sees no hole of the scene{NOTHING_TO_COMPLETE}"
         return ""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sized
 from contextlib import AbstractContextManager, contextmanager, nullcontext
@@ -16,8 +17,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-LOG_SECONDS = 10.0
-"""Seconds between log lines of counted steps."""
+LOG_SECONDS = 5.0
+"""Most seconds without a line in a log while a stage runs, and fewest between counted steps."""
 NOTEBOOK_SECONDS = 0.25
 """Fewest seconds between two pictures of the bars in a notebook."""
 NOTEBOOK_WIDTH = 90
@@ -27,7 +28,8 @@ NOTEBOOK_WIDTH = 90
 class Display:
     """The running activities on a console: tasks of rich, the outermost first.
 
-    On a terminal rich shows them. In a log it only keeps them, for the lines that are printed.
+    On a terminal rich shows them. In a log it only keeps them, for the lines that are printed: one
+    as each begins, and for a stage that takes long one every `LOG_SECONDS`, from a thread.
     """
 
     def __init__(self, console: Console) -> None:
@@ -35,7 +37,17 @@ class Display:
         self._console = console
         self._running = make_bars(console)
         self._line = ""
-        self._line_time = 0.0
+        self._line_time = time.monotonic()
+        self._ended = threading.Event()
+        self._pulse: threading.Thread | None = None
+
+    def start_pulse(self) -> None:
+        """Begin to print a line where a stage is silent for long, unless there are bars."""
+        if self.has_bars:
+            return
+        # A daemon, so that no error of the command waits for it.
+        self._pulse = threading.Thread(target=self._print_silent_stages, daemon=True)
+        self._pulse.start()
 
     @contextmanager
     def show(self, name: str, total: int | None = None) -> Iterator[TaskID]:
@@ -65,9 +77,28 @@ class Display:
             self._log()
 
     def stop(self) -> None:
-        """Remove the live lines."""
+        """Remove the live lines, and end the lines of stages that take long."""
         if self.has_bars:
             self._running.stop()
+        if self._pulse is not None:
+            self._ended.set()
+            self._pulse.join()
+
+    def _print_silent_stages(self) -> None:
+        """Print what runs, with the steps inside of stages, where the log is silent for long."""
+        period = LOG_SECONDS / 10
+        told = self._line_time
+        while not self._ended.wait(period):
+            now = time.monotonic()
+            if now + period < max(told, self._line_time) + LOG_SECONDS:
+                continue
+            # Counted steps that run no stage print a line as each ends.
+            running = self._running.tasks
+            if any(task.total is None for task in running):
+                line = ": ".join(format_label(task) for task in running)
+                seconds = int(running[-1].elapsed or 0)
+                self._console.print(f"{line} ({seconds} s)", soft_wrap=True)
+                told = now
 
     def _log(self) -> None:
         """Print the running activities as a line of a log, unless it would be the last one again.
@@ -84,7 +115,7 @@ class Display:
         if not self.has_bars and line != self._line:
             self._line = line
             self._line_time = time.monotonic()
-            self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+            self._console.print(line, soft_wrap=True)
 
 
 class NotebookDisplay(Display):
@@ -123,9 +154,11 @@ class NotebookDisplay(Display):
 
 def draw_bars(running: Progress) -> dict[str, str]:
     """Draw the bars as HTML, and as text for notebooks that show none."""
-    from rich.console import Console
+    from gscompleter.system.console import make_console
 
-    drawing = Console(record=True, file=io.StringIO(), width=NOTEBOOK_WIDTH, force_jupyter=False)
+    drawing = make_console(
+        record=True, file=io.StringIO(), width=NOTEBOOK_WIDTH, force_jupyter=False
+    )
     drawing.print(running.get_renderable())
     html = drawing.export_html(
         inline_styles=True, clear=False, code_format='<pre style="margin:0">{code}</pre>'
@@ -174,6 +207,8 @@ def show_progress(console: Console | None) -> Iterator[None]:
     """Show activities of the block on `console`; None or a quiet one hides them."""
     display = None if console is None or console.quiet else Display(console)
     token = _display.set(display)
+    if display is not None:
+        display.start_pulse()
     try:
         yield
     finally:
@@ -201,9 +236,9 @@ def show_in_notebook() -> Iterator[None]:
     if _display.get() is not None or not is_notebook():
         yield
         return
-    from rich.console import Console
+    from gscompleter.system.console import make_console
 
-    display = NotebookDisplay(Console(file=io.StringIO(), force_jupyter=False))
+    display = NotebookDisplay(make_console(file=io.StringIO(), force_jupyter=False))
     token = _display.set(display)
     try:
         yield
@@ -217,9 +252,9 @@ def is_notebook() -> bool:
     # A process that has not imported IPython is none, and need not import rich to ask.
     if "IPython" not in sys.modules:
         return False
-    from rich.console import Console
+    from gscompleter.system.console import make_console
 
-    return Console().is_jupyter
+    return make_console().is_jupyter
 
 
 def stage(name: str) -> AbstractContextManager[object]:
@@ -239,11 +274,16 @@ def show_preparation(name: str) -> AbstractContextManager[object]:
     return display.show(name)
 
 
-def track(items: Iterable[T], description: str, total: int | None = None) -> Iterable[T]:
-    """Show the progress while iterating over `items`, `total` if they have no length."""
+def track(
+    items: Iterable[T], description: str, total: int | None = None, has_lines: bool = True
+) -> Iterable[T]:
+    """Show the progress while iterating over `items`, `total` if they have no length.
+
+    `has_lines` is False if the caller prints a line for each item itself; then only bars are shown.
+    """
     display = _display.get()
     total = len(items) if isinstance(items, Sized) else total
-    if display is None or not total:
+    if display is None or not total or not (has_lines or display.has_bars):
         return items
     return count_items(items, description, total, display)
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import re
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from gscompleter.apps.batch.rows import parse_row
 from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.command_line.exit_codes import choose_exit_code
 from gscompleter.apps.commands.batch import BatchOptions
+from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, join_names, print_error, quote_value
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.jobs.jobs import (
@@ -37,6 +38,8 @@ from gscompleter.system.jobs.jobs import (
 )
 from gscompleter.system.progress import show_preparation, show_progress, track
 
+OUTCOMES = {"nothing-gained": "nothing gained"}
+"""Words for outcomes of jobs that did not fail, where they are not `completed`."""
 MAX_NAMED_FAILURES = 5
 """Most failures that the terminal names."""
 
@@ -47,7 +50,7 @@ def complete_batch(options: BatchOptions) -> int:
     if re.match(r"\w\w+:/", str(options.out)):
         raise InputError(f"{quote_value(options.out)} is an address; name a folder.", "out")
     number, count = parse_shard(options.shard, os.environ)
-    console = Console(stderr=True, quiet=options.quiet, highlight=False)
+    console = make_console(stderr=True, quiet=options.quiet)
     with show_progress(console):
         with show_preparation("reading the manifest"):
             common = parse_pairs(options.each, "each")
@@ -71,12 +74,16 @@ def complete_batch(options: BatchOptions) -> int:
         # A folder of scenes can hold the results of earlier runs, which are no input.
         if results := list_results(options.manifest, options.out):
             names = join_names([path.name for path in results], MAX_NAMED_FAILURES)
-            console.print(f"Left out, as results and no scenes: {names}.", markup=False)
+            console.print(f"Left out, as results and no scenes: {names}.", soft_wrap=True)
 
         perform = partial(perform_job, out=out, retries=options.retries)
         ended = run_jobs(left, perform, partial(has_row, out=out), engine, options.retries)
-        for _ in track(ended, "completing", len(left)):
-            pass
+        counted = track(ended, "completing", len(left), has_lines=False)
+        for number, job in enumerate(counted, start=1):
+            state = read_row(job, out)
+            console.print(
+                f"{number} of {len(left)}: {job.name}, {describe_state(state)}", soft_wrap=True
+            )
         with show_preparation("table"):
             write_batch_results(out, jobs)
 
@@ -88,11 +95,20 @@ def complete_batch(options: BatchOptions) -> int:
             failures.append(f"{row['job']}: {row['reason']}")
     print_failures(console, failures, len(share))
     sentence = f"{summarize_rows(out, share, left)} All results: {options.out}/index.html"
-    console.print(sentence, markup=False, soft_wrap=True)
+    console.print(sentence, soft_wrap=True)
     if options.json:
         rows = [row for job in share if (row := read_row(job, out)) is not None]
         print_json({"out": str(options.out), "failed": len(failures), "rows": rows})
     return choose_exit_code(len(failures), len(share))
+
+
+def describe_state(row: Mapping[str, Any] | None) -> str:
+    """Describe in a word or two how a job ended."""
+    if row is None:
+        return "not known"
+    if row["state"] == "failed":
+        return "failed"
+    return OUTCOMES.get(str(row.get("outcome")), "completed")
 
 
 def print_failures(console: Console, failures: Sequence[str], num_cases: int) -> None:
@@ -104,7 +120,7 @@ def print_failures(console: Console, failures: Sequence[str], num_cases: int) ->
         counted = f"{len(failures)} of {num_cases} cases failed"
         print_error(f"{counted}; the first: {failures[0]}")
     for failure in failures[:MAX_NAMED_FAILURES]:
-        console.print(f"Failed: {failure}", markup=False, soft_wrap=True)
+        console.print(f"Failed: {failure}", soft_wrap=True)
     if len(failures) > MAX_NAMED_FAILURES:
         console.print(f"... and {len(failures) - MAX_NAMED_FAILURES} more failed.")
 
@@ -172,6 +188,8 @@ def complete_job(job: Job, jobs: Path) -> dict[str, Any]:
 
     files = [path for path in (jobs / job.name).rglob("*") if path.is_file()]
     return {
+        "outcome": outcome["status"],
+        "headline": outcome["headline"],
         **average_scores(summary),
         "seconds": time.monotonic() - start,
         "cpu_seconds": time.process_time() - cpu_start,

@@ -10,8 +10,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from rich.console import Console
-
 from gscompleter.apps.bench.cases import (
     BenchCase,
     GrowthValues,
@@ -44,6 +42,7 @@ from gscompleter.generators import load_generator
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render.device import choose_device
 from gscompleter.render.loading import load_renderer
+from gscompleter.system.console import make_console
 from gscompleter.system.files.output_folder import check_output, open_output_folder
 from gscompleter.system.progress import show_preparation, show_progress, stage
 
@@ -100,7 +99,7 @@ def measure_completions(options: BenchOptions) -> None:
 
         # A missing frame is reported before minutes of measurements, not in the middle of them.
         check_frames([*cases, *list_grown_cases(series)])
-        with show_progress(None if options.quiet else Console(stderr=True)):
+        with show_progress(None if options.quiet else make_console(stderr=True)):
             with show_preparation("getting ready"):
                 bench = prepare_bench(options, Path(temporary))
             if options.generators:

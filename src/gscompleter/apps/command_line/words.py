@@ -1,42 +1,29 @@
-"""Parser of the command line, and its help pages."""
+"""Parser of the command line."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import redirect_stderr
-from dataclasses import dataclass, is_dataclass, replace
-from inspect import get_annotations
+from dataclasses import dataclass, is_dataclass
 from io import StringIO
-from typing import Annotated, Any, Union, get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 import tyro
-from tyro.constructors import (
-    ConstructorRegistry,
-    StructConstructorSpec,
-    StructFieldSpec,
-    StructTypeInfo,
-)
+from tyro.constructors import ConstructorRegistry, StructTypeInfo
 
+from gscompleter.apps.command_line.help_pages import (
+    DESCRIPTION,
+    HELP,
+    HELP_ALL,
+    Rule,
+    describe_command,
+    make_help_rule,
+    make_program,
+)
 from gscompleter.apps.commands.shared_options import DEFAULT_NUM_TARGETS, CompletingOptions
 from gscompleter.config import CompleterConfig, load_config
-from gscompleter.config.settings import Settings
 from gscompleter.system.errors import InputError, join_names, quote_value
-
-HELP = ("-h", "--help")
-HELP_ALL = "--help-all"
-
-CONFIG = StructFieldSpec(
-    "config",
-    str,
-    "default",
-    "Settings of the method: default, paper, an ablation such as no-sa, or a YAML file. Single "
-    f"settings are changed by options such as --config.holes.dilation 5; {HELP_ALL} lists them.",
-)
-
-DESCRIPTION = "Complete 3D Gaussian Splatting scenes: generate, then register."
-
-Rule = Callable[[StructTypeInfo], StructConstructorSpec | None]
 
 CONTINUING = ("batch", "evaluate")
 """Commands that continue the run in their folder, and replace nothing there."""
@@ -88,7 +75,8 @@ def parse_words(words: Sequence[str], kinds: Mapping[str, type]) -> Any:
             # than for one, which is 2 % of a completion.
             if words and words[0] in kinds:
                 prog = f"gscompleter {words[0]}"
-                parsed = call_tyro(kinds[words[0]], prog, None, words[1:], registry)
+                about = describe_command(kinds[words[0]])
+                parsed = call_tyro(kinds[words[0]], prog, about, words[1:], registry)
                 if not isinstance(parsed, CompletingOptions):
                     return parsed
                 # Only parsed words tell that a splat comes without photographs, or with masks. Its
@@ -100,10 +88,8 @@ def parse_words(words: Sequence[str], kinds: Mapping[str, type]) -> Any:
                     counted, not parsed.lacks_photographs, has_marks=has_marks
                 )
                 registry = make_registry(config, *rules)
-                return call_tyro(kinds[words[0]], prog, None, words[1:], registry)
-            named = [Annotated[kind, tyro.conf.subcommand(name)] for name, kind in kinds.items()]
-            of_any: Any = Union[tuple(named)]  # noqa: UP007  (of as many as there are)
-            return call_tyro(of_any, "gscompleter", DESCRIPTION, words, registry)
+                return call_tyro(kinds[words[0]], prog, about, words[1:], registry)
+            return call_tyro(make_program(kinds), "gscompleter", DESCRIPTION, words, registry)
     except SystemExit as stop:
         # Code 0: the help was printed.
         if not stop.code:
@@ -114,7 +100,7 @@ def parse_words(words: Sequence[str], kinds: Mapping[str, type]) -> Any:
 
 
 def call_tyro(
-    kind: Any, prog: str, description: str | None, words: Sequence[str], rules: ConstructorRegistry
+    kind: Any, prog: str, description: str, words: Sequence[str], rules: ConstructorRegistry
 ) -> Any:
     """Parse words into the options `kind`; `prog` stands before them in the help pages."""
     marks = (tyro.conf.DisallowNone, tyro.conf.FlagCreatePairsOff, tyro.conf.OmitSubcommandPrefixes)
@@ -247,47 +233,6 @@ def make_registry(config: CompleterConfig, *rules: Rule) -> ConstructorRegistry:
     for rule in rules:
         registry.struct_rule(rule)
     return registry
-
-
-def make_help_rule(show_all: bool) -> Rule:
-    """Return a rule by which tyro writes help pages. No option can be parsed with it."""
-    # Classes whose own specification is being made: for them the rule gives way to tyro's.
-    entered: list[type] = []
-
-    def rule(info: StructTypeInfo) -> StructConstructorSpec | None:
-        kind: Any = info.type
-        if not isinstance(kind, type) or not issubclass(kind, Settings) or kind in entered:
-            return None
-        entered.append(kind)
-        spec = ConstructorRegistry.get_struct_spec(info)
-        entered.remove(kind)
-        if not isinstance(spec, StructConstructorSpec):
-            return None
-        # The options of a command itself come first, those that it shares with others after them.
-        own = get_annotations(kind)
-        fields = sorted(spec.fields, key=lambda field: field.name not in own)
-        return replace(spec, fields=tuple(tidy_field(field, show_all) for field in fields))
-
-    return rule
-
-
-def tidy_field(field: StructFieldSpec, show_all: bool) -> StructFieldSpec:
-    """Join the lines of a help text, and hide a default that says nothing.
-
-    Unless `show_all` is set, the settings of the method become one option.
-    """
-    if isinstance(field.default, CompleterConfig) and not show_all:
-        return CONFIG
-
-    def text() -> str | None:
-        # Docstrings are wrapped in the source; tyro wraps them again to the terminal's width.
-        original = field.helptext() if callable(field.helptext) else field.helptext
-        return None if original is None else " ".join(original.split())
-
-    kind: Any = field.type
-    if field.default is None or field.default is False or field.default == ():
-        kind = Annotated[kind, tyro.conf.arg(help_behavior_hint="")]
-    return replace(field, helptext=text, type=kind)
 
 
 def extract_sentence(box: str, own: Collection[str]) -> str:

@@ -21,6 +21,8 @@ class BatchOptions(EngineOptions):
 
     Run the same command again to continue. OUT contains a folder per scene in jobs/, table.csv
     (with the reason where a scene could not be completed) and index.html.
+
+    Example: gscompleter batch scenes.csv --workers 4 --out results
     """
 
     manifest: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="MANIFEST")]

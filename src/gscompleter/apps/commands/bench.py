@@ -21,6 +21,8 @@ class BenchOptions(RunOptions, WritingOptions):
     Every completion is a process of its own, start-up included. Times are also given relative to
     one pass of the renderer, forward and backward, with 196,608 Gaussians at 256 x 256. Without
     cases the pair of `demo` is measured.
+
+    Example: gscompleter bench --quick
     """
 
     cases: Path | None = None

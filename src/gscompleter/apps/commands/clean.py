@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from gscompleter.apps.commands.shared_options import SceneOptions
+from gscompleter.apps.commands.shared_options import SceneOptions, Words
 from gscompleter.config import CleaningConfig
 from gscompleter.system.process import import_without_collection
 
@@ -19,14 +19,20 @@ class CleanOptions(SceneOptions):
 
     No photograph loses more than 0.01 dB. Without SCENE, remove those that stand out from their
     neighbours: isolated, huge, needles, transparent. `gscompleter strip` puts all back.
+
+    Example: gscompleter clean photographs --scene splat.ply --out cleaned
     """
 
     folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = None  # type: ignore[assignment]
-    """Folder of the photographs, as in `complete`; if not given, neighbours decide."""
+    """Folder of the photographs of the splat, in any layout that `complete` reads; if not given,
+    neighbours decide."""
     out: Path
     """Folder for completed.ply, removed.ply and summary.json."""
     scene: Path
     """File of Gaussians to clean."""
+    context: Words = None
+    """Photographs to compare with: file names, or numbers from 0 in the order of the file paths;
+    all of them if not given."""
     dry_run: bool = False
     """Write only removed.ply, the Gaussians that would go, and summary.json."""
     device: Literal["auto", "cpu", "cuda"] = "auto"

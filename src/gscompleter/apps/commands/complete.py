@@ -21,7 +21,10 @@ from gscompleter.system.process import import_without_collection
 
 @dataclass(frozen=True, kw_only=True)
 class CompleteOptions(CompletingOptions):
-    """Fill the parts of a scene that its photographs do not show, and write the result."""
+    """Fill the parts of a scene that its photographs do not show, and write the result.
+
+    Example: gscompleter complete photographs --out result
+    """
 
     target: tuple[str, ...] = ()
     """Cameras to complete the scene for: file names or numbers of photographs, or a file of cameras
@@ -61,7 +64,7 @@ class CompleteOptions(CompletingOptions):
     context.ply only if it differs from the input splat. `.spz` and `.sog` round, so that `strip`
     does not give back the same bytes."""
     video: bool = False
-    """Also write video.mp4: a flight through the holes, before and after side by side."""
+    """Also write video.mp4: a flight through the holes, before beside after."""
 
     def make_poses_request(self) -> PosesRequest:
         """Make the request for the cameras, with the targets among the named photographs."""

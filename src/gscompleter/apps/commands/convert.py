@@ -21,6 +21,8 @@ class ConvertOptions(WritingOptions):
     Formats are .ply, .compressed.ply, .spz, .splat, .sog, .glb (KHR_gaussian_splatting), and
     .usda, .usdc and .usdz (OpenUSD, with usd-core). It also reads .ksplat, the folder of a .sog,
     and .glb with a .spz inside.
+
+    Example: gscompleter convert splat.ply splat.spz
     """
 
     source: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="A")]
@@ -42,14 +44,13 @@ def run_convert(options: ConvertOptions) -> None:
     """Convert A to B, and print the number of Gaussians."""
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
-        from rich.console import Console
-
         from gscompleter.splats.formats import convert_splat, reserve_splat
+        from gscompleter.system.console import make_console
         from gscompleter.system.progress import show_preparation, show_progress
 
     with (
         reserve_splat(options.out, options.overwrite),
-        show_progress(Console(stderr=True, quiet=options.quiet)),
+        show_progress(make_console(stderr=True, quiet=options.quiet)),
         show_preparation("converting"),
     ):
         count, num_generated, note = convert_splat(

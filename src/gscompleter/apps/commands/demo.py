@@ -11,7 +11,10 @@ from gscompleter.system.process import import_without_collection
 
 @dataclass(frozen=True, kw_only=True)
 class DemoOptions(RunOptions, WritingOptions):
-    """Complete the stereo pair that scikit-image contains, and show before and after."""
+    """Complete the stereo pair that scikit-image contains, and show before and after.
+
+    Example: gscompleter demo --out demo
+    """
 
     out: Path = Path("demo")
     """Folder for the scene, its completion and before_after.png."""

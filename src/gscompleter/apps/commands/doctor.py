@@ -18,7 +18,10 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, kw_only=True)
 class DoctorOptions(Settings):
-    """Print what is installed, and for what is missing its purpose and what installs it."""
+    """Print what is installed, and for what is missing its purpose and what installs it.
+
+    Example: gscompleter doctor --needs poses film
+    """
 
     json: bool = False
     """Print the result as JSON."""

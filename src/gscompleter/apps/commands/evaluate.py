@@ -35,6 +35,15 @@ AUTO = "auto"
 """Generator of the preset, or else the default one."""
 
 
+@dataclass(frozen=True)
+class PresetGeneratorOptions(GeneratorOptions):
+    """Model that synthesizes images, and its settings."""
+
+    generator: str = AUTO
+    """Model that synthesizes the image at a target, as in `complete`; `auto` is that of the preset,
+    or else warp-inpaint."""
+
+
 @dataclass(frozen=True, kw_only=True)
 class EvaluateOptions(SynthesisOptions, EngineOptions):
     """Run methods on cases with known target photographs, and score them.
@@ -42,6 +51,8 @@ class EvaluateOptions(SynthesisOptions, EngineOptions):
     Run the same command again to continue. `gscompleter tables OUT` writes the tables at any time.
     With a preset, a table, a figure or several reconstructors it writes tables and figures of the
     paper instead, with several depths one table that compares them.
+
+    Example: gscompleter evaluate cases.json --methods context full --out scores
     """
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
@@ -85,7 +96,9 @@ class EvaluateOptions(SynthesisOptions, EngineOptions):
     weights: tuple[Path, ...] = ()
     """Weights file of each reconstructor, or NAME=FILE for some of them, as in
     mvsplat-re10k=re10k.ckpt; others are downloaded."""
-    synthesis: Annotated[GeneratorOptions, tyro.conf.OmitArgPrefixes] = GeneratorOptions(AUTO)
+    synthesis: Annotated[PresetGeneratorOptions, tyro.conf.OmitArgPrefixes] = (
+        PresetGeneratorOptions()
+    )
     near: float | None = None
     """Smallest depth in the scenes, in the unit of their cameras; by default that of the data, or
     else of the model's authors."""
@@ -97,7 +110,7 @@ class EvaluateOptions(SynthesisOptions, EngineOptions):
     """Engine of `batch` that runs the cases; this process if not given."""
     resolution: Size | None = None
     """Working size as in `complete`; by default that of the cases."""
-    masks: bool = True
+    no_masks: bool = False
     """Use also the pixels that masks (black) or alpha channels (transparent) hide, in the methods
     and in the scores, instead of ignoring them."""
     invert_masks: bool = False
@@ -108,8 +121,9 @@ class EvaluateOptions(SynthesisOptions, EngineOptions):
     """Ignore boxes of moving objects in the same way (Waymo, nuScenes)."""
     one_per_scene: bool = False
     """Run only the first case of each scene and protocol, as the paper does."""
-    ego_mask: bool = True
-    """Ignore what stays the same while the camera moves, such as the bonnet of its car."""
+    no_ego_mask: bool = False
+    """Use also what stays the same while the camera moves, such as the bonnet of its car, instead
+    of ignoring it."""
     limit: Annotated[int, Interval(ge=1)] | None = None
     """Most cases to run, over all shards."""
 

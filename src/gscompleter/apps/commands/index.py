@@ -15,7 +15,10 @@ from gscompleter.system.process import import_without_collection
 
 @dataclass(frozen=True, kw_only=True)
 class IndexOptions(WritingOptions):
-    """Write the frames that a protocol selects in a data set."""
+    """Write the frames that a protocol selects in a data set.
+
+    Example: gscompleter index scenes --protocol n-10 --out index.json
+    """
 
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """Scenes as in `evaluate`."""

@@ -17,6 +17,8 @@ class InspectOptions(Settings):
     """Print what is in a splat, what of it is invented, by what, and how much of pictures that is.
 
     Cameras are those of `--cameras`, or of the completion in whose folder FILE lies.
+
+    Example: gscompleter inspect result/completed.ply
     """
 
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
+
+import tyro
 
 from gscompleter.apps.commands.shared_options import CompletingOptions, Port, Size, list_inputs
 from gscompleter.system.files.overlap import refuse_overlap
@@ -16,8 +19,13 @@ class LiveOptions(CompletingOptions):
 
     The page is that of `view`. What is painted or boxed is removed, filled or repaired, and undone;
     Save also writes strokes.json, which `repair --strokes` does again.
+
+    Example: gscompleter live splat.ply --out repaired
     """
 
+    folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = None
+    """The splat; or the folder of photographs, in any layout that `complete` reads: those of the
+    splat that `--scene` names, or of a scene to reconstruct."""
     out: Path = Path("live")
     """Output folder of the Save button."""
     resolution: Size = (256, 256)

@@ -10,7 +10,10 @@ from gscompleter.system.process import import_without_collection
 
 @dataclass(frozen=True, kw_only=True)
 class ModelsOptions(Settings):
-    """List published model weights with their licences, and show which are downloaded."""
+    """List published model weights with their licences, and show which are downloaded.
+
+    Example: gscompleter models --download mvsplat-re10k
+    """
 
     download: tuple[str, ...] = ()
     """Names of the list, whose files are downloaded and verified first."""

@@ -19,6 +19,8 @@ class PosesOptions(ComputeOptions, WritingOptions):
     """Find the cameras of photographs with COLMAP, and write a COLMAP folder.
 
     A second run with the same photographs or video keeps the result.
+
+    Example: gscompleter poses photographs --out cameras
     """
 
     photographs: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTOS")]
@@ -38,13 +40,12 @@ def run_poses(options: PosesOptions) -> None:
     """Find and write the cameras, and print their number and error."""
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
-        from rich.console import Console
-
         from gscompleter.data.sfm.poses import find_poses
+        from gscompleter.system.console import make_console
         from gscompleter.system.progress import show_progress
 
     reading = MaskReading(options.invert_masks, options.large_masks)
-    with show_progress(Console(stderr=True, quiet=options.quiet)):
+    with show_progress(make_console(stderr=True, quiet=options.quiet)):
         poses = find_poses(
             options.photographs, options.out, options.overwrite, options.frames, reading
         )

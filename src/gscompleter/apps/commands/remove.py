@@ -22,8 +22,13 @@ class RemoveOptions(CompleteOptions):
 
     What other photographs show behind it fills the hole, and the generator invents the rest.
     `gscompleter strip` gives the splat back as it was. Coordinates are those of the splat's file.
+
+    Example: gscompleter remove photographs --scene splat.ply --mask masks --out removed
     """
 
+    folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = None
+    """Folder of the photographs of the splat, in any layout that `complete` reads; leave it out if
+    there are none."""
     scene: Path = field()  # without the default of `complete`
     """File of Gaussians (a splat) to remove something from."""
     box: tuple[float, ...] = ()
@@ -31,7 +36,7 @@ class RemoveOptions(CompleteOptions):
     box_rotation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
     """Rotation of the boxes about their centres, as a quaternion w x y z."""
     sphere: tuple[float, float, float, float] | None = None
-    """Remove Gaussians inside of a sphere: x, y and z of its centre, and its radius."""
+    """Remove Gaussians inside of a sphere: x, y, z of its centre, and its radius."""
     mask: Path | None = None  # type: ignore[assignment]
     """Remove what masks show: a folder of images named as photographs, white there (or opaque, if
     the object is cut out)."""

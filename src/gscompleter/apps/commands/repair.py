@@ -22,12 +22,17 @@ class RepairOptions(CompletingOptions):
     """Take what masks mark out of a splat, and fill its place.
 
     What is marked goes, up to the surface that is seen there, and is a hole whatever stands behind
-    it. SCENE is the splat, or the photographs of the splat of `--scene`, which help. `gscompleter
-    live` marks and repairs in the browser. `gscompleter strip` gives the splat back as it was.
+    it. Photographs of the splat help. `gscompleter live` marks and repairs in the browser.
+    `gscompleter strip` gives the splat back as it was.
+
+    Example: gscompleter repair splat.ply --camera camera.json --mask wrong.png --out repaired
     """
 
+    folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = None
+    """The splat; or the folder of its photographs, in any layout that `complete` reads, if
+    `--scene` names the splat."""
     camera: Path | None = None
-    """File with the camera of each mask, as of `--target`."""
+    """File with the camera of each mask, as in `complete --target`."""
     mask: tuple[Path, ...] = ()
     """Images of the splat from these cameras, in the same order: white where it is wrong."""
     invert_masks: bool = False

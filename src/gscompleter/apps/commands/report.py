@@ -15,7 +15,10 @@ from gscompleter.system.process import import_without_collection
 
 @dataclass(frozen=True, kw_only=True)
 class ReportOptions(Options):
-    """Write report.html of a completion again."""
+    """Write report.html of a completion again.
+
+    Example: gscompleter report result
+    """
 
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="OUT")]
     """Output folder of `complete` or `demo`."""

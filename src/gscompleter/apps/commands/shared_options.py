@@ -119,15 +119,12 @@ class SceneOptions(ComputeOptions, WritingOptions):
     """Options of every command that opens photographs with cameras."""
 
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
-    """Folder of the photographs: COLMAP, nerfstudio, cameras.json, LLFF, KITTI, DGP, Waymo,
-    PandaSet, a pixelSplat chunk, a RealEstate10K camera file, or what Polycam, Record3D or 3d
-    Scanner App exports. If it has no cameras, COLMAP finds them and they are kept in OUT/colmap;
-    also of 360° panoramas (2:1) and of a video (.mp4, .mov, .mkv). One image needs none."""
+    """Folder of the photographs of the splat, in any layout that `complete` reads."""
     frames: NumFrames = 40
     """Most frames of a video to take as photographs, sharp ones at even steps of the camera."""
     context: Words = None
     """Photographs to work with: file names, or numbers from 0 in the order of the file paths. If
-    not given, those that help most; photographs of targets are never used. `clean` takes all."""
+    not given, those that help most; photographs of targets are never used."""
     out: Path
     format: str | None = None
     """Format of SCENE: colmap, nerfstudio, cameras-json, llff, kitti, kitti-raw, dgp, waymo,
@@ -143,10 +140,10 @@ class SceneOptions(ComputeOptions, WritingOptions):
     the model's authors, or else estimated. It is brought forward, and a line says so, if the
     photographs show nearer surfaces."""
     far: float | None = None
-    """Largest depth in the scene, in the unit of its cameras; if not given, as for near."""
+    """Largest depth in the scene, in the unit of its cameras; else as for near."""
     no_given_depth: bool = False
     """Ignore the depth that SCENE holds: depth maps, laser sweeps and COLMAP's points."""
-    masks: bool = True
+    no_masks: bool = False
     """Use also what masks (black) or alpha channels of SCENE hide, instead of ignoring it."""
     invert_masks: bool = False
     """Read the masks of SCENE the other way round: white is ignored, not black."""
@@ -167,7 +164,7 @@ class SceneOptions(ComputeOptions, WritingOptions):
             self.near,
             self.far,
             uses_given_depth=not self.no_given_depth,
-            uses_masks=self.masks,
+            uses_masks=not self.no_masks,
             masks=MaskReading(
                 self.invert_masks and not self.has_marks,
                 self.large_masks,
@@ -199,13 +196,14 @@ class CompletingOptions(SceneOptions, ModelOptions):
     PandaSet, a pixelSplat chunk, a RealEstate10K camera file, or what Polycam, Record3D or 3d
     Scanner App exports. If it has no cameras, COLMAP finds them and they are kept in OUT/colmap;
     also of 360° panoramas (2:1) and of a video (.mp4, .mov, .mkv). One image needs none. A splat
-    may come without photographs: leave SCENE out, or name the splat as SCENE."""
+    without photographs may be SCENE itself."""
     scene: Path | None = None
-    """File of Gaussians (a splat) to complete instead of reconstructing the scene; all are kept."""
+    """File of Gaussians (a splat) of these photographs, to complete instead of reconstructing the
+    scene; all are kept."""
     cameras: Path | None = None
-    """File of cameras for a splat without photographs, as of `--target`: renders at some of them
-    take the place of photographs. If not given, a cameras.json beside the splat, or cameras that
-    are found around the targets."""
+    """File of cameras for a splat without photographs, as in `complete --target`: renders at some
+    of them take the place of photographs. If not given, a cameras.json beside the splat, or cameras
+    that are found around the targets."""
     up: tuple[float, float, float] | None = None
     """Upward direction of a splat whose cameras are found: x, y and z in its file (in the axes of a
     .ply). If not given, what its file or the cameras beside it say, else its floor, else -y."""

@@ -22,6 +22,8 @@ class StripOptions(WritingOptions):
     """Undo edits: remove what was generated, and put back what was removed or recoloured.
 
     Without --last or --edit, all edits are undone, and the scene is as it was given.
+
+    Example: gscompleter strip result/completed.ply --out given.ply
     """
 
     completed: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="COMPLETED")]

@@ -20,6 +20,8 @@ class UpdateOptions(SceneOptions, ReconstructorOptions):
     """Add to a splat what its photographs show and it lacks, and correct what they contradict.
 
     Nothing is invented. The report shows every photograph before and after.
+
+    Example: gscompleter update photographs --scene splat.ply --out updated
     """
 
     scene: Path = field()  # without the default of `complete`

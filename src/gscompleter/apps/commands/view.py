@@ -18,6 +18,8 @@ class ViewOptions(WritingOptions):
     """Show a scene before and after its completion in the browser.
 
     Side by side, with a slider, or one at a time; generated Gaussians can be tinted or hidden.
+
+    Example: gscompleter view result
     """
 
     scene: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="A")]

@@ -15,6 +15,8 @@ class WarmupOptions(ComputeOptions):
     """Compile all kernels for this processor and its GPU into the caches of numba and torch.
 
     NUMBA_CACHE_DIR and TORCH_EXTENSIONS_DIR name these folders.
+
+    Example: gscompleter warmup
     """
 
 
@@ -22,17 +24,16 @@ def run_warmup(options: WarmupOptions) -> None:
     """Compile missing kernels, and print the time and the folder."""
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
-        from rich.console import Console
-
         from gscompleter.apps.warmup import PARTS, compile_gsplat, compile_kernels
         from gscompleter.numerics.kernels.cache import CACHE
         from gscompleter.numerics.kernels.compiled import get_cache_folder
+        from gscompleter.system.console import make_console
         from gscompleter.system.progress import show_progress
 
     # Without a folder for the cache, compiled kernels would end with this process.
     if get_cache_folder() is None:
         raise InputError(str(CACHE.note))
-    with show_progress(Console(stderr=True, quiet=options.quiet)):
+    with show_progress(make_console(stderr=True, quiet=options.quiet)):
         seconds = compile_kernels(list(PARTS))
         about_gpu = compile_gsplat()
     done = " already" if seconds is None else f", in {seconds:.1f} s"

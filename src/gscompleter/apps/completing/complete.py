@@ -47,6 +47,7 @@ from gscompleter.numerics.kernels.parallel import run_in_background
 from gscompleter.splats.alignment.similarity import transform_camera_exactly
 from gscompleter.splats.edits import EditDraft
 from gscompleter.state import Completion
+from gscompleter.system.console import make_console
 from gscompleter.system.errors import print_error, quote_value
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.files.video import find_ffmpeg
@@ -178,7 +179,7 @@ def open_completion(
 
     `takes_over` is that of `reserve_output`.
     """
-    console = Console(stderr=True, quiet=options.quiet)
+    console = make_console(stderr=True, quiet=options.quiet)
     with (
         show_progress(console),
         reserve_output(

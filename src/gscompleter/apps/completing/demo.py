@@ -6,8 +6,6 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-from rich.console import Console
-
 from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.commands.demo import DemoOptions
 from gscompleter.apps.completing.complete import complete_folder
@@ -15,6 +13,7 @@ from gscompleter.apps.completing.printing import answer_completion
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.report.completion import join_images
 from gscompleter.data.demo_scene import write_motorcycle_scene
+from gscompleter.system.console import make_console
 from gscompleter.system.files.image import read_image, write_image
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.files.writing import SUMMARY_FILE, TARGETS_FILE
@@ -39,7 +38,7 @@ def complete_demo(options: DemoOptions) -> None:
         reserve_output(options.out, options.overwrite, COMMAND, RESULTS) as output,
         output.write() as folder,
     ):
-        print_lines(Console(stderr=True, quiet=options.quiet), *output.describe_others())
+        print_lines(make_console(stderr=True, quiet=options.quiet), *output.describe_others())
         scene = folder / "scene"
         write_motorcycle_scene(scene)
         complete_options = CompleteOptions(

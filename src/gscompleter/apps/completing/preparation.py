@@ -35,7 +35,7 @@ from gscompleter.apps.inputs.taken_out import (
     hide_taken_out,
 )
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened, Target
-from gscompleter.apps.warmup import SPLAT_PART, compile_kernels
+from gscompleter.apps.warmup import SPLAT_PART, compile_kernels, list_missing
 from gscompleter.completer import GSCompleter
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.photograph_names import describe_offset
@@ -56,7 +56,12 @@ from gscompleter.system.progress import show_preparation
 from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.types import Camera, Gaussians
 
-PHOTOGRAPH_OPTIONS = {"format": None, "frames": 40, "masks": True, "from_photographs_only": False}
+PHOTOGRAPH_OPTIONS = {
+    "format": None,
+    "frames": 40,
+    "no_masks": False,
+    "from_photographs_only": False,
+}
 """Options that only photographs can follow, with their defaults."""
 
 
@@ -143,7 +148,17 @@ def check_options(options: CompleteOptions) -> CompleteOptions:
     )
     if options.scene is not None:
         options = replace(options, scene=resolve_splat(options.scene))
+    # What is wrong with a model is told before kernels are compiled, which takes a minute or two.
+    # Where there are kernels, it is told soon enough when the photographs are read.
+    if list_missing(list_parts(options)):
+        load_completer(options, ())
     return options
+
+
+def list_parts(options: CompleteOptions) -> list[str]:
+    """List the parts whose kernels a completion needs."""
+    parts = [options.device, options.reconstructor, options.synthesis.generator]
+    return [*parts, SPLAT_PART] if options.scene is not None and "cpu" in parts else parts
 
 
 def open_for_completion(options: CompleteOptions, console: Console) -> Opened:
@@ -162,7 +177,7 @@ def read_inputs(options: CompleteOptions, opened: Opened) -> CompletionTask:
         task = read_task(opened, options.context, options.target, device, has_splat)
         task = add_paintings(task, options, opened)
 
-    parts = (device, options.reconstructor, options.synthesis.generator)
+    parts = list_parts(options)
     if options.scene is None:
         compile_kernels(parts)
         return task
@@ -304,7 +319,7 @@ def add_splat(
         gaussians = load_splat(path, drop_nonfinite)
         if "cpu" in parts:
             check_scene(task, gaussians)
-    compile_kernels([*parts, SPLAT_PART] if "cpu" in parts else parts)
+    compile_kernels(parts)
 
     with show_preparation("aligning the scene"):
         gaussians, splat_file = sort_splat(gaussians, locate_splat(path, drop_nonfinite))
@@ -338,8 +353,7 @@ def read_splat_alone(
         gaussians = load_splat(options.scene, options.drop_nonfinite)
         splat_file = locate_splat(options.scene, options.drop_nonfinite)
         gaussians, splat_file = sort_splat(gaussians, splat_file)
-    parts = [device, options.reconstructor, options.synthesis.generator]
-    compile_kernels([*parts, SPLAT_PART] if device == "cpu" else parts)
+    compile_kernels(list_parts(options))
 
     reading = replace(options, folder=options.scene).make_scene_request()
     request = RenderRequest(

@@ -7,7 +7,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
-from rich.console import Console
 from rich.table import Table
 
 from gscompleter.apps.command_line.answers import print_json
@@ -18,10 +17,10 @@ from gscompleter.apps.inputs.task import Opened, Target
 from gscompleter.apps.report.completion import IMAGES
 from gscompleter.apps.report.film import VIDEO_FILE
 from gscompleter.apps.report.page import REPORT_FILE
-from gscompleter.apps.report.plain_words import group_target_notes, list_notes, list_shared_notes
+from gscompleter.apps.report.plain_words import group_target_warnings, list_warnings
 from gscompleter.apps.report.schema import CompletionSummary, find_completed, read_summary
-from gscompleter.evaluation.verdict.numbers import average, format_number, format_percent
-from gscompleter.evaluation.verdict.outcome import name_unused, select_testing
+from gscompleter.evaluation.verdict.numbers import format_number, format_percent
+from gscompleter.system.console import make_console
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.writing import SUMMARY_FILE, TARGETS_FILE
 
@@ -39,32 +38,33 @@ def answer_completion(
 
 def print_completion(options: CompleteOptions) -> None:
     """Print the scores per camera, the notes, and the location of the results."""
-    console = Console(highlight=False)
+    console = make_console()
     summary = read_summary(options.out)
-    console.print(summary.outcome.headline, markup=False, soft_wrap=True)
+    console.print(summary.outcome.headline, soft_wrap=True)
     console.print(make_score_table(summary))
 
-    # What holds for several targets is said once, before the notes of each. If nothing was gained,
-    # the headline gives the reason for all.
-    sentences = list(list_shared_notes(summary))
+    # What holds for several targets is said once, before the warnings of each. If nothing was
+    # gained, the headline gives the reason for all. The report has the facts.
+    sentences = list(list_warnings(summary))
     if summary.outcome.status != "nothing-gained":
-        for notes, numbers in group_target_notes(summary.targets).items():
+        for warnings, numbers in group_target_warnings(summary.targets).items():
             if len(numbers) == 1:
                 name = summary.targets[numbers[0] - 1].name
-                sentences.append(f"{name}: {' '.join(notes)}")
+                sentences.append(f"{name}: {' '.join(warnings)}")
     sentences += describe_result(summary, options)
     for sentence in sentences:
-        console.print(sentence, markup=False, soft_wrap=True)
+        console.print(sentence, soft_wrap=True)
 
 
 def make_score_table(summary: CompletionSummary) -> Table:
     """Make the table of PSNR before and after at each camera."""
     table = Table("camera", "hole", "PSNR before", "PSNR after", "added", box=None)
+    kind = "context" if summary.scene.renders_from is None else "render"
     # Photographs of the context have neither a hole nor Gaussians of their own.
     for row in summary.context:
         before = format_number(row.psnr_before)
         after = format_number(row.psnr_after)
-        table.add_row(f"context {row.photograph}", "", before, after, "")
+        table.add_row(f"{kind} {row.photograph}", "", before, after, "")
     # Without targets, what was not used tests the result.
     for held_out in () if summary.targets else summary.held_out:
         before = format_number(held_out.psnr_before)
@@ -80,22 +80,6 @@ def make_score_table(summary: CompletionSummary) -> Table:
 
 def describe_result(summary: CompletionSummary, options: CompleteOptions) -> Iterator[str]:
     """Write the sentences below the table."""
-    yield from list_notes(summary)
-
-    # Under photometric trust covered is not enough: photographs have to confirm what covers.
-    share = "Trusted" if summary.settings["config"]["trust"] == "photometric" else "Coverage"
-    before = format_percent(summary.coverage.before)
-    after = format_percent(summary.coverage.after)
-    # Around an object nothing is missing, so that more of an image that shows it is no gain.
-    if summary.settings["config"]["holes"]["kind"] != "enclosed":
-        yield f"{share} around the {summary.scene.images}: {before} before, {after} after."
-
-    rows = select_testing(summary.held_out)
-    if rows:
-        at_first = format_percent(average(row.covered_before for row in rows))
-        at_last = format_percent(average(row.covered_after for row in rows))
-        yield f"Covered of {name_unused(rows)}: {at_first} before, {at_last} after."
-
     counts = summary.gaussians
     seconds = summary.seconds["total"]
     yield (
@@ -127,7 +111,7 @@ def print_plan(
     options: CompleteOptions, opened: Opened, targets: Sequence[Target], holes: Sequence[float]
 ) -> None:
     """Print the targets and their holes."""
-    console = Console(highlight=False)
+    console = make_console()
     if not targets:
         console.print("No camera has much to gain; there is nothing to complete.")
         return
@@ -146,7 +130,7 @@ def print_plan(
 
 def print_export(options: CompleteOptions, lines: Sequence[str]) -> None:
     """Print what was exported, and how to go on."""
-    console = Console(highlight=False)
+    console = make_console()
     folder = options.results
     holes = read_holes(folder)
     table = Table("image", "hole", box=None)
@@ -164,4 +148,4 @@ def print_export(options: CompleteOptions, lines: Sequence[str]) -> None:
         f"{' and '.join(replaced)}.",
     ]
     for sentence in sentences:
-        console.print(sentence, markup=False, soft_wrap=True)
+        console.print(sentence, soft_wrap=True)

@@ -46,7 +46,7 @@ def describe_run(
             "near": options.near,
             "far": options.far,
             "no_given_depth": options.no_given_depth,
-            "masks": options.masks,
+            "masks": not options.no_masks,
             "invert_masks": options.invert_masks,
             "large_masks": options.large_masks,
             "config": asdict(config),

@@ -50,7 +50,7 @@ def collect_tasks(
             clip = open_photographs(scene)
         if clip is not None:
             notes += clip.notes
-            clip = clip if options.masks else clip.leave_out_masks()
+            clip = clip.leave_out_masks() if options.no_masks else clip
             own = mark_masked(read_masks_as_asked(clip, options.mask_reading), own, notes)
         tasks += own
     return tasks
@@ -77,10 +77,10 @@ def apply_options(case: Case, options: EvaluateOptions) -> Case:
         near=case.near if options.near is None else options.near,
         far=case.far if options.far is None else options.far,
         resolution=case.resolution if size is None else parse_resolution(size),
-        masks=options.masks,
+        masks=not options.no_masks,
         invert_masks=options.invert_masks,
         ignore_moving=options.ignore_moving,
-        ego_mask=options.ego_mask,
+        ego_mask=not options.no_ego_mask,
     )
 
 
@@ -112,9 +112,9 @@ def iterate_tasks(
 
             # The authors' code scores every pixel of their data sets.
             scores_all = loader is not None
-            if scores_all or not options.ego_mask:
+            if scores_all or options.no_ego_mask:
                 clip = clip.keep_ego_vehicle()
-            if scores_all or not options.masks:
+            if scores_all or options.no_masks:
                 clip = clip.leave_out_masks()
             clip = read_masks_as_asked(clip, options.mask_reading)
             if options.ignore_moving:
@@ -158,4 +158,4 @@ def find_cases_file(path: Path) -> Path:
 def print_skipped(skipped: Sequence[SkippedScene], console: Console) -> None:
     """Print the skipped clips with the reasons."""
     for clip in skipped:
-        console.print(f"Skipped {clip.name}: {clip.reason}.")
+        console.print(f"Skipped {clip.name}: {clip.reason}.", soft_wrap=True)

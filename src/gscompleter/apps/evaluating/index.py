@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from rich.console import Console
-
 from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.commands.index import IndexOptions
 from gscompleter.apps.evaluating.cases import print_skipped
 from gscompleter.evaluation import protocols
 from gscompleter.evaluation.cases import SkippedScene, filter_usable, open_clips
+from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_file import reserve_file
 from gscompleter.system.progress import show_preparation, show_progress
@@ -22,7 +21,7 @@ def write_index(options: IndexOptions) -> None:
     rule = protocols.parse_protocol(options.protocol)
     with (
         reserve_file(options.out, options.overwrite),
-        show_progress(Console(stderr=True, quiet=options.quiet)),
+        show_progress(make_console(stderr=True, quiet=options.quiet)),
         show_preparation("reading clips"),
     ):
         index = protocols.build_index(rule, filter_usable(open_clips(options.path), skipped))
@@ -36,7 +35,7 @@ def write_index(options: IndexOptions) -> None:
                 "with a smaller step, or other data."
             )
         protocols.write_evaluation_index(options.out, index)
-    console = Console(quiet=options.quiet or options.json, highlight=False)
+    console = make_console(quiet=options.quiet or options.json)
     print_skipped(skipped, console)
 
     # A split is one choice of context frames, and each of its targets is a case.

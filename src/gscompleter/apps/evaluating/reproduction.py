@@ -10,14 +10,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from gscompleter.apps.bench.report import describe_machine
 from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.command_line.exit_codes import choose_exit_code
-from gscompleter.apps.commands.evaluate import AUTO, EvaluateOptions
+from gscompleter.apps.commands.evaluate import AUTO, EvaluateOptions, PresetGeneratorOptions
 from gscompleter.apps.evaluating.scoring import Scored, run_methods, score_methods
-from gscompleter.config.generators import GeneratorOptions
 from gscompleter.evaluation.claims import HEAD, tabulate_claims
 from gscompleter.evaluation.figures import draw_figure
 from gscompleter.evaluation.methods import expand_methods
@@ -39,6 +36,7 @@ from gscompleter.evaluation.protocols import list_indices
 from gscompleter.evaluation.store import make_file_name
 from gscompleter.evaluation.tables import format_markdown, write_tables
 from gscompleter.render.device import choose_device
+from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, NoCaseError, OutputError, quote_value
 from gscompleter.system.files.writing import encode_text, replace_file
 from gscompleter.system.jobs.jobs import make_folder
@@ -92,12 +90,12 @@ def run_evaluation(options: EvaluateOptions) -> int:
 
 def compare_depths(options: EvaluateOptions, weights: Mapping[str, Path]) -> int:
     """Run the methods with each depth, and write one table of all; return the exit code."""
-    console = Console(stderr=True, quiet=options.quiet, highlight=False)
+    console = make_console(stderr=True, quiet=options.quiet)
     methods = expand_methods(options.methods)
     runs = {}
     scored = []
     for depth in options.depth:
-        console.print(f"depth {depth}", markup=False)
+        console.print(f"depth {depth}")
         own = weights.get(depth)
         run = replace(
             options,
@@ -166,7 +164,7 @@ def reproduce(options: EvaluateOptions) -> int:
     Return the exit code, which counts the cases of all tables and figures.
     """
     paper = load_paper()
-    console = Console(stderr=True, quiet=options.quiet, highlight=False)
+    console = make_console(stderr=True, quiet=options.quiet)
     generator = options.synthesis.generator
 
     # A preset or several reconstructors alone stand for the table of models.
@@ -178,7 +176,7 @@ def reproduce(options: EvaluateOptions) -> int:
 
     scored: list[Scored] = []
     for name, spec in [*tables.items(), *figures.items()]:
-        console.print(f"{name}: {spec.title}", markup=False)
+        console.print(f"{name}: {spec.title}")
         try:
             write_output(options, name, spec, scored)
         except InputError as error:
@@ -186,7 +184,7 @@ def reproduce(options: EvaluateOptions) -> int:
             # to succeed.
             if "all" not in (*options.table, *options.figure):
                 raise
-            console.print(f"Left out {name}: {error}", markup=False, soft_wrap=True)
+            console.print(f"Left out {name}: {error}", soft_wrap=True)
     if not scored:
         raise InputError("None of the tables and figures could be begun; the lines above say why.")
 
@@ -194,7 +192,7 @@ def reproduce(options: EvaluateOptions) -> int:
     if options.json:
         print_json(collect_outputs(options.out))
     elif not options.quiet:
-        Console(highlight=False).print(text, markup=False, soft_wrap=True)
+        make_console().print(text, soft_wrap=True)
     failed = sum(len(run.failures) for run in scored)
     return choose_exit_code(failed, sum(run.num_own_rows for run in scored))
 
@@ -294,7 +292,7 @@ def make_run(
     # Settings belong to the generator that was chosen, so that of the table has its defaults.
     synthesis = options.synthesis
     if spec.generator and spec.generator != synthesis.generator:
-        synthesis = GeneratorOptions(spec.generator)
+        synthesis = PresetGeneratorOptions(spec.generator)
     one_per_scene = options.one_per_scene or spec.one_per_scene
     model = options.reconstructor[number]
 

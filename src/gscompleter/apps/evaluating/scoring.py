@@ -7,8 +7,6 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from rich.console import Console
-
 from gscompleter.apps.batch.engine import make_engine
 from gscompleter.apps.batch.running import print_failures
 from gscompleter.apps.command_line.answers import print_json
@@ -25,6 +23,7 @@ from gscompleter.evaluation.methods import expand_methods
 from gscompleter.evaluation.runner import RunConfig, evaluate
 from gscompleter.evaluation.store import list_row_paths
 from gscompleter.render.device import choose_devices
+from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError
 from gscompleter.system.jobs.jobs import parse_shard
 from gscompleter.system.progress import show_preparation, show_progress
@@ -35,7 +34,7 @@ def run_methods(options: EvaluateOptions) -> int:
     scored = score_methods(options)
     # A shard without cases has no tables.
     if list_row_paths(options.out):
-        with show_progress(Console(stderr=True, quiet=options.quiet)):
+        with show_progress(make_console(stderr=True, quiet=options.quiet)):
             write_and_print_tables(
                 options.out, options.quiet, num_rows=scored.num_rows, as_json=options.json
             )
@@ -60,7 +59,7 @@ def score_methods(options: EvaluateOptions) -> Scored:
     """Run and score the methods on the cases, and print the first failures."""
     if not options.paths:
         raise InputError("No data is given; name a cases.json, or scenes with --protocol.")
-    console = Console(stderr=True, quiet=options.quiet, highlight=False)
+    console = make_console(stderr=True, quiet=options.quiet)
     methods = expand_methods(options.methods)
     shard = parse_shard(options.shard, os.environ)
     if options.resolution is not None:
@@ -77,7 +76,7 @@ def score_methods(options: EvaluateOptions) -> Scored:
         )
     # Several clips can have the same note.
     for note in dict.fromkeys(notes):
-        console.print(note, markup=False, soft_wrap=True)
+        console.print(note, soft_wrap=True)
     print_skipped(skipped, console)
 
     devices = choose_devices(options.device, options.renderer_device, options.network_device)
@@ -103,7 +102,7 @@ def score_methods(options: EvaluateOptions) -> Scored:
     own = counts.done + counts.failed + counts.skipped
     print_failures(console, counts.failures, own)
     line = f"Scored {counts.done}, failed {counts.failed}, done earlier {counts.skipped}"
-    console.print(f"{line}, of {len(tasks)} cases by {len(methods)} methods.")
+    console.print(f"{line}, of {len(tasks)} cases by {len(methods)} methods.", soft_wrap=True)
     return Scored(len(tasks) * len(methods), own, counts.failures)
 
 
@@ -123,7 +122,7 @@ def describe_source(options: EvaluateOptions, has_masks: bool = False) -> dict[s
         **({"invert_masks": True} if has_masks and options.invert_masks else {}),
         **({"ignore_moving": True} if options.ignore_moving else {}),
         **({"one_per_scene": True} if options.one_per_scene else {}),
-        **({} if options.ego_mask else {"ego_mask": False}),
+        **({"ego_mask": False} if options.no_ego_mask else {}),
         **({} if loader is None else {"loader": asdict(loader)}),
         **({} if options.near is None else {"near": options.near}),
         **({} if options.far is None else {"far": options.far}),

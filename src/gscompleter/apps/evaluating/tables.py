@@ -5,13 +5,13 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from rich.console import Console
 from rich.table import Table
 
 from gscompleter.apps.command_line.answers import print_json
 from gscompleter.evaluation import tables
 from gscompleter.evaluation.store import list_row_paths
 from gscompleter.evaluation.tables import RunSummary
+from gscompleter.system.console import make_console
 from gscompleter.system.progress import show_preparation
 
 
@@ -57,9 +57,9 @@ def print_tables(summary: RunSummary, out: Path) -> None:
     if summary.common_tasks:
         seconds = [summary.compute_seconds(method)["total"] for method in summary.methods]
         table.add_row("seconds", *(f"{total:.1f}" for total in seconds))
-    console = Console(highlight=False)
+    console = make_console()
     console.print(table)
     for case, method, reason in summary.failures:
-        console.print(f"Failed: {case}, {method}: {reason}", markup=False)
+        console.print(f"Failed: {case}, {method}: {reason}", soft_wrap=True)
     over = f"Over {len(summary.common_tasks)} of {len(summary.tasks)} cases"
     console.print(f"{over}: {out / 'tables.md'}", soft_wrap=True)

@@ -118,4 +118,4 @@ def describe_masks(photographs: Photographs, task: CompletionTask) -> list[str]:
 def print_lines(console: Console, *lines: str) -> None:
     """Print lines without markup."""
     for line in lines:
-        console.print(line, highlight=False, markup=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)

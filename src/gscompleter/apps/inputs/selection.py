@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
@@ -15,7 +16,7 @@ from gscompleter.numerics.geometry import select_spread_cameras
 from gscompleter.planning.select_context import make_points_in_front, select_context
 from gscompleter.planning.select_overview import select_overview, summarize_cameras
 from gscompleter.reconstructors.features.depth_range import estimate_depth_range
-from gscompleter.system.errors import InputError
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.types import Camera
 
 NUM_CONTEXT = 3
@@ -63,10 +64,7 @@ def _choose_frames(
     """Choose context frames among `others`, hidden by a mask or not."""
     cameras = collect_usable_cameras(photographs, others, resolution)
     if not cameras:
-        raise InputError(
-            "The context needs photographs, and without the targets none can be used; name fewer "
-            "targets, or add photographs."
-        )
+        raise InputError(explain_unusable(photographs, others, resolution))
     if len(cameras) == 1:
         return tuple(cameras)
 
@@ -101,6 +99,36 @@ def collect_usable_cameras(
             if photographs.frame(frame).has_photograph():
                 cameras[frame] = photographs.camera(frame, resolution)
     return cameras
+
+
+def explain_unusable(
+    photographs: Photographs, frames: Sequence[int], resolution: Resolution
+) -> str:
+    """Explain why none of the photographs at `frames` can be used."""
+    if not frames:
+        return (
+            "The context needs photographs, and without the targets none is left; name fewer "
+            "targets, or add photographs."
+        )
+    missing = [frame for frame in frames if not photographs.frame(frame).has_photograph()]
+    reasons = []
+    for frame in frames:
+        if frame not in missing:
+            try:
+                photographs.camera(frame, resolution)
+            except InputError as error:
+                # Without the advice, which is the same for all, and what a library says.
+                reasons.append(re.split(r"; | \(", str(error))[0])
+    parts = []
+    if missing:
+        name = quote_value(photographs.frame(missing[0]).name)
+        parts.append(f"{len(missing)} {'is' if len(missing) == 1 else 'are'} missing ({name})")
+    if reasons:
+        parts.append(f"{len(reasons)} cannot be read ({quote_value(reasons[0], 150)})")
+    return (
+        f"None of the {len(frames)} photographs of the context can be used: "
+        f"{' and '.join(parts)}; copy the files again, or name others."
+    )
 
 
 def select_closest(

@@ -16,6 +16,7 @@ from gscompleter.apps.live.serving import LIVE_RESULTS, begin_session, prepare, 
 from gscompleter.apps.live.session import Session, Step, apply_step
 from gscompleter.apps.live.strokes import STROKES_FILE, StrokesFile, read_steps, read_strokes
 from gscompleter.apps.report.results import COMMAND
+from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.progress import show_progress, track
@@ -27,7 +28,7 @@ def replay_strokes(options: RepairOptions, strokes: Path) -> int:
     saved = read_strokes(path)
     steps = read_steps(saved, path.parent)
     options = add_saved_options(options, saved)
-    console = Console(stderr=True, quiet=options.quiet)
+    console = make_console(stderr=True, quiet=options.quiet)
     with (
         show_progress(console),
         reserve_output(options.out, options.overwrite, COMMAND, LIVE_RESULTS) as output,

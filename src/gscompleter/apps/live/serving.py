@@ -33,6 +33,7 @@ from gscompleter.apps.viewer.page import make_page
 from gscompleter.data.photograph_names import name_photograph
 from gscompleter.data.scene import write_cameras
 from gscompleter.state import Completion
+from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import convert_to_pixels
 from gscompleter.system.files.output_folder import check_output, open_output_folder, reserve_output
@@ -51,7 +52,7 @@ def serve_live(options: LiveOptions) -> None:
     check_bindable(resolve_host(options.host), options.host, options.port)
     libraries = packages.load_libraries()
     with reserve_output(options.out, options.overwrite, COMMAND, LIVE_RESULTS) as output:
-        console = Console(stderr=True, quiet=options.quiet)
+        console = make_console(stderr=True, quiet=options.quiet)
         print_lines(console, *output.describe_others())
         with show_progress(console):
             ready = prepare(options, console)

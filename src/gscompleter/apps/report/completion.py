@@ -46,7 +46,7 @@ from gscompleter.evaluation.verdict.kept import measure_kept
 from gscompleter.evaluation.verdict.outcome import judge_completion
 from gscompleter.evaluation.verdict.rows import ScoreRow
 from gscompleter.numerics.geometry import estimate_up
-from gscompleter.numerics.image_ops import compute_mask_fraction, paint_marked
+from gscompleter.numerics.image_ops import compute_mask_fraction, dilate, paint_marked
 from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.reconstructors.features.consistency import measure_pose_errors
 from gscompleter.render.protocols import Renderer
@@ -214,7 +214,7 @@ def make_score_rows(
         for key, group in rows.items()
     }
     # The verdict comes from the rows, so that the page and the terminal agree with them.
-    outcome = judge_completion(completion, held_out_rows, has_searched=has_searched)
+    outcome = judge_completion(completion, held_out_rows, has_searched, rows["context"])
     return {"outcome": asdict(outcome), **scores}
 
 
@@ -326,6 +326,7 @@ def make_target_row(
         target_id=result.target_id if len(added) or result.num_recolored else None,
         unfilled=UnfilledRow(**vars(result.unfilled)),
         notes=result.notes,
+        warnings=result.warnings,
         refused=result.refusal,
         offset=target.offset,
         thin_gaps=gaps.share,
@@ -508,7 +509,8 @@ def write_pictures(
     folder.mkdir()
     results = zip(targets, completion.targets, at_targets, strict=True)
     for number, (target, result, pair) in enumerate(results, start=1):
-        write_images(folder, f"target{number}", name_target_images(target, result, pair))
+        images = name_target_images(target, result, pair, completion.config.holes.dilation)
+        write_images(folder, f"target{number}", images)
     for number, view in enumerate(completion.views, start=1):
         if view.ignore_mask is not None or name_view == "render":
             write_images(folder, f"context{number}", {name_view: paint_ignored(view)})
@@ -541,10 +543,25 @@ def paint_unfilled(result: TargetResult, pair: RenderPair) -> Float[Tensor, "h w
     return paint_marked(pair.after.image, is_open)
 
 
+def paint_reference(result: TargetResult, dilation: int) -> Float[Tensor, "h w 3"] | None:
+    """Paint what was synthesized for a target where it was used; None if nothing was.
+
+    Elsewhere it is the scene before: there the image of Φ only guides the registration, and it may
+    look worse than the scene.
+    """
+    if result.reference is None:
+        return None
+    is_used = dilate(result.hole_mask, dilation)[..., None]
+    return result.reference.image.where(is_used, result.before.image)
+
+
 def name_target_images(
-    target: Target, result: TargetResult, pair: RenderPair
+    target: Target, result: TargetResult, pair: RenderPair, dilation: int
 ) -> dict[str, Tensor | None]:
-    """Name the images of a target: colours [h, w, 3], grey or masks [h, w]."""
+    """Name the images of a target: colours [h, w, 3], grey or masks [h, w].
+
+    `dilation` is that of the hole mask, in pixels.
+    """
     alpha = result.trusted_alpha
     return {
         "before": pair.before.image,
@@ -552,7 +569,7 @@ def name_target_images(
         "hole_mask": result.hole_mask.float(),
         "unfilled": paint_unfilled(result, pair),
         "support": None if torch.equal(alpha, result.before.alpha) else alpha,
-        "reference": None if result.reference is None else result.reference.image,
+        "reference": paint_reference(result, dilation),
         "truth": None if target.view is None else paint_ignored(target.view),
     }
 

@@ -27,9 +27,9 @@ from PIL import Image
 from gscompleter import __version__
 from gscompleter.apps.report.plain_words import (
     describe_alignment,
-    group_target_notes,
-    list_notes,
-    list_shared_notes,
+    group_target_warnings,
+    list_facts,
+    list_warnings,
 )
 from gscompleter.apps.report.schema import SCORES, CompletionSummary, read_record, read_summary
 from gscompleter.data.formats import SCENE_FORMATS
@@ -56,7 +56,8 @@ MAX_LISTED = 2000
 has all."""
 TARGET_COLUMNS = ("hole_fraction", "psnr_before", "psnr_after")
 TABLE_COLUMNS = (
-    *("job", "state", "reason", "attempts"),
+    *("job", "state", "reason", "attempts", "outcome", "headline"),
+    *("unused_before", "unused_after"),
     *("targets", *TARGET_COLUMNS),
     *("coverage_before", "coverage_after", "added"),
     *("seconds", "cpu_seconds", "result_bytes", "peak_bytes"),
@@ -147,10 +148,10 @@ def write_completion_page(folder: Path) -> None:
 def render_completion_page(folder: Path) -> str:
     """Render the page of the completion in `folder`."""
     summary = read_summary(folder)
-    # Notes that only one target has; those of several stand above.
-    groups = group_target_notes(summary.targets)
-    own_notes = [
-        row.notes if len(groups.get(row.notes, ())) == 1 else () for row in summary.targets
+    # Warnings that only one target has; those of several stand above.
+    groups = group_target_warnings(summary.targets)
+    own_warnings = [
+        row.warnings if len(groups.get(row.warnings, ())) == 1 else () for row in summary.targets
     ]
 
     path = summary.scene.splat or str(summary.settings.get("folder") or "")
@@ -162,8 +163,9 @@ def render_completion_page(folder: Path) -> str:
             "summary": summary,
             "record": read_record(folder, summary),
             "gallery": open_gallery(folder / "images"),
-            "notes": [*summary.scene.notes, *list_shared_notes(summary), *list_notes(summary)],
-            "own_notes": own_notes,
+            "warnings": list(list_warnings(summary)),
+            "facts": list_facts(summary),
+            "own_warnings": own_warnings,
             "photographs": list_photographs(summary),
             "describe_alignment": describe_alignment,
             "unit": find_length_unit(summary),
@@ -206,7 +208,11 @@ def average_scores(summary: Mapping[str, Any]) -> dict[str, Any]:
     """Average the scores of a completion over its targets."""
     # Three columns are averages; the others are of the whole completion.
     targets = summary["targets"]
+    # Photographs that were not used test the result, where the scene covers them.
+    unused = [row for row in summary["held_out"] if row["psnr_after"] is not None]
     return {
+        "unused_before": average(row["psnr_before"] for row in unused),
+        "unused_after": average(row["psnr_after"] for row in unused),
         "targets": len(targets),
         **{key: average(target[key] for target in targets) for key in TARGET_COLUMNS},
         "coverage_before": summary["coverage"]["before"],
@@ -238,24 +244,39 @@ def render_batch_page(out: Path, rows: Sequence[Mapping[str, Any]]) -> str:
     """Render the page of the batch in `out`."""
     good = [row for row in rows if row["state"] == "done"]
     bad = [row for row in rows if row["state"] == "failed"]
-    gains = [r["psnr_after"] - r["psnr_before"] for r in good if r["psnr_after"] is not None]
+    empty = [row for row in good if row.get("outcome") == "nothing-gained"]
     seconds = [row["seconds"] for row in good]
     return render_template(
         "batch.html",
         {
-            "counts": {"done": len(good), "failed": len(bad)},
-            "jobs": good[:MAX_LISTED],
+            "counts": {
+                "completed": len(good) - len(empty),
+                "nothing gained": len(empty),
+                "failed": len(bad),
+            },
+            "jobs": [{**dict.fromkeys(TABLE_COLUMNS), **row} for row in good[:MAX_LISTED]],
+            "done": len(good),
             "failures": bad[:MAX_LISTED],
             "reported": {
                 row["job"]
                 for row in bad[:MAX_LISTED]
                 if os.path.isfile(out / JOBS / row["job"] / REPORT_FILE)
             },
-            "gain": median(gains) if gains else None,
-            "seconds": median(seconds) if seconds else None,
+            "gains": {
+                "at unused photographs": find_median_gain(good, "unused"),
+                "at targets": find_median_gain(good, "psnr"),
+            },
+            "seconds": round(median(seconds)) if seconds else None,
             "hours": sum(seconds) / 3600,
             "folder": JOBS,
             "report": REPORT_FILE,
             "table": TABLE_FILE,
         },
     )
+
+
+def find_median_gain(rows: Sequence[Mapping[str, Any]], score: str) -> float | None:
+    """Return the median gain of a score in dB over the jobs that have it, or None."""
+    pairs = [(row.get(f"{score}_before"), row.get(f"{score}_after")) for row in rows]
+    gains = [after - before for before, after in pairs if None not in (before, after)]
+    return median(gains) if gains else None

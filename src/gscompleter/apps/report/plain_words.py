@@ -1,14 +1,16 @@
-"""Notes on what differs from a usual completion, as sentences."""
+"""Notes on a completion, as sentences: what a person has to act on, and facts."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 
 from gscompleter.apps.report.schema import (
     AlignmentRow,
     CompletionSummary,
     RemovalRow,
     TargetRow,
+    UnfilledRow,
 )
 from gscompleter.evaluation.verdict.kept import KeptRow
 from gscompleter.evaluation.verdict.numbers import format_number, format_percent
@@ -59,27 +61,78 @@ NOTHING_NEW_NOTE = (
 )
 
 
-def list_notes(summary: CompletionSummary) -> Iterator[str]:
+@dataclass(frozen=True)
+class Note:
+    """A sentence about a completion."""
+
+    topic: str
+    """What it is about, in a word or two."""
+    text: str
+    is_warning: bool = False
+    """True if a person has to act on it, or has to look at the result; else it is a fact."""
+
+
+def list_warnings(summary: CompletionSummary) -> Iterator[str]:
+    """List the warnings: first those of several targets, then those of the whole completion."""
+    yield from list_shared_warnings(summary)
+    yield from (note.text for note in list_notes(summary) if note.is_warning)
+
+
+def list_facts(summary: CompletionSummary) -> list[tuple[str, str]]:
+    """List what else is known of a completion, as topics and sentences.
+
+    What the headline says of all targets is left out.
+    """
+    notes = list_notes(summary)
+    facts = [("opening", text) for text in summary.scene.notes]
+    facts += [(note.topic, note.text) for note in notes if not note.is_warning]
+    if summary.outcome.status != "nothing-gained":
+        for number, row in enumerate(summary.targets, start=1):
+            own = [text for text in row.notes if text not in row.warnings]
+            own += describe_losses(row.unfilled)
+            facts += [(f"target {number}", text) for text in own]
+    return facts
+
+
+def describe_losses(unfilled: UnfilledRow) -> list[str]:
+    """Describe what stays empty of the hole of a target, and the steps that left it so."""
+    if not unfilled.lost_by:
+        return []
+    steps = ", ".join(f"{step} {format_percent(part)}" for step, part in unfilled.lost_by.items())
+    boxes = "; ".join(
+        f"x {left} to {right}, y {top} to {bottom}" for left, top, right, bottom in unfilled.regions
+    )
+    return [
+        f"Empty of the hole with its seam and padding: {format_percent(unfilled.share)}; by the "
+        f"step after which it was open: {steps}; the largest parts: {boxes} (pixels)."
+    ]
+
+
+def list_notes(summary: CompletionSummary) -> Iterator[Note]:
     """List the notes on the whole completion."""
     frame = summary.frame
     scene = summary.scene
     targets = summary.targets
     if frame.method in FRAME_NOTES:
-        yield f"The splat is {FRAME_NOTES[frame.method]}; summary.json lists the transform."
+        text = f"The splat is {FRAME_NOTES[frame.method]}; summary.json lists the transform."
+        yield Note("frame", text)
     if any(frame.origin):
-        yield ORIGIN_NOTE
+        yield Note("coordinates", ORIGIN_NOTE)
     if scene.renders_from is not None:
-        yield BARE_NOTE
-        yield describe_kept(summary.kept)
+        yield Note("check", BARE_NOTE)
+        is_seen = summary.kept is not None and not summary.kept.is_unseen
+        yield Note("other cameras", describe_kept(summary.kept), is_seen)
     else:
         yield from list_photograph_notes(summary)
-    yield from summary.context_notes
+    for text in summary.context_notes:
+        yield Note("depth", text)
     if scene.renders_from is None and summary.settings.get("context") is None:
-        yield f"{scene.used} of {scene.photographs} photographs were chosen as the context."
+        text = f"{scene.used} of {scene.photographs} photographs were chosen as the context."
+        yield Note("context", text)
     if summary.settings.get("uses_target_photographs"):
-        yield ORACLE_NOTE
-    if targets and all(row.psnr_after is None for row in targets):
-        yield "No target has a photograph, so there are no scores at targets."
+        yield Note("generator", ORACLE_NOTE, is_warning=True)
+    if scene.renders_from is None and targets and all(row.psnr_after is None for row in targets):
+        yield Note("scores", "No target has a photograph, so there are no scores at targets.")
     yield from list_splat_notes(summary)
 
 
@@ -100,25 +153,25 @@ def describe_kept(kept: KeptRow | None) -> str:
     )
 
 
-def group_target_notes(targets: Sequence[TargetRow]) -> dict[tuple[str, ...], list[int]]:
-    """Group targets, numbered from 1, that have the same notes; those without notes are left out.
+def group_target_warnings(targets: Sequence[TargetRow]) -> dict[tuple[str, ...], list[int]]:
+    """Group targets, numbered from 1, that have the same warnings; those without are left out.
 
     What holds for several targets is then said once.
     """
     groups: dict[tuple[str, ...], list[int]] = {}
     for number, row in enumerate(targets, start=1):
-        if row.notes:
-            groups.setdefault(row.notes, []).append(number)
+        if row.warnings:
+            groups.setdefault(row.warnings, []).append(number)
     return groups
 
 
-def list_shared_notes(summary: CompletionSummary) -> Iterator[str]:
-    """List the notes of targets that several have, unless the headline says them."""
+def list_shared_warnings(summary: CompletionSummary) -> Iterator[str]:
+    """List the warnings of targets that several have, unless the headline says them."""
     if summary.outcome.status == "nothing-gained":
         return
-    for notes, numbers in group_target_notes(summary.targets).items():
+    for warnings, numbers in group_target_warnings(summary.targets).items():
         if len(numbers) > 1:
-            yield f"{name_targets(numbers, len(summary.targets))}: {' '.join(notes)}"
+            yield f"{name_targets(numbers, len(summary.targets))}: {' '.join(warnings)}"
 
 
 def name_targets(numbers: Sequence[int], total: int) -> str:
@@ -129,7 +182,7 @@ def name_targets(numbers: Sequence[int], total: int) -> str:
     return f"Targets {first} and {numbers[-1]}"
 
 
-def list_photograph_notes(summary: CompletionSummary) -> Iterator[str]:
+def list_photograph_notes(summary: CompletionSummary) -> Iterator[Note]:
     """List the notes on what moves, on what is ignored, on poses and on exposures."""
     context = summary.context
     moving = [row for row in context if row.dynamic_fraction > 0]
@@ -138,34 +191,40 @@ def list_photograph_notes(summary: CompletionSummary) -> Iterator[str]:
             f"{format_percent(row.dynamic_fraction)} of photograph {row.photograph}"
             for row in moving
         )
-        yield f"{', '.join(shares)} show something that moves; these regions are not used."
+        text = f"{', '.join(shares)} show something that moves; these regions are not used."
+        yield Note("moving things", text)
 
     given_share = max((row.given_depth for row in context), default=0.0)
     if given_share > 0:
-        yield describe_given_depth(given_share, summary)
+        yield Note("given depth", describe_given_depth(given_share, summary))
 
     ignored_share = max((row.ignored for row in context), default=0.0)
     if ignored_share > 0:
-        yield (
+        yield Note(
+            "ignored",
             f"Up to {format_percent(ignored_share)} of a photograph {describe_ignored(summary)}; "
-            "it is ignored, also in scores (images/context*_ignored.png)."
+            "it is ignored, also in scores (images/context*_ignored.png).",
         )
 
     displaced = [row for row in context if (row.pose_error or 0) >= MIN_POSE_ERROR]
     if displaced:
         named = ", ".join(str(row.photograph) for row in displaced)
         worst = max(row.pose_error or 0 for row in displaced)
-        yield (
+        yield Note(
+            "poses",
             f"The poses of photographs {named} contradict the other photographs by up to "
-            f"{format_number(worst, 1)} pixels, which blurs what they show together."
+            f"{format_number(worst, 1)} pixels, which blurs what they show together; leave them "
+            "out (--context names the others), or find all cameras anew (gscompleter poses).",
+            is_warning=True,
         )
 
     factors = [factor for row in context for factor in row.exposure_gain or ()]
     if factors:
-        yield (
+        yield Note(
+            "exposure",
             "The exposures of the context photographs differ by a factor of up to "
             f"{max(factors) / min(factors):.2f}; the scene has the mean exposure, at which these "
-            "photographs are scored. Target photographs are scored as they are."
+            "photographs are scored. Target photographs are scored as they are.",
         )
 
 
@@ -191,39 +250,44 @@ def describe_ignored(summary: CompletionSummary) -> str:
     return "is hidden by a mask, or stays the same while the camera moves, like a vehicle's bonnet"
 
 
-def list_splat_notes(summary: CompletionSummary) -> Iterator[str]:
+def list_splat_notes(summary: CompletionSummary) -> Iterator[Note]:
     """List the notes on what photographs bring to a splat."""
     from_photographs = summary.gaussians.get("from_photographs")
+    num_recolored = summary.gaussians.get("recolored")
     if from_photographs:
         invented = summary.gaussians["added"] - from_photographs
         painters = {row.painter for row in summary.targets if row.painter}
         maker = " and ".join(sorted(painters)) or "the generator"
-        yield (
+        yield Note(
+            "sources",
             f"{from_photographs:,} of the added Gaussians come from photographs, which show what "
-            f"the splat lacked; {maker} invented {invented:,}."
+            f"the splat lacked; {maker} invented {invented:,}.",
         )
     if summary.new_photographs == 0 and not from_photographs:
-        yield NOTHING_NEW_NOTE
-        yield describe_wanted_photographs(summary.targets)
-    elif summary.new_photographs:
-        yield (
+        wanted = describe_wanted_photographs(summary.targets)
+        yield Note("new photographs", f"{NOTHING_NEW_NOTE} {wanted}", is_warning=True)
+    elif summary.new_photographs and num_recolored:
+        yield Note(
+            "new photographs",
             f"The splat does not reproduce {summary.new_photographs} of the photographs; it is "
-            "recoloured to them, which helps most."
+            "recoloured to them, which helps most.",
         )
     num_removed = summary.gaussians.get("removed")
     if num_removed:
-        yield f"{num_removed:,} {REMOVED_NOTE}"
+        yield Note("removed", f"{num_removed:,} {REMOVED_NOTE}")
     if summary.removal is not None:
-        yield describe_removal(summary.removal, summary.scene.renders_from is not None)
+        is_left = summary.removal.continued >= MIN_CONTINUED
+        text = describe_removal(summary.removal, summary.scene.renders_from is not None)
+        yield Note("outline", text, is_left)
     margin = summary.settings.get("margin")
     if isinstance(margin, float) and margin > 0:
-        yield (
+        yield Note(
+            "region",
             f"The region of the removal reaches {margin:.3g} farther than given on every side, "
-            "which is the size of one Gaussian, so that faces go as a whole."
+            "which is the size of one Gaussian, so that faces go as a whole.",
         )
-    num_recolored = summary.gaussians.get("recolored")
     if num_recolored:
-        yield f"{num_recolored:,} {RECOLORED_NOTE}"
+        yield Note("recoloured", f"{num_recolored:,} {RECOLORED_NOTE}")
 
 
 def describe_removal(row: RemovalRow, is_render: bool) -> str:

@@ -93,6 +93,8 @@ class TargetRow(ScoreRow):
     """Value of `generated` of its Gaussians in completed.ply; None if nothing was changed."""
     unfilled: UnfilledRow = UnfilledRow()
     notes: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()
+    """Those of the notes that ask for a look at the result."""
     refused: str | None = None
     """Sentence why the target cannot be completed, or None if it can."""
     derived_file: str | None = None

@@ -12,7 +12,7 @@ from gscompleter.editing.removal import hide_removed
 from gscompleter.evaluation.metrics.coverage import RenderPair
 from gscompleter.evaluation.metrics.image import compute_masked_psnr, compute_masked_ssim
 from gscompleter.evaluation.metrics.unused_photographs import measure_likeness, shrink_view
-from gscompleter.evaluation.verdict.rows import HeldOutRow
+from gscompleter.evaluation.verdict.rows import HeldOutRow, ScoreRow
 from gscompleter.numerics.image_ops import compute_mask_fraction
 from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
@@ -70,6 +70,22 @@ def score_held_out(
 
     map_views = get_view_map(completion.context.means, len(completion.context))
     return list(map_views(score, held_out))
+
+
+def score_context(completion: Completion, renderer: Renderer) -> list[ScoreRow]:
+    """Score the photographs in use, except where they show what was removed, by PSNR alone."""
+
+    def score(view: View) -> ScoreRow:
+        shown = hide_removed(view, completion.source, renderer)
+        pair = render_before_after(completion, view.camera, renderer)
+        renders = (pair.before, pair.after)
+        before, after = (
+            compute_masked_psnr(render.image, shown.image, shown.valid_mask) for render in renders
+        )
+        return ScoreRow(view.frame, before, after, None, None)
+
+    map_views = get_view_map(completion.context.means, len(completion.context))
+    return list(map_views(score, completion.views))
 
 
 def score_photograph(completion: Completion, view: View, renderer: Renderer) -> HeldOutRow:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gscompleter.evaluation.verdict.held_out import HeldOut, score_held_out
+from gscompleter.evaluation.verdict.held_out import HeldOut, score_context, score_held_out
 from gscompleter.evaluation.verdict.outcome import judge_completion
 from gscompleter.evaluation.verdict.rows import OutcomeRow
 from gscompleter.numerics.value_checks import check_views
@@ -32,7 +32,9 @@ def judge(completion: Completion, unused_views: Sequence[View] = ()) -> OutcomeR
     """
     held_out = hold_out(completion, unused_views)
     renderer = load_renderer(completion.views[0].image.device.type)
-    return judge_completion(completion, score_held_out(completion, held_out, renderer))
+    rows = score_held_out(completion, held_out, renderer)
+    context = score_context(completion, renderer) if completion.is_given else []
+    return judge_completion(completion, rows, context=context)
 
 
 def hold_out(completion: Completion, unused_views: Sequence[View]) -> list[HeldOut]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from math import isinf
 from statistics import median
 
 from gscompleter.evaluation.metrics.unused_photographs import shrink_view
@@ -16,7 +17,7 @@ from gscompleter.evaluation.verdict.numbers import (
     format_number,
     format_percent,
 )
-from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow
+from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow, ScoreRow
 from gscompleter.reconstructors.features.consistency import count_consistent_matches
 from gscompleter.stages.target_view import NOTHING_TO_COMPLETE
 from gscompleter.state import Completion, TargetResult
@@ -44,6 +45,8 @@ the cameras differ much, so that this notices about half of them.
 """
 MIN_MATCHES = 20
 """Fewest matched features that decide: by chance, few wrong ones may fit."""
+MIN_GAIN = 0.5
+"""Gain of PSNR in dB from which a photograph of the context counts as better than before."""
 MIN_LOSS = 0.05
 """Loss of PSNR in dB from which the headline mentions it; smaller ones cannot be seen."""
 
@@ -59,11 +62,15 @@ NOTHING_LEFT = "no Gaussian that was generated lies in the hole"
 
 
 def judge_completion(
-    completion: Completion, held_out: Sequence[HeldOutRow], has_searched: bool = True
+    completion: Completion,
+    held_out: Sequence[HeldOutRow],
+    has_searched: bool = True,
+    context: Sequence[ScoreRow] = (),
 ) -> OutcomeRow:
     """Judge a completion by photographs that were not used, and by what was added.
 
-    `has_searched` is False if targets were neither named nor searched for.
+    `has_searched` is False if targets were neither named nor searched for. `context` are the scores
+    at the photographs in use, which tell what a given scene gained where no other one does.
 
     A given scene did reconstruct: it was compared with its photographs when it was aligned. The
     depths of a single photograph are predicted, in a unit that other photographs need not share.
@@ -81,8 +88,10 @@ def judge_completion(
     if not has_gained:
         reason = explain_no_gain(completion) if has_searched else NOTHING_LACKS
         return OutcomeRow("nothing-gained", reason)
-    work = describe_work(completion)
-    return OutcomeRow("completed", describe_gain(work, held_out))
+    gains = context if completion.is_given else ()
+    gain = describe_gain(describe_work(completion), held_out, gains)
+    added = describe_added(completion)
+    return OutcomeRow("completed", f"{gain}; {added}." if added else f"{gain}.")
 
 
 def explain_unreconstructed(completion: Completion, held_out: Sequence[HeldOutRow]) -> str | None:
@@ -177,18 +186,56 @@ def describe_work(completion: Completion) -> str:
     return f"{work} for {changed} of {total} targets" if changed < total else work
 
 
-def describe_gain(work: str, held_out: Sequence[HeldOutRow]) -> str:
-    """Describe a completion, and how other photographs confirm or contradict it."""
-    rows = select_testing([row for row in held_out if row.psnr_after is not None])
-    if not rows:
-        return f"{work}; no unused photograph could test it."
+def describe_gain(
+    work: str, held_out: Sequence[HeldOutRow], context: Sequence[ScoreRow] = ()
+) -> str:
+    """Describe a completion, and how photographs confirm or contradict it, without a full stop.
+
+    Unused photographs tell it best, then those of the `context` of a given scene that gained.
+    """
+    scored = [row for row in held_out if row.psnr_after is not None]
+    better = [row for row in context if compute_gain(row) >= MIN_GAIN]
+    has_unused = any(not row.is_check for row in scored)
+    if not scored or (better and not has_unused):
+        if not better:
+            return f"{work}; no unused photograph could test it"
+        gains = format_number(average(compute_gain(row) for row in better), 1)
+        gain = "1 photograph gains" if len(better) == 1 else f"{len(better)} photographs gain"
+        return f"{work}: {gain} {gains} dB"
+
+    rows = select_testing(scored)
     before = average(row.psnr_before for row in rows) or 0.0
     after = average(row.psnr_after for row in rows) or 0.0
     scores = f"{format_number(before)} dB before, {format_number(after)} dB after"
     scores += describe_measured([row.unmasked for row in rows])
     if after < before - MIN_LOSS:
-        return f"{work}, but it matches {name_unused(rows)} worse than before: {scores}."
-    return f"{work}; at {name_unused(rows)}, where it covers them: {scores}."
+        return f"{work}, but it matches {name_unused(rows)} worse than before: {scores}"
+    verb = "gains" if len(rows) == 1 else "gain"
+    gain = f"{format_number(max(0.0, after - before), 1)} dB"
+    return f"{work}: {name_unused(rows)} {verb} {gain} where it covers them ({scores})"
+
+
+def compute_gain(row: ScoreRow) -> float:
+    """Return the gain of PSNR of a photograph in dB; none without a score or of an equal image."""
+    if row.psnr_before is None or row.psnr_after is None or isinf(row.psnr_before):
+        return 0.0
+    return row.psnr_after - row.psnr_before
+
+
+def describe_added(completion: Completion) -> str:
+    """Describe in a clause where the added Gaussians come from; empty if there are none."""
+    observed = completion.num_observed
+    made = len(completion.added) - observed
+    verb = "painted" if any(result.painter for result in completion.targets) else "invented"
+    if observed:
+        others = round_count(made) if made else "none"
+        return f"{round_count(observed)} Gaussians from photographs, {others} {verb}"
+    return f"{round_count(made)} Gaussians {verb}" if made else ""
+
+
+def round_count(count: int) -> str:
+    """Write a number of Gaussians with two digits that count."""
+    return f"{float(f'{count:.2g}'):,.0f}"
 
 
 def select_testing(held_out: Sequence[HeldOutRow]) -> list[HeldOutRow]:

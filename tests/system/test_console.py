@@ -1,0 +1,92 @@
+"""Lines and tables hold names of files as they are."""
+
+from __future__ import annotations
+
+import ast
+import io
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from rich.table import Table
+
+from command import run
+from gscompleter.apps.completing.printing import print_completion
+from gscompleter.cli import parse_command
+from gscompleter.system.console import make_console
+from paths import TESTS
+from scenes import camera_at, photographed
+
+SOURCES = TESTS.parent / "src" / "gscompleter"
+ODD = "b].png [red][/b] :cat: [link=x]"
+"""A name of which rich would leave out parts, colour others, draw one, and end with an error."""
+
+
+def find_consoles(source: str) -> list[str]:
+    """List what a file takes from rich that would print: names other than the type of a console."""
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in (
+            *("Console", "get_console", "print_json", "from_markup", "render_markup"),
+        ):
+            found.append(ast.unparse(node.func))
+        if isinstance(node, ast.ImportFrom) and node.module == "rich":
+            found += [f"rich.{name.name}" for name in node.names if name.name == "print"]
+        found += [
+            f"{keyword.arg}={ast.unparse(keyword.value)}"
+            for keyword in getattr(node, "keywords", ())
+            if keyword.arg in ("markup", "emoji")
+        ]
+    return found
+
+
+def test_there_is_no_other_console():
+    """Each file prints with `make_console`, and none turns the markup on again."""
+    allowed = {"system/console.py": ["markup=False", "emoji=False"]}
+    for path in SOURCES.rglob("*.py"):
+        name = path.relative_to(SOURCES).as_posix()
+        found = [one for one in find_consoles(path.read_text()) if one != "print_json"]
+        assert found == allowed.get(name, []), name
+
+
+def test_other_consoles_are_found():
+    assert find_consoles("Console(stderr=True)") == ["Console"]
+    assert find_consoles("import rich.console\nrich.console.Console()") == ["rich.console.Console"]
+    assert find_consoles("from rich import print") == ["rich.print"]
+    assert find_consoles("console.print(name, markup=True)") == ["markup=True"]
+
+
+def test_lines_and_cells_hold_a_name_as_it_is():
+    console = make_console(file=io.StringIO(), width=200)
+    console.print(ODD)
+    table = Table(ODD, box=None)
+    table.add_row(ODD)
+    console.print(table)
+    assert [line.strip() for line in console.file.getvalue().splitlines()] == [ODD] * 3
+
+
+def test_a_completion_names_its_folder_and_photographs_as_they_are(tmp_path, capsys, monkeypatch):
+    """Results below a folder `[`, whose photographs have brackets in their names."""
+    monkeypatch.setenv("COLUMNS", "300")
+    out = Path(shutil.copytree(TESTS / "fixtures/results/before-formats", tmp_path / "[" / "o[x]"))
+    summary = json.loads((out / "summary.json").read_text())
+    for row in (*summary["context"], *summary["targets"]):
+        row["file"] = "c [red] b].png"
+    (out / "summary.json").write_text(json.dumps(summary))
+    options = parse_command(["complete", str(tmp_path), "--target", "0", "--out", str(out)])
+    print_completion(options)
+    said = capsys.readouterr().out
+    assert "context 0 (c [red] b].png)" in said
+    assert "(c [red] b].png)" in said.split("target: ")[1]
+    assert f"Report: {out / 'report.html'}" in said
+
+
+@pytest.mark.slow
+def test_a_dry_run_names_its_folder_as_it_is(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "300")
+    scene = photographed(tmp_path / "[", [camera_at(x, size=32) for x in (-0.2, 0.2, 0.6)])
+    out = tmp_path / "o[x]"
+    words = ("--context", 0, 1, "--target", 2, "--near", 0.5, "--far", 20, "--dry-run")
+    assert run(monkeypatch, "complete", scene, *words, "--out", out) == 0
+    assert f"Edit the cameras in {out / 'targets.json'}." in capsys.readouterr().out
