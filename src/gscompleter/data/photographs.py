@@ -93,14 +93,25 @@ class Photographs:
     def __len__(self) -> int:
         return len(self.frames)
 
-    def camera(self, frame: int, resolution: Resolution = None) -> Camera:
-        """Return the camera of a frame, even without its photograph if the file gives the size."""
-        chosen = self.frame(frame)
+    def camera(self, frame: int | str, resolution: Resolution = None) -> Camera:
+        """Return the camera of a frame, even without its photograph if the file gives the size.
+
+        `frame` is its number, or the name of its photograph.
+        """
+        chosen = self.frame(self.find_frame(frame))
         return self._build_camera(chosen, chosen.size(), resolution)
 
-    def views(self, frames: Sequence[int], resolution: Resolution = None) -> list[View]:
-        """Load undistorted photographs with cameras, known depth and the detected vehicle."""
-        return [self._load_view(number, resolution) for number in frames]
+    def views(self, frames: Sequence[int | str], resolution: Resolution = None) -> list[View]:
+        """Load undistorted photographs with cameras, known depth and the detected vehicle.
+
+        `frames` are their numbers or their names.
+        """
+        return [self._load_view(self.find_frame(word), resolution) for word in frames]
+
+    @property
+    def posed(self) -> list[int]:
+        """Numbers of the frames whose camera is known; the others keep their numbers unused."""
+        return [number for number, frame in enumerate(self.frames) if frame.has_camera]
 
     def list_masks(self) -> list[Path]:
         """List the mask images that hide something, without alpha channels."""
@@ -201,9 +212,9 @@ class Photographs:
         A name may lack its ending and its folders, and its case does not matter if no other
         photograph has it.
         """
-        if isinstance(word, int):
+        if not isinstance(word, str):
             self.frame(word)
-            return word
+            return int(word)
         numbers = self._match_names(word)
         names = [self.frame(number).file_name for number in numbers]
         if len(numbers) > 1:

@@ -271,7 +271,7 @@ def choose_known(photographs: Photographs) -> list[int]:
     """Choose photographs to compare with: those that exist, of very many some far apart."""
     frames = [
         number
-        for number in range(len(photographs))
+        for number in photographs.posed
         if photographs.frame(number).has_photograph() and not photographs.is_hidden(number)
     ]
     if len(frames) <= MAX_KNOWN:

@@ -28,12 +28,13 @@ from PIL import Image, ImageOps
 
 from gscompleter.data.camera_files import refuse_other_exports
 from gscompleter.data.file_names import FolderListings
-from gscompleter.data.frame import DOWNSCALE_FACTORS, MASKS
+from gscompleter.data.frame import DOWNSCALE_FACTORS, MASKS, Frame
 from gscompleter.data.limits import require
 from gscompleter.data.mask_checks import check_hiding_masks, refuse_nothing_to_invert
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.masks import MASK_FOLDERS, find_mask, leave_out_masks, load_mask
 from gscompleter.data.panorama import has_panoramas, split_panorama
+from gscompleter.data.photographs import Photographs
 from gscompleter.data.video import NUM_FRAMES, extract_frames, is_video
 from gscompleter.system.children import run_module
 from gscompleter.system.errors import InputError, join_names, quote_value
@@ -156,7 +157,10 @@ class FoundPoses:
             )
         if self.missing:
             names = join_names(self.missing, MAX_NAMED)
-            notes.append(f"No camera was found for {names}; they are left out.")
+            notes.append(
+                f"No camera was found for {names}; they are not used, and the others keep their "
+                "numbers."
+            )
         return notes
 
 
@@ -251,6 +255,34 @@ def read_earlier(out: Path, entry: str, known: Mapping[str, Any]) -> dict[str, A
         return None
     result: dict[str, Any] = content[entry]
     return result
+
+
+def list_unplaced(scene: Photographs, path: Path) -> list[Frame]:
+    """List the copies for which no camera was found, if our search wrote the model in `path`.
+
+    As frames without a camera among the others they keep the numbers of all photographs those of
+    the folder that the user gave.
+    """
+    content = {}
+    if os.path.isfile(path / SUMMARY_FILE) and os.path.isdir(path / IMAGES):
+        content = read_json(path / SUMMARY_FILE, "name another folder")
+    if not isinstance(content, dict) or "poses" not in content:
+        return []
+    placed = {frame.name for frame in scene.frames}
+    first = scene.frames[0]
+    return [
+        replace(
+            first,
+            name=name,
+            title=f"image {quote_value(name)} of {quote_value(path)}",
+            c2w=np.full((4, 4), np.nan),
+            image=path / IMAGES / name,
+            seen_points=None,
+            lack="COLMAP found no camera for it",
+        )
+        for name in list_all_photographs(path / IMAGES)
+        if name not in placed
+    ]
 
 
 def has_photographs(path: Path) -> bool:
