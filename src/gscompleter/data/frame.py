@@ -62,6 +62,8 @@ class Frame:
     """Expected path of the photograph, or a function that returns the bytes of its file."""
     depth: Callable[[], Float[np.ndarray, "h w"]] | None = None
     """Reads a depth map of any size: z-depth in scene units, 0 where unknown."""
+    predicted_depth: Callable[[], Float[np.ndarray, "h w"]] | None = None
+    """Reads a depth map that a network predicted, in scene units as far as its file tells."""
     mask: Path | None = None
     """Mask image; its black pixels are ignored (`data/masks.py`)."""
     has_inverted_mask: bool = False
@@ -217,9 +219,7 @@ class Frame:
     def make_error(self, defect: str) -> InputError:
         """Build the error for a frame with this defect."""
         advice = "correct it, or leave the frame out" if self.lack is None else "name another one"
-        return InputError(
-            f"{capitalize(self.title)} cannot be used, because {defect}; {advice}."
-        )
+        return InputError(f"{capitalize(self.title)} cannot be used, because {defect}; {advice}.")
 
 
 def find_image(path: Path, listings: FolderListings | None = None) -> Path | None:

@@ -113,6 +113,20 @@ class Photographs:
         """Numbers of the frames whose camera is known; the others keep their numbers unused."""
         return [number for number, frame in enumerate(self.frames) if frame.has_camera]
 
+    def load_predicted_depth(self, view: View) -> Float[Tensor, "h w"] | None:
+        """Load the predicted depth beside a photograph at the size of its view; None without one.
+
+        It is z-depth in scene units as far as its file tells, 0 where unknown or ignored.
+        """
+        if view.frame is None or not 0 <= view.frame < len(self):
+            return None
+        frame = self.frame(view.frame)
+        if frame.predicted_depth is None:
+            return None
+        shape = view.camera.height, view.camera.width
+        depth = undistort_and_resize(frame, frame.predicted_depth(), frame.size(), shape)
+        return torch.from_numpy(depth).where(view.valid_mask.cpu(), 0.0)
+
     def list_masks(self) -> list[Path]:
         """List the mask images that hide something, without alpha channels."""
         return [f.mask for f in self.frames if f.mask is not None] if self.is_masked else []

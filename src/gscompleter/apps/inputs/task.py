@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -121,6 +121,8 @@ class CompletionTask:
     """Check views of the input splat, at low resolution."""
     depth_notes: tuple[str, ...] = ()
     """Sentences about the unit of the given depth."""
+    predicted_depths: Mapping[int, Float[Tensor, "h w"]] = field(default_factory=dict)
+    """Predicted z-depth that lies beside photographs, by frame: it only supports stereo."""
     witnesses: Witnesses = Witnesses()
     """Further cameras from which a splat without photographs looks well."""
 
