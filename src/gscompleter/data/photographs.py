@@ -255,7 +255,8 @@ class Photographs:
             if word in (frame.name, frame.file_name, PurePosixPath(path).name):
                 exact.append(number)
             # The word may lack folders, and so may the name: either may be the end of the other.
-            names = fold_name(path), os.path.splitext(fold_name(path))[0]
+            full = [fold_name(path), fold_name(frame.file_name)]
+            names = [*full, *(os.path.splitext(name)[0] for name in full)]
             if any(_ends_alike(PurePosixPath(name).parts, wanted) for name in names):
                 similar.append(number)
         return exact or similar

@@ -16,7 +16,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -61,6 +61,10 @@ ENDINGS = (
 """Endings of photographs, in any case."""
 OTHER_FOLDERS = (*MASK_FOLDERS, "depth", "depths", *(f"images_{n}" for n in DOWNSCALE_FACTORS))
 """Folders that hold no photographs of the user."""
+PACKED_INDEX = "meta.json"
+"""File beside the images of an unpacked .sog, which says what they hold."""
+MAX_INDEX = 1 << 26
+"""Largest such file that is looked into, in bytes."""
 SEPARATORS = r"[\s#]"
 """Characters that names of copies do not have: in COLMAP's lists a space ends a name, and # begins
 a comment."""
@@ -333,12 +337,25 @@ def iterate_photographs(folder: Path) -> Iterator[Path]:
         )
         # In place, as `os.walk` documents it: it then enters only these folders.
         folders[:] = [name for name in folders if is_own(Path(home, name))]
+        if holds_packed_splat(Path(home)):
+            continue
         images = [
             name
             for name in files
             if not name.startswith(".") and Path(name).suffix.lower() in ENDINGS
         ]
         yield from (Path(home, name) for name in leave_out_masks(images))
+
+
+def holds_packed_splat(folder: Path) -> bool:
+    """Check for an unpacked .sog: its images are tables of Gaussians, and no photographs."""
+    file = folder / PACKED_INDEX
+    if not os.path.isfile(file) or os.path.getsize(file) > MAX_INDEX:
+        return False
+    content: object = None
+    with suppress(OSError, ValueError, RecursionError):
+        content = json.loads(file.read_bytes())
+    return isinstance(content, dict) and {"means", "quats"} <= content.keys()
 
 
 def is_own(folder: Path) -> bool:
