@@ -19,12 +19,14 @@ from gscompleter.data.transforms import OPENCV_FROM_OPENGL, parse_camera_frame
 from gscompleter.system.errors import quote_value, require_path
 from gscompleter.system.files.result_format import MARK
 from gscompleter.system.files.writing import replace_file
+from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import Camera, View
 
 CAMERA_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "transform_matrix")
 """Keys by which `describe_camera` describes a camera."""
 
 
+@run_in_plain_torch
 def load_views(
     scene: Path | str,
     frames: Sequence[int | str] | None = None,
@@ -58,6 +60,7 @@ def load_views(
     return photographs.views(chosen, resolution)
 
 
+@run_in_plain_torch
 def load_camera(
     scene: Path | str,
     frame: int | str | None = None,
@@ -78,6 +81,7 @@ def load_camera(
     return photographs.camera(0 if frame is None else frame, resolution)
 
 
+@run_in_plain_torch
 def load_cameras(
     path: Path | str,
     resolution: Resolution = None,
