@@ -96,9 +96,9 @@ def as_generator(phi: Any) -> Generator:
     is_object = isinstance(phi, Generator) and not isinstance(phi, type)
     if not is_object and (not callable(phi) or isinstance(phi, type)):
         raise InputError(
-            "The generator has to be one that gsc.load_generator returns, a function of nearest "
-            "view, target and context, or an object with supports_padding, max_batch_size and "
-            f"synthesize, and is {describe(phi)}."
+            "The generator has to be a function of nearest view, target and context, or an object "
+            "with supports_padding, max_batch_size and synthesize, such as gsc.load_generator "
+            f"returns, and is {describe(phi)}."
         )
     generator: Generator = phi if is_object else FunctionGenerator(phi)
     if not is_whole(generator.max_batch_size) or generator.max_batch_size < 1:
