@@ -7,6 +7,7 @@ PyTorch's inference mode, which both nodes leave because registration needs grad
 from __future__ import annotations
 
 import json
+import os
 from dataclasses import dataclass, replace
 from itertools import count
 from pathlib import Path
@@ -16,10 +17,14 @@ import torch
 from torch import Tensor
 
 import gscompleter as gsc
+from gscompleter.apps.inputs.named_photographs import is_image
 from gscompleter.apps.inputs.task import InputSplatFile
 from gscompleter.apps.report.completion import write_scenes
 from gscompleter.apps.report.hole_pictures import draw_hole
 from gscompleter.data.formats import open_photographs
+from gscompleter.data.mask_checks import read_masks_as_asked, refuse_nothing_to_invert
+from gscompleter.data.mask_reading import MaskReading
+from gscompleter.data.photographs import Photographs
 from gscompleter.generators.painted import Painted, fit_painting
 from gscompleter.system.files.image import write_image
 from gscompleter.system.files.output_folder import open_output_folder
@@ -66,14 +71,16 @@ class FindHoles:
         return {
             "required": {
                 "scene": ("STRING", {"default": "", "tooltip": "Folder of photographs and poses"}),
-                "context": ("STRING", {"default": "0 1", "tooltip": "Frames to work with"}),
-                "target": ("STRING", {"default": "2", "tooltip": "Frame, or file of cameras"}),
+                "context": ("STRING", {"default": "0 1", "tooltip": "Photographs to work with"}),
+                "target": ("STRING", {"default": "2", "tooltip": "Photograph, or cameras"}),
                 "height": ("INT", side),
                 "width": ("INT", side),
             },
             "optional": {
                 "splat": ("STRING", {"default": "", "tooltip": "Splat to complete"}),
                 "camera": ("INT", {"default": 0, "min": 0, "tooltip": "Number in that file"}),
+                "invert_masks": ("BOOLEAN", {"default": False, "tooltip": "White is ignored"}),
+                "large_masks": ("BOOLEAN", {"default": False, "tooltip": "Masks hide that much"}),
             },
         }
 
@@ -86,10 +93,14 @@ class FindHoles:
         width: int,
         splat: str = "",
         camera: int = 0,
+        invert_masks: bool = False,
+        large_masks: bool = False,
     ) -> tuple[Tensor, Tensor, Holes, Tensor, Tensor, Tensor]:
         """Return image [1, h, w, 3], mask [1, h, w], the state, and three further images."""
         with torch.inference_mode(False), torch.enable_grad():
-            holes = open_holes(scene, parse_frames(context), target, (height, width), splat, camera)
+            photographs = open_masked(scene, MaskReading(invert_masks, large_masks))
+            frames = parse_frames(context)
+            holes = open_holes(photographs, frames, target, (height, width), splat, camera)
             shown = draw_hole(holes.completer.observe(holes.state, holes.target))
             return (
                 shown.image.clamp(0, 1)[None],
@@ -101,22 +112,44 @@ class FindHoles:
             )
 
 
-def parse_frames(text: str) -> list[int]:
-    """Parse frame numbers between blanks or commas."""
+def parse_frames(text: str) -> list[int | str]:
+    """Parse numbers or names of photographs between blanks or commas."""
     words = text.replace(",", " ").split()
-    if not words or not all(word.isdecimal() for word in words):
-        raise gsc.InputError(f"{text!r} names no frames; write numbers, as in 0 4.", "context")
-    return [int(word) for word in words]
+    if not words:
+        raise gsc.InputError(
+            "No photographs are named; write numbers or names of files, as in 0 4.", "context"
+        )
+    return [parse_frame(word) for word in words]
+
+
+def parse_frame(word: str) -> int | str:
+    """Parse the number or the name of a photograph."""
+    return int(word) if word.isdecimal() else word
+
+
+def open_masked(scene: str, reading: MaskReading) -> Photographs:
+    """Open photographs, and check their masks as `complete` does."""
+    photographs = open_photographs(scene)
+    refuse_nothing_to_invert(photographs.list_masks(), reading)
+    return read_masks_as_asked(photographs, reading)
 
 
 def open_holes(
-    scene: str, frames: list[int], target: str, size: tuple[int, int], splat: str, number: int
+    photographs: Photographs,
+    words: list[int | str],
+    target: str,
+    size: tuple[int, int],
+    splat: str,
+    number: int,
 ) -> Holes:
     """Open a scene as `complete` does: a splat with further photographs that check it."""
-    photographs = open_photographs(scene)
+    frames = [photographs.find_frame(word) for word in words]
     views = photographs.views(frames, size)
-    if target.strip().isdecimal():
-        camera = photographs.camera(int(target), size)
+    word = target.strip()
+    target_frame = None
+    if not os.path.exists(word) or is_image(word):
+        target_frame = photographs.find_frame(parse_frame(word))
+        camera = photographs.camera(target_frame, size)
     else:
         cameras = gsc.load_cameras(target, size, origin=photographs.origin.tolist())
         if number >= len(cameras):
@@ -125,8 +158,12 @@ def open_holes(
     completer = gsc.GSCompleter(generator=Painted((), PAINTER))  # no padding, as what is painted
     if not splat:
         return Holes(completer, completer.begin(views, targets=[camera]), camera, None)
-    used = {*frames, int(target) if target.strip().isdecimal() else -1}
-    others = [frame for frame in range(len(photographs)) if frame not in used]
+    used = {*frames, target_frame}
+    others = [
+        frame
+        for frame in photographs.posed
+        if frame not in used and photographs.frame(frame).has_photograph()
+    ]
     checks = photographs.views(others[:: 1 + len(others) // MAX_CHECK_VIEWS], size)
     state = completer.begin(views, gsc.load_splat(splat), checks, [camera])
     return Holes(completer, state, camera, Path(splat))

@@ -41,11 +41,19 @@ from gscompleter.stages.register import register_along_rays
 from gscompleter.stages.register_paper import register_as_paper
 from gscompleter.stages.synthesize import GeneratedView, synthesize
 from gscompleter.stages.target_view import TargetView, render_target
-from gscompleter.state import NEW_PHOTO_ID, Completion, Photo, Step, find_last_target_id
+from gscompleter.state import (
+    NEW_PHOTO_ID,
+    Completion,
+    Photo,
+    Step,
+    check_state,
+    find_last_target_id,
+)
 from gscompleter.system.errors import InputError
 from gscompleter.system.progress import show_in_notebook, track
 from gscompleter.system.tensor_checks import describe, is_whole
 from gscompleter.system.timing import record_seconds, timed_stage
+from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.trust import Trust
 from gscompleter.trust.photometric import load_trust
 from gscompleter.types import Camera, DepthAffine, Gaussians, PaddedCamera, View, merge
@@ -109,6 +117,7 @@ class GSCompleter:
         return SceneRenderer(self.renderer)
 
     @show_in_notebook()
+    @run_in_plain_torch
     def __call__(
         self,
         views: Sequence[View],
@@ -138,11 +147,14 @@ class GSCompleter:
         return self.complete(self.begin(views, scene, check_views, targets), targets)
 
     @show_in_notebook()
+    @run_in_plain_torch
     def complete(self, state: Completion, targets: Sequence[Camera]) -> Completion:
         """Complete a begun scene for targets, one group after the other.
 
         Raises InputError if every target is refused.
         """
+        check_state(state)
+        check_target_list(targets)
         batch = as_generator(self.generator).max_batch_size
         counted_as = "target" if batch == 1 else "group of targets"
         for start in track(range(0, len(targets), batch), counted_as):
@@ -151,6 +163,7 @@ class GSCompleter:
         return state
 
     @show_in_notebook()
+    @run_in_plain_torch
     def begin(
         self,
         views: Sequence[View],
@@ -215,6 +228,7 @@ class GSCompleter:
         return {key: name_model(model) for key, model in models.items() if model is not None}
 
     @show_in_notebook()
+    @run_in_plain_torch
     def advance(
         self, state: Completion, target: Camera, reference: GeneratedView | None = None
     ) -> Completion:
@@ -223,6 +237,7 @@ class GSCompleter:
         `reference` is the image at the target if it was synthesized in advance, padded if Φ
         supports it.
         """
+        check_state(state)
         check_target_ids(state.context, len(state.targets) + 1)
         # Seeded anew for each target, so that its result does not depend on how many came before.
         rng = torch.Generator().manual_seed(self.seed)
@@ -297,11 +312,14 @@ class GSCompleter:
         verified, _ = verify(Attempt(view, image, DepthAffine(), Refined(placed, plans, ())))
         return [*steps, *verified][-1].gaussians
 
+    @run_in_plain_torch
     def advance_batch(self, state: Completion, targets: Sequence[Camera]) -> Completion:
         """Complete several targets, whose images Φ synthesizes in one call.
 
         All images are of the scene before the first of these targets.
         """
+        check_state(state)
+        check_target_list(targets)
         if len(targets) == 1:
             return self.advance(state, targets[0])
         with record_seconds() as seconds:
@@ -312,6 +330,7 @@ class GSCompleter:
             state = self.advance(state, target, None if view.skip_reason else next(images))
         return state
 
+    @run_in_plain_torch
     @timed_stage("context")
     def observe(
         self, state: Completion, target: Camera, reference: View | None = None
@@ -320,6 +339,7 @@ class GSCompleter:
 
         A reference that was synthesized in advance determines the padding by its camera.
         """
+        check_state(state)
         check_camera(target, "The target")
         camera = self.pad_target(state, target)
         if reference:
@@ -357,6 +377,12 @@ def name_model(model: object) -> str:
     """Name a model by its own `name`, or that of its function or class."""
     own = getattr(model, "name", None) or getattr(model, "__name__", None)
     return own if isinstance(own, str) else type(model).__name__
+
+
+def check_target_list(targets: object) -> None:
+    """Raise InputError unless these are a list; its cameras are checked one by one."""
+    if not isinstance(targets, Sequence) or isinstance(targets, str):
+        raise InputError(f"The targets have to be a list of cameras, and are {describe(targets)}.")
 
 
 def list_targets(target: object) -> list[Camera]:

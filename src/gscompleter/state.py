@@ -12,8 +12,10 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import CompleterConfig
+from gscompleter.system.errors import InputError
 from gscompleter.system.files.display import Displayed
 from gscompleter.system.plugins import load_function
+from gscompleter.system.tensor_checks import describe
 from gscompleter.system.timing import add_seconds
 from gscompleter.trust import Trust
 from gscompleter.types import (
@@ -434,3 +436,12 @@ def find_last_target_id(scene: Gaussians) -> int:
     """Find the largest target id in a scene; 0 if nothing was generated for a target."""
     ids = scene.generated.where(scene.generated != NEW_PHOTO_ID, 0)
     return int(ids.max()) if len(ids) else 0
+
+
+def check_state(state: object) -> None:
+    """Raise InputError for a value in place of a completion."""
+    if not isinstance(state, Completion):
+        raise InputError(
+            "The state has to be a Completion, such as GSCompleter.begin returns, and is "
+            f"{describe(state)}."
+        )

@@ -319,11 +319,11 @@ class View(Displayed, TensorDataclass):
 
     owner: ClassVar[str] = "a view"
     forms: ClassVar[dict[str, Form]] = {
-        "image": (FLOATS, (None, None, 3)),
-        "depth": (FLOATS, (None, None)),
-        "ignore_mask": (BOOLS, (None, None)),
-        "dynamic_mask": (BOOLS, (None, None)),
-        "given_depth": (FLOATS, (None, None)),
+        "image": (FLOATS, ("h", "w", 3)),
+        "depth": (FLOATS, ("h", "w")),
+        "ignore_mask": (BOOLS, ("h", "w")),
+        "dynamic_mask": (BOOLS, ("h", "w")),
+        "given_depth": (FLOATS, ("h", "w")),
     }
 
     def __post_init__(self) -> None:
@@ -437,13 +437,13 @@ class Gaussians(Displayed, TensorDataclass):
 
     owner: ClassVar[str] = "Gaussians"
     forms: ClassVar[dict[str, Form]] = {
-        "means": (FLOATS, (None, 3)),
-        "quats": (FLOATS, (None, 4)),
-        "scales": (FLOATS, (None, 3)),
-        "opacities": (FLOATS, (None,)),
-        "sh": (FLOATS, (None, None, 3)),
-        "generated": (BYTES, (None,)),
-        "encoded": (FLOATS, (None, 4)),
+        "means": (FLOATS, ("n", 3)),
+        "quats": (FLOATS, ("n", 4)),
+        "scales": (FLOATS, ("n", 3)),
+        "opacities": (FLOATS, ("n",)),
+        "sh": (FLOATS, ("n", "k", 3)),
+        "generated": (BYTES, ("n",)),
+        "encoded": (FLOATS, ("n", 4)),
     }
 
     def __post_init__(self) -> None:
@@ -507,6 +507,11 @@ def make_observed(
     sh: Float[Tensor, "n k 3"],
 ) -> Gaussians:
     """Make Gaussians that are labelled as observed."""
+    if not isinstance(means, Tensor) or means.dim() == 0:
+        raise InputError(
+            "The means of Gaussians have to be a tensor of shape [n, 3], and are "
+            f"{describe(means)}."
+        )
     generated = torch.zeros(len(means), dtype=torch.uint8, device=means.device)
     return Gaussians(means, quats, scales, opacities, sh, generated)
 
@@ -594,9 +599,9 @@ class DepthMap(Displayed, TensorDataclass):
 
     owner: ClassVar[str] = "a depth map"
     forms: ClassVar[dict[str, Form]] = {
-        "depth": (FLOATS, (None, None)),
-        "valid": (BOOLS, (None, None)),
-        "confidence": (FLOATS, (None, None)),
+        "depth": (FLOATS, ("h", "w")),
+        "valid": (BOOLS, ("h", "w")),
+        "confidence": (FLOATS, ("h", "w")),
     }
 
     def __post_init__(self) -> None:
@@ -644,9 +649,9 @@ class Reconstruction:
 
     owner: ClassVar[str] = "a reconstruction"
     forms: ClassVar[dict[str, Form]] = {
-        "view_index": (INTEGERS, (None,)),
-        "pixel_index": (INTEGERS, (None,)),
-        "exposure_gains": (FLOATS, (None, 3)),
+        "view_index": (INTEGERS, ("n",)),
+        "pixel_index": (INTEGERS, ("n",)),
+        "exposure_gains": (FLOATS, ("v", 3)),
     }
 
     def __post_init__(self) -> None:

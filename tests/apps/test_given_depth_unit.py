@@ -43,7 +43,8 @@ def make_scene(folder: Path, ending: str = "png", change=lambda depth, number: d
 
 def check_exact(folder: Path, frames: tuple[int, ...] = (0, 1)) -> tuple[str, ...]:
     """Check that the given depth is the true one within 2 %; return the sentences."""
-    views, notes = read_with_depth(open_photographs(folder), frames)
+    read = read_with_depth(open_photographs(folder), frames)
+    views, notes = read.views, read.notes
     for view, number in zip(views, frames, strict=True):
         given, true = view.given_depth.numpy(), CAMERAS[number].depth
         known = given > 0
@@ -90,7 +91,8 @@ def test_depth_that_cannot_be_compared_is_used_and_said(tmp_path):
     block = np.zeros((72, 96))
     block[30:38, 40:48] = 1
     scene = make_scene(tmp_path / "room", "png", lambda z, _: block * z)
-    views, (note,) = read_with_depth(open_photographs(scene), (0, 1))
+    read = read_with_depth(open_photographs(scene), (0, 1))
+    views, (note,) = read.views, read.notes
     assert any(view.given_depth.any() for view in views)
     assert "show too little to compare" in note
 

@@ -1,12 +1,18 @@
 """Lines and refusals while photographs are opened."""
 
 import json
+import zipfile
 
 import pytest
 
 from command import run
 from exact_room import make_cameras, write_photographs, write_transforms
+from gscompleter.apps.commands.shared_options import is_splat
 from gscompleter.apps.inputs.opening import describe_cameras_above
+from gscompleter.data.sfm.poses import has_photographs, list_all_photographs
+from gscompleter.splats.formats import save_splat
+from pose_files import write_camera_list
+from scenes import random_gaussians
 
 CAMERAS = make_cameras(4, width=64, height=48, focal=52.0)
 
@@ -75,3 +81,46 @@ def test_photographs_that_are_missing_are_named_also_in_the_report(tmp_path, mon
     assert "nerfstudio, 3 of 4 photographs." in said
     assert json.loads((out / "summary.json").read_text())["scene"]["notes"] == [told]
     assert told in (out / "report.html").read_text()
+
+
+def write_packed(folder):
+    """Write an unpacked .sog of a few Gaussians, whose tables are images."""
+    save_splat(folder.with_suffix(".sog"), random_gaussians(40))
+    with zipfile.ZipFile(folder.with_suffix(".sog")) as archive:
+        archive.extractall(folder)
+    return folder
+
+
+def test_an_unpacked_sog_is_a_splat_and_no_folder_of_photographs(tmp_path, monkeypatch, capsys):
+    folder = write_packed(tmp_path / "scene")
+    assert len(list(folder.glob("*.webp"))) >= 4
+    assert is_splat(folder)
+    assert not has_photographs(folder)
+    out = ("--out", tmp_path / "out")
+    assert run(monkeypatch, "poses", folder, *out) == 2
+    assert "There are 0 photographs" in capsys.readouterr().err
+    assert run(monkeypatch, "clean", folder, "--scene", folder.with_suffix(".sog"), *out) == 2
+    assert "is a folder of Gaussians, which goes to --scene" in capsys.readouterr().err
+    # Beside photographs, its tables are none of them.
+    write_photographs(tmp_path, CAMERAS)
+    assert list_all_photographs(tmp_path) == [f"photo_{number:03d}.png" for number in range(4)]
+
+
+def test_a_streamed_scene_is_named_where_photographs_are_expected(tmp_path, monkeypatch, capsys):
+    scene = tmp_path / "scene"
+    scene.mkdir()
+    (scene / "lod-meta.json").write_text('{"lodLevels": 2}')
+    write_packed(scene / "0_0")
+    assert run(monkeypatch, "complete", scene, "--out", tmp_path / "out") == 2
+    assert "is a streamed scene in several levels of detail" in capsys.readouterr().err
+
+
+def test_the_model_folder_of_a_trainer_is_a_splat_unless_it_has_photographs(tmp_path):
+    folder = tmp_path / "model"
+    (folder / "point_cloud/iteration_7").mkdir(parents=True)
+    save_splat(folder / "point_cloud/iteration_7/point_cloud.ply", random_gaussians(4))
+    write_camera_list(folder / "cameras.json")
+    write_photographs(folder / "train/ours_7/renders", CAMERAS)
+    assert is_splat(folder)
+    write_photographs(folder / "images", CAMERAS)
+    assert not is_splat(folder)

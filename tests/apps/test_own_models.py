@@ -10,6 +10,7 @@ import pytest
 import gscompleter as gsc
 from command import run
 from paths import ROOT
+from scenes import camera_at, photographed
 
 EXAMPLES = ROOT / "examples"
 SMALL = ("--context", 0, 1, "--target", 2, "--resolution", 32, "--near", 0.5, "--far", 20)
@@ -109,3 +110,32 @@ def test_depths_are_compared_in_one_table(room, tmp_path, monkeypatch, capsys):
     assert "named twice" in refuse(monkeypatch, capsys, *words, "--depth", "none", "none")
     line = refuse(monkeypatch, capsys, *words, "--depth", "none", DEPTH, "--table", "models")
     assert "table of their own" in line
+
+
+WAVES = """
+import torch
+from gscompleter import DepthMap
+
+def depth(view):
+    height, width = view.image.shape[:2]
+    rows = torch.linspace(0, 30, height)[:, None]
+    columns = torch.linspace(0, 40, width)[None]
+    return DepthMap(3 + 2 * torch.sin(rows) * torch.cos(columns), torch.ones(height, width).bool())
+"""
+"""Source of a depth that has nothing to do with the scene."""
+
+
+def test_evaluate_says_what_the_reconstructor_says_of_photographs(tmp_path, monkeypatch, capsys):
+    cameras = [camera_at(x, size=64) for x in (-0.3, 0.1, 0.5)]
+    scene = photographed(tmp_path / "room", cameras)
+    (tmp_path / "waves.py").write_text(WAVES)
+    cases = tmp_path / "cases.json"
+    row = {"scene": scene.name, "context": [0, 1], "target": 2}
+    cases.write_text(json.dumps({"resolution": [64, 64], "cases": [row]}))
+    words = ("--depth", f"{tmp_path / 'waves.py'}:depth", "--methods", "context")
+    assert run(monkeypatch, "evaluate", cases, *words, "--out", tmp_path / "out") == 0
+    sentence = "The predicted depth is not used in photographs 0, 1"
+    assert f": {sentence}" in capsys.readouterr().err
+    (file,) = (tmp_path / "out" / "tasks").glob("*/context.json")
+    (note,) = json.loads(file.read_text())["context_notes"]
+    assert note.startswith(sentence)

@@ -368,6 +368,15 @@ def test_a_known_depth_is_told_with_its_source(completed_room, format, said):
     assert note.text.startswith(f"Up to 1.4 % of a photograph's pixels have {said}")
 
 
+def test_depth_maps_beside_a_colmap_model_are_no_points(completed_room):
+    summary = read_summary(completed_room)
+    row = ContextRow(7, *[None] * 4, given_depth=0.9)
+    notes = ("4 of 4 photographs have inverse depth of 3DGS (depth_params.json).",)
+    scene = replace(summary.scene, format="colmap", notes=notes)
+    (note,) = list_photograph_notes(replace(summary, scene=scene, context=(row,)))
+    assert "have a measured or predicted depth, which" in note
+
+
 def test_what_is_ignored_is_told_with_its_cause(completed_room):
     summary = read_summary(completed_room)
     hidden = replace(summary, context=(ContextRow(7, *[None] * 4, ignored=0.25),))

@@ -12,7 +12,7 @@ import torch
 from PIL import Image, ImageOps, features
 
 from exact_room import make_cameras, make_pose, write_colmap, write_photographs, write_transforms
-from gscompleter import InputError, load_cameras
+from gscompleter import InputError, load_camera, load_cameras, load_views
 from gscompleter.data.file_names import list_endings
 from gscompleter.data.formats import open_photographs
 from gscompleter.system.files import image as image_io
@@ -194,7 +194,7 @@ def test_a_photograph_of_another_size_but_the_same_shape_is_read(tmp_path):
     assert (first.camera.width, second.camera.width) == (8, 31)
 
 
-def test_a_camera_with_a_nan_pose_is_left_out_and_said(tmp_path):
+def test_a_camera_with_a_nan_pose_is_said_and_the_others_keep_their_numbers(tmp_path):
     scene = write_transforms(tmp_path / "nerfstudio", CAMERAS, NAMES)
     change(scene, transform_matrix=np.full((4, 4), np.nan).tolist())
     model = write_colmap(tmp_path / "colmap", CAMERAS)
@@ -205,11 +205,30 @@ def test_a_camera_with_a_nan_pose_is_left_out_and_said(tmp_path):
     for folder in (scene, model):
         photographs = open_photographs(folder)
         assert [frame.file_name for frame in photographs.frames] == [
-            f"photo_{number:03d}.png" for number in (1, 2, 3)
+            f"photo_{number:03d}.png" for number in range(4)
         ]
         (note,) = photographs.notes
         assert "1 of 4 cameras" in note
-        assert "photo_000.png" in note
+        assert "photo_000.png; the others keep their numbers" in note
+        # A number is that of its file, and one that cannot be used is refused by both its names.
+        (view,) = photographs.views([2])
+        assert np.array_equal((view.image * 255).round().numpy(), CAMERAS[2].photograph)
+        for name in (0, "photo_000.png"):
+            with pytest.raises(InputError, match=r"photo_000.*its pose holds NaN"):
+                photographs.views([name])
+        assert [view.frame for view in load_views(folder)] == [1, 2, 3]
+
+
+def test_photographs_are_named_by_number_or_file_in_python(tmp_path):
+    scene = write_transforms(tmp_path, CAMERAS, NAMES)
+    named = load_views(scene, ["photo_001.png", "images/photo_003.png", 2])
+    assert [view.frame for view in named] == [1, 3, 2]
+    camera = load_camera(scene, "PHOTO_002")
+    assert torch.equal(camera.c2w, load_camera(scene, 2).c2w)
+    with pytest.raises(InputError, match=r"no photograph 'photo_009.png' .* such as photo_000.png"):
+        load_views(scene, ["photo_009.png"])
+    with pytest.raises(InputError, match="list of numbers or names"):
+        load_views(scene, "photo_001.png")
 
 
 def test_a_scene_without_a_finite_pose_is_refused(tmp_path):

@@ -12,7 +12,7 @@ from PIL import Image
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.sfm import placing, poses
-from gscompleter.data.sfm.placing import identify_input, place_photographs
+from gscompleter.data.sfm.placing import identify_input, name_new, place_photographs
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.image import write_image
 from mapping_stand_in import stand_in
@@ -72,7 +72,7 @@ def test_new_photographs_are_placed_and_known_cameras_stay(known, new, tmp_path)
         "sparse",
         "summary.json",
     }
-    assert [frame.name for frame in joined.frames[6:]] == ["new_2.png", "new_5.png"]
+    assert [frame.file_name for frame in joined.frames[6:]] == ["new/new_2.png", "new/new_5.png"]
 
     # The next run with the same photographs needs no COLMAP.
     again, reused = place_photographs(new, known, tmp_path / "colmap")
@@ -111,6 +111,17 @@ def test_photographs_none_of_which_fits_are_refused_and_nothing_is_left(known, t
     with pytest.raises(InputError, match=r"No photograph in .* could be placed .*wall\.png"):
         place_photographs(other, known, tmp_path / "colmap")
     assert not (tmp_path / "colmap").exists()
+
+
+@pytest.mark.parametrize(("folder", "home"), [("phone", "phone"), ("images", "new")])
+def test_a_new_photograph_with_the_name_of_an_old_one_is_told_apart(known, tmp_path, folder, home):
+    old = known.frame(1)
+    frame = name_new(replace(old, name=old.file_name), tmp_path / folder)
+    assert frame.file_name == f"{home}/{old.file_name}"
+    joined = replace(known, frames=(*known.frames, frame))
+    assert joined.find_frame(frame.file_name) == 6
+    with pytest.raises(InputError, match="2 photographs of .* name the path of one"):
+        joined.find_frame(old.file_name)
 
 
 def test_photographs_of_the_scene_are_not_placed_again(known, new, tmp_path):

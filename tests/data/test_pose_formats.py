@@ -38,6 +38,18 @@ from room_checks import check, check_room, write_cloud
 from scenes import Room, view_of
 
 
+def test_a_photograph_that_is_listed_without_ending_has_the_name_of_its_file(tmp_path):
+    write_camera_list(tmp_path / "cameras.json")
+    write_photographs(tmp_path / "input", [name.replace(".png", ".jpg") for name in NAMES])
+    photographs = open_photographs(tmp_path)
+    assert [frame.name for frame in photographs.frames] == ["0", "1", "2", "3", "4"]
+    assert [frame.file_name for frame in photographs.frames][:2] == ["0.jpg", "1.jpg"]
+    for word in ("1.jpg", "input/1.jpg", "1", "1.JPG"):
+        assert photographs.find_frame(word) == 1
+    with pytest.raises(InputError, match=r"such as 0\.jpg"):
+        photographs.find_frame("missing.jpg")
+
+
 @pytest.mark.parametrize("kind", WRITERS)
 def test_every_format_shows_the_room_from_where_it_says(tmp_path, kind):
     name, write = WRITERS[kind]

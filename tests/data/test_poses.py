@@ -23,6 +23,7 @@ from gscompleter.data.sfm.poses import (
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.image import write_image
 from mapping_stand_in import model_script, similarity_removed, stand_in
+from pose_files import write_colmap_text
 from scenes import Room, camera_at, view_of
 
 CAMERAS = [
@@ -66,6 +67,19 @@ def test_the_cameras_of_a_room_are_found_up_to_a_similarity(tmp_path, monkeypatc
     assert focal == pytest.approx(float(CAMERAS[0].K[0, 0]), rel=0.03)
 
 
+def test_photographs_that_are_not_placed_keep_the_numbers_of_the_others(tmp_path, monkeypatch):
+    given, out = blank(tmp_path / "photos", 4), tmp_path / "poses"
+    stand_in(monkeypatch, tmp_path, model_script(["0.png", "2.png", "3.png"]))
+    find_poses(given, out)
+    write_colmap_text(out / "sparse" / "0", ["0.png", "2.png", "3.png"])
+    photographs = open_photographs(out)
+    assert [frame.file_name for frame in photographs.frames] == list_photograph_files(given)
+    assert photographs.posed == [0, 2, 3]
+    assert photographs.frame(2).has_photograph()
+    with pytest.raises(InputError, match=r"1\.png.*COLMAP found no camera for it; name another"):
+        photographs.views(["1.png"])
+
+
 def test_the_next_run_keeps_what_was_found(tmp_path, monkeypatch):
     given, out = blank(tmp_path / "photos", 4), tmp_path / "poses"
     stand_in(monkeypatch, tmp_path, model_script(["0.png", "2.png", "3.png"]))
@@ -89,7 +103,9 @@ def test_photographs_without_a_camera_are_named(tmp_path, monkeypatch, capsys):
     stand_in(monkeypatch, tmp_path, model_script(["0.png", "2.png", "3.png"]))
     assert run(monkeypatch, "poses", blank(tmp_path / "p", 4), "--out", tmp_path / "out") == 0
     said = capsys.readouterr().out.splitlines()
-    assert said[0] == "No camera was found for 1.png; they are left out."
+    assert said[0] == (
+        "No camera was found for 1.png; they are not used, and the others keep their numbers."
+    )
     assert said[1].startswith("3 of 4 cameras and 90 points, mean error 0.50 px: ")
 
 

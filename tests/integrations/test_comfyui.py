@@ -5,14 +5,17 @@ from __future__ import annotations
 import importlib.util
 import inspect
 import json
+import shutil
 import sys
 from pathlib import Path
 
 import pytest
 import torch
+from PIL import Image
 
 import gscompleter as gsc
 from command import run
+from gscompleter.data.formats import open_photographs
 from gscompleter.data.scene import write_cameras
 from paths import ROOT
 from scenes import Room, camera_at, gaussians_of, labelled, photographed, view_of
@@ -154,7 +157,8 @@ def test_a_splat_keeps_its_bytes(scene, tmp_path, monkeypatch):
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
-        ({"context": "left right"}, "names no frames"),
+        ({"context": "left right"}, "no photograph 'left'"),
+        ({"context": " , "}, "No photographs are named"),
         ({"context": "0 9"}, "9"),
         ({"camera": 2}, "has 2 cameras"),
         ({"target": "nowhere.json"}, "nowhere.json"),
@@ -163,6 +167,28 @@ def test_a_splat_keeps_its_bytes(scene, tmp_path, monkeypatch):
 def test_wrong_inputs_get_a_sentence(scene, more, sentence):
     with pytest.raises(gsc.InputError, match=sentence):
         find(scene, **more)
+
+
+def test_photographs_are_named_by_their_files(scene, found):
+    name = open_photographs(scene).frame(0).file_name
+    image, mask, *_ = find(scene, context=f"{name} 2")
+    assert torch.equal(image, found[0])
+    assert torch.equal(mask, found[1])
+
+
+def test_masks_are_checked_as_the_commands_do(scene, tmp_path):
+    copy = Path(shutil.copytree(scene, tmp_path / "scene"))
+    for frame in open_photographs(copy).frames:
+        pixels = Image.new("L", (SIZE, SIZE))  # black: what is ignored
+        pixels.paste(255, (0, 0, SIZE, SIZE // 4))
+        (copy / "masks").mkdir(exist_ok=True)
+        pixels.save(copy / "masks" / f"{Path(frame.file_name).stem}.png")
+    with pytest.raises(gsc.InputError, match=r"Masks hide 75 % of the photographs"):
+        find(copy)
+    _, _, holes, *_ = find(copy, invert_masks=True)
+    assert holes.state.views[0].ignore_mask.float().mean() == 0.25
+    with pytest.raises(gsc.InputError, match="No mask is used"):
+        find(scene, invert_masks=True)
 
 
 def test_wrong_paintings_get_a_sentence_and_write_nothing(found, tmp_path):

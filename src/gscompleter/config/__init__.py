@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+import os
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from annotated_types import Interval, Predicate
@@ -367,7 +369,17 @@ class CompleterConfig(Settings):
     next_best_view: NextBestViewConfig = NextBestViewConfig()
 
     def __post_init__(self) -> None:
-        """Raise InputError for settings of the registration that is not used."""
+        """Raise InputError for another value in place of a group of settings.
+
+        So are settings of the registration that is not used.
+        """
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(field.default, Settings) and not isinstance(value, type(field.default)):
+                raise InputError(
+                    f"The {field.name} of a config has to be of {type(field.default).__name__}, "
+                    f"and is {quote_value(value)}."
+                )
         # Such settings would change nothing, and a comparison of their values would mislead.
         if self.registration_method == "ours":
             others = "paper_registration"
@@ -539,12 +551,12 @@ def get_named_config(
 
 
 def load_config(
-    source: str, is_splat: bool = False, has_photographs: bool = True
+    source: Path | str, is_splat: bool = False, has_photographs: bool = True
 ) -> CompleterConfig:
     """Return a config by name, or read the changes to its `base` from a YAML file."""
     path = require_path(source)
     if path.suffix not in {".yaml", ".yml"}:
-        return get_named_config(source, is_splat, has_photographs)
+        return get_named_config(os.fspath(source), is_splat, has_photographs)
     changes = read_yaml(path)
     base_name = str(changes.pop("base", "default"))
     base = get_named_config(base_name, is_splat, has_photographs)

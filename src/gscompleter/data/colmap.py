@@ -27,6 +27,7 @@ from gscompleter.data.cameras import (
     compute_rotation,
     invert_viewmat,
 )
+from gscompleter.data.depth_beside_colmap import attach_depth_maps
 from gscompleter.data.frame import Frame, find_file, find_path, keep_existing, locate_images
 from gscompleter.data.limits import MAX_COEFFICIENT, MAX_NUMBER
 from gscompleter.data.photographs import Photographs, build_photographs
@@ -328,7 +329,8 @@ def open_colmap(path: Path) -> Iterator[Photographs]:
     model, frames, notes = _select_largest(path)
     roots = _list_roots(path.parent if is_image_file(path) else path, model)
     there, missing = keep_existing(locate_images(frames, roots), str(model))
-    notes += missing
+    there, depth_notes = attach_depth_maps(there, roots, model)
+    notes += (*missing, *depth_notes)
     notes += _describe_orientation(there[0])
     photographs = build_photographs(roots[-1].name, str(model), there)
     yield replace(photographs, notes=notes, sparse=_make_point_reader(model))

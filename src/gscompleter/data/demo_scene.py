@@ -13,7 +13,7 @@ import torch
 from skimage.data import stereo_motorcycle
 
 from gscompleter.data.scene import write_cameras
-from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.errors import InputError, quote_value, require_path
 from gscompleter.system.files.image import write_image
 from gscompleter.types import Camera
 
@@ -30,7 +30,7 @@ def write_demo_scene(folder: Path | str) -> Path:
     The folder gets a `transforms.json` with both photographs, and a `targets.json`. Writing it
     again changes nothing. Raise InputError for a folder with other files.
     """
-    folder = Path(folder)
+    folder = require_path(folder)
     others = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
     if not others <= {"images", "transforms.json", "targets.json"}:
         raise InputError(f"{quote_value(folder)} holds other files; name another folder.")

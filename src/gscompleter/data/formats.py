@@ -20,7 +20,7 @@ from gscompleter.data.driving.mmdet3d import has_infos, open_infos
 from gscompleter.data.driving.pandaset import has_pandaset, open_pandaset
 from gscompleter.data.driving.waymo import list_segments, open_waymo
 from gscompleter.data.ego_vehicle import attach_vehicle_detector
-from gscompleter.data.frame import FOLDERS, describe_moved, keep_posed
+from gscompleter.data.frame import FOLDERS, describe_moved, describe_unposed
 from gscompleter.data.limits import check_planes, require
 from gscompleter.data.llff import has_llff, open_llff
 from gscompleter.data.masks import attach_masks
@@ -33,7 +33,7 @@ from gscompleter.data.real_estate import (
     open_camera_files,
     open_chunks,
 )
-from gscompleter.data.sfm.poses import ENDINGS, is_own
+from gscompleter.data.sfm.poses import ENDINGS, is_own, list_unplaced
 from gscompleter.data.transforms import has_transforms, open_transforms
 from gscompleter.system.errors import InputError, join_names, quote_value, require_path
 from gscompleter.system.files.reading import list_folders
@@ -106,9 +106,13 @@ def open_photographs(
     far = scene.far if far is None else far
     check_planes(near, far)
     sparse = None if scene.sparse is None else cache(scene.sparse)
-    posed, lost = keep_posed(scene.frames, scene.title)
-    notes = (*scene.notes, *lost, *describe_moved(posed, scene.title))
-    frames = attach_vehicle_detector(attach_masks(posed))
+    unposed = describe_unposed(scene.frames, scene.title)
+    notes = (*scene.notes, *unposed, *describe_moved(scene.frames, scene.title))
+    frames = scene.frames
+    unplaced = list_unplaced(scene, path)
+    if unplaced:
+        frames = tuple(sorted([*frames, *unplaced], key=lambda frame: frame.name))
+    frames = attach_vehicle_detector(attach_masks(frames))
     return replace(
         scene, frames=frames, near=near, far=far, notes=notes, format=format_name, sparse=sparse
     )

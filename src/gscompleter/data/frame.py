@@ -62,6 +62,8 @@ class Frame:
     """Expected path of the photograph, or a function that returns the bytes of its file."""
     depth: Callable[[], Float[np.ndarray, "h w"]] | None = None
     """Reads a depth map of any size: z-depth in scene units, 0 where unknown."""
+    predicted_depth: Callable[[], Float[np.ndarray, "h w"]] | None = None
+    """Reads a depth map that a network predicted, in scene units as far as its file tells."""
     mask: Path | None = None
     """Mask image; its black pixels are ignored (`data/masks.py`)."""
     has_inverted_mask: bool = False
@@ -78,11 +80,16 @@ class Frame:
     """Detects the vehicle that carries the camera, as a mask of any size; None to keep it."""
     written: str | None = None
     """Path of the photograph in the file, if only an end of it exists here; else None."""
+    lack: str | None = None
+    """Why it has no camera, as in "COLMAP found no camera for it"; None if it has one."""
 
     @property
     def file_name(self) -> str:
         """Path of the photograph below the folder of all, as users know it."""
         path = PurePosixPath(self.name.replace("\\", "/"))
+        # Trainers list photographs without the ending that the file has.
+        if isinstance(self.image, Path) and self.image.stem == path.name:
+            path = path.with_name(self.image.name)
         # "images" in front of a name is the folder of all, which users do not name.
         inside = len(path.parts) > 1 and path.parts[0].casefold() in FOLDERS
         return str(PurePosixPath(*path.parts[1:]) if inside else path)
@@ -164,6 +171,8 @@ class Frame:
 
     def find_defect(self, width: int, height: int) -> str | None:
         """Describe why the camera is impossible at this photograph size; None if it is valid."""
+        if self.lack is not None:
+            return self.lack
         if max(width, height) > MAX_SIDE:
             return f"its {width} × {height} pixels have a side above {MAX_SIDE}"
         if not self.intrinsics.fits(width, height):
@@ -205,12 +214,15 @@ class Frame:
         """True if no number of the pose is NaN or infinite."""
         return bool(np.isfinite(self.c2w).all())
 
+    @property
+    def has_camera(self) -> bool:
+        """True if its camera was found, and its pose is finite."""
+        return self.lack is None and self.has_finite_pose
+
     def make_error(self, defect: str) -> InputError:
         """Build the error for a frame with this defect."""
-        return InputError(
-            f"{capitalize(self.title)} cannot be used, because {defect}; correct it, or leave "
-            "the frame out."
-        )
+        advice = "correct it, or leave the frame out" if self.lack is None else "name another one"
+        return InputError(f"{capitalize(self.title)} cannot be used, because {defect}; {advice}.")
 
 
 def find_image(path: Path, listings: FolderListings | None = None) -> Path | None:
@@ -311,22 +323,23 @@ def keep_existing(frames: Sequence[Frame], title: str) -> tuple[tuple[Frame, ...
     return tuple(there), (note,)
 
 
-def keep_posed(frames: Sequence[Frame], title: str) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
-    """Keep the frames whose pose is finite, and note the others."""
-    there = tuple(frame for frame in frames if frame.has_finite_pose)
-    lost = [frame.name for frame in frames if not frame.has_finite_pose]
-    if not there:
+def describe_unposed(frames: Sequence[Frame], title: str) -> tuple[str, ...]:
+    """Say which photographs have no camera; raise InputError if none has one.
+
+    They stay among the frames, so that the number of each photograph is that of its file.
+    """
+    lost = [frame.name for frame in frames if frame.lack is None and not frame.has_finite_pose]
+    if len(lost) == len(frames):
         raise InputError(
             f"The poses of all {len(frames)} cameras of {title} hold NaN or infinity "
             f"({join_names(lost, MAX_NAMED)}); export the scene again."
         )
     if not lost:
-        return there, ()
-    note = (
-        f"{len(lost)} of {len(frames)} cameras of {title} are left out, because their poses hold "
-        f"NaN or infinity: {join_names(lost, MAX_NAMED)}."
+        return ()
+    return (
+        f"{len(lost)} of {len(frames)} cameras of {title} are not used, because their poses hold "
+        f"NaN or infinity: {join_names(lost, MAX_NAMED)}; the others keep their numbers.",
     )
-    return there, (note,)
 
 
 def describe_moved(frames: Sequence[Frame], title: str) -> tuple[str, ...]:

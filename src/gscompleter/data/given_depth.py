@@ -71,7 +71,8 @@ def project_tracks(
 
 def drop_unsure(depth: Float[Tensor, "h w"], frame: Frame) -> Float[Tensor, "h w"]:
     """Set the measured depth of a frame to 0 where sensor and photograph may see two surfaces."""
-    return drop_edges(depth) if frame.depth is not None else drop_hidden(depth)
+    is_sweep = frame.depth is None and frame.laser_points is not None
+    return drop_hidden(depth) if is_sweep else drop_edges(depth)
 
 
 def drop_edges(depth: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:

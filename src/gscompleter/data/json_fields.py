@@ -78,7 +78,7 @@ def get_array(
         array = np.zeros(0)
     sizes = " or ".join(" × ".join(map(str, shape)) for shape in shapes)
     require(
-        # Not `<=`, which NaN would fail: a pose may hold it, and is left out later (`keep_posed`).
+        # Not `<=`, which NaN would fail: a pose may hold it (`Frame.has_camera`).
         array.shape in shapes and not (np.abs(array) > MAX_NUMBER).any(),
         f"The `{key}` of {title} is no list of {sizes} numbers, none above {MAX_NUMBER:g}; correct "
         "it.",

@@ -93,14 +93,39 @@ class Photographs:
     def __len__(self) -> int:
         return len(self.frames)
 
-    def camera(self, frame: int, resolution: Resolution = None) -> Camera:
-        """Return the camera of a frame, even without its photograph if the file gives the size."""
-        chosen = self.frame(frame)
+    def camera(self, frame: int | str, resolution: Resolution = None) -> Camera:
+        """Return the camera of a frame, even without its photograph if the file gives the size.
+
+        `frame` is its number, or the name of its photograph.
+        """
+        chosen = self.frame(self.find_frame(frame))
         return self._build_camera(chosen, chosen.size(), resolution)
 
-    def views(self, frames: Sequence[int], resolution: Resolution = None) -> list[View]:
-        """Load undistorted photographs with cameras, known depth and the detected vehicle."""
-        return [self._load_view(number, resolution) for number in frames]
+    def views(self, frames: Sequence[int | str], resolution: Resolution = None) -> list[View]:
+        """Load undistorted photographs with cameras, known depth and the detected vehicle.
+
+        `frames` are their numbers or their names.
+        """
+        return [self._load_view(self.find_frame(word), resolution) for word in frames]
+
+    @property
+    def posed(self) -> list[int]:
+        """Numbers of the frames whose camera is known; the others keep their numbers unused."""
+        return [number for number, frame in enumerate(self.frames) if frame.has_camera]
+
+    def load_predicted_depth(self, view: View) -> Float[Tensor, "h w"] | None:
+        """Load the predicted depth beside a photograph at the size of its view; None without one.
+
+        It is z-depth in scene units as far as its file tells, 0 where unknown or ignored.
+        """
+        if view.frame is None or not 0 <= view.frame < len(self):
+            return None
+        frame = self.frame(view.frame)
+        if frame.predicted_depth is None:
+            return None
+        shape = view.camera.height, view.camera.width
+        depth = undistort_and_resize(frame, frame.predicted_depth(), frame.size(), shape)
+        return torch.from_numpy(depth).where(view.valid_mask.cpu(), 0.0)
 
     def list_masks(self) -> list[Path]:
         """List the mask images that hide something, without alpha channels."""
@@ -201,9 +226,9 @@ class Photographs:
         A name may lack its ending and its folders, and its case does not matter if no other
         photograph has it.
         """
-        if isinstance(word, int):
+        if not isinstance(word, str):
             self.frame(word)
-            return word
+            return int(word)
         numbers = self._match_names(word)
         names = [self.frame(number).file_name for number in numbers]
         if len(numbers) > 1:
@@ -230,7 +255,8 @@ class Photographs:
             if word in (frame.name, frame.file_name, PurePosixPath(path).name):
                 exact.append(number)
             # The word may lack folders, and so may the name: either may be the end of the other.
-            names = fold_name(path), os.path.splitext(fold_name(path))[0]
+            full = [fold_name(path), fold_name(frame.file_name)]
+            names = [*full, *(os.path.splitext(name)[0] for name in full)]
             if any(_ends_alike(PurePosixPath(name).parts, wanted) for name in names):
                 similar.append(number)
         return exact or similar

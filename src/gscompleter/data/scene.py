@@ -19,15 +19,17 @@ from gscompleter.data.transforms import OPENCV_FROM_OPENGL, parse_camera_frame
 from gscompleter.system.errors import quote_value, require_path
 from gscompleter.system.files.result_format import MARK
 from gscompleter.system.files.writing import replace_file
+from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import Camera, View
 
 CAMERA_KEYS = ("fl_x", "fl_y", "cx", "cy", "w", "h", "transform_matrix")
 """Keys by which `describe_camera` describes a camera."""
 
 
+@run_in_plain_torch
 def load_views(
     scene: Path | str,
-    frames: Sequence[int] | None = None,
+    frames: Sequence[int | str] | None = None,
     resolution: Resolution = None,
     near: float | None = None,
     far: float | None = None,
@@ -41,29 +43,35 @@ def load_views(
     Black pixels of masks and transparent ones are ignored; with `invert_masks` white ones of masks.
     Masks that hide more than half of most photographs may be the other way round and raise an
     InputError; `large_masks` takes them as they are.
-    `frames` are counted by sorted names, all if None; `resolution` is height and width in pixels,
+    `frames` are numbers, counted by sorted names, or names of photographs as on the command line;
+    all that have a camera if None. `resolution` is height and width in pixels,
     or the most pixels of the longer side; `near` and `far` are z-depths in scene units, if known.
     """
     reading = MaskReading(invert_masks, large_masks)
     photographs = open_photographs(scene, near=near, far=far)
     refuse_nothing_to_invert(photographs.list_masks(), reading)
     photographs = read_masks_as_asked(photographs, reading)
-    chosen = range(len(photographs)) if frames is None else frames
+    chosen = photographs.posed if frames is None else frames
     require(
         isinstance(chosen, (Sequence, np.ndarray)) and not isinstance(chosen, (str, bytes)),
-        f"The frames have to be a list of numbers, and are '{quote_value(chosen)}'.",
+        f"The frames have to be a list of numbers or names of photographs, and are "
+        f"'{quote_value(chosen)}'.",
     )
     return photographs.views(chosen, resolution)
 
 
+@run_in_plain_torch
 def load_camera(
     scene: Path | str,
-    frame: int | None = None,
+    frame: int | str | None = None,
     resolution: Resolution = None,
     near: float | None = None,
     far: float | None = None,
 ) -> Camera:
-    """Load the camera of a frame, with or without photograph; None takes the only frame."""
+    """Load the camera of a frame, with or without photograph; None takes the only frame.
+
+    `frame` is its number, or the name of its photograph.
+    """
     photographs = open_photographs(scene, near=near, far=far)
     require(
         frame is not None or len(photographs) == 1,
@@ -73,6 +81,7 @@ def load_camera(
     return photographs.camera(0 if frame is None else frame, resolution)
 
 
+@run_in_plain_torch
 def load_cameras(
     path: Path | str,
     resolution: Resolution = None,

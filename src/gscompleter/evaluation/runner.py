@@ -215,6 +215,7 @@ def prepare_task(task: Task, folder: Path, config: RunConfig) -> PreparedTask:
         tuple(set_depth_range(neighbours, near, far)),
         models,
         context.seconds,
+        context.notes,
     )
 
 
@@ -240,10 +241,22 @@ def load_or_reconstruct(path: Path, views: Sequence[View], models: Models) -> st
             float(camera.far),
             seconds["total"],
             context.exposure_gains,
+            tuple(context.notes),
         )
         store.save_values(path, vars(saved))
     # Always read back, so that a resumed run continues with the same tensors.
     return store.SavedContext(**store.load_values(path, views[0].image.device))
+
+
+def collect_context_notes(out: Path, tasks: Sequence[Task]) -> dict[str, str]:
+    """Collect what Ψ said about the photographs of tasks, by the name of the task."""
+    notes = {}
+    for task in tasks:
+        for path in sorted(store.get_task_folder(out, task.name).glob("*.json")):
+            said = store.read_run_file(path).get("context_notes", [])
+            if said:
+                notes[task.name] = " ".join(said)
+    return notes
 
 
 def build_row(
@@ -255,6 +268,8 @@ def build_row(
         progress = complete_task(prepared, method, folder)
         steps = [asdict(step) for step in progress.steps]
         outcome = {"error": progress.error, "reconstruct_seconds": prepared.seconds, "steps": steps}
+        if prepared.context_notes:
+            outcome["context_notes"] = list(prepared.context_notes)
     named = {key: getattr(task, key) for key in ("name", "context", "targets", "neighbours")}
     return {"version": store.VERSION, "task": named, "method": method, **outcome}
 

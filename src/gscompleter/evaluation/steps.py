@@ -41,6 +41,8 @@ class PreparedTask:
     models: Models
     seconds: float
     """Wall time of the reconstruction of the context."""
+    context_notes: tuple[str, ...] = ()
+    """Sentences of Ψ about the photographs, such as on a depth that it did not use."""
 
 
 @dataclass(frozen=True)

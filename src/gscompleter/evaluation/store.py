@@ -119,6 +119,8 @@ class SavedContext:
     seconds: float
     gains: Float[Tensor, "v 3"] | None = None
     """Exposure gain of each photograph by channel, or None without exposure normalization."""
+    notes: tuple[str, ...] = ()
+    """Sentences of Ψ about the photographs."""
 
 
 def save_prediction(path: Path, prediction: Prediction) -> None:

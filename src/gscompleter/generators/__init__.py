@@ -97,8 +97,8 @@ def as_generator(phi: Any) -> Generator:
     if not is_object and (not callable(phi) or isinstance(phi, type)):
         raise InputError(
             "The generator has to be a function of nearest view, target and context, or an object "
-            "with supports_padding, max_batch_size and synthesize, and is "
-            f"{describe(phi)}."
+            "with supports_padding, max_batch_size and synthesize, such as gsc.load_generator "
+            f"returns, and is {describe(phi)}."
         )
     generator: Generator = phi if is_object else FunctionGenerator(phi)
     if not is_whole(generator.max_batch_size) or generator.max_batch_size < 1:

@@ -52,7 +52,7 @@ class Painting(View):
     earlier target may have filled a part of it since then."""
 
     owner: ClassVar[str] = "a painting"
-    forms: ClassVar[dict[str, Form]] = {**View.forms, "asked": (BOOLS, (None, None))}
+    forms: ClassVar[dict[str, Form]] = {**View.forms, "asked": (BOOLS, ("h", "w"))}
 
 
 @dataclass(frozen=True)

@@ -128,13 +128,8 @@ def check_inputs(
             )
 
 
-def check_views(views: object, name: str) -> None:
-    """Raise InputError unless these are photographs to work on.
-
-    They are a list of `View`, at least `MIN_SIDE` pixels wide and high, with colours
-    in [0, 1], depths of at least 0, and some pixel that is not ignored. `name` is for the
-    sentences, such as "context".
-    """
+def check_view_list(views: object, name: str) -> None:
+    """Raise InputError unless these are a list of `View`, whose numbers are not read."""
     if not isinstance(views, (list, tuple)):
         raise InputError(
             f"The {name} views have to be a list, such as gsc.load_views returns, and are "
@@ -146,6 +141,25 @@ def check_views(views: object, name: str) -> None:
                 f"The {name} views have to be a list of View, and number {number} is "
                 f"{describe(view)}."
             )
+
+
+def check_given_views(views: object) -> None:
+    """Raise InputError unless Ψ is given a list of at least one `View`."""
+    check_view_list(views, "context")
+    if not views:
+        raise InputError("No view was given that could be reconstructed; give at least one.")
+
+
+def check_views(views: object, name: str) -> None:
+    """Raise InputError unless these are photographs to work on.
+
+    They are a list of `View`, at least `MIN_SIDE` pixels wide and high, with colours
+    in [0, 1], depths of at least 0, and some pixel that is not ignored. `name` is for the
+    sentences, such as "context".
+    """
+    check_view_list(views, name)
+    assert isinstance(views, (list, tuple))
+    for number, view in enumerate(views):
         check_camera(view.camera, f"The camera of {name} view {number}")
         _check_float32(view.image, f"The image of {name} view {number}")
         check_colors(view.image, f"The image of {name} view {number}")

@@ -17,6 +17,7 @@ from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
 from gscompleter.system.progress import show_in_notebook, stage
 from gscompleter.system.tensor_checks import describe
+from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import Camera, Gaussians, View
 
 NUM_TARGETS = 4
@@ -24,6 +25,7 @@ NUM_TARGETS = 4
 
 
 @show_in_notebook()
+@run_in_plain_torch
 def remove(
     scene: Gaussians,
     chosen: Bool[Tensor, "n"],

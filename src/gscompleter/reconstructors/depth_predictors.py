@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from gscompleter.numerics.value_checks import check_depth
 from gscompleter.reconstructors.own_models import load_own_model
@@ -22,6 +24,22 @@ def predict_nothing(view: View) -> DepthMap:
     """Predict no depth: surfaces continue what stereo measured."""
     depth = torch.ones_like(view.image[..., 0])
     return DepthMap(depth, torch.zeros_like(depth, dtype=torch.bool))
+
+
+@dataclass(frozen=True, eq=False)
+class StoredDepth:
+    """Predictor that takes the depth of photographs from maps, by their frames; of others none."""
+
+    depths: Mapping[int, Float[Tensor, "h w"]]
+    """z-depth, 0 where unknown."""
+
+    def __call__(self, view: View) -> DepthMap:
+        """Return the map of the frame of a view, if it has the size of the view."""
+        stored = None if view.frame is None else self.depths.get(view.frame)
+        if stored is None or stored.shape != view.image.shape[:2]:
+            return predict_nothing(view)
+        depth = stored.to(view.image)
+        return DepthMap(depth.where(depth > 0, 1.0), depth > 0)
 
 
 def predict_depth(predict: DepthPredictor, view: View) -> DepthMap:

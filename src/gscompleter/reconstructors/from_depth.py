@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool
 from torch import Tensor
 
-from gscompleter.numerics.value_checks import check_depths
+from gscompleter.numerics.value_checks import check_depths, check_given_views
 from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.reconstructors.features.stereo_image import (
     StereoImage,
@@ -20,6 +20,7 @@ from gscompleter.reconstructors.features.stereo_image import (
 )
 from gscompleter.reconstructors.plane_sweep.fusion import DepthLayer
 from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
+from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import DepthMap, Reconstruction, View
 
 
@@ -38,8 +39,10 @@ class FromDepth(Splatter):
 
     model: DepthModel
 
+    @run_in_plain_torch
     def __call__(self, views: Sequence[View]) -> Reconstruction:
         """Predict depths and build the scene; errors as in `PlaneSweep.__call__`."""
+        check_given_views(views)
         views = set_depth_range(views, *get_depth_range(views))
         images, unit = make_stereo_images(views)
         depths = self.predict(views)

@@ -14,6 +14,9 @@ import zlib
 from contextlib import suppress
 from pathlib import Path
 
+from gscompleter.data.formats import find_format
+from gscompleter.data.frame import FOLDERS
+from gscompleter.data.sfm.poses import ENDINGS, holds_packed_splat
 from gscompleter.splats.packing import ZIP_MAGIC
 from gscompleter.system.errors import InputError, quote_value
 
@@ -30,6 +33,10 @@ POINT_CLOUD_STARTS = (b"LASF", b"ASTM-E57", b"# .PCD")
 MESHES = (".obj", ".stl", ".fbx", ".dae", ".off")
 SPLATS = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".usdz", ".usdc", ".usda")
 """Endings of files that are worth naming in an archive or folder."""
+
+SPLAT_NEIGHBOURS = (None, "cameras-json", "photograph")
+"""Formats that a folder may have beside the splat that it stands for: a trainer keeps the cameras
+of its photographs, which lie elsewhere, and renders."""
 
 # Where trainers write their splats, below the folder of a model; the number is the iteration.
 _PATTERNS = (
@@ -60,6 +67,20 @@ def find_newest_splat(folder: Path) -> Path | None:
         if paths:
             return max(paths, key=lambda path: (get_iteration(path), str(path)))
     return None
+
+
+def holds_splat_alone(folder: Path) -> bool:
+    """Check whether a folder stands for a splat: it holds one, and no photographs to work on.
+
+    It is an unpacked .sog, a streamed scene (which `refuse_folder` names), or a trainer's model
+    folder. Such a folder may have cameras, and renders below it.
+    """
+    if holds_packed_splat(folder) or os.path.isfile(folder / LOD_META):
+        return True
+    if find_newest_splat(folder) is None or find_format(folder) not in SPLAT_NEIGHBOURS:
+        return False
+    names = [name.lower() for name in os.listdir(folder)]
+    return not any(name in FOLDERS or name.endswith(ENDINGS) for name in names)
 
 
 def resolve_splat(path: Path) -> Path:

@@ -56,6 +56,7 @@ from gscompleter.system.files.output_file import check_free, reserve_file
 from gscompleter.system.files.ply import read_header
 from gscompleter.system.files.reading import hash_file, open_file, read_json
 from gscompleter.system.files.writing import replace_file
+from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import Gaussians
 
 OPACITY_TOLERANCE = 1e-3
@@ -127,6 +128,7 @@ RECORDING = (write_compressed_ply, *LABELLING)
 """Writers of formats that hold the record of who made the file, besides .ply."""
 
 
+@run_in_plain_torch
 def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     """Load the Gaussians of a file in any format of `FORMATS`, in the axes of a 3DGS .ply.
 
@@ -180,6 +182,7 @@ def validate_ranges(gaussians: Gaussians, path: Path) -> Gaussians:
     return replace(gaussians, opacities=opacities.clamp(0, 1))
 
 
+@run_in_plain_torch
 def save_splat(path: Path | str, gaussians: Gaussians, made_by: Provenance = NOTHING_KNOWN) -> None:
     """Write Gaussians in the format given by the extension of `path`.
 

@@ -40,6 +40,7 @@ from gscompleter.system.files.ply import (
     release_pages,
     write_ply_file,
 )
+from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import Gaussians, merge
 
 MEANS = ("x", "y", "z")
@@ -73,6 +74,7 @@ CHUNK_ROWS = 16 * BLOCK_ROWS
 """Rows of a file that are copied at a time."""
 
 
+@run_in_plain_torch
 def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
     """Load the Gaussians of a 3DGS .ply of SH degree 0 to 3.
 
@@ -298,6 +300,7 @@ def _to_array(values: Tensor | None) -> Float[ndarray, "n *c"]:
     return values.detach().cpu().float().contiguous().numpy()
 
 
+@run_in_plain_torch
 def save_ply(
     path: Path | str,
     gaussians: Gaussians,

@@ -1,6 +1,7 @@
 """Errors for the user, and the sentences that they hold."""
 
 import os
+import re
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
@@ -12,6 +13,10 @@ PROGRAM = "gscompleter: "
 MAX_MESSAGE_LENGTH = 300
 MAX_QUOTE_LENGTH = 60
 MAX_PATH_LENGTH = 250
+MAX_NAME_BYTES = 255
+"""Longest name of a file or folder on usual disks."""
+ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")
+"""Place in memory in the text of an object without one of its own."""
 
 LFS_POINTER = b"version https://git-lfs"
 
@@ -70,7 +75,9 @@ def quote_value(value: object, length: int | None = None) -> str:
     """
     if length is None:
         length = MAX_PATH_LENGTH if isinstance(value, os.PathLike) else MAX_QUOTE_LENGTH
-    text = str(value) if isinstance(value, (str, os.PathLike)) else _REPR.repr(value)
+    is_text = isinstance(value, (str, os.PathLike))
+    # The place of an object in memory tells nothing, and is another one in each run.
+    text = str(value) if is_text else re.sub(ADDRESS, "", _REPR.repr(value))
     # Only the ends of very long texts are processed.
     ends = text if len(text) <= 4 * length else text[: 2 * length] + text[-2 * length :]
     # Line breaks and control characters would split the sentence or drive the terminal.
@@ -100,6 +107,9 @@ def require_path(value: object) -> Path:
     """Return a path, or raise InputError for a value that is none."""
     if isinstance(value, (str, os.PathLike)):
         path = Path(value)
+        for part in path.parts:
+            if "\0" in part or len(part.encode("utf-8", "surrogatepass")) > MAX_NAME_BYTES:
+                raise InputError(f"No file can be called '{quote_value(part)}'; name another path.")
         if isinstance(value, os.PathLike) or value:
             return path
     raise InputError(

@@ -22,8 +22,8 @@ BOOLS = (torch.bool,)
 BYTES = (torch.uint8,)
 INTEGERS = (torch.int32, torch.int64)
 
-Form = tuple[tuple[torch.dtype, ...], tuple[int | None, ...]]
-"""Allowed dtypes and the shape of a tensor; None stands for any length."""
+Form = tuple[tuple[torch.dtype, ...], tuple[int | str, ...]]
+"""Allowed dtypes and the shape of a tensor; a letter stands for any length, and names it."""
 
 
 def check_tensors(value: object, owner: str, forms: Mapping[str, Form]) -> None:
@@ -64,14 +64,14 @@ def check_tensors(value: object, owner: str, forms: Mapping[str, Form]) -> None:
 
 
 def _has_form(
-    tensor: Tensor, dtypes: tuple[torch.dtype, ...], shape: tuple[int | None, ...]
+    tensor: Tensor, dtypes: tuple[torch.dtype, ...], shape: tuple[int | str, ...]
 ) -> bool:
     if tensor.dtype not in dtypes or len(tensor.shape) != len(shape):
         return False
     if tensor.layout is not torch.strided or _lacks_values(tensor):
         return False
     sides = zip(shape, tensor.shape, strict=True)
-    return all(length is None or length == side for length, side in sides)
+    return all(isinstance(length, str) or length == side for length, side in sides)
 
 
 def _lacks_values(tensor: Tensor) -> bool:
@@ -110,10 +110,9 @@ def describe(value: object) -> str:
     return f"a {layout}tensor of {name_dtype(value.dtype)} and shape {shape}{place}"
 
 
-def describe_form(dtypes: tuple[torch.dtype, ...], shape: tuple[int | None, ...]) -> str:
+def describe_form(dtypes: tuple[torch.dtype, ...], shape: tuple[int | str, ...]) -> str:
     """Describe the dtype and shape that a tensor has to have."""
-    letters = iter("nkm")
-    lengths = ", ".join(next(letters) if side is None else str(side) for side in shape)
+    lengths = ", ".join(map(str, shape))
     return f"a tensor of {name_dtype(dtypes[0])} and shape [{lengths}]"
 
 

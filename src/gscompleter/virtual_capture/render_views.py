@@ -10,6 +10,7 @@ from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
 from gscompleter.system.errors import InputError
 from gscompleter.system.tensor_checks import describe
+from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import Camera, Gaussians, View
 
 MIN_OPAQUE = 0.95
@@ -17,6 +18,7 @@ MIN_OPAQUE = 0.95
 rims of holes would be kept as if they had been seen (decision 053)."""
 
 
+@run_in_plain_torch
 def render_views(
     scene: Gaussians, cameras: Sequence[Camera], renderer: Renderer | None = None
 ) -> list[View]:

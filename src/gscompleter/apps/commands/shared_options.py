@@ -267,10 +267,15 @@ def list_inputs(options: Settings) -> list[Path]:
 
 
 def is_splat(path: Path) -> bool:
-    """Check whether a path names an existing file of Gaussians, by its ending."""
+    """Check whether a path names an existing file of Gaussians, or a folder of nothing else."""
+    # As in `replace_by_scenes`.
+    if os.path.isdir(path):
+        from gscompleter.splats.foreign import holds_splat_alone
+
+        return holds_splat_alone(path)
     if not os.path.isfile(path):
         return False
-    from gscompleter.splats.formats import has_splat_extension  # as in `replace_by_scenes`
+    from gscompleter.splats.formats import has_splat_extension
 
     return has_splat_extension(path)
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -41,7 +41,8 @@ from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.photograph_names import describe_offset
 from gscompleter.generators import load_generator
 from gscompleter.planning.planner import Choice, ViewPlanner
-from gscompleter.reconstructors import check_reconstructor, load_reconstructor
+from gscompleter.reconstructors import DepthAware, check_reconstructor, load_reconstructor
+from gscompleter.reconstructors.depth_predictors import StoredDepth
 from gscompleter.render.device import choose_devices
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
@@ -191,6 +192,7 @@ def load_models(
     # Only here, because the oracle is given the photographs of the targets.
     with show_preparation("loading models"):
         completer = load_completer(options, task.targets)
+    completer, task = use_predicted_depth(options, completer, task)
     reconstructor = completer.reconstructor
 
     # A single photograph has no stereo, so a network predicts its depth; a splat needs neither.
@@ -213,6 +215,28 @@ def load_models(
 
     cameras = collect_cameras(opened, task)
     return Prepared(options, opened, task, ViewPlanner(completer), cameras, seconds)
+
+
+def use_predicted_depth(
+    options: CompleteOptions, completer: GSCompleter, task: CompletionTask
+) -> tuple[GSCompleter, CompletionTask]:
+    """Let predicted depth that lies beside the photographs support stereo, or say why it does not.
+
+    A depth that the user named takes its place.
+    """
+    reconstructor = completer.reconstructor
+    if not task.predicted_depths:
+        return completer, task
+    is_aware = isinstance(reconstructor, DepthAware) and is_dataclass(reconstructor)
+    if options.depth == "none" and is_aware:
+        stored = StoredDepth(task.predicted_depths)
+        supported = replace(reconstructor, predict_depth=stored)  # type: ignore[type-var]
+        return replace(completer, reconstructor=supported), task
+    reason = f"the reconstructor {options.reconstructor} takes none"
+    if is_aware:
+        reason = f"--depth {options.depth} takes its place"
+    note = f"Inverse depth that only supports stereo is not used: {reason}."
+    return completer, replace(task, depth_notes=(*task.depth_notes, note))
 
 
 def open_input(options: SceneOptions, console: Console, check: Callable[[], object]) -> Opened:

@@ -20,6 +20,7 @@ from gscompleter.apps.completing.preparation import (
     load_models,
     open_for_completion,
     read_inputs,
+    use_predicted_depth,
 )
 from gscompleter.apps.inputs.depth_range import apply_splat_range
 from gscompleter.apps.inputs.describing import print_lines
@@ -32,6 +33,7 @@ from gscompleter.apps.inputs.task import Opened
 from gscompleter.config import CompleterConfig
 from gscompleter.data.formats import find_format
 from gscompleter.data.sfm.placing import place_photographs
+from gscompleter.planning.planner import ViewPlanner
 from gscompleter.splats.alignment.similarity import transform_view
 from gscompleter.stages.add_observed import MIN_SHARE, find_lacks
 from gscompleter.system.errors import InputError
@@ -158,11 +160,18 @@ def choose_evidence(ready: Prepared, new: Sequence[int]) -> Prepared:
         views=[transform_view(view, transform) for view in read.views],
         check_views=[transform_view(view, transform) for view in read.check_views or ()],
         depth_notes=read.depth_notes,
+        predicted_depths=read.predicted_depths,
     )
     assert task.scene is not None
     task = apply_splat_range(task, task.scene, ready.completer.renderer)
     task = hide_taken_out(task, task.taken_out)
-    return replace(ready, task=task, cameras=collect_cameras(opened, task))
+    completer, task = use_predicted_depth(ready.options, ready.completer, task)
+    return replace(
+        ready,
+        task=task,
+        explorer=ViewPlanner(completer),
+        cameras=collect_cameras(opened, task),
+    )
 
 
 def measure_lacks(ready: Prepared) -> dict[int, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -20,13 +20,16 @@ from gscompleter.apps.warmup import compile_kernels
 from gscompleter.data.photographs import check_resolution
 from gscompleter.evaluation.cases import SkippedScene
 from gscompleter.evaluation.methods import expand_methods
-from gscompleter.evaluation.runner import RunConfig, evaluate
+from gscompleter.evaluation.runner import RunConfig, collect_context_notes, evaluate
 from gscompleter.evaluation.store import list_row_paths
 from gscompleter.render.device import choose_devices
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError
 from gscompleter.system.jobs.jobs import parse_shard
 from gscompleter.system.progress import show_preparation, show_progress
+
+MAX_NAMED = 5
+"""Most cases of which a line says what Ψ said about their photographs."""
 
 
 def run_methods(options: EvaluateOptions) -> int:
@@ -99,11 +102,22 @@ def score_methods(options: EvaluateOptions) -> Scored:
         compile_kernels((config.device, config.reconstructor, config.generator))
         counts = evaluate(tasks, methods, options.out, config, shard, options.rerun, engine)
 
+    print_context_notes(collect_context_notes(options.out, tasks), console)
     own = counts.done + counts.failed + counts.skipped
     print_failures(console, counts.failures, own)
     line = f"Scored {counts.done}, failed {counts.failed}, done earlier {counts.skipped}"
     console.print(f"{line}, of {len(tasks)} cases by {len(methods)} methods.", soft_wrap=True)
     return Scored(len(tasks) * len(methods), own, counts.failures)
+
+
+def print_context_notes(notes: Mapping[str, str], console: Console) -> None:
+    """Print what Ψ said about the photographs of the first cases, and the number of the others."""
+    for name, note in list(notes.items())[:MAX_NAMED]:
+        console.print(f"{name}: {note}", markup=False, soft_wrap=True)
+    if len(notes) > MAX_NAMED:
+        console.print(
+            f"... and of {len(notes) - MAX_NAMED} more cases (`context_notes` of their rows)."
+        )
 
 
 def describe_source(options: EvaluateOptions, has_masks: bool = False) -> dict[str, Any]:

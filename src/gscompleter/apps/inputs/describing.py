@@ -61,7 +61,7 @@ def describe_opening(opened: Opened, task: CompletionTask) -> list[str]:
     scene = task.scene
     camera = task.views[0].camera
     photographs = opened.photographs
-    used = len(photographs) - len(list_missing(photographs))
+    used = len(photographs.posed) - len(list_missing(photographs))
     splat = ""
     if scene is not None:
         mode = "antialiased " if scene.is_antialiased else ""
@@ -84,7 +84,8 @@ def describe_opening(opened: Opened, task: CompletionTask) -> list[str]:
 
 def list_missing(photographs: Photographs) -> list[str]:
     """List the names of photographs that cameras name and that are not there."""
-    named = [frame for frame in photographs.frames if frame.image is not None]
+    posed = [photographs.frame(number) for number in photographs.posed]
+    named = [frame for frame in posed if frame.image is not None]
     return [frame.name for frame in named if not frame.has_photograph()]
 
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import torch
 from jaxtyping import Float
+from torch import Tensor
 
 from gscompleter.data.given_depth import drop_unsure, give_depth, project_tracks
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.reconstructors.features.depth_factor import (
+    MIN_OWN_SAMPLES,
     MIN_SAMPLES,
     DepthSamples,
     compare_maps,
@@ -20,33 +22,124 @@ from gscompleter.reconstructors.features.depth_factor import (
     fit_depth_factor,
     join_samples,
 )
-from gscompleter.system.errors import InputError
+from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.types import View
 
 WAY_OUT = "--no-given-depth leaves it out"
+MAX_DEVIATION = 0.03
+"""Largest median deviation of predicted depth from triangulated points that counts as measured.
+Stereo of photographs is about as exact, so that a worse map only helps where stereo measures
+nothing (decision 088)."""
+MAX_NAMED = 3
+"""Photographs that a sentence names."""
+
+
+@dataclass(frozen=True)
+class DepthReading:
+    """Photographs with the depth that the scene holds of them."""
+
+    views: Sequence[View]
+    notes: tuple[str, ...] = ()
+    """Sentences about its unit and its use."""
+    predicted: Mapping[int, Float[Tensor, "h w"]] = field(default_factory=dict)
+    """Predicted z-depth by frame, 0 where unknown, that only supports stereo."""
 
 
 def read_with_depth(
     photographs: Photographs, frames: Sequence[int], resolution: Resolution = None
-) -> tuple[list[View], tuple[str, ...]]:
+) -> DepthReading:
     """Load photographs with their given depth in scene units, and say how its unit was found.
 
-    Raises InputError if it contradicts what the photographs and the points of the scene measure.
+    Raises InputError if measured depth contradicts what the photographs and the points of the scene
+    measure. Depth that a network predicted counts as measured only where it agrees with these.
     """
     views = photographs.views(frames, resolution)
     factor = 1.0
     note = ""
     if any(view.depth is not None for view in views):
         factor, note = find_factor(photographs, frames, views, resolution)
+    predicted = sort_predicted(photographs, frames, views)
 
     views_with_depth = []
     for view, frame in zip(views, frames, strict=True):
         if view.depth is not None and factor != 1.0:
             view = replace(view, depth=view.depth * factor)
         # Given depth takes the place of stereo in the reconstruction (decision 046).
+        view = replace(view, depth=predicted.agreeing.get(frame, view.depth))
         view = give_depth(view, photographs.frame(frame), photographs.origin)
         views_with_depth.append(view)
-    return views_with_depth, (note,) if note else ()
+    notes = (*((note,) if note else ()), *predicted.describe(photographs))
+    return DepthReading(views_with_depth, notes, predicted.others)
+
+
+@dataclass(frozen=True)
+class PredictedDepth:
+    """Predicted depth of photographs by frame, apart by how it agrees with points and matches."""
+
+    agreeing: Mapping[int, Float[Tensor, "h w"]]
+    others: Mapping[int, Float[Tensor, "h w"]]
+    deviations: Mapping[int, float]
+    """Median relative deviation; photographs with too few points to tell have none."""
+
+    def describe(self, photographs: Photographs) -> tuple[str, ...]:
+        """Say how the depth of which photographs is used."""
+
+        def name(frames: Mapping[int, object]) -> str:
+            files = [photographs.frame(frame).file_name for frame in frames]
+            return join_names([quote_value(file) for file in files], MAX_NAMED)
+
+        def format_worst(frames: Mapping[int, object]) -> str:
+            return f"{100 * max(self.deviations.get(frame, 0.0) for frame in frames):.1f} %"
+
+        notes = []
+        if self.agreeing:
+            notes.append(
+                f"The inverse depth of {name(self.agreeing)} agrees with the points of the scene "
+                f"to {format_worst(self.agreeing)}, and is used as its depth ({WAY_OUT})."
+            )
+        far = {frame: None for frame in self.others if frame in self.deviations}
+        untold = {frame: None for frame in self.others if frame not in self.deviations}
+        for frames, reason in (
+            (far, f"deviates by up to {format_worst(far) if far else ''} from the points"),
+            (untold, "cannot be compared, because the photographs show too few points"),
+        ):
+            if frames:
+                notes.append(
+                    f"The inverse depth of {name(frames)} {reason}, and is used only where stereo "
+                    f"measures nothing ({WAY_OUT})."
+                )
+        return tuple(notes)
+
+
+def sort_predicted(
+    photographs: Photographs, frames: Sequence[int], views: Sequence[View]
+) -> PredictedDepth:
+    """Load predicted depth of photographs without measured depth, and compare it with points."""
+    maps = {}
+    for frame, view in zip(frames, views, strict=True):
+        depth = None if view.depth is not None else photographs.load_predicted_depth(view)
+        if depth is not None:
+            maps[frame] = depth
+    if not maps:
+        return PredictedDepth({}, {}, {})
+
+    shown = [
+        replace(view, depth=maps.get(frame)) for frame, view in zip(frames, views, strict=True)
+    ]
+    samples = compare_given_depth(photographs, frames, shown)
+    deviations = {}
+    for number, frame in enumerate(frames):
+        own = samples.select(number)
+        if frame in maps and len(own) >= MIN_OWN_SAMPLES:
+            ratios = np.log(own.measured) - np.log(own.given)
+            deviations[frame] = float(np.expm1(np.median(np.abs(ratios))))
+    agreeing = {
+        frame: depth
+        for frame, depth in maps.items()
+        if deviations.get(frame, np.inf) <= MAX_DEVIATION
+    }
+    others = {frame: depth for frame, depth in maps.items() if frame not in agreeing}
+    return PredictedDepth(agreeing, others, deviations)
 
 
 def find_factor(

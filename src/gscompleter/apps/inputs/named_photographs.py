@@ -53,8 +53,9 @@ def find_frame(photographs: Photographs, word: int | str, option: str) -> int:
     except InputError as error:
         if option == "target" and isinstance(number, str):
             raise InputError(
-                f"'{quote_value(word, 60)}' is no target: name a photograph or its number from 0 "
-                f"to {len(photographs) - 1}, or an existing file of cameras, such as a "
+                f"'{quote_value(word, 60)}' is no target: name a photograph, such as "
+                f"{quote_value(photographs.frame(0).file_name)}, or its number from 0 to "
+                f"{len(photographs) - 1}, or an existing file of cameras, such as a "
                 "transforms.json.",
                 option,
             ) from error

@@ -25,6 +25,7 @@ from gscompleter.data.photographs import check_resolution
 from gscompleter.data.sfm.poses import find_poses, has_photographs, list_all_photographs
 from gscompleter.data.video import is_video
 from gscompleter.splats.alignment.training_size import find_training_size
+from gscompleter.splats.foreign import holds_splat_alone
 from gscompleter.splats.formats import has_splat_extension
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import POSES, refuse_link
@@ -46,9 +47,11 @@ def open_scene(
     after it.
     """
     folder = request.folder
-    if not os.path.isdir(folder) and has_splat_extension(folder):
+    is_folder = os.path.isdir(folder)
+    if holds_splat_alone(folder) if is_folder else has_splat_extension(folder):
+        kind = "folder" if is_folder else "file"
         raise InputError(
-            f"{quote_value(folder, 80)} is a file of Gaussians, which goes to --scene; SCENE has "
+            f"{quote_value(folder, 80)} is a {kind} of Gaussians, which goes to --scene; SCENE has "
             "to be the folder of its photographs, with or without cameras, or a video."
         )
     check_planes(request.near, request.far)

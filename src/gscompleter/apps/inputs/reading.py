@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 
-from gscompleter.apps.inputs.given_depth import read_with_depth
+from gscompleter.apps.inputs.given_depth import DepthReading, read_with_depth
 from gscompleter.apps.inputs.named_photographs import (
     PhotographNames,
     add_photograph,
@@ -91,12 +91,11 @@ def make_task(
     cameras = [bounded.camera(frame, resolution) for frame in frames]
     check_sizes([*cameras, *(target.camera for target in targets)])
 
-    depth_notes: tuple[str, ...] = ()
     if request.uses_given_depth:
-        views, depth_notes = read_with_depth(bounded, frames, resolution)
+        read = read_with_depth(bounded, frames, resolution)
     else:
-        views = bounded.views(frames, resolution)
-    views = [view.to(device) for view in views]
+        read = DepthReading(bounded.views(frames, resolution))
+    views = [view.to(device) for view in read.views]
 
     # Photographs of the targets score the result, and only the oracle generator sees them.
     targets = [add_photograph(target, bounded, resolution) for target in targets]
@@ -106,7 +105,8 @@ def make_task(
         compute_frame_from_photographs(photographs.origin),
         photographs.origin,
         find_depth_sources(opened, bounded, has_splat),
-        depth_notes=depth_notes,
+        depth_notes=read.notes,
+        predicted_depths=read.predicted,
     )
 
 

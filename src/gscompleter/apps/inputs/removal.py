@@ -103,6 +103,12 @@ def choose_gaussians(
     if selection.masks:
         photographs = opened.photographs
         masks = find_masks(selection.masks, [frame.name for frame in photographs.frames])
+        if not masks.keys() & cameras.keys():
+            raise InputError(
+                f"All masks in {quote_value(selection.masks)} are of photographs that cannot be "
+                "used; mark what goes in one that has a camera.",
+                "mask",
+            )
         resolution = opened.request.resolution
         shown = find_in_masks(
             masks, scene, photographs, cameras, resolution, renderer, selection.mask_reading

@@ -124,6 +124,8 @@ class CompletionTask:
     """Check views of the input splat, at low resolution."""
     depth_notes: tuple[str, ...] = ()
     """Sentences about the unit of the given depth."""
+    predicted_depths: Mapping[int, Float[Tensor, "h w"]] = field(default_factory=dict)
+    """Predicted z-depth that lies beside photographs, by frame: it only supports stereo."""
     witnesses: Witnesses = Witnesses()
     """Further cameras from which a splat without photographs looks well."""
     taken_out: TakenOut | None = None

@@ -42,7 +42,7 @@ from gscompleter.render.protocols import Renderer
 from gscompleter.splats.edits import EDITS, EditDraft
 from gscompleter.splats.formats import load_splat
 from gscompleter.state import Completion
-from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.errors import InputError, quote_value, require_path
 from gscompleter.system.files.output_folder import open_output_folder
 from gscompleter.system.files.writing import (
     COMPLETED_FILES,
@@ -54,6 +54,7 @@ from gscompleter.system.files.writing import (
     replace_file,
 )
 from gscompleter.system.progress import show_in_notebook, stage
+from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import Camera, View
 
 COMMAND = "complete"
@@ -126,6 +127,7 @@ def score_result(completion: Completion, unused_views: Sequence[View]) -> dict[s
 
 
 @show_in_notebook()
+@run_in_plain_torch
 def save_result(
     completion: Completion,
     out: Path | str,
@@ -134,18 +136,21 @@ def save_result(
     overwrite: bool,
 ) -> Path:
     """Write all files of a completion to a folder; see `Completion.save`."""
-    splat_file = None if splat is None else find_splat_file(Path(splat), completion)
+    out = require_path(out)
+    splat_file = None if splat is None else find_splat_file(require_path(splat), completion)
     judged = prepare_judged(completion, unused_views)
     with stage("report"), open_output_folder(out, overwrite, COMMAND) as folder:
         write_result(folder, judged, splat_file)
-    return Path(out)
+    return out
 
 
 @show_in_notebook()
+@run_in_plain_torch
 def write_result_page(
     completion: Completion, file: Path | str, unused_views: Sequence[View]
 ) -> Path:
     """Write the page of a completion alone; see `Completion.report`."""
+    file = require_path(file)
     judged = prepare_judged(completion, unused_views)
     with stage("report"), tempfile.TemporaryDirectory(prefix="gscompleter-") as place:
         folder = Path(place)
@@ -153,7 +158,7 @@ def write_result_page(
         page = (folder / REPORT_FILE).read_bytes()
         with replace_file(file) as output:
             output.write(page)
-    return Path(file)
+    return file
 
 
 def write_result(folder: Path, judged: Judged, splat_file: InputSplatFile | None) -> None:

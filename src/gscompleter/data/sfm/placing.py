@@ -25,7 +25,7 @@ from PIL import Image
 from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.colmap import open_colmap
 from gscompleter.data.file_names import FolderListings
-from gscompleter.data.frame import MASKS, Frame
+from gscompleter.data.frame import FOLDERS, MASKS, Frame
 from gscompleter.data.mask_checks import check_hiding_masks
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.masks import find_mask
@@ -175,8 +175,18 @@ def place_photographs(
             (draft / SUMMARY_FILE).write_bytes(json.dumps(content, indent=1).encode())
     placed = replace(placed, skipped=len(found) - len(names))
     (opened,) = open_colmap(out)
-    joined = replace(photographs, frames=(*photographs.frames, *opened.frames))
-    return joined, placed
+    added = [name_new(frame, folder) for frame in opened.frames]
+    return replace(photographs, frames=(*photographs.frames, *added)), placed
+
+
+def name_new(frame: Frame, folder: Path) -> Frame:
+    """Name a new photograph by its folder, too, since phones count from IMG_0001 again and again.
+
+    A folder of the usual names, which lines leave out, would not tell it from those of the scene.
+    """
+    home = folder.resolve().name
+    home = NEW if home.casefold() in (*FOLDERS, "") else home
+    return replace(frame, name=f"{home}/{frame.name}")
 
 
 def find_stored_file(frame: Frame) -> Path | None:
@@ -271,7 +281,7 @@ def choose_known(photographs: Photographs) -> list[int]:
     """Choose photographs to compare with: those that exist, of very many some far apart."""
     frames = [
         number
-        for number in range(len(photographs))
+        for number in photographs.posed
         if photographs.frame(number).has_photograph() and not photographs.is_hidden(number)
     ]
     if len(frames) <= MAX_KNOWN:

@@ -16,7 +16,7 @@ import re
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -28,12 +28,13 @@ from PIL import Image, ImageOps
 
 from gscompleter.data.camera_files import refuse_other_exports
 from gscompleter.data.file_names import FolderListings
-from gscompleter.data.frame import DOWNSCALE_FACTORS, MASKS
+from gscompleter.data.frame import DOWNSCALE_FACTORS, MASKS, Frame
 from gscompleter.data.limits import require
 from gscompleter.data.mask_checks import check_hiding_masks, refuse_nothing_to_invert
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.masks import MASK_FOLDERS, find_mask, leave_out_masks, load_mask
 from gscompleter.data.panorama import has_panoramas, split_panorama
+from gscompleter.data.photographs import Photographs
 from gscompleter.data.video import NUM_FRAMES, extract_frames, is_video
 from gscompleter.system.children import run_module
 from gscompleter.system.errors import InputError, join_names, quote_value
@@ -60,6 +61,10 @@ ENDINGS = (
 """Endings of photographs, in any case."""
 OTHER_FOLDERS = (*MASK_FOLDERS, "depth", "depths", *(f"images_{n}" for n in DOWNSCALE_FACTORS))
 """Folders that hold no photographs of the user."""
+PACKED_INDEX = "meta.json"
+"""File beside the images of an unpacked .sog, which says what they hold."""
+MAX_INDEX = 1 << 26
+"""Largest such file that is looked into, in bytes."""
 SEPARATORS = r"[\s#]"
 """Characters that names of copies do not have: in COLMAP's lists a space ends a name, and # begins
 a comment."""
@@ -156,7 +161,10 @@ class FoundPoses:
             )
         if self.missing:
             names = join_names(self.missing, MAX_NAMED)
-            notes.append(f"No camera was found for {names}; they are left out.")
+            notes.append(
+                f"No camera was found for {names}; they are not used, and the others keep their "
+                "numbers."
+            )
         return notes
 
 
@@ -253,6 +261,34 @@ def read_earlier(out: Path, entry: str, known: Mapping[str, Any]) -> dict[str, A
     return result
 
 
+def list_unplaced(scene: Photographs, path: Path) -> list[Frame]:
+    """List the copies for which no camera was found, if our search wrote the model in `path`.
+
+    As frames without a camera among the others they keep the numbers of all photographs those of
+    the folder that the user gave.
+    """
+    content = {}
+    if os.path.isfile(path / SUMMARY_FILE) and os.path.isdir(path / IMAGES):
+        content = read_json(path / SUMMARY_FILE, "name another folder")
+    if not isinstance(content, dict) or "poses" not in content:
+        return []
+    placed = {frame.name for frame in scene.frames}
+    first = scene.frames[0]
+    return [
+        replace(
+            first,
+            name=name,
+            title=f"image {quote_value(name)} of {quote_value(path)}",
+            c2w=np.full((4, 4), np.nan),
+            image=path / IMAGES / name,
+            seen_points=None,
+            lack="COLMAP found no camera for it",
+        )
+        for name in list_all_photographs(path / IMAGES)
+        if name not in placed
+    ]
+
+
 def has_photographs(path: Path) -> bool:
     """Check whether `path` is a video or a folder with photographs, with or without cameras."""
     return is_video(path) or any(True for _ in iterate_photographs(path))
@@ -301,12 +337,25 @@ def iterate_photographs(folder: Path) -> Iterator[Path]:
         )
         # In place, as `os.walk` documents it: it then enters only these folders.
         folders[:] = [name for name in folders if is_own(Path(home, name))]
+        if holds_packed_splat(Path(home)):
+            continue
         images = [
             name
             for name in files
             if not name.startswith(".") and Path(name).suffix.lower() in ENDINGS
         ]
         yield from (Path(home, name) for name in leave_out_masks(images))
+
+
+def holds_packed_splat(folder: Path) -> bool:
+    """Check for an unpacked .sog: its images are tables of Gaussians, and no photographs."""
+    file = folder / PACKED_INDEX
+    if not os.path.isfile(file) or os.path.getsize(file) > MAX_INDEX:
+        return False
+    content: object = None
+    with suppress(OSError, ValueError, RecursionError):
+        content = json.loads(file.read_bytes())
+    return isinstance(content, dict) and {"means", "quats"} <= content.keys()
 
 
 def is_own(folder: Path) -> bool:

@@ -9,11 +9,13 @@ from gscompleter.evaluation.verdict.outcome import judge_completion
 from gscompleter.evaluation.verdict.rows import OutcomeRow
 from gscompleter.numerics.value_checks import check_views
 from gscompleter.render.loading import load_renderer
-from gscompleter.state import Completion
+from gscompleter.state import Completion, check_state
 from gscompleter.system.errors import InputError
+from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import View
 
 
+@run_in_plain_torch
 def judge(completion: Completion, unused_views: Sequence[View] = ()) -> OutcomeRow:
     """Judge whether the scene reconstructed and whether anything was gained, as `complete` does.
 
@@ -30,6 +32,7 @@ def judge(completion: Completion, unused_views: Sequence[View] = ()) -> OutcomeR
     Raises:
         InputError: An unused view is none, or is a part of the context.
     """
+    check_state(completion)
     held_out = hold_out(completion, unused_views)
     renderer = load_renderer(completion.views[0].image.device.type)
     rows = score_held_out(completion, held_out, renderer)

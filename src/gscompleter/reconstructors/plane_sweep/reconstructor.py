@@ -16,6 +16,7 @@ from torch import Tensor
 from gscompleter.numerics.geometry import compute_sparse_depth, measure_baseline, unproject
 from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.numerics.sky import SKY_DEPTH, is_sky
+from gscompleter.numerics.value_checks import check_given_views
 from gscompleter.reconstructors.depth_predictors import (
     DepthPredictor,
     predict_depth,
@@ -47,6 +48,7 @@ from gscompleter.reconstructors.plane_sweep.sweep import (
     measure_depths,
 )
 from gscompleter.system.errors import join_names
+from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import DepthMap, Reconstruction, View
 
 LIFT_ITERATIONS = ITERATIONS // 2
@@ -69,8 +71,10 @@ class PlaneSweep(Splatter):
     predict_depth: DepthPredictor = predict_nothing
     """Monocular depth, used where stereo measures nothing and confirms it elsewhere."""
 
+    @run_in_plain_torch
     def __call__(self, views: Sequence[View]) -> Reconstruction:
         """Reconstruct the scene and the depth of every pixel."""
+        check_given_views(views)
         views = set_depth_range(views, *get_depth_range(views))
         rig = build_rig(views)
         contradicted = find_contradicted(rig, views)
@@ -104,6 +108,7 @@ class PlaneSweep(Splatter):
         """Find a near plane that no surface of the photographs stands before; at most `near`."""
         return near if len(views) == 1 else find_near_plane(views, near, far)
 
+    @run_in_plain_torch
     def lift(self, views: Sequence[View], pixel_mask: Bool[Tensor, "h w"]) -> Reconstruction:
         """Lift the pixels of `pixel_mask` in the first view, a synthesized image.
 

@@ -127,6 +127,12 @@ def convert_write_errors(path: Path | str, numbers: Container[int] | None = None
     except OSError as error:
         if numbers is not None and error.errno not in numbers:
             raise
+        folder = Path(path).parent
+        if error.errno == errno.ENOENT and not os.path.isdir(folder):
+            raise OutputError(
+                f"Cannot write {quote_value(Path(path))}: there is no folder "
+                f"{quote_value(folder)}; make it, or choose another place."
+            ) from error
         kind = FullDiskError if error.errno in FULL_DISK_ERRORS else OutputError
         raise kind(
             f"Cannot write {quote_value(Path(path))}: {error.strerror or error}; free some space, "
