@@ -51,6 +51,7 @@ from gscompleter.splats.sog import META, read_sog, read_sog_remarks, write_sog
 from gscompleter.splats.splat import read_splat_rows, write_splat
 from gscompleter.splats.spz import read_spz, write_spz
 from gscompleter.splats.usd import read_usd, read_usd_remarks, write_usd
+from gscompleter.system.damage import describe_damage
 from gscompleter.system.errors import InputError, quote_value, refuse_pointer, require_path
 from gscompleter.system.files.output_file import check_free, reserve_file
 from gscompleter.system.files.ply import read_header
@@ -158,8 +159,8 @@ def decode_splat(path: Path) -> Gaussians:
         raise make_memory_error(path) from error
     except errors as error:
         raise InputError(
-            f"{quote_value(path)} cannot be read: {quote_value(str(error), MAX_DEFECT)}; fetch the "
-            "file again, or export it as .ply."
+            f"{quote_value(path)} cannot be read: {quote_value(describe_damage(error), MAX_DEFECT)}"
+            "; fetch the file again, or export it as .ply."
         ) from error
     # Labels lie in the file, or beside it as an earlier version wrote them for all formats.
     if not gaussians.generated.any():
@@ -284,8 +285,8 @@ def read_provenance(path: Path) -> Provenance:
             table = None
     except (*DECODING_ERRORS, *JSON_ERRORS) as error:
         raise InputError(
-            f"{quote_value(path)} cannot be read: {quote_value(str(error), MAX_DEFECT)}; fetch the "
-            "file again."
+            f"{quote_value(path)} cannot be read: {quote_value(describe_damage(error), MAX_DEFECT)}"
+            "; fetch the file again."
         ) from error
     return parse_provenance(table, quote_value(path))
 

@@ -36,6 +36,7 @@ from gscompleter.splats.transform import (
     rotate_half_turn,
     transform_gaussians,
 )
+from gscompleter.system.damage import DamagedError, check_rows
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_bytes
 from gscompleter.system.files.writing import replace_file
@@ -86,7 +87,7 @@ def read_glb(path: Path) -> Gaussians:
         count += int(_get_accessor(document, primitive, "POSITION")["count"])
         check_count(count, len(document.binary))
         if len(placed) > MAX_PRIMITIVES:
-            raise ValueError(f"it claims to hold more than {MAX_PRIMITIVES:,} primitives")
+            raise DamagedError(f"it claims to hold more than {MAX_PRIMITIVES:,} primitives")
     if not placed:
         raise UnsupportedError(_describe_other_content(document.table))
     parts = [
@@ -114,10 +115,16 @@ def _parse_document(data: bytes) -> GlbDocument:
     chunks: dict[int, bytes] = {}
     start = FILE_HEADER.size
     while start < len(data):
+        if len(data) - start < CHUNK_HEADER.size:
+            raise DamagedError("it ends within the header of a chunk")
         size, kind = CHUNK_HEADER.unpack_from(data, start)
         start += CHUNK_HEADER.size + size
+        if start > len(data):
+            raise DamagedError(f"it ends after {len(data):,} of {start:,} bytes")
         chunks.setdefault(kind, data[start - size : start])
-    return GlbDocument(json.loads(chunks.get(JSON, b"")), chunks.get(BINARY, b""))
+    if JSON not in chunks:
+        raise DamagedError("it holds no description of its content")
+    return GlbDocument(json.loads(chunks[JSON]), chunks.get(BINARY, b""))
 
 
 def _find_primitives(
@@ -134,7 +141,7 @@ def _find_primitives(
     while waiting:
         index, above = waiting.pop(0)
         if index in visited:
-            raise ValueError("its nodes contain each other")
+            raise DamagedError("its nodes contain each other")
         visited.add(index)
         node = table["nodes"][index]
         place = above @ _read_transform(node)
@@ -180,7 +187,7 @@ def _decode_packed(
     # Its own axes are converted to those of glTF, as the extension demands.
     gaussians = decode_spz(document.binary[start : start + int(view["byteLength"])])
     if len(gaussians) != _get_accessor(document, primitive, "POSITION")["count"]:
-        raise ValueError("its .spz has another number of Gaussians than its accessors")
+        raise DamagedError("its .spz has another number of Gaussians than its accessors")
     return rotate_half_turn(gaussians, HALF_TURN_Z)
 
 
@@ -200,7 +207,7 @@ def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gauss
     def read_attribute(name: str, kind: str = "VEC3") -> Float[ndarray, "n k"]:
         accessor = _get_accessor(document, primitive, name)
         if accessor["type"] != kind:
-            raise ValueError(f"its attribute {name} is no {kind}")
+            raise DamagedError(f"its attribute {name} is no {kind}")
         return _read_accessor(document, accessor)
 
     sh = [read_attribute(name) for name in SH_NAMES if name in primitive["attributes"]]
@@ -226,7 +233,9 @@ def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[nda
     start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
     stride = int(view.get("byteStride", 0)) or width * kind.itemsize
     shape = (int(accessor["count"]), width)
-    # numpy refuses views that exceed the buffer.
+    # The last row may be shorter than the distance between two.
+    num_bytes = len(document.binary) - start + max(stride - width * kind.itemsize, 0)
+    check_rows(num_bytes, stride, shape[0])
     values = np.ndarray(shape, kind, document.binary, start, (stride, kind.itemsize))
     if kind.kind == "f":
         return values.astype(np.float32)

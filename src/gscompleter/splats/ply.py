@@ -106,7 +106,7 @@ def find_finite_rows(path: Path) -> Bool[Tensor, "n"]:
 
 def read_scene(path: Path) -> PlyFile:
     """Read the rows of a 3DGS .ply, surfels of 2DGS included."""
-    scene = read_ply_file(path, _NEEDED, "3DGS scene", describe_other_content)
+    scene = read_ply_file(path, _NEEDED, "3DGS scene", describe_other_content, "Gaussians")
     names = scene.rows.dtype.names or ()
     num_rest = count_rest(scene)
     if num_rest not in _NUM_REST or any(f"f_rest_{i}" not in names for i in range(num_rest)):
@@ -264,7 +264,9 @@ def require_finite(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Ga
 def check_finite(count: int, total: int, path: Path, drop_nonfinite: bool) -> None:
     """Raise InputError if not all Gaussians of a file are finite, or if none is."""
     bad = total - count
-    if count == 0 and (bad == 0 or drop_nonfinite):
+    if total == 0:
+        raise InputError(f"{quote_value(path)} holds no Gaussians; name another file.")
+    if count == 0 and drop_nonfinite:
         raise InputError(f"{quote_value(path)} holds no Gaussian that is finite; write it anew.")
     if bad > 0 and not drop_nonfinite:
         raise InputError(

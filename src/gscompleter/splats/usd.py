@@ -38,6 +38,7 @@ from gscompleter.splats.transform import (
     rotate_half_turn,
     transform_gaussians,
 )
+from gscompleter.system.damage import DamagedError
 from gscompleter.system.errors import InputError, OutputError, quote_value
 from gscompleter.system.files.unfinished import make_unfinished_name
 from gscompleter.system.files.writing import convert_write_errors, replace_file
@@ -205,7 +206,7 @@ def _open_stage(path: Path) -> Iterator[Usd.Stage]:
         try:
             yield Usd.Stage.Open(str(place))
         except RuntimeError as error:  # of OpenUSD, about its own sources
-            raise ValueError("OpenUSD finds it damaged") from error
+            raise DamagedError("OpenUSD finds it damaged") from error
 
 
 def _read_prim(prim: Usd.Prim, has_z_up: bool) -> Gaussians:
