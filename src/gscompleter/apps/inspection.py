@@ -29,7 +29,12 @@ from gscompleter.render.device import choose_device
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
 from gscompleter.splats.foreign import resolve_splat
-from gscompleter.splats.formats import decode_splat, detect_splat_format, read_provenance
+from gscompleter.splats.formats import (
+    decode_splat,
+    describe_oddities,
+    detect_splat_format,
+    read_provenance,
+)
 from gscompleter.splats.provenance import ModelRecord, RunRecord
 from gscompleter.state import NEW_PHOTO_ID
 from gscompleter.system.errors import InputError, quote_value
@@ -126,7 +131,7 @@ def inspect_splat(options: InspectOptions) -> Inspection:
         tuple(list_runs(labels, runs)),
         defect,
         measure_pictures(gaussians, cameras, options.device) if cameras else (),
-        notes,
+        (*describe_oddities(path), *notes),
     )
 
 

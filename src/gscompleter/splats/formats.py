@@ -34,12 +34,14 @@ from gscompleter.splats.packing import ZIP_MAGIC, UnsupportedError
 from gscompleter.splats.ply import (
     copy_ply,
     decode_gaussians,
+    describe_values,
     load_ply,
     make_memory_error,
     read_scene,
     require_finite,
     save_ply,
 )
+from gscompleter.splats.properties import describe_further
 from gscompleter.splats.provenance import (
     KEY,
     NOTHING_KNOWN,
@@ -128,16 +130,19 @@ RECORDING = (write_compressed_ply, *LABELLING)
 """Writers of formats that hold the record of who made the file, besides .ply."""
 
 
-def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
+def load_splat(
+    path: Path | str, drop_nonfinite: bool = False, ignore_properties: bool = False
+) -> Gaussians:
     """Load the Gaussians of a file in any format of `FORMATS`, in the axes of a 3DGS .ply.
 
     Of a trainer's model folder, the newest iteration is loaded. Labels of generated Gaussians are
     in the file, or in `NAME.generated.json` beside it. `drop_nonfinite` drops
-    Gaussians with NaN, infinity or a zero quaternion instead of refusing the file.
+    Gaussians with NaN, infinity or a zero quaternion instead of refusing the file, and
+    `ignore_properties` goes on with one whose further properties change what is seen.
     """
     path = resolve_splat(require_path(path))
     if detect_splat_format(path) == "ply":
-        return load_ply(path, drop_nonfinite)
+        return load_ply(path, drop_nonfinite, ignore_properties)
     return require_finite(decode_splat(path), path, drop_nonfinite)
 
 
@@ -166,6 +171,16 @@ def decode_splat(path: Path) -> Gaussians:
     if not gaussians.generated.any():
         gaussians = replace(gaussians, generated=load_labels(path, len(gaussians)))
     return validate_ranges(gaussians, path)
+
+
+def describe_oddities(path: Path) -> list[str]:
+    """Describe in sentences what a file has that plain 3DGS does not, and how it is read."""
+    path = resolve_splat(path)
+    if detect_splat_format(path) != "ply":
+        return []
+    scene = read_scene(path)
+    further = describe_further(scene.rows.dtype.names or ())
+    return [*describe_values(scene), *([] if further is None else [further])]
 
 
 def validate_ranges(gaussians: Gaussians, path: Path) -> Gaussians:
@@ -209,7 +224,11 @@ def save_splat(path: Path | str, gaussians: Gaussians, made_by: Provenance = NOT
 
 
 def convert_splat(
-    source: Path, out: Path, drop_nonfinite: bool = False, keep_labels: bool = True
+    source: Path,
+    out: Path,
+    drop_nonfinite: bool = False,
+    keep_labels: bool = True,
+    ignore_properties: bool = False,
 ) -> tuple[int, int, str | None]:
     """Convert a file of Gaussians to the format given by the extension of `out`.
 
@@ -219,8 +238,9 @@ def convert_splat(
     source = resolve_splat(source)
     made_by = read_provenance(source) if keep_labels else NOTHING_KNOWN
     if get_writer(out) is save_ply and detect_splat_format(source) == "ply":
-        return (*copy_ply(source, out, drop_nonfinite, keep_labels, made_by), None)
-    gaussians = load_splat(source, drop_nonfinite)
+        counts = copy_ply(source, out, drop_nonfinite, keep_labels, made_by, ignore_properties)
+        return (*counts, None)
+    gaussians = load_splat(source, drop_nonfinite, ignore_properties)
     generated = gaussians.generated
     # Without generated Gaussians a writer leaves the labels out altogether.
     written = generated if keep_labels else torch.zeros_like(generated)

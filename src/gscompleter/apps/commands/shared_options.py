@@ -154,6 +154,8 @@ class SceneOptions(ComputeOptions, WritingOptions):
     """Go on with masks that hide more than half of most photographs: they are meant so."""
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
+    ignore_properties: bool = False
+    """Go on with a splat whose further properties change what is seen, such as a moving one."""
 
     def make_scene_request(self) -> SceneRequest:
         """Make the request for the photographs."""

@@ -78,9 +78,10 @@ def check_selection(selection: Selection) -> None:
         )
     if selection.masks and not os.path.isdir(selection.masks):
         raise InputError(f"There is no folder {quote_value(selection.masks)}.", "mask")
-    # Read only to refuse a damaged file before the scene is opened.
+    # Only the positions of its Gaussians count. Read now to refuse a damaged file before the scene
+    # is opened.
     if selection.file:
-        load_splat(selection.file, selection.drop_nonfinite)
+        load_splat(selection.file, selection.drop_nonfinite, ignore_properties=True)
 
 
 def choose_gaussians(
@@ -135,7 +136,7 @@ def find_selected(
     points = scene.means.double() + torch.from_numpy(origin).to(scene.means.device)
     chosen = find_in_region(points, selection)
     if selection.file:
-        selected = load_splat(selection.file, selection.drop_nonfinite)
+        selected = load_splat(selection.file, selection.drop_nonfinite, ignore_properties=True)
         # Moved as the scene was, whose positions are then exactly equal.
         if origin.any():
             moved = selected.means.double() - torch.from_numpy(origin)

@@ -215,7 +215,7 @@ def find_splat_file(path: Path, completion: Completion) -> InputSplatFile:
     if not os.path.isfile(path):
         raise InputError(f"There is no splat {quote_value(path)}; name the file of the scene.")
     context = completion.context
-    loaded = load_splat(path)
+    loaded = load_splat(path, ignore_properties=True)  # it was completed as it is
     if len(loaded) != len(context) or not torch.equal(loaded.means, context.means.cpu()):
         raise InputError(
             f"{quote_value(path)} holds another scene than the one that was completed; name its "

@@ -87,11 +87,14 @@ def move_scene_camera(
     return transform_camera(camera, transform @ compute_frame_from_photographs(-origin))
 
 
-def load_viewer_files(after: Path, before: Path | None, drop_nonfinite: bool) -> ViewerContent:
+def load_viewer_files(
+    after: Path, before: Path | None, drop_nonfinite: bool, ignore_properties: bool = False
+) -> ViewerContent:
     """Load a splat to compare with `before`, or with its observed part if that is None."""
-    scene = load_splat(after, drop_nonfinite)
+    scene = load_splat(after, drop_nonfinite, ignore_properties)
     if before is not None:
-        return ViewerContent(after.name, scene, load_splat(before, drop_nonfinite))
+        other = load_splat(before, drop_nonfinite, ignore_properties)
+        return ViewerContent(after.name, scene, other)
     is_observed = scene.generated == 0
     # Without anything generated or anything observed there is only one state to show.
     has_two_states = bool(is_observed.any()) and not bool(is_observed.all())
@@ -103,8 +106,13 @@ def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:
     summary = read_summary(folder)
     content = ViewerContent(
         folder.resolve().name,
-        after=load_splat(find_completed(folder), drop_nonfinite),
-        before=load_splat(Path(summary.scene.context or folder / CONTEXT_FILE), drop_nonfinite),
+        # What is shown was completed as it is, whatever further properties it has.
+        after=load_splat(find_completed(folder), drop_nonfinite, ignore_properties=True),
+        before=load_splat(
+            Path(summary.scene.context or folder / CONTEXT_FILE),
+            drop_nonfinite,
+            ignore_properties=True,
+        ),
         transform=np.array(summary.frame.transform),
         origin=np.array(summary.frame.origin),
     )
