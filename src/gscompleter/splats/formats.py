@@ -30,6 +30,7 @@ from gscompleter.splats.foreign import refuse_folder, refuse_foreign, resolve_sp
 from gscompleter.splats.glb import read_glb, read_glb_remarks, write_glb
 from gscompleter.splats.ksplat import read_ksplat
 from gscompleter.splats.morton import sort_along_morton
+from gscompleter.splats.origin import measure_distance
 from gscompleter.splats.packing import ZIP_MAGIC, UnsupportedError
 from gscompleter.splats.ply import (
     copy_ply,
@@ -126,6 +127,8 @@ UNMARKED = (write_splat, write_glb, write_usd)
 """Writers of formats that cannot mark Gaussians as antialiased."""
 LABELLING = (write_sog, write_glb, write_usd)
 """Writers of formats that hold the labels of generated Gaussians, besides .ply."""
+PLACING = (write_glb, write_usd)
+"""Writers of formats that hold the origin of Gaussians in float64, besides .ply."""
 RECORDING = (write_compressed_ply, *LABELLING)
 """Writers of formats that hold the record of who made the file, besides .ply."""
 
@@ -213,6 +216,8 @@ def save_splat(path: Path | str, gaussians: Gaussians, made_by: Provenance = NOT
     gaussians = gaussians.detach().to("cpu")
     if write in SORTED:
         gaussians = sort_along_morton(gaussians)
+    if write not in PLACING:
+        gaussians = gaussians.move_origin(None)
     if write in RECORDING:
         write(path, gaussians, made_by)
         made_by = NOTHING_KNOWN
@@ -245,8 +250,9 @@ def convert_splat(
     # Without generated Gaussians a writer leaves the labels out altogether.
     written = generated if keep_labels else torch.zeros_like(generated)
     save_splat(out, replace(gaussians, generated=written), made_by)
-    note = describe_mode_loss(out, gaussians)
-    return len(gaussians), int((generated > 0).sum()), note
+    notes = [describe_mode_loss(out, gaussians), describe_rounding(out, gaussians)]
+    note = " ".join(note for note in notes if note is not None)
+    return len(gaussians), int((generated > 0).sum()), note or None
 
 
 def describe_mode_loss(path: Path, gaussians: Gaussians) -> str | None:
@@ -256,6 +262,23 @@ def describe_mode_loss(path: Path, gaussians: Gaussians) -> str | None:
     return (
         f"A {path.suffix} file cannot mark Gaussians as antialiased: viewers will render them as "
         "classic ones, which makes small ones too opaque."
+    )
+
+
+def describe_rounding(path: Path, gaussians: Gaussians) -> str | None:
+    """Describe how far a file that was written holds Gaussians from their places.
+
+    None if they have no origin, which tells that their coordinates are large, or if it holds that.
+    """
+    write = get_writer(path)
+    if gaussians.origin is None or write is save_ply or write in PLACING:
+        return None
+    written = gaussians.detach().to("cpu")
+    written = sort_along_morton(written) if write in SORTED else written
+    distance = measure_distance(written, decode_splat(path))
+    return (
+        f"A {path.suffix} file cannot hold coordinates this large: the largest rounding of a "
+        f"position is {distance:.3g}; a .ply, .glb or .usdz holds them."
     )
 
 

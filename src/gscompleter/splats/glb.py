@@ -32,15 +32,16 @@ from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
 from gscompleter.splats.spz import decode_spz
 from gscompleter.splats.transform import (
     HALF_TURN_Z,
+    merge_placed,
+    place_gaussians,
     require_similarity,
     rotate_half_turn,
-    transform_gaussians,
 )
 from gscompleter.system.damage import DamagedError, check_rows
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_bytes
 from gscompleter.system.files.writing import replace_file
-from gscompleter.types import SH_C0, Gaussians, merge
+from gscompleter.types import SH_C0, Gaussians, Origin
 
 FILE_HEADER = struct.Struct("<4sII")
 CHUNK_HEADER = struct.Struct("<II")
@@ -91,10 +92,10 @@ def read_glb(path: Path) -> Gaussians:
     if not placed:
         raise UnsupportedError(_describe_other_content(document.table))
     parts = [
-        transform_gaussians(_decode_primitive(document, primitive), place)
+        place_gaussians(_decode_primitive(document, primitive), place)
         for primitive, place in placed
     ]
-    return rotate_half_turn(merge(parts), HALF_TURN_Z)
+    return rotate_half_turn(merge_placed(parts), HALF_TURN_Z)
 
 
 def read_glb_remarks(path: Path) -> object:
@@ -149,7 +150,7 @@ def _find_primitives(
         if "mesh" in node:
             for primitive in table["meshes"][node["mesh"]]["primitives"]:
                 if EXTENSION in primitive.get("extensions", {}):
-                    yield primitive, place.float()
+                    yield primitive, place
 
 
 def _read_transform(node: dict[str, Any]) -> Float[Tensor, "4 4"]:
@@ -247,9 +248,10 @@ def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[nda
 
 
 def write_glb(path: Path, gaussians: Gaussians, made_by: Provenance = NOTHING_KNOWN) -> None:
-    """Write a .glb whose scene is one primitive of Gaussians, with all SH."""
-    columns = _make_columns(rotate_half_turn(gaussians, HALF_TURN_Z))
-    scene = _describe_scene(columns)
+    """Write a .glb whose scene is one primitive of Gaussians, with all SH, at their origin."""
+    turned = rotate_half_turn(gaussians, HALF_TURN_Z)
+    columns = _make_columns(turned)
+    scene = _describe_scene(columns, turned.origin)
     if made_by.runs:
         scene["asset"]["extras"] = {KEY: made_by.to_json()}
     text = json.dumps(scene).encode()
@@ -286,7 +288,9 @@ def _make_columns(gaussians: Gaussians) -> dict[str, Float[ndarray, "n k"]]:
     return {name: np.require(tensor.numpy(), "<f4", ["C"]) for name, tensor in columns.items()}
 
 
-def _describe_scene(columns: dict[str, Float[ndarray, "n k"]]) -> dict[str, Any]:
+def _describe_scene(
+    columns: dict[str, Float[ndarray, "n k"]], origin: Origin | None
+) -> dict[str, Any]:
     """Describe a scene of one primitive whose attributes follow each other in the binary part."""
     kinds = {count: kind for kind, count in NUM_COMPONENTS.items()}
     views: list[dict[str, Any]] = []
@@ -310,7 +314,7 @@ def _describe_scene(columns: dict[str, Float[ndarray, "n k"]]) -> dict[str, Any]
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [{"mesh": 0} if origin is None else {"mesh": 0, "translation": list(origin)}],
         "meshes": [{"primitives": [primitive]}],
         "buffers": [{"byteLength": size}],
         "bufferViews": views,

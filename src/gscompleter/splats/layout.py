@@ -47,6 +47,7 @@ from gscompleter.splats.ply import (
     make_scene_header,
     read_columns,
     read_labels,
+    read_means,
     read_scene,
     require_finite,
     save_parts,
@@ -161,10 +162,14 @@ def _is_read_from(
     layout: SceneFile, numbers: Int[ndarray, "m"], context: Gaussians, order: Int64[Tensor, "k"]
 ) -> bool:
     """Return True if the positions of rows are those of Gaussians of the context, one by one."""
-    return len(numbers) == len(order) and all(
-        np.array_equal(read_columns(rows, MEANS), context.means[order[block]].cpu().numpy())
-        for block, rows in iterate_rows(layout, numbers)
-    )
+    if len(numbers) != len(order) or layout.origin != context.origin:
+        return False
+    for block, rows in iterate_rows(layout, numbers):
+        origin = layout.origin
+        means = read_columns(rows, MEANS) if origin is None else read_means(rows, origin)
+        if not np.array_equal(means, context.means[order[block]].cpu().numpy()):
+            return False
+    return True
 
 
 def _add_labels(layout: SceneFile) -> tuple[bytes, np.dtype]:
@@ -206,7 +211,7 @@ def is_same_scene(path: Path, other: Path) -> bool:
     for start in range(0, len(scenes[0].rows), CHUNK_ROWS):
         rows = slice(start, start + CHUNK_ROWS)
         first, second = (decode_gaussians(replace(s, rows=s.rows[rows])) for s in scenes)
-        if first.is_antialiased != second.is_antialiased:
+        if (first.is_antialiased, first.origin) != (second.is_antialiased, second.origin):
             return False
         if not all(torch.equal(getattr(first, f), getattr(second, f)) for f in _STORED):
             return False

@@ -7,6 +7,7 @@ In the file scales are logarithms, opacities are logits, and f_rest_* has all co
 then green, then blue. A comment marks antialiased Gaussians: Brush's is written, Postshot's are
 read too.
 
+Positions of double that float32 would round are read relative to an origin, and written as double.
 Variants are read as ordinary Gaussians. A property `filter_3D` (Mip-Splatting, GOF) is fused into
 scales and opacities, as their viewers do. Surfels of 2DGS, which have two scales and the third axis
 as their normal, get a thin third scale. Scales and opacities that were written without logarithm
@@ -31,6 +32,7 @@ from torch import Tensor
 from gscompleter.numerics.kernels import splat_rows as kernels
 from gscompleter.numerics.kernels.parallel import run_calls, share
 from gscompleter.numerics.value_checks import LARGEST, check_gaussians, find_finite
+from gscompleter.splats.origin import choose_origin, find_step, is_too_far
 from gscompleter.splats.properties import refuse_other_kinds
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, add_comments
 from gscompleter.system.errors import InputError, quote_value, require_path
@@ -42,7 +44,7 @@ from gscompleter.system.files.ply import (
     release_pages,
     write_ply_file,
 )
-from gscompleter.types import Gaussians, merge
+from gscompleter.types import Gaussians, Origin, merge
 
 MEANS = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
@@ -95,6 +97,8 @@ class SceneFile(PlyFile):
     """True if its scales are sizes in scene units, and not logarithms."""
     has_plain_opacities: bool = False
     """True if its opacities are fractions, and not logits."""
+    origin: Origin | None = None
+    """Place to which positions are relative once they are decoded; None for zero."""
 
     @property
     def is_usual(self) -> bool:
@@ -154,7 +158,38 @@ def read_scene(path: Path) -> SceneFile:
         **vars(scene),
         has_linear_scales=has_linear_scales,
         has_plain_opacities=find_plain_opacities(scene.rows, has_linear_scales),
+        origin=find_origin(scene.rows, has_linear_scales),
     )
+
+
+def find_origin(rows: ndarray, has_linear_scales: bool) -> Origin | None:
+    """Find the place to which positions are read that float32 would round; None for zero."""
+    if not has_doubles(rows):
+        return None
+    middle = []
+    for name in MEANS:
+        values = rows[name].astype(np.float64)
+        finite = values[np.isfinite(values)]
+        if len(finite) == 0:
+            return None
+        middle.append(np.median(finite))
+    size = _measure_scales(rows)[1]
+    size = size if has_linear_scales else math.exp(min(size, 80))
+    return choose_origin(np.array(middle), size)
+
+
+def has_doubles(rows: ndarray) -> bool:
+    """Return True if positions are stored more exactly than by float32."""
+    kinds = [rows.dtype[name] for name in MEANS]
+    return any(kind.kind == "f" and kind.itemsize == 8 for kind in kinds)
+
+
+def read_means(rows: ndarray, origin: Origin) -> Float[ndarray, "n 3"]:
+    """Read positions relative to an origin, which is taken off in float64."""
+    places = zip(MEANS, origin, strict=True)
+    columns = [rows[name].astype(np.float64) - place for name, place in places]
+    with np.errstate(over="ignore"):
+        return np.stack(columns, axis=1).astype(np.float32)
 
 
 def find_linear_scales(rows: ndarray) -> bool:
@@ -212,6 +247,32 @@ def _are_within(rows: ndarray, names: Sequence[str], most: float) -> bool:
 
 def describe_values(scene: SceneFile) -> list[str]:
     """Describe in sentences what a file stores as no trainer does, and how it is read."""
+    return [*_describe_positions(scene), *_describe_forms(scene)]
+
+
+def _describe_positions(scene: SceneFile) -> list[str]:
+    """Describe positions that are far from zero, relative to the size of Gaussians."""
+    if scene.origin is not None:
+        place = ", ".join(f"{x:.12g}" for x in scene.origin)
+        return [f"Its coordinates are too large for float, and are read relative to ({place})."]
+    rows = scene.rows
+    if len(rows) == 0 or has_doubles(rows):
+        return []
+    middle = np.median(read_columns(rows, MEANS), axis=0).astype(np.float64)
+    size = _measure_scales(rows)[1]
+    size = size if scene.has_linear_scales else math.exp(min(size, 80))
+    if not is_too_far(middle, size):
+        return []
+    step = find_step(float(np.abs(middle).max()))
+    return [
+        f"Its positions are floats in steps of {step:.3g}, and half of its Gaussians are smaller "
+        f"than {size:.3g}: they were rounded when it was written; export it with positions of "
+        "double, or near zero."
+    ]
+
+
+def _describe_forms(scene: SceneFile) -> list[str]:
+    """Describe scales and opacities in another form than that of a .ply."""
     if len(scene.rows) < MIN_TELLING:
         return []
     sentences = []
@@ -275,6 +336,8 @@ def decode_gaussians(scene: SceneFile) -> Gaussians:
         if not scene.is_usual:
             table = encode_columns(scene, table, places)
         kernels.decode_rows(0, len(part), block.start, table, places, *arrays)
+        if scene.origin is not None:
+            arrays[0][block] = read_means(part, scene.origin)
         if LABEL_COLUMN in names:
             generated[block] = read_labels(part)
         release_pages(part)
@@ -290,6 +353,7 @@ def decode_gaussians(scene: SceneFile) -> Gaussians:
         generated=torch.from_numpy(generated),
         encoded=encoded,
         is_antialiased=has_mode_comment(scene.header),
+        origin=scene.origin,
     )
     if FILTER not in names:
         return gaussians
@@ -554,9 +618,13 @@ def make_scene_header(gaussians: Gaussians, provenance: bool) -> bytes:
 def make_row_type(gaussians: Gaussians, provenance: bool) -> np.dtype:
     """Make the type of a row in the standard layout, with or without `generated`."""
     rest = (f"f_rest_{i}" for i in range(3 * (gaussians.sh.shape[1] - 1)))
-    names = (*MEANS, *_NORMALS, *_DC, *rest, "opacity", *_SCALES, *_QUATS)
+    names = (*_NORMALS, *_DC, *rest, "opacity", *_SCALES, *_QUATS)
     labels = [(LABEL_COLUMN, "<f4")] if provenance else []
-    return np.dtype([*((name, "<f4") for name in names), *labels])
+    # Positions that were read as double are written as double.
+    kind = "<f4" if gaussians.origin is None else "<f8"
+    return np.dtype(
+        [*((name, kind) for name in MEANS), *((name, "<f4") for name in names), *labels]
+    )
 
 
 def make_rows(gaussians: Gaussians, provenance: bool, block: slice | None = None) -> np.ndarray:
@@ -567,14 +635,26 @@ def make_rows(gaussians: Gaussians, provenance: bool, block: slice | None = None
         *(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities),
         *(gaussians.sh, gaussians.encoded),
     )
-    plain = make_row_type(gaussians, provenance=False)
+    plain = make_row_type(replace(gaussians, origin=None), provenance=False)
     table = np.empty((stop - start, len(plain.names or ())), np.float32)
     kernels.encode_rows(0, len(table), start, *map(_to_array, properties), table)
     rows = table.astype("<f4", copy=False).view(plain)[:, 0]
+    if gaussians.origin is not None:
+        rows = restore_positions(rows, gaussians.origin, make_row_type(gaussians, provenance=False))
     if not provenance:
         return rows
     dtype = make_row_type(gaussians, provenance=True)
     return append_labels(rows, dtype, gaussians.generated[block].cpu().numpy())
+
+
+def restore_positions(rows: ndarray, origin: Origin, dtype: np.dtype) -> ndarray:
+    """Add an origin to the positions of rows, in float64; all else stays."""
+    restored = np.empty(len(rows), dtype)
+    for name in dtype.names or ():
+        restored[name] = rows[name]
+    for name, place in zip(MEANS, origin, strict=True):
+        restored[name] += place
+    return restored
 
 
 def append_labels(rows: ndarray, dtype: np.dtype, labels: UInt8[ndarray, "n"]) -> ndarray:

@@ -70,7 +70,7 @@ TEXTURED = SplatKind(
     "a textured splat",
     "its textures would be missing",
     "export plain Gaussians with its trainer",
-    re.compile(r"tex(?:ture)?_\w+|tex_(?:rgb|alpha)\w*"),
+    re.compile(r"texture_\w+|tex_\w+"),
 )
 KINDS = (MOVING, OTHER_KERNEL, TEXTURED)
 """Kinds whose picture is surely wrong without their own properties."""

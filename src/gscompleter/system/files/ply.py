@@ -34,7 +34,7 @@ _SCALARS = {
     **dict.fromkeys(("float", "float32"), "f4"),
     **dict.fromkeys(("double", "float64"), "f8"),
 }
-_NAMES = {"<f4": "float", "<u4": "uint", "|u1": "uchar"}
+_NAMES = {"<f4": "float", "<f8": "double", "<u4": "uint", "|u1": "uchar"}
 _BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _COUNT_LINE = re.compile(rb"^(element\s+vertex\s+)\d+", re.M)
 
@@ -185,9 +185,13 @@ def _read_ascii_rows(file: BinaryIO, vertex: Element, path: Path) -> np.ndarray:
         raise InputError(
             f"{path} holds rows that are not {width} numbers each; write it anew."
         ) from error
+    # Digits that a float cannot hold are kept, such as those of map coordinates.
+    columns: Mapping[str, Any] = vertex.dtype.fields or {}
+    kinds = {name: columns[name][0] for name in vertex.dtype.names or ()}
+    wide = [(name, "f8" if kind == np.dtype("f4") else kind) for name, kind in kinds.items()]
     # Values out of range become infinite or wrong; relevant ones are checked later.
     with np.errstate(over="ignore", invalid="ignore"):
-        return unstructured_to_structured(table, vertex.dtype)
+        return unstructured_to_structured(table, np.dtype(wide))
 
 
 def make_header(elements: Mapping[str, tuple[int, np.dtype]], comment: str | None = None) -> bytes:
