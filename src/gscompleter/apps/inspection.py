@@ -21,6 +21,7 @@ from gscompleter.apps.viewer.exhibit import (
     ViewerContent,
     load_known_cameras,
     load_scene_cameras,
+    place_content,
 )
 from gscompleter.apps.warmup import compile_kernels
 from gscompleter.config.settings import Device
@@ -193,14 +194,10 @@ def list_cameras(
 ) -> tuple[list[tuple[str, Camera]], tuple[str, ...]]:
     """List the cameras of pictures with their names, and notes on those that are missing."""
     # Cameras are read into the frame of the file: that of the photographs, then its transform.
-    content = ViewerContent("", gaussians, None)
     summary = None if folder is None else read_summary(folder)
-    if summary is not None:
-        content = replace(
-            content,
-            transform=np.array(summary.frame.transform),
-            origin=np.array(summary.frame.origin),
-        )
+    content = place_content(
+        ViewerContent("", gaussians, None), None if summary is None else summary.frame
+    )
     if options.cameras is not None:
         cameras = load_scene_cameras(
             options.cameras, content.transform, content.origin, options.resolution

@@ -60,7 +60,7 @@ from gscompleter.system.files.output_file import check_free, reserve_file
 from gscompleter.system.files.ply import read_header
 from gscompleter.system.files.reading import hash_file, open_file, read_json
 from gscompleter.system.files.writing import replace_file
-from gscompleter.types import Gaussians
+from gscompleter.types import Gaussians, Origin
 
 OPACITY_TOLERANCE = 1e-3
 """Distance from [0, 1] up to which an opacity is clamped instead of refused."""
@@ -174,6 +174,29 @@ def decode_splat(path: Path) -> Gaussians:
     if not gaussians.generated.any():
         gaussians = replace(gaussians, generated=load_labels(path, len(gaussians)))
     return validate_ranges(gaussians, path)
+
+
+def find_origin(path: Path) -> Origin | None:
+    """Find the origin of the Gaussians of a file; None if its coordinates lie near zero."""
+    path = resolve_splat(path)
+    name = detect_splat_format(path)
+    if name == "ply":
+        return read_scene(path).origin
+    return decode_splat(path).origin if name in ("glb", "usd", "usdz") else None
+
+
+def load_splat_at(path: Path, origin: Origin | None, drop_nonfinite: bool = False) -> Gaussians:
+    """Load the Gaussians of a file relative to the origin of another one.
+
+    Their positions are equal to those of the same Gaussians there. Further properties do not count.
+    """
+    path = resolve_splat(path)
+    if origin is not None and detect_splat_format(path) == "ply":
+        scene = read_scene(path)
+        if scene.origin is not None:
+            gaussians = decode_gaussians(replace(scene, origin=origin))
+            return require_finite(gaussians, path, drop_nonfinite)
+    return load_splat(path, drop_nonfinite, ignore_properties=True).move_origin(origin)
 
 
 def describe_oddities(path: Path) -> list[str]:

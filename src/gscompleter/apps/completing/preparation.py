@@ -41,7 +41,7 @@ from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.alignment.similarity import transform_camera
 from gscompleter.splats.foreign import resolve_splat
-from gscompleter.splats.formats import load_splat
+from gscompleter.splats.formats import find_origin, load_splat
 from gscompleter.splats.morton import sort_nearby
 from gscompleter.stages.context import prepare_single
 from gscompleter.state import Completion
@@ -190,6 +190,10 @@ def open_input(options: SceneOptions, console: Console, check: Callable[[], obje
     `check` is that of `open_scene`.
     """
     opened = open_scene(options.make_scene_request(), options.make_poses_request(), console, check)
+    # Photographs in the map of a splat are relative to its origin from here on.
+    origin = None if options.scene is None else find_origin(options.scene)
+    if origin is not None:
+        opened = replace(opened, photographs=opened.photographs.at_origin(np.array(origin)))
     if options.scene is not None and options.resolution is None:
         opened = choose_working_size(opened, options.scene, console)
     return opened

@@ -362,7 +362,8 @@ def write_scenes(
     `run` is what the completed scene and the additions say about who made them.
     """
     made_by = NOTHING_KNOWN if run is None else Provenance((run,))
-    added = completion.added
+    # What is added lies in the frame of the context, and is written in that of its file.
+    added = replace(completion.added, origin=completion.context.origin)
     if input_splat is None:
         order = torch.arange(len(completion.context))
         parts = [(part, torch.arange(len(part))) for part in (completion.kept_context, added)]

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+
 from gscompleter.apps.report.schema import (
     AlignmentRow,
     CompletionSummary,
@@ -66,7 +68,9 @@ def list_notes(summary: CompletionSummary) -> Iterator[str]:
     targets = summary.targets
     if frame.method in FRAME_NOTES:
         yield f"The splat is {FRAME_NOTES[frame.method]}; summary.json lists the transform."
-    if any(frame.origin):
+    # A splat with positions of double is written where it was.
+    place = np.array(frame.transform) @ [*frame.origin, 1.0]
+    if any(frame.origin) and np.abs(place[:3]).max() < 0.5 * np.abs(frame.origin).max():
         yield ORIGIN_NOTE
     if scene.renders_from is not None:
         yield BARE_NOTE
