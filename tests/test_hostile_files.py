@@ -56,7 +56,7 @@ def test_a_scene_behind_another_element_is_refused(tmp_path, rows, properties):
 def test_a_scene_that_claims_more_gaussians_than_bytes_is_truncated(tmp_path, file_format):
     path = ply(tmp_path, "comment nothing", file_format)
     path.write_bytes(path.read_bytes().replace(b"vertex 1\n", b"vertex 10000000000000000\n"))
-    assert "of 10,000,000,000,000,000 rows are there" in sentence(load_ply, path)
+    assert "of 10,000,000,000,000,000 Gaussians" in sentence(load_ply, path)
 
 
 def test_a_header_is_quoted_in_part(tmp_path):

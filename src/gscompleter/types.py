@@ -64,6 +64,9 @@ MAX_SKEW = 1e-6
 NUM_SH = (1, 4, 9, 16)
 """Spherical harmonics per channel, by degree."""
 
+Origin = tuple[float, float, float]
+"""Place in the coordinates of a file, in float64."""
+
 M = TypeVar("M", bound="TensorDataclass")
 V = TypeVar("V", bound="View")
 
@@ -434,6 +437,9 @@ class Gaussians(Displayed, TensorDataclass):
     is_antialiased: bool = False
     """True for Mip-Splatting: opacities are multiplied by `sqrt(det S / det(S + 0.3 I))`.
     S is the covariance in the image, in px²."""
+    origin: Origin | None = None
+    """Place of zero in the coordinates of the file, in scene units, if these are too large for
+    float32 as those of maps; writers add it again. None for zero."""
 
     owner: ClassVar[str] = "Gaussians"
     forms: ClassVar[dict[str, Form]] = {
@@ -466,6 +472,15 @@ class Gaussians(Displayed, TensorDataclass):
                 "is_antialiased of Gaussians has to be True or False, and is "
                 f"{describe(self.is_antialiased)}."
             )
+        if self.origin is not None and not (
+            isinstance(self.origin, tuple)
+            and len(self.origin) == 3
+            and all(is_number(x) and math.isfinite(x) for x in self.origin)
+        ):
+            raise InputError(
+                f"The origin of Gaussians has to be three numbers or None, and is "
+                f"{describe(self.origin)}."
+            )
 
     def summarize(self) -> str:
         """Describe the number, the generated ones, the extent and the degree of harmonics."""
@@ -477,6 +492,8 @@ class Gaussians(Displayed, TensorDataclass):
             low, high = self.means.aminmax(dim=0)
             corners = [", ".join(f"{x:.4g}" for x in corner.tolist()) for corner in (low, high)]
             parts.append(f"from ({corners[0]}) to ({corners[1]})")
+        if self.origin is not None:
+            parts.append(f"relative to ({', '.join(f'{x:.12g}' for x in self.origin)})")
         parts.append(f"harmonics of degree {self.sh_degree}")
         return ", ".join([*parts, "antialiased"] if self.is_antialiased else parts)
 
@@ -498,6 +515,17 @@ class Gaussians(Displayed, TensorDataclass):
         """Degree of the spherical harmonics, 0 to 3."""
         return NUM_SH.index(self.sh.shape[1])
 
+    def move_origin(self, origin: Origin | None) -> Gaussians:
+        """Express the Gaussians relative to another origin; they stay where they are."""
+        if origin == self.origin:
+            return self
+        # In float64, since both origins may be large, and their difference is small.
+        there = torch.tensor(self.origin or (0, 0, 0), dtype=torch.float64)
+        here = torch.tensor(origin or (0, 0, 0), dtype=torch.float64)
+        shift = (there - here).to(self.means.device)
+        means = (self.means.double() + shift).to(self.means.dtype)
+        return replace(self, means=means, origin=origin)
+
 
 def make_observed(
     means: Float[Tensor, "n 3"],
@@ -517,7 +545,11 @@ def make_observed(
 
 
 def merge(parts: Sequence[Gaussians]) -> Gaussians:
-    """Concatenate Gaussians; SH of lower degree are padded with zeros, which changes no colour."""
+    """Concatenate Gaussians; SH of lower degree are padded with zeros, which changes no colour.
+
+    The origin is that of the first part with one. Parts without an origin are relative to it, as
+    Gaussians that were made for a scene are.
+    """
     if not isinstance(parts, (list, tuple)):
         raise InputError(f"merge takes a list of Gaussians, and got one {describe(parts)}.")
     for part in parts:
@@ -528,6 +560,8 @@ def merge(parts: Sequence[Gaussians]) -> Gaussians:
     if len({part.is_antialiased for part in parts}) > 1:
         raise InputError("Antialiased Gaussians cannot be merged with others; convert one of them.")
 
+    origin = next((part.origin for part in parts if part.origin is not None), None)
+    parts = [part if part.origin is None else part.move_origin(origin) for part in parts]
     k = max(part.sh.shape[1] for part in parts)
     sh = [torch.nn.functional.pad(part.sh, (0, 0, 0, k - part.sh.shape[1])) for part in parts]
     encoded = None
@@ -551,6 +585,7 @@ def merge(parts: Sequence[Gaussians]) -> Gaussians:
         generated=torch.cat([part.generated for part in parts]),
         encoded=encoded,
         is_antialiased=parts[0].is_antialiased,
+        origin=origin,
     )
 
 

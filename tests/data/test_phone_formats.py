@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 import torch
 
+from damage import require_plain
 from gscompleter import InputError
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.phones import export
@@ -180,6 +181,28 @@ def test_other_files_beside_photographs_are_no_cameras(tmp_path):
     files["frame_1.json"] = b'{"shapes": []}'
     with pytest.raises(InputError, match="There are no posed photographs"):
         open_photographs(write_folder(tmp_path / "room", files))
+
+
+PARTS = {
+    "polycam": (polycam, ("keyframes/corrected_images/", "keyframes/depth/")),
+    "scanner": (scanner_app, (".jpg", "depth_", "conf_")),
+    "record3d": (record3d, ("rgbd/1.jpg", "rgbd/1.depth", "rgbd/1.conf")),
+}
+
+
+@pytest.mark.parametrize("kind", PARTS)
+def test_files_that_were_cut_are_told_in_plain_words(tmp_path, kind):
+    write, parts = PARTS[kind]
+    for number, part in enumerate(parts):
+        files = dict(write())
+        names = [name for name in files if part in name]
+        assert names
+        for keep in (1, 20):
+            cut = {name: files[name][:keep] for name in names}
+            folder = write_folder(tmp_path / f"{number}-{keep}" / "room", {**files, **cut})
+            with pytest.raises(InputError) as error:
+                open_photographs(folder).views(range(3))
+            assert "again" in require_plain(str(error.value))
 
 
 # Archives.

@@ -323,10 +323,18 @@ def test_dgp_says_what_is_missing(tmp_path):
     content = json.loads(path.read_text())
     content["data"][1]["id"]["name"] = "CAMERA_09"
     path.write_text(json.dumps(content))
-    with pytest.raises(InputError, match="camera CAMERA_09 is not in the calibration"):
+    with pytest.raises(InputError, match="camera CAMERA_09 of .* is not in the calibration"):
+        open_photographs(scene)
+    del content["data"][1]["id"]["name"]
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match="does not say which camera took it"):
         open_photographs(scene)
     (scene / "calibration" / "abc.json").unlink()
     with pytest.raises(InputError, match="calibration of .* is missing; put it at .*abc.json"):
+        open_photographs(scene)
+    del content["samples"][0]["calibration_key"]
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match="does not name its calibration"):
         open_photographs(scene)
 
 

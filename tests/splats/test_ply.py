@@ -205,12 +205,12 @@ def test_a_truncated_file_says_how_much_is_there(tmp_path):
     whole = path.read_bytes()
     row = 17 * 4
     path.write_bytes(whole[: -10 * row - 5])
-    refused(path, "truncated: 89 of 100 rows")
+    refused(path, "ends after 89 of 100 Gaussians")
     path.write_bytes(whole[:60])
     refused(path, "truncated: its header")
     text = rewritten(saved(tmp_path, random_gaussians(5)), tmp_path / "text.ply", text=True)
     text.write_bytes(b"\n".join(text.read_bytes().split(b"\n")[:-3]) + b"\n")
-    refused(text, "truncated: 3 of 5 rows")
+    refused(text, "ends after 3 of 5 Gaussians")
 
 
 def test_what_is_no_scene_is_refused(tmp_path):
@@ -359,7 +359,7 @@ def test_community_files_are_read_or_refused(shared):
         ),
         (b"property float nx", b"property quad nx", "broken header"),
         (b"property float nx", b"property list uchar float nx", "no lists"),
-        (b"vertex 3", b"vertex 99999999999999999999", "truncated: 3 of 99,999,999,999,999,999,999"),
+        (b"vertex 3", b"vertex 99999999999999999999", "ends after 3 of 99,999,999,999,999,999,999"),
     ],
 )
 def test_a_header_that_lies_is_refused(tmp_path, before, after, sentence):

@@ -334,13 +334,13 @@ def test_what_is_no_splat_is_refused(tmp_path):
         ("empty.splat", b"", "is empty"),
         ("a.txt", b"hello", "format that is known"),
         ("b.spz", b"hello", "format that is known"),
-        ("c.splat", b"hello", "buffer size"),
+        ("c.splat", b"hello", "ends after 0 Gaussians"),
         ("d.spz", gzip.compress(b"x" * 100), "no .spz"),
         ("e.spz", b"NGSP" + struct.pack("<IIBBBB", 9, 1, 0, 12, 0, 0), "version 9"),
         ("f.glb", b"glTF" + bytes(8), "cannot be read"),
         ("g.json", b'{"frames": []}', "JSON file without Gaussians"),
         ("meta.json", b'{"frames": []}', "describes no .sog"),
-        ("h.ksplat", b"\x00\x07" + bytes(4094), "got none"),
+        ("h.ksplat", b"\x00\x07" + bytes(4094), "holds no Gaussians"),
         ("i.ksplat", b"\x09" + bytes(4095), "version 9"),
     ]:
         (tmp_path / name).write_bytes(data)

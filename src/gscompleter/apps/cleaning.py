@@ -180,7 +180,7 @@ def clean_alone(options: CleanOptions, console: Console) -> Cleaning:
 def load_given_splat(options: CleanOptions) -> Gaussians:
     """Read the splat to clean."""
     with show_preparation("reading the scene"):
-        return load_splat(options.scene, options.drop_nonfinite)
+        return load_splat(options.scene, options.drop_nonfinite, options.ignore_properties)
 
 
 def score_cleaning(

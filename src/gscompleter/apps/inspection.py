@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,6 +20,7 @@ from gscompleter.apps.viewer.exhibit import (
     ViewerContent,
     load_known_cameras,
     load_scene_cameras,
+    place_content,
 )
 from gscompleter.apps.warmup import compile_kernels
 from gscompleter.config.settings import Device
@@ -28,16 +30,24 @@ from gscompleter.render.device import choose_device
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
 from gscompleter.splats.foreign import resolve_splat
-from gscompleter.splats.formats import decode_splat, detect_splat_format, read_provenance
+from gscompleter.splats.formats import (
+    decode_splat,
+    describe_oddities,
+    detect_splat_format,
+    read_provenance,
+)
 from gscompleter.splats.provenance import ModelRecord, RunRecord
 from gscompleter.state import NEW_PHOTO_ID
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import COMPLETED_FILE, SUMMARY_FILE
-from gscompleter.types import Camera, Gaussians, sh_from_rgb
+from gscompleter.types import Camera, Gaussians, Origin, sh_from_rgb
 
 MIDDLE = (0.01, 0.99)
 """Quantiles of the coordinates that floaters leave alone."""
+
+MOST_DIGITS = 15
+"""Digits that float64 holds."""
 
 Bounds = tuple[tuple[float, float], ...]
 """Smallest and largest x, y and z."""
@@ -119,14 +129,14 @@ def inspect_splat(options: InspectOptions) -> Inspection:
         len(decoded) - len(gaussians),
         gaussians.sh_degree,
         gaussians.is_antialiased,
-        make_bounds(low, high),
-        make_bounds(*compute_middle(gaussians.means)),
+        make_bounds(low, high, gaussians.origin),
+        make_bounds(*compute_middle(gaussians.means), gaussians.origin),
         int(find_invented(labels).sum()),
         int((labels == NEW_PHOTO_ID).sum()),
         tuple(list_runs(labels, runs)),
         defect,
         measure_pictures(gaussians, cameras, options.device) if cameras else (),
-        notes,
+        (*describe_oddities(path), *notes),
     )
 
 
@@ -142,9 +152,13 @@ def locate(file: Path) -> tuple[Path, Path | None]:
     return path, beside if is_result else None
 
 
-def make_bounds(low: Float[Tensor, "3"], high: Float[Tensor, "3"]) -> Bounds:
-    """Pair the smallest and the largest coordinate of each axis."""
-    return tuple(zip(low.tolist(), high.tolist(), strict=True))
+def make_bounds(
+    low: Float[Tensor, "3"], high: Float[Tensor, "3"], origin: Origin | None = None
+) -> Bounds:
+    """Pair the smallest and the largest coordinate of each axis, in the frame of the file."""
+    place = torch.tensor(origin or (0, 0, 0), dtype=torch.float64)
+    lowest, highest = low.double() + place, high.double() + place
+    return tuple(zip(lowest.tolist(), highest.tolist(), strict=True))
 
 
 def compute_middle(means: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
@@ -180,14 +194,10 @@ def list_cameras(
 ) -> tuple[list[tuple[str, Camera]], tuple[str, ...]]:
     """List the cameras of pictures with their names, and notes on those that are missing."""
     # Cameras are read into the frame of the file: that of the photographs, then its transform.
-    content = ViewerContent("", gaussians, None)
     summary = None if folder is None else read_summary(folder)
-    if summary is not None:
-        content = replace(
-            content,
-            transform=np.array(summary.frame.transform),
-            origin=np.array(summary.frame.origin),
-        )
+    content = place_content(
+        ViewerContent("", gaussians, None), None if summary is None else summary.frame
+    )
     if options.cameras is not None:
         cameras = load_scene_cameras(
             options.cameras, content.transform, content.origin, options.resolution
@@ -269,7 +279,17 @@ def describe_splat(found: Inspection) -> Iterator[tuple[str, str]]:
 def describe_bounds(bounds: Bounds) -> str:
     """Describe an extent in scene units."""
     axes = zip("xyz", bounds, strict=True)
-    return ", ".join(f"{axis} {low:.4g} to {high:.4g}" for axis, (low, high) in axes)
+    return ", ".join(f"{axis} {describe_range(low, high)}" for axis, (low, high) in axes)
+
+
+def describe_range(low: float, high: float) -> str:
+    """Describe a range with as many digits as tell its ends apart to a thousandth of it."""
+    largest = max(abs(low), abs(high))
+    digits = 4
+    if 0 < high - low < largest:
+        digits += math.ceil(math.log10(largest / (high - low)))
+    digits = min(digits, MOST_DIGITS)
+    return f"{low:.{digits}g} to {high:.{digits}g}"
 
 
 def describe_run(row: RunRow) -> str:

@@ -42,6 +42,11 @@ def choose_local_origin(poses: Sequence[Float[np.ndarray, "4 4"]]) -> Float[np.n
     return centers[0] if remote else np.zeros(3)
 
 
+def is_near(middle: Float[np.ndarray, "3"], origin: Float[np.ndarray, "3"]) -> bool:
+    """Return True if coordinates lie nearer to an origin than half-way to zero."""
+    return bool(np.abs(middle - origin).max() < 0.5 * np.abs(origin).max())
+
+
 def compute_frame_from_photographs(origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
     """Build the transform from the photographs' frame to the frame with zero at `origin`."""
     transform = np.eye(4)
@@ -56,10 +61,9 @@ def choose_scene_origin(scene: Gaussians, origin: Float[np.ndarray, "3"]) -> Flo
     """
     if len(scene) == 0 or not origin.any():
         return origin
-    # Near is less than half-way to zero, by the largest coordinate. The median ignores floaters.
+    # The median ignores floaters.
     middle = scene.means.median(dim=0).values.double().cpu().numpy()
-    there = np.abs(middle - origin).max() < 0.5 * np.abs(origin).max()
-    return origin if there else np.zeros(3)
+    return origin if is_near(middle, origin) else np.zeros(3)
 
 
 def shift_to_origin(

@@ -22,7 +22,7 @@ from torch import Tensor
 
 from gscompleter.data.cameras import compute_fov, compute_undistortion_map, find_pose_defect, remap
 from gscompleter.data.frame import Frame
-from gscompleter.data.local_origin import choose_local_origin
+from gscompleter.data.local_origin import choose_local_origin, is_near
 from gscompleter.data.masks import fill_hidden, find_masked
 from gscompleter.data.moving_boxes import mask_moving
 from gscompleter.numerics.geometry import compute_sparse_depth
@@ -182,6 +182,17 @@ class Photographs:
         if boxes is None:
             return None
         return torch.from_numpy(mask_moving(boxes(), self.camera(frame, resolution), self.origin))
+
+    def at_origin(self, origin: Float[np.ndarray, "3"]) -> Photographs:
+        """Return the photographs relative to the origin of a splat in their map, if they are there.
+
+        Photographs in coordinates of their own stay as they are.
+        """
+        poses = [frame.c2w for frame in self.frames if frame.has_finite_pose]
+        if not poses:
+            return self
+        middle = np.median([pose[:3, 3] for pose in poses], axis=0)
+        return replace(self, origin=origin) if is_near(middle, origin) else self
 
     def points(self) -> Float[Tensor, "n 3"] | None:
         """Load points on the scene's surfaces relative to `origin`; None if unknown."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -35,11 +36,13 @@ def load_views(
     far: float | None = None,
     invert_masks: bool = False,
     large_masks: bool = False,
+    origin: Sequence[float] | None = None,
 ) -> list[View]:
     """Load the photographs of a scene with their cameras, and true depth if available.
 
     Lens distortion is removed. If coordinates are so large that float32 would lose the baselines,
-    cameras are relative to `open_photographs(scene).origin`.
+    cameras are relative to `open_photographs(scene).origin`; with a splat in the same map, give
+    its `origin`.
     Black pixels of masks and transparent ones are ignored; with `invert_masks` white ones of masks.
     Masks that hide more than half of most photographs may be the other way round and raise an
     InputError; `large_masks` takes them as they are.
@@ -48,7 +51,7 @@ def load_views(
     or the most pixels of the longer side; `near` and `far` are z-depths in scene units, if known.
     """
     reading = MaskReading(invert_masks, large_masks)
-    photographs = open_photographs(scene, near=near, far=far)
+    photographs = place_photographs(open_photographs(scene, near=near, far=far), origin)
     refuse_nothing_to_invert(photographs.list_masks(), reading)
     photographs = read_masks_as_asked(photographs, reading)
     chosen = photographs.posed if frames is None else frames
@@ -67,18 +70,31 @@ def load_camera(
     resolution: Resolution = None,
     near: float | None = None,
     far: float | None = None,
+    origin: Sequence[float] | None = None,
 ) -> Camera:
     """Load the camera of a frame, with or without photograph; None takes the only frame.
 
-    `frame` is its number, or the name of its photograph.
+    `frame` is its number, or the name of its photograph. `origin` is as in `load_views`.
     """
-    photographs = open_photographs(scene, near=near, far=far)
+    photographs = place_photographs(open_photographs(scene, near=near, far=far), origin)
     require(
         frame is not None or len(photographs) == 1,
         f"{photographs.title} has {len(photographs)} frames; choose one, from 0 to "
         f"{len(photographs) - 1}.",
     )
     return photographs.camera(0 if frame is None else frame, resolution)
+
+
+def place_photographs(photographs: Photographs, origin: Sequence[float] | None) -> Photographs:
+    """Return photographs relative to an origin, or to their own if it is None."""
+    if origin is None:
+        return photographs
+    place = np.asarray(origin, dtype=np.float64)
+    require(
+        place.shape == (3,) and bool(np.isfinite(place).all()),
+        f"An origin has three numbers, and is '{quote_value(origin)}'.",
+    )
+    return replace(photographs, origin=place)
 
 
 @run_in_plain_torch

@@ -28,6 +28,7 @@ from gscompleter.splats.packing import (
 )
 from gscompleter.splats.ply import MODE_COMMENT, encode, has_mode_comment, iterate_blocks
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, add_comments
+from gscompleter.system.damage import DamagedError, check_rows
 from gscompleter.system.files.ply import make_header, read_header
 from gscompleter.system.files.writing import replace_file
 from gscompleter.types import SH_C0, Gaussians
@@ -67,6 +68,11 @@ def read_compressed_ply(path: Path) -> Gaussians:
     header, tables = _read_tables(path)
     chunk = tables["chunk"]
     vertex = tables["vertex"]
+    # One chunk has 256 Gaussians, the last one fewer.
+    if len(chunk) * CHUNK_SIZE < len(vertex):
+        raise DamagedError(
+            f"its {len(chunk):,} chunks have too few bounds for its {len(vertex):,} Gaussians"
+        )
     position, rotation, scale, color = [
         vertex[name].astype(np.uint32) for name in PACKED_PROPERTIES
     ]
@@ -102,11 +108,13 @@ def _read_tables(path: Path) -> tuple[bytes, dict[str, ndarray]]:
         header, elements = read_header(file, path)
         data = file.read()
     if b"\nformat binary" not in header:
-        raise ValueError("it is no binary file")
+        raise DamagedError("it is no binary file")
     tables = {}
     start = 0
     for element in elements:
         if element.dtype.itemsize > 0:
+            what = "Gaussians" if element.name == "vertex" else f"rows of '{element.name}'"
+            check_rows(len(data) - start, element.dtype.itemsize, element.count, what)
             rows = np.frombuffer(data, element.dtype, element.count, start)
             tables[element.name] = rows
             start += rows.nbytes
@@ -119,7 +127,7 @@ def _unpack_sh_rest(table: ndarray) -> Float[ndarray, "n k 3"]:
     # The file has one channel after the other.
     names = [f"f_rest_{i}" for i in range(len(fields))]
     if any(fields[name][0] != np.uint8 for name in names):
-        raise ValueError("its spherical harmonics are no bytes")
+        raise DamagedError("its spherical harmonics are no bytes")
     columns = np.array([fields[name][1] for name in names]).reshape(3, -1).T
     rows = table.view(np.uint8).reshape(len(table), table.dtype.itemsize)
     rest = np.empty((len(table), *columns.shape), np.float32)

@@ -30,16 +30,19 @@ from gscompleter.splats.foreign import refuse_folder, refuse_foreign, resolve_sp
 from gscompleter.splats.glb import read_glb, read_glb_remarks, write_glb
 from gscompleter.splats.ksplat import read_ksplat
 from gscompleter.splats.morton import sort_along_morton
+from gscompleter.splats.origin import measure_distance
 from gscompleter.splats.packing import ZIP_MAGIC, UnsupportedError
 from gscompleter.splats.ply import (
     copy_ply,
     decode_gaussians,
+    describe_values,
     load_ply,
     make_memory_error,
     read_scene,
     require_finite,
     save_ply,
 )
+from gscompleter.splats.properties import describe_further
 from gscompleter.splats.provenance import (
     KEY,
     NOTHING_KNOWN,
@@ -51,13 +54,14 @@ from gscompleter.splats.sog import META, read_sog, read_sog_remarks, write_sog
 from gscompleter.splats.splat import read_splat_rows, write_splat
 from gscompleter.splats.spz import read_spz, write_spz
 from gscompleter.splats.usd import read_usd, read_usd_remarks, write_usd
+from gscompleter.system.damage import describe_damage
 from gscompleter.system.errors import InputError, quote_value, refuse_pointer, require_path
 from gscompleter.system.files.output_file import check_free, reserve_file
 from gscompleter.system.files.ply import read_header
 from gscompleter.system.files.reading import hash_file, open_file, read_json
 from gscompleter.system.files.writing import replace_file
 from gscompleter.system.torch_modes import run_in_plain_torch
-from gscompleter.types import Gaussians
+from gscompleter.types import Gaussians, Origin
 
 OPACITY_TOLERANCE = 1e-3
 """Distance from [0, 1] up to which an opacity is clamped instead of refused."""
@@ -124,21 +128,26 @@ UNMARKED = (write_splat, write_glb, write_usd)
 """Writers of formats that cannot mark Gaussians as antialiased."""
 LABELLING = (write_sog, write_glb, write_usd)
 """Writers of formats that hold the labels of generated Gaussians, besides .ply."""
+PLACING = (write_glb, write_usd)
+"""Writers of formats that hold the origin of Gaussians in float64, besides .ply."""
 RECORDING = (write_compressed_ply, *LABELLING)
 """Writers of formats that hold the record of who made the file, besides .ply."""
 
 
 @run_in_plain_torch
-def load_splat(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
+def load_splat(
+    path: Path | str, drop_nonfinite: bool = False, ignore_properties: bool = False
+) -> Gaussians:
     """Load the Gaussians of a file in any format of `FORMATS`, in the axes of a 3DGS .ply.
 
     Of a trainer's model folder, the newest iteration is loaded. Labels of generated Gaussians are
     in the file, or in `NAME.generated.json` beside it. `drop_nonfinite` drops
-    Gaussians with NaN, infinity or a zero quaternion instead of refusing the file.
+    Gaussians with NaN, infinity or a zero quaternion instead of refusing the file, and
+    `ignore_properties` goes on with one whose further properties change what is seen.
     """
     path = resolve_splat(require_path(path))
     if detect_splat_format(path) == "ply":
-        return load_ply(path, drop_nonfinite)
+        return load_ply(path, drop_nonfinite, ignore_properties)
     return require_finite(decode_splat(path), path, drop_nonfinite)
 
 
@@ -160,13 +169,46 @@ def decode_splat(path: Path) -> Gaussians:
         raise make_memory_error(path) from error
     except errors as error:
         raise InputError(
-            f"{quote_value(path)} cannot be read: {quote_value(str(error), MAX_DEFECT)}; fetch the "
-            "file again, or export it as .ply."
+            f"{quote_value(path)} cannot be read: {quote_value(describe_damage(error), MAX_DEFECT)}"
+            "; fetch the file again, or export it as .ply."
         ) from error
     # Labels lie in the file, or beside it as an earlier version wrote them for all formats.
     if not gaussians.generated.any():
         gaussians = replace(gaussians, generated=load_labels(path, len(gaussians)))
     return validate_ranges(gaussians, path)
+
+
+def find_origin(path: Path) -> Origin | None:
+    """Find the origin of the Gaussians of a file; None if its coordinates lie near zero."""
+    path = resolve_splat(path)
+    name = detect_splat_format(path)
+    if name == "ply":
+        return read_scene(path).origin
+    return decode_splat(path).origin if name in ("glb", "usd", "usdz") else None
+
+
+def load_splat_at(path: Path, origin: Origin | None, drop_nonfinite: bool = False) -> Gaussians:
+    """Load the Gaussians of a file relative to the origin of another one.
+
+    Their positions are equal to those of the same Gaussians there. Further properties do not count.
+    """
+    path = resolve_splat(path)
+    if origin is not None and detect_splat_format(path) == "ply":
+        scene = read_scene(path)
+        if scene.origin is not None:
+            gaussians = decode_gaussians(replace(scene, origin=origin))
+            return require_finite(gaussians, path, drop_nonfinite)
+    return load_splat(path, drop_nonfinite, ignore_properties=True).move_origin(origin)
+
+
+def describe_oddities(path: Path) -> list[str]:
+    """Describe in sentences what a file has that plain 3DGS does not, and how it is read."""
+    path = resolve_splat(path)
+    if detect_splat_format(path) != "ply":
+        return []
+    scene = read_scene(path)
+    further = describe_further(scene.rows.dtype.names or ())
+    return [*describe_values(scene), *([] if further is None else [further])]
 
 
 def validate_ranges(gaussians: Gaussians, path: Path) -> Gaussians:
@@ -200,6 +242,8 @@ def save_splat(path: Path | str, gaussians: Gaussians, made_by: Provenance = NOT
     gaussians = gaussians.detach().to("cpu")
     if write in SORTED:
         gaussians = sort_along_morton(gaussians)
+    if write not in PLACING:
+        gaussians = gaussians.move_origin(None)
     if write in RECORDING:
         write(path, gaussians, made_by)
         made_by = NOTHING_KNOWN
@@ -211,7 +255,11 @@ def save_splat(path: Path | str, gaussians: Gaussians, made_by: Provenance = NOT
 
 
 def convert_splat(
-    source: Path, out: Path, drop_nonfinite: bool = False, keep_labels: bool = True
+    source: Path,
+    out: Path,
+    drop_nonfinite: bool = False,
+    keep_labels: bool = True,
+    ignore_properties: bool = False,
 ) -> tuple[int, int, str | None]:
     """Convert a file of Gaussians to the format given by the extension of `out`.
 
@@ -221,14 +269,16 @@ def convert_splat(
     source = resolve_splat(source)
     made_by = read_provenance(source) if keep_labels else NOTHING_KNOWN
     if get_writer(out) is save_ply and detect_splat_format(source) == "ply":
-        return (*copy_ply(source, out, drop_nonfinite, keep_labels, made_by), None)
-    gaussians = load_splat(source, drop_nonfinite)
+        counts = copy_ply(source, out, drop_nonfinite, keep_labels, made_by, ignore_properties)
+        return (*counts, None)
+    gaussians = load_splat(source, drop_nonfinite, ignore_properties)
     generated = gaussians.generated
     # Without generated Gaussians a writer leaves the labels out altogether.
     written = generated if keep_labels else torch.zeros_like(generated)
     save_splat(out, replace(gaussians, generated=written), made_by)
-    note = describe_mode_loss(out, gaussians)
-    return len(gaussians), int((generated > 0).sum()), note
+    notes = [describe_mode_loss(out, gaussians), describe_rounding(out, gaussians)]
+    note = " ".join(note for note in notes if note is not None)
+    return len(gaussians), int((generated > 0).sum()), note or None
 
 
 def describe_mode_loss(path: Path, gaussians: Gaussians) -> str | None:
@@ -238,6 +288,23 @@ def describe_mode_loss(path: Path, gaussians: Gaussians) -> str | None:
     return (
         f"A {path.suffix} file cannot mark Gaussians as antialiased: viewers will render them as "
         "classic ones, which makes small ones too opaque."
+    )
+
+
+def describe_rounding(path: Path, gaussians: Gaussians) -> str | None:
+    """Describe how far a file that was written holds Gaussians from their places.
+
+    None if they have no origin, which tells that their coordinates are large, or if it holds that.
+    """
+    write = get_writer(path)
+    if gaussians.origin is None or write is save_ply or write in PLACING:
+        return None
+    written = gaussians.detach().to("cpu")
+    written = sort_along_morton(written) if write in SORTED else written
+    distance = measure_distance(written, decode_splat(path))
+    return (
+        f"A {path.suffix} file cannot hold coordinates this large: the largest rounding of a "
+        f"position is {distance:.3g}; a .ply, .glb or .usdz holds them."
     )
 
 
@@ -287,8 +354,8 @@ def read_provenance(path: Path) -> Provenance:
             table = None
     except (*DECODING_ERRORS, *JSON_ERRORS) as error:
         raise InputError(
-            f"{quote_value(path)} cannot be read: {quote_value(str(error), MAX_DEFECT)}; fetch the "
-            "file again."
+            f"{quote_value(path)} cannot be read: {quote_value(describe_damage(error), MAX_DEFECT)}"
+            "; fetch the file again."
         ) from error
     return parse_provenance(table, quote_value(path))
 

@@ -32,14 +32,16 @@ from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
 from gscompleter.splats.spz import decode_spz
 from gscompleter.splats.transform import (
     HALF_TURN_Z,
+    merge_placed,
+    place_gaussians,
     require_similarity,
     rotate_half_turn,
-    transform_gaussians,
 )
+from gscompleter.system.damage import DamagedError, check_rows
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_bytes
 from gscompleter.system.files.writing import replace_file
-from gscompleter.types import SH_C0, Gaussians, merge
+from gscompleter.types import SH_C0, Gaussians, Origin
 
 FILE_HEADER = struct.Struct("<4sII")
 CHUNK_HEADER = struct.Struct("<II")
@@ -86,14 +88,14 @@ def read_glb(path: Path) -> Gaussians:
         count += int(_get_accessor(document, primitive, "POSITION")["count"])
         check_count(count, len(document.binary))
         if len(placed) > MAX_PRIMITIVES:
-            raise ValueError(f"it claims to hold more than {MAX_PRIMITIVES:,} primitives")
+            raise DamagedError(f"it claims to hold more than {MAX_PRIMITIVES:,} primitives")
     if not placed:
         raise UnsupportedError(_describe_other_content(document.table))
     parts = [
-        transform_gaussians(_decode_primitive(document, primitive), place)
+        place_gaussians(_decode_primitive(document, primitive), place)
         for primitive, place in placed
     ]
-    return rotate_half_turn(merge(parts), HALF_TURN_Z)
+    return rotate_half_turn(merge_placed(parts), HALF_TURN_Z)
 
 
 def read_glb_remarks(path: Path) -> object:
@@ -114,10 +116,16 @@ def _parse_document(data: bytes) -> GlbDocument:
     chunks: dict[int, bytes] = {}
     start = FILE_HEADER.size
     while start < len(data):
+        if len(data) - start < CHUNK_HEADER.size:
+            raise DamagedError("it ends within the header of a chunk")
         size, kind = CHUNK_HEADER.unpack_from(data, start)
         start += CHUNK_HEADER.size + size
+        if start > len(data):
+            raise DamagedError(f"it ends after {len(data):,} of {start:,} bytes")
         chunks.setdefault(kind, data[start - size : start])
-    return GlbDocument(json.loads(chunks.get(JSON, b"")), chunks.get(BINARY, b""))
+    if JSON not in chunks:
+        raise DamagedError("it holds no description of its content")
+    return GlbDocument(json.loads(chunks[JSON]), chunks.get(BINARY, b""))
 
 
 def _find_primitives(
@@ -134,7 +142,7 @@ def _find_primitives(
     while waiting:
         index, above = waiting.pop(0)
         if index in visited:
-            raise ValueError("its nodes contain each other")
+            raise DamagedError("its nodes contain each other")
         visited.add(index)
         node = table["nodes"][index]
         place = above @ _read_transform(node)
@@ -142,7 +150,7 @@ def _find_primitives(
         if "mesh" in node:
             for primitive in table["meshes"][node["mesh"]]["primitives"]:
                 if EXTENSION in primitive.get("extensions", {}):
-                    yield primitive, place.float()
+                    yield primitive, place
 
 
 def _read_transform(node: dict[str, Any]) -> Float[Tensor, "4 4"]:
@@ -180,7 +188,7 @@ def _decode_packed(
     # Its own axes are converted to those of glTF, as the extension demands.
     gaussians = decode_spz(document.binary[start : start + int(view["byteLength"])])
     if len(gaussians) != _get_accessor(document, primitive, "POSITION")["count"]:
-        raise ValueError("its .spz has another number of Gaussians than its accessors")
+        raise DamagedError("its .spz has another number of Gaussians than its accessors")
     return rotate_half_turn(gaussians, HALF_TURN_Z)
 
 
@@ -200,7 +208,7 @@ def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gauss
     def read_attribute(name: str, kind: str = "VEC3") -> Float[ndarray, "n k"]:
         accessor = _get_accessor(document, primitive, name)
         if accessor["type"] != kind:
-            raise ValueError(f"its attribute {name} is no {kind}")
+            raise DamagedError(f"its attribute {name} is no {kind}")
         return _read_accessor(document, accessor)
 
     sh = [read_attribute(name) for name in SH_NAMES if name in primitive["attributes"]]
@@ -226,7 +234,9 @@ def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[nda
     start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
     stride = int(view.get("byteStride", 0)) or width * kind.itemsize
     shape = (int(accessor["count"]), width)
-    # numpy refuses views that exceed the buffer.
+    # The last row may be shorter than the distance between two.
+    num_bytes = len(document.binary) - start + max(stride - width * kind.itemsize, 0)
+    check_rows(num_bytes, stride, shape[0])
     values = np.ndarray(shape, kind, document.binary, start, (stride, kind.itemsize))
     if kind.kind == "f":
         return values.astype(np.float32)
@@ -238,9 +248,10 @@ def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[nda
 
 
 def write_glb(path: Path, gaussians: Gaussians, made_by: Provenance = NOTHING_KNOWN) -> None:
-    """Write a .glb whose scene is one primitive of Gaussians, with all SH."""
-    columns = _make_columns(rotate_half_turn(gaussians, HALF_TURN_Z))
-    scene = _describe_scene(columns)
+    """Write a .glb whose scene is one primitive of Gaussians, with all SH, at their origin."""
+    turned = rotate_half_turn(gaussians, HALF_TURN_Z)
+    columns = _make_columns(turned)
+    scene = _describe_scene(columns, turned.origin)
     if made_by.runs:
         scene["asset"]["extras"] = {KEY: made_by.to_json()}
     text = json.dumps(scene).encode()
@@ -277,7 +288,9 @@ def _make_columns(gaussians: Gaussians) -> dict[str, Float[ndarray, "n k"]]:
     return {name: np.require(tensor.numpy(), "<f4", ["C"]) for name, tensor in columns.items()}
 
 
-def _describe_scene(columns: dict[str, Float[ndarray, "n k"]]) -> dict[str, Any]:
+def _describe_scene(
+    columns: dict[str, Float[ndarray, "n k"]], origin: Origin | None
+) -> dict[str, Any]:
     """Describe a scene of one primitive whose attributes follow each other in the binary part."""
     kinds = {count: kind for kind, count in NUM_COMPONENTS.items()}
     views: list[dict[str, Any]] = []
@@ -301,7 +314,7 @@ def _describe_scene(columns: dict[str, Float[ndarray, "n k"]]) -> dict[str, Any]
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0}],
+        "nodes": [{"mesh": 0} if origin is None else {"mesh": 0, "translation": list(origin)}],
         "meshes": [{"primitives": [primitive]}],
         "buffers": [{"byteLength": size}],
         "bufferViews": views,

@@ -22,6 +22,7 @@ from gscompleter.splats.packing import (
     assemble_sh,
     build_gaussians,
 )
+from gscompleter.system.damage import DamagedError, check_rows
 from gscompleter.system.files.reading import read_bytes
 from gscompleter.types import Gaussians, merge
 
@@ -61,6 +62,8 @@ class Section(NamedTuple):
 def read_ksplat(path: Path) -> Gaussians:
     """Read a .ksplat of SH degree 0 to 3."""
     data = memoryview(read_bytes(path))
+    if len(data) < HEADER_BYTES:
+        raise DamagedError("it ends within its header")
     major, minor, num_sections, level, *sh_range = HEADER.unpack_from(data)
     if major != 0 or minor < 1 or level > 2:
         raise UnsupportedError(
@@ -68,15 +71,22 @@ def read_ksplat(path: Path) -> Gaussians:
             "compression 0 to 2 is read"
         )
     parts = []
+    check_rows(len(data) - HEADER_BYTES, SECTION_HEADER_BYTES, num_sections, "headers of sections")
     start = HEADER_BYTES + num_sections * SECTION_HEADER_BYTES
     for number in range(num_sections):
         header = SECTION_HEADER.unpack_from(data, HEADER_BYTES + number * SECTION_HEADER_BYTES)
         section = Section(*header)
+        if section.degree >= len(NUM_SH_REST):
+            raise DamagedError(f"its harmonics have degree {section.degree}")
         row = _make_row_dtype(level, section.degree)
         end = start + section.rows_offset + section.capacity * row.itemsize
         if section.num_rows:
+            num_bytes = len(data) - start - section.rows_offset
+            check_rows(num_bytes, row.itemsize, section.num_rows)
             parts.append(_decode_section(data[start:end], section, row, sh_range))
         start = end
+    if not parts:
+        raise DamagedError("it holds no Gaussians")
     return merge(parts)
 
 

@@ -35,6 +35,7 @@ from gscompleter.splats.ply import (
     LABEL_COLUMN,
     LABEL_TYPES,
     MEANS,
+    SceneFile,
     append_labels,
     check_finite,
     count_rest,
@@ -46,6 +47,7 @@ from gscompleter.splats.ply import (
     make_scene_header,
     read_columns,
     read_labels,
+    read_means,
     read_scene,
     require_finite,
     save_parts,
@@ -53,7 +55,7 @@ from gscompleter.splats.ply import (
 )
 from gscompleter.splats.provenance import RunRecord, make_comment_lines
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.ply import PlyFile, release_pages, write_ply_file
+from gscompleter.system.files.ply import release_pages, write_ply_file
 from gscompleter.system.files.writing import REMOVED_FILE
 from gscompleter.types import NUM_SH, Gaussians, merge
 
@@ -67,12 +69,12 @@ _LABEL_TYPE = re.compile(rb"^(property\s+)\w+(\s+generated\s*?\n)", re.M)
 _ELEMENT_LINE = re.compile(rb"^(?:element|end_header)", re.M)
 
 
-def find_layout(path: Path | None) -> PlyFile | None:
-    """Read the layout of the file of a splat, or None if it is no binary .ply."""
+def find_layout(path: Path | None) -> SceneFile | None:
+    """Read the layout of the file of a splat, or None if it is no binary .ply of usual numbers."""
     if path is None or detect_splat_format(path) != "ply":
         return None
     layout = read_scene(path)
-    return None if layout.is_ascii else layout
+    return None if layout.is_ascii or not layout.is_usual else layout
 
 
 def split_header(header: bytes) -> tuple[bytes, bytes, bytes]:
@@ -81,7 +83,7 @@ def split_header(header: bytes) -> tuple[bytes, bytes, bytes]:
     return header[: starts[1]], header[starts[1] : starts[-1]], header[starts[-1] :]
 
 
-def drop_generated(layout: PlyFile) -> PlyFile:
+def drop_generated(layout: SceneFile) -> SceneFile:
     """Remove the generated rows, the column `generated`, and who made them."""
     if LABEL_COLUMN not in (layout.rows.dtype.names or ()):
         return layout
@@ -140,7 +142,7 @@ def save_like(
     write_ply_file(path, header, len(order) + len(added), generate_blocks(), layout.trailer)
 
 
-def iterate_rows(layout: PlyFile, numbers: Int[ndarray, "m"]) -> Iterator[tuple[slice, ndarray]]:
+def iterate_rows(layout: SceneFile, numbers: Int[ndarray, "m"]) -> Iterator[tuple[slice, ndarray]]:
     """Yield copies of rows by ascending numbers, some at a time, with their places among these."""
     for block in iterate_blocks(len(numbers)):
         chosen = numbers[block]
@@ -148,7 +150,7 @@ def iterate_rows(layout: PlyFile, numbers: Int[ndarray, "m"]) -> Iterator[tuple[
         release_pages(layout.rows[chosen[0] : chosen[-1] + 1])
 
 
-def _can_hold(layout: PlyFile, added: Gaussians) -> bool:
+def _can_hold(layout: SceneFile, added: Gaussians) -> bool:
     """Return True if rows of a file can hold `added`, and their labels."""
     names = layout.rows.dtype.names or ()
     has_other_labels = LABEL_COLUMN in names and layout.rows.dtype[LABEL_COLUMN] not in LABEL_TYPES
@@ -157,16 +159,20 @@ def _can_hold(layout: PlyFile, added: Gaussians) -> bool:
 
 
 def _is_read_from(
-    layout: PlyFile, numbers: Int[ndarray, "m"], context: Gaussians, order: Int64[Tensor, "k"]
+    layout: SceneFile, numbers: Int[ndarray, "m"], context: Gaussians, order: Int64[Tensor, "k"]
 ) -> bool:
     """Return True if the positions of rows are those of Gaussians of the context, one by one."""
-    return len(numbers) == len(order) and all(
-        np.array_equal(read_columns(rows, MEANS), context.means[order[block]].cpu().numpy())
-        for block, rows in iterate_rows(layout, numbers)
-    )
+    if len(numbers) != len(order) or layout.origin != context.origin:
+        return False
+    for block, rows in iterate_rows(layout, numbers):
+        origin = layout.origin
+        means = read_columns(rows, MEANS) if origin is None else read_means(rows, origin)
+        if not np.array_equal(means, context.means[order[block]].cpu().numpy()):
+            return False
+    return True
 
 
-def _add_labels(layout: PlyFile) -> tuple[bytes, np.dtype]:
+def _add_labels(layout: SceneFile) -> tuple[bytes, np.dtype]:
     """Return header and type of rows with `float generated`, after all other columns if it is new.
 
     Numbers of the file have one byte order.
@@ -205,7 +211,7 @@ def is_same_scene(path: Path, other: Path) -> bool:
     for start in range(0, len(scenes[0].rows), CHUNK_ROWS):
         rows = slice(start, start + CHUNK_ROWS)
         first, second = (decode_gaussians(replace(s, rows=s.rows[rows])) for s in scenes)
-        if first.is_antialiased != second.is_antialiased:
+        if (first.is_antialiased, first.origin) != (second.is_antialiased, second.origin):
             return False
         if not all(torch.equal(getattr(first, f), getattr(second, f)) for f in _STORED):
             return False
@@ -224,7 +230,8 @@ def strip(path: Path, out: Path) -> tuple[int, int]:
         counts = strip_rows(path, layout, out)
         if counts is not None:
             return counts
-    completed = load_splat(path)
+    # A file with properties of its own is given back; nothing is shown.
+    completed = load_splat(path, ignore_properties=True)
     scene = drop_sh_padding(completed)
     layout = None if layout is None else drop_generated(layout)
     removed = path.parent / REMOVED_FILE
@@ -244,7 +251,7 @@ def strip(path: Path, out: Path) -> tuple[int, int]:
     return len(scene), int((completed.generated > 0).sum())
 
 
-def strip_rows(path: Path, layout: PlyFile, out: Path) -> tuple[int, int] | None:
+def strip_rows(path: Path, layout: SceneFile, out: Path) -> tuple[int, int] | None:
     """Write the input scene from the rows of a completed .ply, some at a time, as `strip` does.
 
     None if rows cannot be copied: the file has the SH of generated Gaussians of a higher degree, or
@@ -305,7 +312,7 @@ def strip_rows(path: Path, layout: PlyFile, out: Path) -> tuple[int, int] | None
 
 
 def find_places(
-    source: PlyFile, path: Path, num_kept: int, is_antialiased: bool
+    source: SceneFile, path: Path, num_kept: int, is_antialiased: bool
 ) -> Int64[ndarray, "n"]:
     """Find the rows of the originals of the file `path` in a scene of `num_kept` others.
 
@@ -369,8 +376,8 @@ def save_removed(
 
 
 def reinsert(
-    kept: Gaussians, layout: PlyFile | None, path: Path
-) -> tuple[Gaussians, PlyFile | None]:
+    kept: Gaussians, layout: SceneFile | None, path: Path
+) -> tuple[Gaussians, SceneFile | None]:
     """Insert the replaced originals of the file `path` at their rows; None if columns differ."""
     source = read_scene(path)
     rows = find_places(source, path, len(kept), kept.is_antialiased)

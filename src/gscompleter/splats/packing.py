@@ -10,6 +10,7 @@ import torch
 from jaxtyping import Float, Integer, Shaped, UInt32
 from numpy import ndarray
 
+from gscompleter.system.damage import DamagedError
 from gscompleter.system.errors import quote_value
 from gscompleter.types import SH_C0, Gaussians, make_observed
 
@@ -74,14 +75,14 @@ def drop_largest(
 
 
 def check_count(count: int, stored: int) -> None:
-    """Raise ValueError if `stored` bytes claim more Gaussians than any file would hold in them.
+    """Raise DamagedError if `stored` bytes claim more Gaussians than any file would hold in them.
 
     What is equal for all Gaussians, such as their size, takes hardly a byte in a packed format, so
     that no ratio of sizes tells a bomb. Only where a count would fill the memory has each further
     Gaussian to be a byte: what tells Gaussians apart, such as their positions, takes several.
     """
     if count > FREE_GAUSSIANS + stored:
-        raise ValueError(
+        raise DamagedError(
             f"its {stored:,} bytes claim to hold {quote_value(f'{count:,}')} Gaussians"
         )
 
@@ -96,7 +97,7 @@ def build_gaussians(
     """Build observed Gaussians (`generated` is 0) from arrays, as float32."""
     arrays = (means, quats, scales, opacities, sh)
     if len({len(array) for array in arrays}) > 1 or sh.shape[1] - 1 not in NUM_SH_REST:
-        raise ValueError("its Gaussians do not all have the same properties")
+        raise DamagedError("its Gaussians do not all have the same properties")
     return make_observed(
         *[torch.from_numpy(np.require(array, np.float32, ["C", "W"])) for array in arrays]
     )
@@ -106,7 +107,7 @@ def with_labels(gaussians: Gaussians, labels: Shaped[ndarray, "n"]) -> Gaussians
     """Return Gaussians with the labels of a file, whole numbers from 0 to 255."""
     generated = labels.astype(np.uint8)
     if len(generated) != len(gaussians) or not np.array_equal(generated, labels):
-        raise ValueError("its labels of generated Gaussians are no bytes, or too few")
+        raise DamagedError("its labels of generated Gaussians are no bytes, or too few")
     return replace(gaussians, generated=torch.from_numpy(generated))
 
 

@@ -7,9 +7,11 @@ In the file scales are logarithms, opacities are logits, and f_rest_* has all co
 then green, then blue. A comment marks antialiased Gaussians: Brush's is written, Postshot's are
 read too.
 
-Two variants are read as ordinary Gaussians. A property `filter_3D` (Mip-Splatting, GOF) is fused
-into scales and opacities, as their viewers do. Surfels of 2DGS, which have two scales and the third
-axis as their normal, get a thin third scale.
+Positions of double that float32 would round are read relative to an origin, and written as double.
+Variants are read as ordinary Gaussians. A property `filter_3D` (Mip-Splatting, GOF) is fused into
+scales and opacities, as their viewers do. Surfels of 2DGS, which have two scales and the third axis
+as their normal, get a thin third scale. Scales and opacities that were written without logarithm
+and logit are read as what they are, where that is certain.
 """
 
 from __future__ import annotations
@@ -17,7 +19,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,8 @@ from torch import Tensor
 from gscompleter.numerics.kernels import splat_rows as kernels
 from gscompleter.numerics.kernels.parallel import run_calls, share
 from gscompleter.numerics.value_checks import LARGEST, check_gaussians, find_finite
+from gscompleter.splats.origin import choose_origin, find_step, is_too_far
+from gscompleter.splats.properties import refuse_other_kinds
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, add_comments
 from gscompleter.system.errors import InputError, quote_value, require_path
 from gscompleter.system.files.ply import (
@@ -41,7 +45,7 @@ from gscompleter.system.files.ply import (
     write_ply_file,
 )
 from gscompleter.system.torch_modes import run_in_plain_torch
-from gscompleter.types import Gaussians, merge
+from gscompleter.types import Gaussians, Origin, merge
 
 MEANS = ("x", "y", "z")
 _NORMALS = ("nx", "ny", "nz")
@@ -56,6 +60,18 @@ FILTER = "filter_3D"
 """Standard deviation of the smoothing filter of Mip-Splatting and GOF, in scene units."""
 SURFEL_THICKNESS = 1e-3
 """Thickness of a surfel of 2DGS, relative to its smaller scale."""
+MIN_TELLING = 100
+"""Fewest Gaussians whose numbers tell how they are stored."""
+MIDDLE = (0.01, 0.99)
+"""Quantiles of positions that floaters leave alone."""
+LARGE_SIZE = 0.1
+"""Largest size of the median Gaussian that is plausible, relative to the extent of the scene."""
+SURELY_LARGE = 0.25
+"""Size of the median Gaussian that no scene has, relative to its extent."""
+ONE_SIZE = 1.35
+"""Largest Gaussian of a scene in which all are about one unit large, in scene units."""
+SEVERAL_SIZES = 5.0
+"""Ratio of the largest to the smallest Gaussian above which they have several sizes."""
 _NUM_REST = (0, 9, 24, 45)
 """Number of properties f_rest_* by SH degree."""
 
@@ -74,17 +90,40 @@ CHUNK_ROWS = 16 * BLOCK_ROWS
 """Rows of a file that are copied at a time."""
 
 
+@dataclass(frozen=True)
+class SceneFile(PlyFile):
+    """A 3DGS .ply, and what its numbers stand for."""
+
+    has_linear_scales: bool = False
+    """True if its scales are sizes in scene units, and not logarithms."""
+    has_plain_opacities: bool = False
+    """True if its opacities are fractions, and not logits."""
+    origin: Origin | None = None
+    """Place to which positions are relative once they are decoded; None for zero."""
+
+    @property
+    def is_usual(self) -> bool:
+        """True if numbers are stored as in a file of 3DGS, so that rows of ours can join them."""
+        return not (self.has_linear_scales or self.has_plain_opacities)
+
+
 @run_in_plain_torch
-def load_ply(path: Path | str, drop_nonfinite: bool = False) -> Gaussians:
+def load_ply(
+    path: Path | str, drop_nonfinite: bool = False, ignore_properties: bool = False
+) -> Gaussians:
     """Load the Gaussians of a 3DGS .ply of SH degree 0 to 3.
 
-    With `drop_nonfinite`, Gaussians with NaN, infinity or a zero quaternion are dropped; otherwise
-    the file is refused. Infinite opacity logits are valid: converters write them for opacities of 1
-    and 0.
+    A file whose further properties change what is seen, as those of a moving splat, is refused
+    unless `ignore_properties` is set. With `drop_nonfinite`, Gaussians with NaN, infinity or a zero
+    quaternion are dropped; otherwise the file is refused. Infinite opacity logits are valid:
+    converters write them for opacities of 1 and 0.
     """
     path = require_path(path)
     try:
-        return require_finite(decode_gaussians(read_scene(path)), path, drop_nonfinite)
+        scene = read_scene(path)
+        if not ignore_properties:
+            refuse_other_kinds(scene.rows.dtype.names or (), path)
+        return require_finite(decode_gaussians(scene), path, drop_nonfinite)
     except MemoryError as error:
         raise make_memory_error(path) from error
     except RuntimeError as error:
@@ -106,9 +145,9 @@ def find_finite_rows(path: Path) -> Bool[Tensor, "n"]:
     return find_finite(decode_gaussians(read_scene(path)))
 
 
-def read_scene(path: Path) -> PlyFile:
-    """Read the rows of a 3DGS .ply, surfels of 2DGS included."""
-    scene = read_ply_file(path, _NEEDED, "3DGS scene", describe_other_content)
+def read_scene(path: Path) -> SceneFile:
+    """Read the rows of a 3DGS .ply, surfels of 2DGS included, and find out how they are stored."""
+    scene = read_ply_file(path, _NEEDED, "3DGS scene", describe_other_content, "Gaussians")
     names = scene.rows.dtype.names or ()
     num_rest = count_rest(scene)
     if num_rest not in _NUM_REST or any(f"f_rest_{i}" not in names for i in range(num_rest)):
@@ -116,7 +155,149 @@ def read_scene(path: Path) -> PlyFile:
             f"{path} has {num_rest} properties f_rest_*; spherical harmonics of degree 0 to 3 "
             "have 0, 9, 24 or 45, numbered from 0."
         )
-    return scene
+    has_linear_scales = find_linear_scales(scene.rows)
+    return SceneFile(
+        **vars(scene),
+        has_linear_scales=has_linear_scales,
+        has_plain_opacities=find_plain_opacities(scene.rows, has_linear_scales),
+        origin=find_origin(scene.rows, has_linear_scales),
+    )
+
+
+def find_origin(rows: ndarray, has_linear_scales: bool) -> Origin | None:
+    """Find the place to which positions are read that float32 would round; None for zero."""
+    if not has_doubles(rows):
+        return None
+    middle = []
+    for name in MEANS:
+        values = rows[name].astype(np.float64)
+        finite = values[np.isfinite(values)]
+        if len(finite) == 0:
+            return None
+        middle.append(np.median(finite))
+    size = _measure_scales(rows)[1]
+    size = size if has_linear_scales else math.exp(min(size, 80))
+    return choose_origin(np.array(middle), size)
+
+
+def has_doubles(rows: ndarray) -> bool:
+    """Return True if positions are stored more exactly than by float32."""
+    kinds = [rows.dtype[name] for name in MEANS]
+    return any(kind.kind == "f" and kind.itemsize == 8 for kind in kinds)
+
+
+def read_means(rows: ndarray, origin: Origin) -> Float[ndarray, "n 3"]:
+    """Read positions relative to an origin, which is taken off in float64."""
+    places = zip(MEANS, origin, strict=True)
+    columns = [rows[name].astype(np.float64) - place for name, place in places]
+    with np.errstate(over="ignore"):
+        return np.stack(columns, axis=1).astype(np.float32)
+
+
+def find_linear_scales(rows: ndarray) -> bool:
+    """Return True if the scales of a file are surely sizes, and not logarithms of sizes.
+
+    Some converters forget the logarithm. Then no number is negative, and the median Gaussian is far
+    smaller than the scene. As logarithms they would say that it is a large part of the scene, or
+    that all Gaussians are about one unit large; no trainer makes such a scene.
+    """
+    names = [name for name in _SCALES if name in (rows.dtype.names or ())]
+    # Most files have a negative logarithm among their first rows, so that no more is read of them.
+    if len(rows) < MIN_TELLING or not _are_within(rows, names, math.inf):
+        return False
+    low, median, high = _measure_scales(rows)
+    extent = _measure_extent(rows)
+    if not 0 < median <= LARGE_SIZE * extent:
+        return False
+    is_large = median >= math.log(SURELY_LARGE * extent)
+    return is_large or (high <= math.log(ONE_SIZE) and high >= SEVERAL_SIZES * low)
+
+
+def _measure_scales(rows: ndarray) -> tuple[float, float, float]:
+    """Measure the largest scale of Gaussians as it is stored: low, median and high quantile."""
+    names = tuple(name for name in _SCALES if name in (rows.dtype.names or ()))
+    low, median, high = np.quantile(read_columns(rows, names).max(axis=1), (0.01, 0.5, 0.99))
+    return float(low), float(median), float(high)
+
+
+def _measure_extent(rows: ndarray) -> float:
+    """Measure the largest side of the box around nearly all Gaussians, in scene units."""
+    return float(np.ptp(np.quantile(read_columns(rows, MEANS), MIDDLE, axis=0), axis=0).max())
+
+
+def find_plain_opacities(rows: ndarray, has_linear_scales: bool) -> bool:
+    """Return True if the opacities of a file are surely fractions, and not logits of fractions.
+
+    All logits in [0, 1] would be opacities from 50 to 73 %. That is a file of fractions if its
+    scales are no logarithms either, or if they fill [0, 1] and never exceed it.
+    """
+    if len(rows) < MIN_TELLING or not _are_within(rows, ["opacity"], 1.0):
+        return False
+    low, high = np.quantile(read_columns(rows, ("opacity",)), (0.05, 0.95))
+    return has_linear_scales or bool(low <= 0.1 and high >= 0.9)
+
+
+def _are_within(rows: ndarray, names: Sequence[str], most: float) -> bool:
+    """Return True if all values of columns lie from 0 to `most`; the first rows usually tell."""
+    for block in iterate_blocks(len(rows)):
+        for name in names:
+            values = rows[name][block]
+            if not ((values >= 0) & (values <= most)).all():  # False for NaN
+                return False
+    return True
+
+
+def describe_values(scene: SceneFile) -> list[str]:
+    """Describe in sentences what a file stores as no trainer does, and how it is read."""
+    return [*_describe_positions(scene), *_describe_forms(scene)]
+
+
+def _describe_positions(scene: SceneFile) -> list[str]:
+    """Describe positions that are far from zero, relative to the size of Gaussians."""
+    if scene.origin is not None:
+        place = ", ".join(f"{x:.12g}" for x in scene.origin)
+        return [f"Its coordinates are too large for float, and are read relative to ({place})."]
+    rows = scene.rows
+    if len(rows) == 0 or has_doubles(rows):
+        return []
+    middle = np.median(read_columns(rows, MEANS), axis=0).astype(np.float64)
+    size = _measure_scales(rows)[1]
+    size = size if scene.has_linear_scales else math.exp(min(size, 80))
+    if not is_too_far(middle, size):
+        return []
+    step = find_step(float(np.abs(middle).max()))
+    return [
+        f"Its positions are floats in steps of {step:.3g}, and half of its Gaussians are smaller "
+        f"than {size:.3g}: they were rounded when it was written; export it with positions of "
+        "double, or near zero."
+    ]
+
+
+def _describe_forms(scene: SceneFile) -> list[str]:
+    """Describe scales and opacities in another form than that of a .ply."""
+    if len(scene.rows) < MIN_TELLING:
+        return []
+    sentences = []
+    # Sizes may be infinite, and positions all the same; both are told elsewhere.
+    median = math.exp(min(_measure_scales(scene.rows)[1], 80))
+    share = median / max(_measure_extent(scene.rows), 1e-30)
+    if scene.has_linear_scales:
+        sentences.append("Its scales are sizes, not their logarithms, and are read as such.")
+    elif share > LARGE_SIZE:
+        sentences.append(
+            f"Half of its Gaussians are larger than {100 * share:.3g} % of the scene; its scales "
+            "may be no logarithms of sizes, as a .ply has them."
+        )
+    if scene.has_plain_opacities:
+        sentences.append("Its opacities are fractions, not logits, and are read as such.")
+    elif _are_within(scene.rows, ["opacity"], 1.0):
+        opacities = read_columns(scene.rows, ("opacity",))
+        if opacities.min() < opacities.max():
+            sentences.append(
+                "All of its opacities are from 50 to 73 %, as if they had been stored without the "
+                "logit that .ply files have; they are read with it."
+            )
+    return sentences
 
 
 def count_rest(scene: PlyFile) -> int:
@@ -130,7 +311,7 @@ def has_mode_comment(header: bytes) -> bool:
     return bool(modes) and modes[-1].lower() in _ANTIALIASED
 
 
-def decode_gaussians(scene: PlyFile) -> Gaussians:
+def decode_gaussians(scene: SceneFile) -> Gaussians:
     """Decode the Gaussians of a .ply, non-finite ones included.
 
     Blocks of rows are decoded one by one, and their pages of a mapped file are released: the memory
@@ -154,7 +335,11 @@ def decode_gaussians(scene: PlyFile) -> Gaussians:
         part = rows[block]
         table = view_as_table(part) if columns is not None else gather_table(scene, part)
         places = np.arange(table.shape[1]) if columns is None else columns
+        if not scene.is_usual:
+            table = encode_columns(scene, table, places)
         kernels.decode_rows(0, len(part), block.start, table, places, *arrays)
+        if scene.origin is not None:
+            arrays[0][block] = read_means(part, scene.origin)
         if LABEL_COLUMN in names:
             generated[block] = read_labels(part)
         release_pages(part)
@@ -170,6 +355,7 @@ def decode_gaussians(scene: PlyFile) -> Gaussians:
         generated=torch.from_numpy(generated),
         encoded=encoded,
         is_antialiased=has_mode_comment(scene.header),
+        origin=scene.origin,
     )
     if FILTER not in names:
         return gaussians
@@ -210,16 +396,40 @@ def view_as_table(part: ndarray) -> Float[ndarray, "n c"]:
     return np.ascontiguousarray(raw[:, : 4 * width]).view("<f4").astype(np.float32, copy=False)
 
 
-def gather_table(scene: PlyFile, part: ndarray) -> Float[ndarray, "n c"]:
+def gather_table(scene: SceneFile, part: ndarray) -> Float[ndarray, "n c"]:
     """Gather the properties of Gaussians, of any type, in the order of `name_columns`."""
     names = name_columns(scene)
     if not has_surfels(scene):
         return read_columns(part, names)
     table = read_columns(part, tuple(name for name in names if name != _SCALES[2]))
-    # Logarithms of scales: the third one of a surfel is thinner than the smaller one by a factor.
+    # The third scale of a surfel is thinner than the smaller one by a factor.
     place = names.index(_SCALES[2])
-    thin = table[:, place - 2 : place].min(axis=1) + np.float32(math.log(SURFEL_THICKNESS))
+    thin = table[:, place - 2 : place].min(axis=1)
+    if scene.has_linear_scales:
+        thin = thin * np.float32(SURFEL_THICKNESS)
+    else:
+        thin = thin + np.float32(math.log(SURFEL_THICKNESS))
     return np.insert(table, place, thin, axis=1)
+
+
+def encode_columns(
+    scene: SceneFile, table: Float[ndarray, "n c"], places: Int64[ndarray, "d"]
+) -> Float[ndarray, "n c"]:
+    """Encode sizes and fractions as the logarithms and logits that a file of 3DGS has.
+
+    `places` are the columns of properties in the order of `name_columns`.
+    """
+    table = table.copy()  # the file itself may be mapped
+    names = name_columns(scene)
+    with np.errstate(divide="ignore"):  # sizes of 0, opacities of 0 and 1
+        if scene.has_linear_scales:
+            scales = places[[names.index(name) for name in _SCALES]]
+            table[:, scales] = np.log(table[:, scales])
+        if scene.has_plain_opacities:
+            opacity = places[names.index("opacity")]
+            fractions = table[:, opacity].astype(np.float64)
+            table[:, opacity] = np.log(fractions) - np.log1p(-fractions)
+    return table
 
 
 def has_surfels(scene: PlyFile) -> bool:
@@ -266,7 +476,9 @@ def require_finite(gaussians: Gaussians, path: Path, drop_nonfinite: bool) -> Ga
 def check_finite(count: int, total: int, path: Path, drop_nonfinite: bool) -> None:
     """Raise InputError if not all Gaussians of a file are finite, or if none is."""
     bad = total - count
-    if count == 0 and (bad == 0 or drop_nonfinite):
+    if total == 0:
+        raise InputError(f"{quote_value(path)} holds no Gaussians; name another file.")
+    if count == 0 and drop_nonfinite:
         raise InputError(f"{quote_value(path)} holds no Gaussian that is finite; write it anew.")
     if bad > 0 and not drop_nonfinite:
         raise InputError(
@@ -354,6 +566,7 @@ def copy_ply(
     drop_nonfinite: bool = False,
     keep_labels: bool = True,
     made_by: Provenance = NOTHING_KNOWN,
+    ignore_properties: bool = False,
 ) -> tuple[int, int]:
     """Write what `load_ply` and `save_ply` would, some Gaussians at a time.
 
@@ -361,6 +574,8 @@ def copy_ply(
     generated, whether or not `keep_labels` writes that.
     """
     scene = read_scene(source)
+    if not ignore_properties:
+        refuse_other_kinds(scene.rows.dtype.names or (), source)
     total = len(scene.rows)
 
     def decode_chunks() -> Iterator[Gaussians]:
@@ -406,9 +621,13 @@ def make_scene_header(gaussians: Gaussians, provenance: bool) -> bytes:
 def make_row_type(gaussians: Gaussians, provenance: bool) -> np.dtype:
     """Make the type of a row in the standard layout, with or without `generated`."""
     rest = (f"f_rest_{i}" for i in range(3 * (gaussians.sh.shape[1] - 1)))
-    names = (*MEANS, *_NORMALS, *_DC, *rest, "opacity", *_SCALES, *_QUATS)
+    names = (*_NORMALS, *_DC, *rest, "opacity", *_SCALES, *_QUATS)
     labels = [(LABEL_COLUMN, "<f4")] if provenance else []
-    return np.dtype([*((name, "<f4") for name in names), *labels])
+    # Positions that were read as double are written as double.
+    kind = "<f4" if gaussians.origin is None else "<f8"
+    return np.dtype(
+        [*((name, kind) for name in MEANS), *((name, "<f4") for name in names), *labels]
+    )
 
 
 def make_rows(gaussians: Gaussians, provenance: bool, block: slice | None = None) -> np.ndarray:
@@ -419,14 +638,26 @@ def make_rows(gaussians: Gaussians, provenance: bool, block: slice | None = None
         *(gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities),
         *(gaussians.sh, gaussians.encoded),
     )
-    plain = make_row_type(gaussians, provenance=False)
+    plain = make_row_type(replace(gaussians, origin=None), provenance=False)
     table = np.empty((stop - start, len(plain.names or ())), np.float32)
     kernels.encode_rows(0, len(table), start, *map(_to_array, properties), table)
     rows = table.astype("<f4", copy=False).view(plain)[:, 0]
+    if gaussians.origin is not None:
+        rows = restore_positions(rows, gaussians.origin, make_row_type(gaussians, provenance=False))
     if not provenance:
         return rows
     dtype = make_row_type(gaussians, provenance=True)
     return append_labels(rows, dtype, gaussians.generated[block].cpu().numpy())
+
+
+def restore_positions(rows: ndarray, origin: Origin, dtype: np.dtype) -> ndarray:
+    """Add an origin to the positions of rows, in float64; all else stays."""
+    restored = np.empty(len(rows), dtype)
+    for name in dtype.names or ():
+        restored[name] = rows[name]
+    for name, place in zip(MEANS, origin, strict=True):
+        restored[name] += place
+    return restored
 
 
 def append_labels(rows: ndarray, dtype: np.dtype, labels: UInt8[ndarray, "n"]) -> ndarray:

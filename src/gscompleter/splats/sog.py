@@ -40,6 +40,7 @@ from gscompleter.splats.packing import (
 )
 from gscompleter.splats.ply import encode
 from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
+from gscompleter.system.damage import DamagedError
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.reading import read_bytes, read_zip_entry
 from gscompleter.system.files.writing import replace_file
@@ -98,6 +99,8 @@ def read_sog_remarks(path: Path) -> object:
 
 
 def _read_entry(bundle: zipfile.ZipFile, name: str, most: int) -> bytes:
+    if name not in bundle.NameToInfo:
+        raise DamagedError(f"it lacks its file {quote_value(name)}")
     if bundle.getinfo(name).flag_bits & 1:
         raise UnsupportedError(f"is encrypted ({quote_value(name)})")
     return read_zip_entry(bundle, name, most)
@@ -141,7 +144,7 @@ def _open_image(read: FileReader, name: object, count: int) -> Image.Image:
     It is not decoded yet.
     """
     if not isinstance(name, str) or not name or Path(name).name != name:
-        raise ValueError(f"it names a file '{quote_value(name)}' that is not beside it")
+        raise DamagedError(f"it names a file '{quote_value(name)}' that is not beside it")
     # The images of a scene have a pixel for each Gaussian, so that the count tells how large they
     # are; of one colour they take any number of pixels in a few bytes.
     most = FREE_PIXELS + PADDING * max(count, 0)
@@ -149,11 +152,13 @@ def _open_image(read: FileReader, name: object, count: int) -> Image.Image:
     try:
         image = Image.open(io.BytesIO(data), formats=["WEBP"])
     except UnidentifiedImageError as error:
-        raise ValueError(f"its {quote_value(name)} is no WebP image") from error
+        raise DamagedError(f"its {quote_value(name)} is no WebP image") from error
+    except OSError as error:
+        raise DamagedError(f"its {quote_value(name)} is damaged, or ends too early") from error
     if not 0 <= count <= image.width * image.height:
-        raise ValueError(f"its {quote_value(name)} has fewer pixels than there are Gaussians")
+        raise DamagedError(f"its {quote_value(name)} has fewer pixels than there are Gaussians")
     if image.width * image.height > most:
-        raise ValueError(
+        raise DamagedError(
             f"its {quote_value(name)} claims to hold {image.width:,} × {image.height:,} pixels, "
             f"and there are {count:,} Gaussians"
         )
@@ -162,8 +167,14 @@ def _open_image(read: FileReader, name: object, count: int) -> Image.Image:
 
 def _read_pixels(read: FileReader, name: object, count: int) -> UInt8[ndarray, "n 4"]:
     """Read the first `count` pixels of an image."""
-    image = _open_image(read, name, count)
-    return np.array(image.convert("RGBA")).reshape(-1, 4)[:count]
+    return _decode_image(_open_image(read, name, count), name).reshape(-1, 4)[:count]
+
+
+def _decode_image(image: Image.Image, name: object) -> UInt8[ndarray, "h w 4"]:
+    try:
+        return np.array(image.convert("RGBA"))
+    except (OSError, SyntaxError, ValueError) as error:
+        raise DamagedError(f"its {quote_value(name)} is damaged, or ends too early") from error
 
 
 def _decode_means(read: FileReader, table: dict[str, Any], count: int) -> Float[ndarray, "n 3"]:
@@ -213,10 +224,10 @@ def _decode_sh_rest(read: FileReader, table: dict[str, Any], count: int) -> Floa
     """Decode SH of degree 1 and above from the palette."""
     centroids, labels = table["files"]
     # Its rows are numbered by 16 bits, whatever the number of Gaussians.
-    palette = np.array(_open_image(read, centroids, 0).convert("RGBA"))[:, :, :3]
+    palette = _decode_image(_open_image(read, centroids, 0), centroids)[:, :, :3]
     k = palette.shape[1] // PALETTE_WIDTH
     if k not in NUM_SH_REST[1:]:
-        raise ValueError("its palette has no harmonics of degree 1 to 3")
+        raise DamagedError("its palette has no harmonics of degree 1 to 3")
     rows = palette.reshape(-1, k, 3)
     label = _read_pixels(read, labels, count).astype(np.int64)
     number = label[:, 0] + 256 * label[:, 1]

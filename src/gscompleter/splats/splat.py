@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gscompleter.splats.packing import assemble_sh, build_gaussians
+from gscompleter.system.damage import DamagedError
 from gscompleter.system.files.reading import read_bytes
 from gscompleter.system.files.writing import replace_file
 from gscompleter.types import SH_C0, Gaussians
@@ -20,7 +21,14 @@ ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("rgba", "u1", 4), ("qu
 
 def read_splat_rows(path: Path) -> Gaussians:
     """Read a .splat."""
-    rows = np.frombuffer(read_bytes(path), ROW)
+    data = read_bytes(path)
+    whole, rest = divmod(len(data), ROW.itemsize)
+    if rest > 0:
+        raise DamagedError(
+            f"it ends after {whole:,} Gaussians, within the next one, which has {ROW.itemsize} "
+            f"bytes and not {rest}"
+        )
+    rows = np.frombuffer(data, ROW)
     rgba = rows["rgba"].astype(np.float32) / 255
     quats = (rows["quat"].astype(np.float32) - 128) / 128
     return build_gaussians(rows["mean"], quats, rows["scale"], rgba[:, 3], assemble_sh(rgba[:, :3]))

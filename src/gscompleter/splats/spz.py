@@ -35,6 +35,7 @@ from gscompleter.splats.packing import (
 )
 from gscompleter.splats.ply import encode
 from gscompleter.splats.transform import HALF_TURN_X, rotate_half_turn
+from gscompleter.system.damage import DamagedError, check_rows
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_bytes
 from gscompleter.system.files.writing import replace_file
@@ -58,6 +59,12 @@ REST_VALUES = (np.arange(256, dtype=np.float32) - 128) / 128
 """Coefficient of SH of degree 1 and above that each byte stands for."""
 GZIP_HEADER = gzip.compress(b"", compresslevel=6, mtime=0)[:10]
 """Signature, method, no time and the mark of the system, as the module `gzip` writes them."""
+
+
+GZIP_BITS = 31
+"""Window of zlib, 15 bits, and 16 for a header of gzip."""
+ATTRIBUTES = ("positions", "opacities", "colours", "sizes", "rotations", "harmonics")
+"""Attributes in the order of the file."""
 
 
 class SpzHeader(NamedTuple):
@@ -102,9 +109,11 @@ def decode_spz(data: bytes) -> Gaussians:
 
 
 def _parse_header(data: bytes) -> SpzHeader:
+    if len(data) < HEADER.size:
+        raise DamagedError("it ends within its header")
     header = SpzHeader(*HEADER.unpack_from(data))
     if header.magic != MAGIC:
-        raise ValueError("it is no .spz but other data")
+        raise DamagedError("it is no .spz but other data")
     if header.version not in (2, 3, 4) or header.degree > 3:
         raise UnsupportedError(
             f"is .spz version {header.version} of SH degree {header.degree}, and version 2 to 4 of "
@@ -115,14 +124,17 @@ def _parse_header(data: bytes) -> SpzHeader:
 
 def _unpack_gzip(data: bytes) -> bytes:
     # The header says how long the content is; a bomb is refused before it is unpacked.
-    with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
-        start = file.read(HEADER.size)
-        header = _parse_header(start)
-        check_count(header.num_gaussians, len(data))
-        size = sum(header.stream_sizes)
-        body = file.read(size)
-        file.read(1)  # compares the checksum
-    return start + body
+    unpacker = zlib.decompressobj(wbits=GZIP_BITS)
+    start = unpacker.decompress(data, HEADER.size)
+    header = _parse_header(start)
+    check_count(header.num_gaussians, len(data))
+    size = sum(header.stream_sizes)
+    # One byte more than there should be reaches the end, where the checksum is compared. What a cut
+    # file has of its content is returned: how far it reaches is told by the missing rows.
+    body = unpacker.decompress(unpacker.unconsumed_tail, size + 1)
+    if len(body) == size and not unpacker.eof:
+        raise DamagedError("it ends after its Gaussians, before their checksum")
+    return start + body[:size]
 
 
 def _read_zstd(header: SpzHeader, data: bytes) -> list[bytes]:
@@ -131,7 +143,10 @@ def _read_zstd(header: SpzHeader, data: bytes) -> list[bytes]:
 
     check_count(header.num_gaussians, len(data))
     # After the header lies the offset of a table with the packed and unpacked size of each stream.
+    if len(data) < HEADER.size + 4:
+        raise DamagedError("it ends within its header")
     (place,) = struct.unpack_from("<I", data, HEADER.size)
+    check_rows(len(data) - place, 16, header.num_streams, "entries of its table of contents")
     table = np.frombuffer(data, "<u8", 2 * header.num_streams, place).reshape(-1, 2)
     start = place + table.nbytes
     streams = []
@@ -141,7 +156,8 @@ def _read_zstd(header: SpzHeader, data: bytes) -> list[bytes]:
         try:
             streams.append(unpacker.stream_reader(data[start : start + packed]).read(size))
         except zstandard.ZstdError as error:
-            raise ValueError(str(error)) from error
+            # What a stream lacks that ends too early is told by the missing rows.
+            raise DamagedError("its compressed content is damaged") from error
         start += packed
     return [*streams, b""][: len(header.stream_sizes)]
 
@@ -149,6 +165,8 @@ def _read_zstd(header: SpzHeader, data: bytes) -> list[bytes]:
 def _decode_streams(header: SpzHeader, streams: list[bytes]) -> Gaussians:
     """Decode the Gaussians, in the axes of the file."""
     n = header.num_gaussians
+    for stream, width, what in zip(streams, header.widths, ATTRIBUTES, strict=True):
+        check_rows(len(stream), width, n, what)
     positions, opacities, colours, scales, rotations, rest = [
         np.frombuffer(stream, np.uint8).reshape(n, width)
         for stream, width in zip(streams, header.widths, strict=True)

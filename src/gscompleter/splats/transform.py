@@ -6,6 +6,7 @@ y up, z back, which is half a turn about x; glTF has x left, y up, z forward, ha
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
@@ -14,8 +15,9 @@ from torch import Tensor
 
 from gscompleter.numerics.geometry import multiply_quats, rotations_to_quats
 from gscompleter.render.spherical_harmonics import evaluate_sh_basis
+from gscompleter.splats.origin import choose_origin, measure_size
 from gscompleter.splats.packing import UnsupportedError
-from gscompleter.types import Gaussians
+from gscompleter.types import Gaussians, Origin, merge
 
 MAX_SKEW = 1e-3
 """Largest relative error of a similarity of a file."""
@@ -38,7 +40,15 @@ def rotate_half_turn(gaussians: Gaussians, signs: tuple[float, float, float]) ->
         means=gaussians.means * flip,
         quats=gaussians.quats * torch.tensor((1.0, *signs)),
         sh=gaussians.sh * (after / before).round().mT,
+        origin=_turn_origin(gaussians.origin, signs),
     )
+
+
+def _turn_origin(origin: Origin | None, signs: tuple[float, float, float]) -> Origin | None:
+    if origin is None:
+        return None
+    x, y, z = (place * sign for place, sign in zip(origin, signs, strict=True))
+    return (x, y, z)
 
 
 def require_similarity(place: Float[Tensor, "4 4"], name: str) -> None:
@@ -53,7 +63,15 @@ def require_similarity(place: Float[Tensor, "4 4"], name: str) -> None:
 
 
 def transform_gaussians(gaussians: Gaussians, similarity: Float[Tensor, "4 4"]) -> Gaussians:
-    """Transform Gaussians by a similarity `x' = s R x + t`."""
+    """Transform Gaussians by a similarity `x' = s R x + t` of the coordinates of their file.
+
+    An origin is turned and scaled with them, and t moves the Gaussians alone.
+    """
+    origin = gaussians.origin
+    if origin is not None:
+        linear = similarity[:3, :3].double().cpu()
+        x, y, z = (linear @ torch.tensor(origin, dtype=torch.float64)).tolist()
+        origin = (x, y, z)
     scale = torch.linalg.det(similarity[:3, :3]) ** (1 / 3)
     rotation = similarity[:3, :3] / scale
     return replace(
@@ -63,7 +81,29 @@ def transform_gaussians(gaussians: Gaussians, similarity: Float[Tensor, "4 4"]) 
         scales=gaussians.scales * scale,
         sh=_rotate_sh(gaussians.sh, rotation),
         encoded=None,
+        origin=origin,
     )
+
+
+def place_gaussians(gaussians: Gaussians, place: Float[Tensor, "4 4"]) -> Gaussians:
+    """Transform Gaussians by a similarity of float64 whose shift may be too large for float32.
+
+    Such a shift becomes their origin.
+    """
+    scale = float(torch.linalg.det(place[:3, :3])) ** (1 / 3)
+    origin = choose_origin(place[:3, 3].numpy(), scale * measure_size(gaussians))
+    if origin is None:
+        return transform_gaussians(gaussians, place.float())
+    near = place.clone()
+    near[:3, 3] -= torch.tensor(origin, dtype=torch.float64)
+    return replace(transform_gaussians(gaussians, near.float()), origin=origin)
+
+
+def merge_placed(parts: Sequence[Gaussians]) -> Gaussians:
+    """Merge parts of a file, of which some may have an origin, and others lie near zero."""
+    if any(part.origin is not None for part in parts):
+        parts = [replace(part, origin=part.origin or (0.0, 0.0, 0.0)) for part in parts]
+    return merge(parts)
 
 
 def _rotate_sh(

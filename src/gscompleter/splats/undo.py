@@ -22,13 +22,14 @@ from gscompleter.splats.formats import get_writer
 from gscompleter.splats.layout import iterate_rows, strip
 from gscompleter.splats.ply import (
     LABEL_COLUMN,
+    SceneFile,
     has_mode_comment,
     iterate_blocks,
     read_scene,
     save_ply,
 )
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.ply import PlyFile, write_ply_file
+from gscompleter.system.files.ply import write_ply_file
 from gscompleter.system.files.reading import hash_file
 from gscompleter.system.files.writing import EDITS_FILE
 
@@ -47,7 +48,7 @@ class Originals:
 
     keys: Keys
     """Key of each row, ascending."""
-    scenes: Sequence[PlyFile]
+    scenes: Sequence[SceneFile]
     places: Int64[ndarray, "n 2"]
     """Number of the scene of each row, and the row in it."""
 
@@ -187,7 +188,7 @@ def read_originals(edits: Edits, edit: Edit, before: Keys) -> Originals:
 
 def join_originals(parts: Sequence[Originals]) -> Originals:
     """Join the rows that several edits left out."""
-    scenes: list[PlyFile] = []
+    scenes: list[SceneFile] = []
     places = []
     for part in parts:
         places.append(part.places + np.array([len(scenes), 0]))
@@ -198,7 +199,7 @@ def join_originals(parts: Sequence[Originals]) -> Originals:
 
 
 def make_header(
-    layout: PlyFile, edits: Sequence[Edit], remaining: Sequence[int], had_labels: str | None
+    layout: SceneFile, edits: Sequence[Edit], remaining: Sequence[int], had_labels: str | None
 ) -> tuple[bytes, np.dtype]:
     """Make header and type of rows without the comments of the edits that are taken off.
 
@@ -230,7 +231,7 @@ def make_header(
 
 
 def copy_rows(
-    layout: PlyFile, final: Keys, originals: Originals, keys: Keys, dtype: np.dtype
+    layout: SceneFile, final: Keys, originals: Originals, keys: Keys, dtype: np.dtype
 ) -> ndarray:
     """Copy rows by their keys, from the splat or from what was left out of it."""
     rows = np.zeros(len(keys), dtype)
@@ -255,7 +256,7 @@ def fill_columns(rows: ndarray, places: Int64[ndarray, "k"], values: ndarray) ->
             rows[name][places] = values[name]
 
 
-def check_columns(scene: PlyFile, layout: PlyFile) -> None:
+def check_columns(scene: SceneFile, layout: SceneFile) -> None:
     """Refuse originals that have other columns, as those of a splat of a lower degree."""
     columns = [set(file.rows.dtype.names or ()) - {LABEL_COLUMN} for file in (scene, layout)]
     is_same_mode = has_mode_comment(scene.header) == has_mode_comment(layout.header)

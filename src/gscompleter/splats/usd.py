@@ -34,14 +34,16 @@ from gscompleter.splats.packing import (
 from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
 from gscompleter.splats.transform import (
     HALF_TURN_X,
+    merge_placed,
+    place_gaussians,
     require_similarity,
     rotate_half_turn,
-    transform_gaussians,
 )
+from gscompleter.system.damage import DamagedError
 from gscompleter.system.errors import InputError, OutputError, quote_value
 from gscompleter.system.files.unfinished import make_unfinished_name
 from gscompleter.system.files.writing import convert_write_errors, replace_file
-from gscompleter.types import Gaussians, merge
+from gscompleter.types import Gaussians
 
 if TYPE_CHECKING:
     from pxr import Usd
@@ -121,7 +123,7 @@ def _convert_usd_errors(path: Path, folder: Path) -> Iterator[None]:
 
 def _make_stage(gaussians: Gaussians) -> Usd.Stage:
     """Make a stage of one prim, from Gaussians in its axes."""
-    from pxr import Sdf, Usd, UsdGeom, Vt
+    from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
     stage = Usd.Stage.CreateInMemory()
     UsdGeom.SetStageUpAxis(stage, UsdGeom.Tokens.y)
@@ -129,6 +131,8 @@ def _make_stage(gaussians: Gaussians) -> Usd.Stage:
     prim = stage.DefinePrim("/Splat", KIND)
     stage.SetDefaultPrim(prim)
     Usd.ColorSpaceAPI.Apply(prim).CreateColorSpaceNameAttr(COLOR_SPACE)
+    if gaussians.origin is not None:
+        UsdGeom.Xformable(prim).AddTranslateOp().Set(Gf.Vec3d(*gaussians.origin))
     means = gaussians.means
     reach = EXTENT * gaussians.scales.amax(1, keepdim=True)
     values = {
@@ -174,7 +178,7 @@ def read_usd(path: Path) -> Gaussians:
             raise UnsupportedError(f"is OpenUSD without Gaussians ({KIND})")
         has_z_up = UsdGeom.GetStageUpAxis(stage) == UsdGeom.Tokens.z
         parts = [_read_prim(prim, has_z_up) for prim in prims]
-    return rotate_half_turn(merge(parts), HALF_TURN_X)
+    return rotate_half_turn(merge_placed(parts), HALF_TURN_X)
 
 
 def read_usd_remarks(path: Path) -> object:
@@ -205,7 +209,7 @@ def _open_stage(path: Path) -> Iterator[Usd.Stage]:
         try:
             yield Usd.Stage.Open(str(place))
         except RuntimeError as error:  # of OpenUSD, about its own sources
-            raise ValueError("OpenUSD finds it damaged") from error
+            raise DamagedError("OpenUSD finds it damaged") from error
 
 
 def _read_prim(prim: Usd.Prim, has_z_up: bool) -> Gaussians:
@@ -238,7 +242,7 @@ def _read_prim(prim: Usd.Prim, has_z_up: bool) -> Gaussians:
     if has_z_up:
         place = torch.tensor(Y_FROM_Z_UP, dtype=torch.float64) @ place
     require_similarity(place, "prim")
-    return transform_gaussians(gaussians, place.float())
+    return place_gaussians(gaussians, place)
 
 
 def _find_color_space(prim: Usd.Prim) -> str:

@@ -16,6 +16,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from gscompleter.system.damage import DamagedError, describe_damage
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.names import fold_name, make_valid_name
 from gscompleter.system.files.output_folder import read_command
@@ -103,9 +104,14 @@ def read_manifest_rows(manifest: Path, out: Path | None = None) -> list[Options]
     content = read_bytes(manifest, LONGEST_FILE)
     try:
         return list(parsers[manifest.suffix](content.decode("utf-8-sig")))
-    except (ValueError, csv.Error, RecursionError) as error:
+    except csv.Error as error:  # its words are about lines, quotation marks and the like
         raise InputError(
             f"The manifest {quote_value(manifest)} cannot be read: {quote_value(str(error))}; "
+            "correct it."
+        ) from error
+    except (ValueError, RecursionError) as error:
+        raise InputError(
+            f"The manifest {quote_value(manifest)} cannot be read: {describe_damage(error)}; "
             "correct it."
         ) from error
 
@@ -141,9 +147,12 @@ def parse_json_lines(text: str) -> Iterator[Options]:
     """Parse JSON lines."""
     for number, line in enumerate(text.splitlines(), start=1):
         if line.strip():
-            row = json.loads(line)
+            try:
+                row = json.loads(line)
+            except ValueError as error:
+                raise DamagedError(f"line {number} is no JSON") from error
             if not isinstance(row, dict):
-                raise ValueError(f"line {number} is not a JSON object")
+                raise DamagedError(f"line {number} is not a JSON object")
             yield row
 
 

@@ -31,6 +31,8 @@ class ConvertOptions(WritingOptions):
     """File to write."""
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
+    ignore_properties: bool = False
+    """Go on with a splat whose further properties change what is seen, such as a moving one."""
     plain: bool = False
     """Write neither labels of generated Gaussians, which some programs misread (no property
     `generated` in a .ply, no file beside other formats), nor who made them."""
@@ -44,7 +46,7 @@ def run_convert(options: ConvertOptions) -> None:
     """Convert A to B, and print the number of Gaussians."""
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
-        from gscompleter.splats.formats import convert_splat, reserve_splat
+        from gscompleter.splats.formats import convert_splat, describe_oddities, reserve_splat
         from gscompleter.system.console import make_console
         from gscompleter.system.progress import show_preparation, show_progress
 
@@ -54,10 +56,14 @@ def run_convert(options: ConvertOptions) -> None:
         show_preparation("converting"),
     ):
         count, num_generated, note = convert_splat(
-            options.source, options.out, options.drop_nonfinite, not options.plain
+            options.source,
+            options.out,
+            options.drop_nonfinite,
+            not options.plain,
+            options.ignore_properties,
         )
     # Some formats cannot say that a scene is antialiased.
-    notes = [] if note is None else [note]
+    notes = [*describe_oddities(options.source), *([] if note is None else [note])]
     content = {
         "out": str(options.out),
         "gaussians": count,

@@ -154,6 +154,8 @@ class SceneOptions(ComputeOptions, WritingOptions):
     forget_edits: bool = False
     """Use photographs also where they show what earlier commands removed from the splat, or what
     was marked there as wrong, so that it may come back."""
+    ignore_properties: bool = False
+    """Go on with a splat whose further properties change what is seen, such as a moving one."""
 
     def make_scene_request(self) -> SceneRequest:
         """Make the request for the photographs."""

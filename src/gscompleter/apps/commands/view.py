@@ -42,6 +42,8 @@ class ViewOptions(WritingOptions):
     """Print the address without opening a browser."""
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
+    ignore_properties: bool = False
+    """Go on with a splat whose further properties change what is seen, such as a moving one."""
 
     def check_overlap(self) -> None:
         """Refuse to write the page over an input."""

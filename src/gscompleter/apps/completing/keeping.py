@@ -27,7 +27,12 @@ def keep_small(
     `context.ply`, the summary names it instead.
     """
     if suffix != COMPLETED_FILE.removeprefix("completed"):
-        convert_splat(folder / COMPLETED_FILE, folder / f"completed{suffix}")
+        # The input was read as it is, whatever further properties it has.
+        small = folder / f"completed{suffix}"
+        note = convert_splat(folder / COMPLETED_FILE, small, ignore_properties=True)[2]
+        if note is not None:
+            notes = [*summary["scene"]["notes"], note]
+            summary = {**summary, "scene": {**summary["scene"], "notes": notes}}
         (folder / COMPLETED_FILE).unlink()
         rename_edited(folder, folder / f"completed{suffix}")
     context = None

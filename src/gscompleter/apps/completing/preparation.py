@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, is_dataclass, replace
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -48,7 +47,7 @@ from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.alignment.similarity import transform_camera
 from gscompleter.splats.foreign import resolve_splat
-from gscompleter.splats.formats import load_splat
+from gscompleter.splats.formats import find_origin, load_splat
 from gscompleter.splats.morton import sort_nearby
 from gscompleter.stages.context import prepare_single
 from gscompleter.state import Completion
@@ -182,7 +181,7 @@ def read_inputs(options: CompleteOptions, opened: Opened) -> CompletionTask:
     if options.scene is None:
         compile_kernels(parts)
         return task
-    return add_splat(task, options.scene, options.drop_nonfinite, opened, parts)
+    return add_splat(task, options, opened, parts)
 
 
 def load_models(
@@ -245,6 +244,10 @@ def open_input(options: SceneOptions, console: Console, check: Callable[[], obje
     `check` is that of `open_scene`.
     """
     opened = open_scene(options.make_scene_request(), options.make_poses_request(), console, check)
+    # Photographs in the map of a splat are relative to its origin from here on.
+    origin = None if options.scene is None else find_origin(options.scene)
+    if origin is not None:
+        opened = replace(opened, photographs=opened.photographs.at_origin(np.array(origin)))
     if options.scene is not None and options.resolution is None:
         opened = choose_working_size(opened, options.scene, console)
     return opened
@@ -331,22 +334,24 @@ def check_completion_inputs(options: CompleteOptions) -> None:
     load_completer(options, ())
     check_target_files(options.target, parse_resolution(options.resolution))
     if options.scene is not None:
-        load_splat(options.scene, options.drop_nonfinite)
+        load_splat(options.scene, options.drop_nonfinite, options.ignore_properties)
 
 
 def add_splat(
-    task: CompletionTask, path: Path, drop_nonfinite: bool, opened: Opened, parts: Sequence[str]
+    task: CompletionTask, options: CompleteOptions, opened: Opened, parts: Sequence[str]
 ) -> CompletionTask:
     """Compile the kernels, and add the input splat to the task."""
+    path = options.scene
+    assert path is not None
     with show_preparation("reading the scene"):
         task = add_check_views(task, opened)
-        gaussians = load_splat(path, drop_nonfinite)
+        gaussians = load_splat(path, options.drop_nonfinite, options.ignore_properties)
         if "cpu" in parts:
             check_scene(task, gaussians)
     compile_kernels(parts)
 
     with show_preparation("aligning the scene"):
-        gaussians, splat_file = sort_splat(gaussians, locate_splat(path, drop_nonfinite))
+        gaussians, splat_file = sort_splat(gaussians, locate_splat(path, options.drop_nonfinite))
         return move_to_splat(task, gaussians, splat_file, opened)
 
 
@@ -374,7 +379,7 @@ def read_splat_alone(
     # What can be wrong is read before anything that takes time.
     load_completer(options, ())
     with show_preparation("reading the scene"):
-        gaussians = load_splat(options.scene, options.drop_nonfinite)
+        gaussians = load_splat(options.scene, options.drop_nonfinite, options.ignore_properties)
         splat_file = locate_splat(options.scene, options.drop_nonfinite)
         gaussians, splat_file = sort_splat(gaussians, splat_file)
     compile_kernels(list_parts(options))

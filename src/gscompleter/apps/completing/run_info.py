@@ -10,12 +10,16 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
+import numpy as np
+from jaxtyping import Float
+
 from gscompleter.apps.commands.shared_options import SceneOptions
 from gscompleter.apps.inputs.describing import describe_missing
 from gscompleter.apps.inputs.selection import select_closest
 from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.apps.report.schema import find_completed
 from gscompleter.config import CleaningConfig, CompleterConfig
+from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.evaluation.verdict.held_out import HeldOut
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.types import Camera, View
@@ -62,11 +66,22 @@ def describe_run(
         },
         "frame": {
             "method": task.method,
-            "transform": task.frame.tolist(),
+            "transform": compute_frame_of_file(task).tolist(),
             "origin": task.origin.tolist(),
         },
         "depth_range": {"near": camera.near, "far": camera.far, "from": dict(task.depths)},
     }
+
+
+def compute_frame_of_file(task: CompletionTask) -> Float[np.ndarray, "4 4"]:
+    """Compute the similarity from the frame of the photographs to that of the written files.
+
+    A splat with an origin is written in the coordinates of its file again.
+    """
+    origin = None if task.scene is None else task.scene.origin
+    if origin is None:
+        return task.frame
+    return compute_frame_from_photographs(-np.array(origin)) @ task.frame
 
 
 def read_held_out(

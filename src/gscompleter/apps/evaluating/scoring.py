@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from rich.console import Console
+
 from gscompleter.apps.batch.engine import make_engine
 from gscompleter.apps.batch.running import print_failures
 from gscompleter.apps.command_line.answers import print_json
@@ -113,7 +115,7 @@ def score_methods(options: EvaluateOptions) -> Scored:
 def print_context_notes(notes: Mapping[str, str], console: Console) -> None:
     """Print what Ψ said about the photographs of the first cases, and the number of the others."""
     for name, note in list(notes.items())[:MAX_NAMED]:
-        console.print(f"{name}: {note}", markup=False, soft_wrap=True)
+        console.print(f"{name}: {note}", soft_wrap=True)
     if len(notes) > MAX_NAMED:
         console.print(
             f"... and of {len(notes) - MAX_NAMED} more cases (`context_notes` of their rows)."

@@ -11,6 +11,7 @@ from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.data.photograph_names import name_photograph
 from gscompleter.data.photographs import Photographs
 from gscompleter.numerics.image_ops import compute_mask_fraction
+from gscompleter.splats.formats import describe_oddities
 from gscompleter.system.errors import join_names, quote_value
 from gscompleter.system.memory import format_whole_gigabytes, read_memory_bytes
 
@@ -78,6 +79,7 @@ def describe_opening(opened: Opened, task: CompletionTask) -> list[str]:
         f"{camera.far:.3g}; worked at {camera.width} x {camera.height} (--resolution changes it).",
         *describe_missing(photographs),
         *describe_masks(photographs, task),
+        *([] if task.splat_file is None else describe_oddities(task.splat_file.path)),
         *task.depth_notes,
     ]
 

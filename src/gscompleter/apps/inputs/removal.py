@@ -21,7 +21,7 @@ from gscompleter.data.photographs import Photographs, Resolution, resize_mask
 from gscompleter.editing.removal import sum_in_mask
 from gscompleter.numerics.geometry import quats_to_rotations
 from gscompleter.render.protocols import Renderer
-from gscompleter.splats.formats import load_splat
+from gscompleter.splats.formats import load_splat, load_splat_at
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.progress import track
 from gscompleter.types import Camera, Gaussians
@@ -78,9 +78,10 @@ def check_selection(selection: Selection) -> None:
         )
     if selection.masks and not os.path.isdir(selection.masks):
         raise InputError(f"There is no folder {quote_value(selection.masks)}.", "mask")
-    # Read only to refuse a damaged file before the scene is opened.
+    # Only the positions of its Gaussians count. Read now to refuse a damaged file before the scene
+    # is opened.
     if selection.file:
-        load_splat(selection.file, selection.drop_nonfinite)
+        load_splat(selection.file, selection.drop_nonfinite, ignore_properties=True)
 
 
 def choose_gaussians(
@@ -141,9 +142,9 @@ def find_selected(
     points = scene.means.double() + torch.from_numpy(origin).to(scene.means.device)
     chosen = find_in_region(points, selection)
     if selection.file:
-        selected = load_splat(selection.file, selection.drop_nonfinite)
+        selected = load_splat_at(selection.file, scene.origin, selection.drop_nonfinite)
         # Moved as the scene was, whose positions are then exactly equal.
-        if origin.any():
+        if scene.origin is None and origin.any():
             moved = selected.means.double() - torch.from_numpy(origin)
             selected = replace(selected, means=moved.float())
         chosen |= find_same_positions(scene, selected.to(scene.means.device))

@@ -37,6 +37,7 @@ from gscompleter.apps.inputs.named_photographs import find_context, read_targets
 from gscompleter.apps.inputs.reading import check_sizes
 from gscompleter.apps.inputs.scene_request import SceneRequest
 from gscompleter.apps.inputs.selection import choose_context
+from gscompleter.apps.inputs.splat import place_scene
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened, Target
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.cameras import Intrinsics
@@ -45,7 +46,6 @@ from gscompleter.data.limits import check_planes
 from gscompleter.data.local_origin import (
     choose_scene_origin,
     compute_frame_from_photographs,
-    shift_to_origin,
 )
 from gscompleter.data.photographs import (
     Photographs,
@@ -90,7 +90,8 @@ def open_renders(
 
     # Coordinates of maps are too large for float32, so that work is done near a local origin.
     known = read_known_cameras(path, request)
-    origin = choose_scene_origin(scene, known.origin)
+    own = scene.origin
+    origin = choose_scene_origin(scene, known.origin) if own is None else np.array(own)
     known = replace(known, origin=origin, near=reading.near, far=reading.far)
     targets = read_targets(known, request.targets, reading.resolution, has_splat=True)
     targets = [
@@ -99,7 +100,8 @@ def open_renders(
     ]
     all_cameras = [known.camera(number, reading.resolution) for number in range(len(known))]
     all_cameras += [target.camera for target in targets]
-    scene = shift_to_origin(origin, scene, all_cameras).to(device)
+    scene, _ = place_scene(scene, origin, all_cameras)
+    scene = scene.to(device)
 
     capture, kind, holes = choose_capture(request, path, known, targets, scene, renderer)
     if capture is None:

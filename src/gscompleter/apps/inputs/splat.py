@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
 
 from gscompleter.apps.inputs.selection import (
     CHECK_VIEW_SIZE,
@@ -25,7 +29,7 @@ from gscompleter.splats.alignment.trainer_frames import InputSplat
 from gscompleter.splats.formats import detect_splat_format
 from gscompleter.splats.ply import find_finite_rows
 from gscompleter.system.errors import InputError
-from gscompleter.types import Gaussians, merge
+from gscompleter.types import Camera, Gaussians, merge
 
 MAX_CHECK_VIEWS = 40
 """Most photographs that check a splat."""
@@ -39,6 +43,20 @@ def locate_splat(path: Path, drop_nonfinite: bool) -> InputSplatFile:
     return InputSplatFile(path)
 
 
+def place_scene(
+    scene: Gaussians, origin: Float[np.ndarray, "3"], cameras: Sequence[Camera]
+) -> tuple[Gaussians, Float[np.ndarray, "3"]]:
+    """Express a scene near an origin, and return it with that origin.
+
+    It is the scene's own if its file states positions beyond float32. Otherwise it is `origin`,
+    that of the photographs, if the scene lies there.
+    """
+    if scene.origin is not None:
+        return scene, np.array(scene.origin)
+    chosen = choose_scene_origin(scene, origin)
+    return shift_to_origin(chosen, scene, cameras), chosen
+
+
 def move_to_splat(
     task: CompletionTask,
     scene: Gaussians,
@@ -49,8 +67,8 @@ def move_to_splat(
     photographs = opened.photographs
 
     # Coordinates of maps are too large for float32, so that work is done near the scene's origin.
-    origin = choose_scene_origin(scene, photographs.origin)
-    scene = shift_to_origin(origin, scene, task.cameras).to(task.device)
+    scene, origin = place_scene(scene, photographs.origin, task.cameras)
+    scene = scene.to(task.device)
 
     # Photographs still show what was taken out, so they are compared with the splat as it was.
     splat_file = replace(splat_file, origin=origin)

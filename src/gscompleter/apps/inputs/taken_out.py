@@ -6,8 +6,6 @@ from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
-import torch
-
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Target
 from gscompleter.editing.taken_out import TakenOut
 from gscompleter.render.protocols import Renderer
@@ -30,8 +28,8 @@ def load_taken_out(splat_file: InputSplatFile) -> Gaussians | None:
     parts = [load_splat(edits.find(name)) for name in names]
     gaussians = merge([replace(part, sh=part.sh[:, :1]) for part in parts])
     # Files have their own coordinates, and the splat of a task is relative to its origin.
-    means = gaussians.means.double() - torch.from_numpy(splat_file.origin)
-    return replace(gaussians, means=means.float())
+    x, y, z = splat_file.origin.tolist()
+    return replace(gaussians.move_origin((x, y, z)), origin=None)
 
 
 def find_taken_out(task: CompletionTask, renderer: Renderer) -> TakenOut | None:

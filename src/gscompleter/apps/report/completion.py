@@ -366,7 +366,8 @@ def write_scenes(
     `run` is what the completed scene and the additions say about who made them.
     """
     made_by = NOTHING_KNOWN if run is None else Provenance((run,))
-    added = completion.added
+    # What is added lies in the frame of the context, and is written in that of its file.
+    added = replace(completion.added, origin=completion.context.origin)
     changed = completion.recolored_mask | completion.source.gone_mask
     generated = merge([completion.recolored, added])
     if input_splat is None:
@@ -403,7 +404,7 @@ def write_scenes(
         has_record=run is not None,
         # Without the file of the given scene, recoloured rows stand where their originals were.
         can_be_undone=input_splat is not None or not completion.recolored_mask.any().item(),
-        taken_out=completion.source.removed,
+        taken_out=replace(completion.source.removed, origin=completion.context.origin),
     )
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from gscompleter.apps.report.schema import (
     AlignmentRow,
     CompletionSummary,
@@ -117,7 +119,9 @@ def list_notes(summary: CompletionSummary) -> Iterator[Note]:
     if frame.method in FRAME_NOTES:
         text = f"The splat is {FRAME_NOTES[frame.method]}; summary.json lists the transform."
         yield Note("frame", text)
-    if any(frame.origin):
+    # A splat with positions of double is written where it was.
+    place = np.array(frame.transform) @ [*frame.origin, 1.0]
+    if any(frame.origin) and np.abs(place[:3]).max() < 0.5 * np.abs(frame.origin).max():
         yield Note("coordinates", ORIGIN_NOTE)
     if scene.renders_from is not None:
         yield Note("check", BARE_NOTE)

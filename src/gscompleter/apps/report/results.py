@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from gscompleter.apps.inputs.splat import locate_splat
@@ -27,6 +28,7 @@ from gscompleter.apps.report.film import VIDEO_FILE
 from gscompleter.apps.report.page import REPORT_FILE, write_completion_page
 from gscompleter.apps.report.run_record import describe_python_run
 from gscompleter.apps.report.schema import RECORD_FILE
+from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.scene import write_cameras
 from gscompleter.editing.removal import restore_surroundings
 from gscompleter.evaluation.metrics.coverage import (
@@ -187,6 +189,7 @@ def describe_values(judged: Judged, splat_file: InputSplatFile | None) -> Mappin
     """Describe the input and the settings for `summary.json`, as `describe_run` does."""
     completion = judged.completion
     camera = completion.views[0].camera
+    origin = np.array(completion.context.origin or (0.0, 0.0, 0.0))
     splat = None if splat_file is None else str(splat_file.path)
     return {
         "settings": {
@@ -207,10 +210,10 @@ def describe_values(judged: Judged, splat_file: InputSplatFile | None) -> Mappin
             "renders_from": None,
             "notes": [],
         },
-        # Values are in one frame, that of the result.
+        # Values are in one frame, that of the result, whose files add its origin.
         "frame": {
             "method": "given",
-            "transform": torch.eye(4).tolist(),
+            "transform": compute_frame_from_photographs(-origin).tolist(),
             "origin": [0.0, 0.0, 0.0],
         },
         "depth_range": {"near": camera.near, "far": camera.far, "from": {}},
@@ -223,7 +226,8 @@ def find_splat_file(path: Path, completion: Completion) -> InputSplatFile:
     if not os.path.isfile(path):
         raise InputError(f"There is no splat {quote_value(path)}; name the file of the scene.")
     context = completion.context
-    loaded = load_splat(path)
+    # It was completed as it is, and perhaps relative to another origin.
+    loaded = load_splat(path, ignore_properties=True).move_origin(context.origin)
     if len(loaded) != len(context) or not torch.equal(loaded.means, context.means.cpu()):
         raise InputError(
             f"{quote_value(path)} holds another scene than the one that was completed; name its "

@@ -9,7 +9,12 @@ import numpy as np
 from jaxtyping import Float
 from PIL import Image
 
-from gscompleter.apps.report.schema import CompletionSummary, find_completed, read_summary
+from gscompleter.apps.report.schema import (
+    CompletionSummary,
+    ResultFrame,
+    find_completed,
+    read_summary,
+)
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.frame import Frame
@@ -87,27 +92,43 @@ def move_scene_camera(
     return transform_camera(camera, transform @ compute_frame_from_photographs(-origin))
 
 
-def load_viewer_files(after: Path, before: Path | None, drop_nonfinite: bool) -> ViewerContent:
+def load_viewer_files(
+    after: Path, before: Path | None, drop_nonfinite: bool, ignore_properties: bool = False
+) -> ViewerContent:
     """Load a splat to compare with `before`, or with its observed part if that is None."""
-    scene = load_splat(after, drop_nonfinite)
+    scene = load_splat(after, drop_nonfinite, ignore_properties)
     if before is not None:
-        return ViewerContent(after.name, scene, load_splat(before, drop_nonfinite))
+        other = load_splat(before, drop_nonfinite, ignore_properties).move_origin(scene.origin)
+        return place_content(ViewerContent(after.name, scene, other))
     is_observed = scene.generated == 0
     # Without anything generated or anything observed there is only one state to show.
     has_two_states = bool(is_observed.any()) and not bool(is_observed.all())
-    return ViewerContent(after.name, scene, scene[is_observed] if has_two_states else None)
+    before_that = scene[is_observed] if has_two_states else None
+    return place_content(ViewerContent(after.name, scene, before_that))
+
+
+def place_content(content: ViewerContent, frame: ResultFrame | None = None) -> ViewerContent:
+    """Add the way of further cameras into the frame of the scene.
+
+    They are in that of the file, or in that of the photographs of a completion with its `frame`.
+    """
+    origin = np.array(content.after.origin or (0.0, 0.0, 0.0))
+    to_scene = compute_frame_from_photographs(origin)
+    if frame is None:
+        return replace(content, transform=to_scene, origin=origin)
+    transform = to_scene @ np.array(frame.transform)
+    return replace(content, transform=transform, origin=np.array(frame.origin))
 
 
 def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:
     """Load an output folder of `complete`, with target and context cameras."""
     summary = read_summary(folder)
-    content = ViewerContent(
-        folder.resolve().name,
-        after=load_splat(find_completed(folder), drop_nonfinite),
-        before=load_splat(Path(summary.scene.context or folder / CONTEXT_FILE), drop_nonfinite),
-        transform=np.array(summary.frame.transform),
-        origin=np.array(summary.frame.origin),
-    )
+    # What is shown was completed as it is, whatever further properties it has.
+    after = load_splat(find_completed(folder), drop_nonfinite, ignore_properties=True)
+    context = Path(summary.scene.context or folder / CONTEXT_FILE)
+    before = load_splat(context, drop_nonfinite, ignore_properties=True)
+    before = before.move_origin(after.origin)
+    content = place_content(ViewerContent(folder.resolve().name, after, before), summary.frame)
     cameras, notes = load_known_cameras(folder, summary, content)
     return replace(content, cameras=cameras, notes=notes)
 

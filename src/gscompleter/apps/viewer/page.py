@@ -146,7 +146,7 @@ def make_page_parts(
     cameras = viewer_content.cameras or (make_overview(viewer_content.after, up or USUAL),)
     content = {
         "title": viewer_content.title,
-        "frame": {"centre": frame.centre.tolist(), "unit": frame.unit},
+        "frame": {"centre": place_page(frame, after, is_live), "unit": frame.unit},
         "counts": {name: len(part) for name, part in shown.items()},
         "layers": layer_sources,
         "antialiased": {name: scene.is_antialiased for name, scene in scenes.items()},
@@ -161,6 +161,16 @@ def make_page_parts(
     head, tail = fill_template(content, SOURCES_MARK).split(SOURCES_MARK)
     page = chain([encode_text(head)], make_scripts(sources), [encode_text(tail)])
     return page, (*viewer_content.notes, *notes)
+
+
+def place_page(frame: PageFrame, scene: Gaussians, is_live: bool) -> list[float]:
+    """Place the origin of the page in the coordinates that it shows and saves.
+
+    They are those of the file, and in a session those of its scene, which the server moves.
+    """
+    origin = torch.tensor(scene.origin or (0, 0, 0), dtype=torch.float64)
+    centre = frame.centre.double().cpu()
+    return (centre if is_live else centre + origin).tolist()
 
 
 def encode_layer(name: str, scene: Gaussians, rows: Int64[Tensor, "m"], frame: PageFrame) -> bytes:

@@ -86,13 +86,14 @@ def load_content(options: ViewOptions) -> ViewerContent:
     if not (scene / SUMMARY_FILE).is_file():
         scene = resolve_splat(scene)
 
+    reading = options.drop_nonfinite, options.ignore_properties
     if options.other is not None:
         # B is the scene after, A the one before.
-        content = load_viewer_files(options.other, scene, options.drop_nonfinite)
+        content = load_viewer_files(options.other, scene, *reading)
     elif os.path.isdir(scene) and not os.path.isfile(scene / META):
         content = load_viewer_completion(scene, options.drop_nonfinite)
     else:
-        content = load_viewer_files(scene, None, options.drop_nonfinite)
+        content = load_viewer_files(scene, None, *reading)
 
     if options.cameras is not None:
         content = add_file_cameras(content, options.cameras, options.resolution)

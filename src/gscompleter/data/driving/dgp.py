@@ -54,13 +54,15 @@ def _parse_frame(
     datum: Any, cameras: Mapping[str, Intrinsics], sweeps: Mapping[str, Any], file: Path
 ) -> Frame:
     image = datum["datum"]["image"]
-    camera = str(get_part(datum, "id", dict).get("name"))
+    sensor = get_part(datum, "id", dict).get("name")
+    camera = "" if sensor is None else str(sensor)
     name = get_text(image, "filename", str(file)) or ""
     title = f"image {quote_value(name)} of {quote_value(file)}"
+    require(name, f"The {title} has no `filename`; {ADVICE}.")
+    require(camera, f"The {title} does not say which camera took it (`id.name`); {ADVICE}.")
     require(
-        name and camera in cameras,
-        f"The {title} has no file name, or its camera {quote_value(camera)} is not in the "
-        f"calibration; {ADVICE}.",
+        camera in cameras,
+        f"The camera {quote_value(camera)} of {title} is not in the calibration; {ADVICE}.",
     )
     intrinsics = replace(cameras[camera], size=get_size(image, title))
 
@@ -110,9 +112,14 @@ def _read_calibrations(scene: Path, content: Any) -> dict[str, Intrinsics]:
     samples = get_part(content, "samples", list)
     key = get_text(samples[0] if samples else None, "calibration_key", str(scene))
     # One folder of calibrations for all samples, or a single file for the scene.
-    keyed = scene.parent / "calibration" / f"{key}.json"
-    candidates = (keyed, scene.with_name("calibration.json"))
-    file = next((path for path in candidates if os.path.isfile(path)), None)
+    single = scene.with_name("calibration.json")
+    keyed = single if key is None else scene.parent / "calibration" / f"{key}.json"
+    file = next((path for path in (keyed, single) if os.path.isfile(path)), None)
+    if file is None and key is None:
+        raise InputError(
+            f"{quote_value(scene)} does not name its calibration (`calibration_key` of its first "
+            f"sample); {ADVICE}."
+        )
     if file is None:
         raise InputError(
             f"The calibration of {quote_value(scene)} is missing; put it at {quote_value(keyed)}."

@@ -26,6 +26,7 @@ from gscompleter.data.frame import Frame
 from gscompleter.data.json_fields import get_array, get_number, get_part, get_size, get_text
 from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_drive
+from gscompleter.system.damage import DamagedError, describe_damage
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import check_plain, read_bytes
 
@@ -160,7 +161,7 @@ class _PlainUnpickler(pickle._Unpickler):  # that in C allocates whatever a few 
         # `numpy._core` is the name of the module since NumPy 2.
         constructor = CONSTRUCTORS.get((module.replace("numpy._core", "numpy.core"), name))
         if constructor is None:
-            raise pickle.UnpicklingError(f"it names {module}.{name}")
+            raise DamagedError(f"it names {module}.{name}")
         return constructor
 
 
@@ -171,8 +172,8 @@ def load_plain(path: Path) -> Any:
         value = _PlainUnpickler(io.BytesIO(data)).load()
     except Exception as error:  # damaged pickles raise anything
         raise InputError(
-            f"{quote_value(path)} is no pickle of plain values ({type(error).__name__}: "
-            f"{quote_value(str(error))}); write it again with lists and numbers only."
+            f"{quote_value(path)} is no pickle of plain values ("
+            f"{quote_value(describe_damage(error))}); write it again with lists and numbers only."
         ) from error
     # An object may refer to itself many times, and a small pickle then stands for a huge value.
     check_plain(value, path, MAX_REPEATS * len(data))

@@ -26,6 +26,7 @@ from gscompleter.data.limits import require
 from gscompleter.data.phones.export import ADVICE, Files, PoseAndLens, build_recording, find_files
 from gscompleter.data.phones.lzfse import measure_unpacked
 from gscompleter.data.photographs import Photographs
+from gscompleter.system.damage import DamagedError, describe_damage
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import parse_json
 from gscompleter.types import MAX_COORDINATE
@@ -139,11 +140,11 @@ def _unpack(kind: str, size: tuple[int, int], data: bytes, title: str) -> Shaped
         # Four bytes a pixel or one; checked before anything is unpacked.
         limit = 8 * math.prod(size)
         if len(data) > limit or measure_unpacked(data) > limit:
-            raise ValueError("it is larger than the photograph")
+            raise DamagedError("it is larger than the photograph")
         # The map has no header: its height follows from the number of values and the aspect ratio.
         values = np.frombuffer(decompress(data), kind)
         return values.reshape(round(math.sqrt(len(values) * size[1] / size[0])), -1)
     except Exception as error:  # damaged bytes raise anything
         raise InputError(
-            f"The depth of {title} cannot be read ({quote_value(str(error))}); {ADVICE}."
+            f"The depth of {title} cannot be read ({describe_damage(error)}); {ADVICE}."
         ) from error

@@ -22,6 +22,7 @@ from gscompleter.data.frame import Frame
 from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
+from gscompleter.system.damage import describe_damage
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import open_image
 from gscompleter.system.files.reading import check_file, read_bytes, read_zip_entry
@@ -73,7 +74,7 @@ def _open_archive(path: Path) -> Iterator[ZipFile]:
         yield _keep_open(path, path.stat().st_mtime_ns)
     except Exception as error:  # damaged archives raise anything
         raise InputError(
-            f"{quote_value(path)} cannot be read ({quote_value(str(error), 120)}); {ADVICE}."
+            f"{quote_value(path)} cannot be read ({describe_damage(error)}); {ADVICE}."
         ) from error
 
 

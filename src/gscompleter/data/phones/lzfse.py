@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import struct
 
+from gscompleter.system.damage import DamagedError
+
 END = b"bvx$"
 RAW = b"bvx-"
 """Block of bytes as they are: magic, number of bytes."""
@@ -21,7 +23,7 @@ PAYLOAD_MASK = 0xFFFFF
 
 
 def measure_unpacked(data: bytes) -> int:
-    """Add up the unpacked sizes of all blocks, in bytes; raise ValueError for other data."""
+    """Add up the unpacked sizes of all blocks, in bytes; raise DamagedError for other data."""
     size = start = 0
     while data[start : start + 4] != END:
         magic = data[start : start + 4]
@@ -41,6 +43,6 @@ def measure_unpacked(data: bytes) -> int:
             header_bytes = third & 0xFFFFFFFF
             start += max(header_bytes, LZFSE_HEADER.size) + literals + matches
         else:
-            raise ValueError("it is no LZFSE stream, or ends too early")
+            raise DamagedError("it is no LZFSE stream, or ends too early")
         size += unpacked
     return size

@@ -112,7 +112,9 @@ class Parameters:
         """Assemble the scene, differentiable in the parameters."""
         means, quats, log_scales, logits, sh = self.leaves
         leaves = means, quats, log_scales.exp(), logits.sigmoid(), sh, self.scene.generated
-        return Gaussians(*leaves, is_antialiased=self.scene.is_antialiased)
+        return Gaussians(
+            *leaves, is_antialiased=self.scene.is_antialiased, origin=self.scene.origin
+        )
 
 
 def compute_extent(cameras: Sequence[Camera]) -> float:

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from gscompleter.models.weights.fetching import fetch
 from gscompleter.models.weights.published import PUBLISHED, PublishedWeights
+from gscompleter.system.damage import describe_damage
 from gscompleter.system.errors import InputError, join_names, quote_value, refuse_pointer
 from gscompleter.system.files.reading import hash_file, open_file
 
@@ -99,7 +100,7 @@ def check_archive(path: Path, name: str) -> None:
         with zipfile.ZipFile(path) as archive:
             damaged = archive.testzip()
     except Exception as error:  # damaged archives raise many types
-        damaged = str(error)
+        damaged = describe_damage(error)
     if damaged is not None:
         raise _create_file_error(path, f"is damaged ({quote_value(damaged)})", name)
 
@@ -133,7 +134,7 @@ def read_safetensors(path: Path, name: str) -> dict[str, Tensor]:
         return safetensors.torch.load_file(path)
     except Exception as error:  # damaged files raise many types
         raise InputError(
-            f"{path} is no safetensors file ({quote_value(str(error))}); give {name}."
+            f"{path} is no safetensors file ({quote_value(describe_damage(error))}); give {name}."
         ) from error
 
 

@@ -14,8 +14,9 @@ from jaxtyping import Bool, Float, Shaped, UInt8
 from PIL import Image, features
 from torch import Tensor
 
+from gscompleter.system.damage import DamagedError, describe_damage
 from gscompleter.system.errors import InputError, join_names, quote_value, refuse_pointer
-from gscompleter.system.files.reading import check_file, read_head
+from gscompleter.system.files.reading import check_file, make_read_error, read_head
 from gscompleter.system.files.writing import replace_file
 
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000")
@@ -271,11 +272,11 @@ def _read_array(path: Path) -> np.ndarray:
         # A memory map cannot exceed the file, whatever size its header claims.
         values = np.lib.format.open_memmap(path, mode="r")
         if not 0 < values.size <= MAX_PIXELS:
-            raise ValueError(f"it claims {values.size:,} values")
+            raise DamagedError(f"it claims {values.size:,} values")
     except Exception as error:  # damaged files raise any kind
         raise InputError(
-            f"The depth map {quote_value(path)} cannot be read ({quote_value(str(error))}); copy "
-            "it again."
+            f"The depth map {quote_value(path)} cannot be read ({describe_damage(error)}); copy it "
+            "again."
         ) from error
     return values
 
@@ -294,10 +295,12 @@ def open_image(stored: Path | str | bytes, name: str = "") -> Iterator[Image.Ima
     try:
         with Image.open(file, formats=formats) as image:
             yield image
+    except PermissionError as error:
+        raise make_read_error(Path(str(file)), error) from error
     except Exception as error:  # damaged files raise any kind
         raise InputError(
-            f"{shown} is not an image that can be read ({quote_value(str(error), 120)}); copy it "
-            "again."
+            f"{shown} is not an image that can be read ({quote_value(describe_damage(error), 120)})"
+            "; copy it again."
         ) from error
 
 

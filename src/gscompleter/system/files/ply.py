@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy.lib.recfunctions import unstructured_to_structured
 
+from gscompleter.system.damage import DamagedError, describe_damage
 from gscompleter.system.errors import InputError, quote_value, refuse_pointer
 from gscompleter.system.files.reading import open_file
 from gscompleter.system.files.writing import replace_file
@@ -33,7 +34,7 @@ _SCALARS = {
     **dict.fromkeys(("float", "float32"), "f4"),
     **dict.fromkeys(("double", "float64"), "f8"),
 }
-_NAMES = {"<f4": "float", "<u4": "uint", "|u1": "uchar"}
+_NAMES = {"<f4": "float", "<f8": "double", "<u4": "uint", "|u1": "uchar"}
 _BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _COUNT_LINE = re.compile(rb"^(element\s+vertex\s+)\d+", re.M)
 
@@ -73,9 +74,9 @@ def read_header(file: BinaryIO, path: Path) -> tuple[bytes, list[Element]]:
             raise InputError(f"{path} is truncated: its header has no end; fetch the file again.")
     try:
         return b"".join(lines), _parse_elements(lines[1:-1])
-    except (LookupError, ValueError) as error:
+    except DamagedError as error:
         raise InputError(
-            f"{path} has a broken header ({quote_value(str(error))}); export it again."
+            f"{path} has a broken header ({quote_value(describe_damage(error))}); export it again."
         ) from error
 
 
@@ -83,19 +84,27 @@ def _parse_elements(lines: Iterable[bytes]) -> list[Element]:
     tables: list[tuple[str, int, list[tuple[str, str]]]] = []
     byte_order = ""
     for line in lines:
-        match line.decode("latin-1").split():
-            case [] | ["comment" | "obj_info", *_]:
-                pass
-            case ["format", name, *_]:
-                byte_order = _BYTE_ORDERS[name]
-            case ["element", name, count] if count.isdecimal():
-                tables.append((name, int(count), []))
-            case ["property", "list", _, _, name]:
-                tables[-1][2].append((name, "O"))
-            case ["property", kind, name]:
-                tables[-1][2].append((name, byte_order + _SCALARS[kind]))
-            case words:
-                raise ValueError(" ".join(words))
+        words = line.decode("latin-1").split()
+        try:
+            match words:
+                case [] | ["comment" | "obj_info", *_]:
+                    pass
+                case ["format", name, *_]:
+                    byte_order = _BYTE_ORDERS[name]
+                case ["element", name, count] if count.isdecimal():
+                    tables.append((name, int(count), []))
+                case ["property", "list", _, _, name]:
+                    tables[-1][2].append((name, "O"))
+                case ["property", kind, name]:
+                    tables[-1][2].append((name, byte_order + _SCALARS[kind]))
+                case _:
+                    raise DamagedError
+        except (LookupError, ValueError) as error:
+            # An unknown format or type, a property of no element, or other words.
+            raise DamagedError(" ".join(words)) from error
+    for name, _, columns in tables:
+        if len({column for column, _ in columns}) < len(columns):
+            raise DamagedError(f"'{name}' has a property more than once")
     return [Element(name, count, np.dtype(columns)) for name, count, columns in tables]
 
 
@@ -104,11 +113,12 @@ def read_ply_file(
     needed: Sequence[str],
     kind: str,
     describe_content: Callable[[Sequence[Element], Sequence[str]], str | None] | None = None,
+    unit: str = "points",
 ) -> PlyFile:
-    """Read a file whose vertices have the properties `needed`; errors name the `kind` of file.
+    """Read a file whose vertices have the properties `needed`.
 
-    `describe_content` says what a file holds instead, from its elements and the missing properties;
-    None if it does not know.
+    Errors name the `kind` of file, and the `unit` that a row is. `describe_content` says what a
+    file holds instead, from its elements and the missing properties; None if it does not know.
     """
     with open_file(path) as file:
         header, elements = read_header(file, path)
@@ -131,8 +141,8 @@ def read_ply_file(
             rows = _map_rows(file, vertex.dtype, len(header), vertex.count)
         if len(rows) < vertex.count:
             raise InputError(
-                f"{path} is truncated: {len(rows):,} of {quote_value(f'{vertex.count:,}')} rows "
-                "are there; fetch or write the file again."
+                f"{path} is truncated: it ends after {len(rows):,} of "
+                f"{quote_value(f'{vertex.count:,}')} {unit}; fetch or write the file again."
             )
         trailer = _map_rows(file, np.dtype(np.uint8), len(header) + rows.nbytes)
         return PlyFile(header, rows, trailer, is_ascii)
@@ -175,9 +185,13 @@ def _read_ascii_rows(file: BinaryIO, vertex: Element, path: Path) -> np.ndarray:
         raise InputError(
             f"{path} holds rows that are not {width} numbers each; write it anew."
         ) from error
+    # Digits that a float cannot hold are kept, such as those of map coordinates.
+    columns: Mapping[str, Any] = vertex.dtype.fields or {}
+    kinds = {name: columns[name][0] for name in vertex.dtype.names or ()}
+    wide = [(name, "f8" if kind == np.dtype("f4") else kind) for name, kind in kinds.items()]
     # Values out of range become infinite or wrong; relevant ones are checked later.
     with np.errstate(over="ignore", invalid="ignore"):
-        return unstructured_to_structured(table, vertex.dtype)
+        return unstructured_to_structured(table, np.dtype(wide))
 
 
 def make_header(elements: Mapping[str, tuple[int, np.dtype]], comment: str | None = None) -> bytes:

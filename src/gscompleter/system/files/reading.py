@@ -13,6 +13,7 @@ from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from gscompleter.system.damage import DamagedError, describe_damage
 from gscompleter.system.errors import InputError, quote_value
 
 MAX_BYTES = 1 << 33
@@ -36,7 +37,7 @@ def check_file(path: Path) -> None:
     try:
         mode = os.stat(path).st_mode
     except (OSError, ValueError) as error:  # ValueError: a name that no file can have
-        raise _make_read_error(path, error) from error
+        raise make_read_error(path, error) from error
     if not stat.S_ISREG(mode):
         raise InputError(f"{quote_value(path)} is no regular file; correct the path.")
 
@@ -49,7 +50,7 @@ def open_file(path: Path) -> Iterator[BinaryIO]:
         with path.open("rb") as file:
             yield file
     except OSError as error:
-        raise _make_read_error(path, error) from error
+        raise make_read_error(path, error) from error
 
 
 def read_head(path: Path, count: int) -> bytes:
@@ -76,17 +77,17 @@ def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
 
 
 def read_zip_entry(archive: zipfile.ZipFile, name: str, max_bytes: int) -> bytes:
-    """Read a file in an archive; raise ValueError if it has more than `max_bytes` bytes.
+    """Read a file in an archive; raise DamagedError if it has more than `max_bytes` bytes.
 
     However little an archive takes, it may hold any number of bytes, and state any other.
     """
     entry = archive.getinfo(name)
     if entry.file_size > max_bytes:
         claim = f"{entry.compress_size:,} bytes claim to hold {entry.file_size:,}"
-        raise ValueError(f"its {quote_value(name)} is too large: {claim}")
+        raise DamagedError(f"its {quote_value(name)} is too large: {claim}")
     # Python unpacks other methods at once, whatever the size that is stated.
     if entry.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-        raise ValueError(f"its {quote_value(name)} is packed by another method than deflate")
+        raise DamagedError(f"its {quote_value(name)} is packed by another method than deflate")
     with archive.open(entry) as file:
         return file.read(entry.file_size)
 
@@ -126,7 +127,7 @@ def parse_json(data: bytes, name: Path | str, advice: str) -> Any:
         value = json.loads(data.decode("utf-8-sig"), parse_int=_parse_integer)
     except (ValueError, RecursionError) as error:
         raise InputError(
-            f"{quote_value(name)} is not JSON ({quote_value(str(error))}); {advice}."
+            f"{quote_value(name)} is not JSON ({quote_value(describe_damage(error))}); {advice}."
         ) from error
     check_plain(value, name, len(data))
     return value
@@ -134,7 +135,7 @@ def parse_json(data: bytes, name: Path | str, advice: str) -> Any:
 
 def _parse_integer(digits: str) -> int:
     if len(digits.lstrip("-")) > MAX_DIGITS:
-        raise ValueError(f"an integer of {len(digits.lstrip('-'))} digits")
+        raise DamagedError(f"an integer of {len(digits.lstrip('-'))} digits")
     return int(digits)
 
 
@@ -172,6 +173,7 @@ def _check_size(path: Path, file: BinaryIO, max_bytes: int) -> None:
         )
 
 
-def _make_read_error(path: Path, error: Exception) -> InputError:
+def make_read_error(path: Path, error: Exception) -> InputError:
+    """Make the error of a file that the system does not let read."""
     reason = getattr(error, "strerror", None) or "no file can have that name"
     return InputError(f"{quote_value(path)} cannot be read: {reason}; correct the path.")

@@ -1,0 +1,59 @@
+"""Local origins of splats whose coordinates are too large for float32, such as those of maps.
+
+At 5,000,000 m float32 has steps of half a metre, which swallow Gaussians of two centimetres. Files
+that hold positions more exactly are read relative to a place near their middle
+(`Gaussians.origin`), and writers add it again: the frame of a scene is the local one, that of its
+file lies at the origin.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from jaxtyping import Float
+from numpy import ndarray
+
+from gscompleter.types import Gaussians, Origin
+
+MAX_STEP = 0.01
+"""Largest step of positions, relative to the size of the median Gaussian."""
+
+
+def find_step(coordinate: float) -> float:
+    """Find the distance of neighbouring numbers of float32 at a coordinate."""
+    return float(np.spacing(np.float32(abs(coordinate))))
+
+
+def is_too_far(middle: Float[ndarray, "3"], size: float) -> bool:
+    """Return True if float32 would round positions near `middle` visibly.
+
+    `size` is that of the median Gaussian, in scene units.
+    """
+    farthest = float(np.abs(middle).max())
+    return math.isfinite(farthest) and find_step(farthest) > MAX_STEP * size
+
+
+def choose_origin(middle: Float[ndarray, "3"], size: float) -> Origin | None:
+    """Choose the origin for positions near `middle`, in whole units; None for zero."""
+    if not is_too_far(middle, size):
+        return None
+    x, y, z = middle.round().tolist()
+    return (x, y, z)
+
+
+def measure_size(gaussians: Gaussians) -> float:
+    """Measure the size of the median Gaussian: its largest standard deviation, in scene units."""
+    if len(gaussians) == 0:
+        return 0.0
+    return float(gaussians.scales.amax(dim=1).median())
+
+
+def measure_distance(gaussians: Gaussians, others: Gaussians) -> float:
+    """Measure the largest distance of Gaussians from others in their order, in scene units."""
+    places = [
+        scene.means.double().cpu() + torch.tensor(scene.origin or (0, 0, 0), dtype=torch.float64)
+        for scene in (gaussians, others)
+    ]
+    return float((places[0] - places[1]).norm(dim=1).max())
