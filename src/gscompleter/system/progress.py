@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import io
 import sys
+import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Sized
+from collections.abc import Callable, Iterable, Iterator, Sequence, Sized
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from contextvars import ContextVar
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -16,8 +17,8 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-LOG_SECONDS = 10.0
-"""Seconds between log lines of counted steps."""
+LOG_SECONDS = 5.0
+"""Seconds after which a log says again what runs, with the step that it has come to."""
 NOTEBOOK_SECONDS = 0.25
 """Fewest seconds between two pictures of the bars in a notebook."""
 NOTEBOOK_WIDTH = 90
@@ -27,8 +28,12 @@ NOTEBOOK_WIDTH = 90
 class Display:
     """The running activities on a console: tasks of rich, the outermost first.
 
-    On a terminal rich shows them. In a log it only keeps them, for the lines that are printed.
+    On a terminal rich shows them. In a log it only keeps them, for the lines that are printed: one
+    at each begin, and one whenever `LOG_SECONDS` have passed without any, also within a step.
     """
+
+    repeats = True
+    """Whether a log says again what runs; the bars of a notebook are drawn instead."""
 
     def __init__(self, console: Console) -> None:
         self.has_bars = console.is_terminal and not console.is_dumb_terminal
@@ -36,6 +41,8 @@ class Display:
         self._running = make_bars(console)
         self._line = ""
         self._line_time = 0.0
+        self._is_over = threading.Event()
+        self._repeater: threading.Thread | None = None
 
     @contextmanager
     def show(self, name: str, total: int | None = None) -> Iterator[TaskID]:
@@ -46,8 +53,13 @@ class Display:
             self._running.start()
         running = self._running
         task = running.add_task(name, total=total)
+        if self.repeats and not self.has_bars and self._repeater is None:
+            # A thread, because a step may take longer than any number of seconds.
+            self._repeater = threading.Thread(target=self._repeat, daemon=True)
+            self._repeater.start()
         try:
-            self._log()
+            if self._shows_last():
+                self._log()
             yield task
         finally:
             # With whatever an exception left running inside.
@@ -62,29 +74,55 @@ class Display:
         """Count a step; a log shows it only `LOG_SECONDS` after its last line."""
         self._running.advance(task)
         if time.monotonic() >= self._line_time + LOG_SECONDS:
-            self._log()
+            self._log(has_steps=True)
 
     def stop(self) -> None:
-        """Remove the live lines."""
+        """Remove the live lines, and say nothing more."""
+        self._is_over.set()
+        if self._repeater is not None:
+            self._repeater.join()
         if self.has_bars:
             self._running.stop()
 
-    def _log(self) -> None:
+    def _repeat(self) -> None:
+        """Say again what runs, with its time, whenever a log was silent for `LOG_SECONDS`."""
+        while not self._is_over.wait(LOG_SECONDS / 5):
+            running = self._running.tasks
+            if running and time.monotonic() >= self._line_time + LOG_SECONDS:
+                self._log(has_steps=True, seconds=running[-1].elapsed)
+
+    def _shows_last(self) -> bool:
+        """Check whether the innermost activity is shown when it begins."""
+        return is_shown(self._running.tasks)[-1]
+
+    def _log(self, has_steps: bool = False, seconds: float | None = None) -> None:
         """Print the running activities as a line of a log, unless it would be the last one again.
 
-        Steps inside a stage are hidden.
+        Steps inside a stage are hidden unless `has_steps`. `seconds` is how long the innermost
+        activity has run.
         """
         running = self._running.tasks
         shown = [
             format_label(task)
-            for outer, task in zip([None, *running], running, strict=False)
-            if task.total is None or outer is None or outer.total is not None
+            for task, is_begin in zip(running, is_shown(running), strict=True)
+            if has_steps or is_begin
         ]
         line = ": ".join(shown)
+        if seconds is not None:
+            line += f" ({seconds:.0f} s)"
         if not self.has_bars and line != self._line:
             self._line = line
             self._line_time = time.monotonic()
             self._console.print(line, highlight=False, markup=False, soft_wrap=True)
+
+
+def is_shown(running: Sequence[Task]) -> list[bool]:
+    """Tell for each activity, the outermost first, if a log says when it begins.
+
+    Steps inside a stage are not said.
+    """
+    pairs = zip([None, *running], running, strict=False)
+    return [t.total is None or outer is None or outer.total is not None for outer, t in pairs]
 
 
 class NotebookDisplay(Display):
@@ -92,6 +130,8 @@ class NotebookDisplay(Display):
 
     rich draws them. Its own live display needs ipywidgets, which few kernels have.
     """
+
+    repeats = False
 
     def __init__(self, console: Console) -> None:
         super().__init__(console)
@@ -109,8 +149,12 @@ class NotebookDisplay(Display):
         if self._place is not None:
             self._place.update({"text/html": "", "text/plain": ""}, raw=True)
 
-    def _log(self) -> None:
-        """Draw the bars anew."""
+    def _shows_last(self) -> bool:
+        """Draw all activities when they begin."""
+        return True
+
+    def _log(self, has_steps: bool = False, seconds: float | None = None) -> None:
+        """Draw the bars anew, which show all steps and times."""
         from IPython.display import display
 
         self._drawn = time.monotonic()
