@@ -29,7 +29,12 @@ from gscompleter.render.device import choose_device
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
 from gscompleter.splats.foreign import resolve_splat
-from gscompleter.splats.formats import decode_splat, detect_splat_format, read_provenance
+from gscompleter.splats.formats import (
+    decode_splat,
+    describe_other_name,
+    detect_splat_format,
+    read_provenance,
+)
 from gscompleter.splats.provenance import ModelRecord, RunRecord
 from gscompleter.state import NEW_PHOTO_ID
 from gscompleter.system.errors import InputError, quote_value
@@ -110,6 +115,9 @@ def inspect_splat(options: InspectOptions) -> Inspection:
         defect = str(error)
     labels = gaussians.generated
     cameras, notes = list_cameras(options, folder, gaussians)
+    other_name = describe_other_name(path)
+    if other_name is not None:
+        notes = (other_name, *notes)
     low, high = gaussians.means.amin(0), gaussians.means.amax(0)
     return Inspection(
         str(path),
