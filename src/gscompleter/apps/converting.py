@@ -1,4 +1,4 @@
-"""Conversion of splats: read, joined, cut, turned, thinned out, and written in another format."""
+"""Conversion of splats: read, joined, cut, turned, reduced, and written in another format."""
 
 from __future__ import annotations
 

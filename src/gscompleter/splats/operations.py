@@ -1,4 +1,4 @@
-"""What `convert` does to Gaussians on the way: choose, turn, scale, move, and thin out.
+"""What `convert` does to Gaussians on the way: choose, scale, turn, move, and reduce.
 
 In this order, whatever the order on the command line: bands of harmonics, box and sphere (in the
 coordinates of the input), similarity, number. All numbers are in the axes of a .ply: x right,
@@ -15,15 +15,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.render.lod import choose_thinned_rows
+from gscompleter.render.lod import merge_nearby
+from gscompleter.splats.morton import sort_along_morton
 from gscompleter.splats.transform import transform_gaussians
 from gscompleter.system.errors import InputError
 from gscompleter.types import NUM_SH, Gaussians
-
-MAX_ROUNDS = 20
-"""Most corrections of the number of Gaussians that are kept."""
-NUMBER_TOLERANCE = 0.005
-"""Relative error of that number that is tolerated."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +91,7 @@ class Operations:
             return done
         is_share = isinstance(self.decimate, float)
         count = round(self.decimate * len(done)) if is_share else int(self.decimate)
-        return thin(done, max(count, 1))
+        return reduce_number(done, max(count, 1))
 
     def apply_to_rows(self, gaussians: Gaussians) -> Gaussians:
         """Apply those that treat each Gaussian alone."""
@@ -146,21 +142,8 @@ def make_rotation(degrees: Sequence[float]) -> Float[Tensor, "3 3"]:
     return rotation
 
 
-def thin(gaussians: Gaussians, count: int) -> Gaussians:
-    """Keep about `count` Gaussians, enlarged to cover the same area.
-
-    Large ones are kept rather than small ones, and every stretch of the file is thinned evenly
-    (`choose_thinned_rows`).
-    """
+def reduce_number(gaussians: Gaussians, count: int) -> Gaussians:
+    """Merge neighbours until about `count` Gaussians are left, in the order of a Morton curve."""
     if count >= len(gaussians):
         return gaussians
-    # Probabilities of the largest are bounded by 1, so that fewer are chosen than asked for.
-    asked = count
-    for _ in range(MAX_ROUNDS):
-        rows, growth = choose_thinned_rows(gaussians, asked)
-        missing = count - len(rows)
-        if abs(missing) <= NUMBER_TOLERANCE * count:
-            break
-        asked = min(max(asked + missing, 1), len(gaussians) - 1)
-    chosen = replace(gaussians, encoded=None)[rows]
-    return replace(chosen, scales=chosen.scales * growth[:, None])
+    return merge_nearby(sort_along_morton(replace(gaussians, encoded=None)), count)

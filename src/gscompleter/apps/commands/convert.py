@@ -1,4 +1,4 @@
-"""The command `convert`: another format, and splats joined, cut, turned and thinned out."""
+"""The command `convert`: another format, and splats joined, cut, turned and reduced."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class ConvertOptions(WritingOptions):
     Formats are .ply, .compressed.ply, .spz, .splat, .sog, .glb (KHR_gaussian_splatting), and
     .usda, .usdc and .usdz (OpenUSD, with usd-core). It also reads .ksplat, the folder of a .sog,
     and .glb with a .spz inside. On the way a splat can be joined with others, cut, scaled, turned,
-    moved and thinned out, in the order of the options below, whatever their order is when they are
+    moved and reduced, in the order of the options below, whatever their order is when they are
     given. Numbers are in the axes of a .ply: x right, y down, z forward.
     """
 
@@ -36,9 +36,9 @@ class ConvertOptions(WritingOptions):
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="B")]
     """File to write."""
     level: Level | None = None
-    """Level of detail to read of a streamed .sog (its folder, or lod-meta.json); 0 is the finest."""
+    """Level of detail to read of a streamed .sog (its folder or lod-meta.json); 0 is the finest."""
     merge: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE [FILE ...]")] = ()
-    """Splats to add to A, in its coordinates; their labels of generated Gaussians follow its own."""
+    """Splats to add to A, in its coordinates; their labels of what is generated follow its own."""
     bands: Literal[0, 1, 2, 3] | None = None
     """Leave out harmonics above this degree; 3 also reads files of degree 4."""
     crop_box: Annotated[
@@ -66,7 +66,7 @@ class ConvertOptions(WritingOptions):
     )
     """Move by this."""
     decimate: Annotated[str | None, tyro.conf.arg(metavar="N|N%")] = None
-    """Keep about this number or share of the Gaussians, enlarged to cover the same area."""
+    """Merge neighbours until about this number or share of the Gaussians is left."""
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
     plain: bool = False
