@@ -12,7 +12,8 @@ import torch
 from command import run
 from gscompleter.config import FloaterConfig
 from gscompleter.data.scene import load_views
-from gscompleter.editing.floaters import find_floaters, rate_gaussians
+from gscompleter.editing.floaters import Surroundings, find_floaters, rate_gaussians
+from gscompleter.editing.nearest import NearestGaussians
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.render.loading import load_renderer
 from gscompleter.splats import load_splat
@@ -77,9 +78,35 @@ def test_a_cluster_of_as_many_as_half_of_the_neighbours_goes(count, goes):
 def test_floaters_that_hide_one_another_are_found_in_several_rounds():
     places = gaussians_of(VIEW, 0.5 * VIEW.depth).means[:: SIZE * SIZE // 12]
     scene = merge([ROOM, blobs(places, 6.0)])
-    first = torch.stack([*rate_gaussians(scene, FloaterConfig()).values()]).any(dim=0)
+    config = FloaterConfig()
+    everything = torch.ones(len(scene), dtype=torch.bool)
+    around = Surroundings(scene, config.neighbors)
+    first = torch.stack([*rate_gaussians(scene, everything, around, config).values()]).any(dim=0)
     assert 0 < first.sum() < len(places)
     assert taken(scene).tolist() == [False] * len(ROOM) + [True] * len(places)
+
+
+def test_neighbours_are_searched_for_again_only_around_what_went(monkeypatch):
+    places = gaussians_of(VIEW, 0.5 * VIEW.depth).means[:: SIZE * SIZE // 12]
+    scene = merge([ROOM, blobs(places, 6.0)])
+    searches = []
+    search = NearestGaussians._search
+    monkeypatch.setattr(
+        NearestGaussians,
+        "_search",
+        lambda self, points, among: (searches.append(len(points)), search(self, points, among))[1],
+    )
+    assert taken(scene)[len(ROOM) :].all()
+    assert searches[0] == len(scene)
+    assert len(searches) > 2
+    assert max(searches[1:]) < 0.05 * len(scene)
+
+
+def test_a_strength_of_two_takes_more_and_of_a_half_less():
+    scene = merge([ROOM, *(blobs(MIDDLE, size, opacity=0.9) for size in (3.0, 5.0, 8.0))])
+    counts = [taken(scene, FloaterConfig().strengthen(s)).sum().item() for s in (0.5, 1.0, 2.0)]
+    assert counts[0] < counts[1] <= counts[2]
+    assert FloaterConfig().strengthen(1.0) == FloaterConfig()
 
 
 def test_a_huge_one_that_swallows_its_neighbours_goes():
@@ -136,15 +163,15 @@ def test_the_command_takes_them_out_and_strip_puts_them_back(tmp_path, monkeypat
     assert labels.tolist() == list(range(700, 700 + len(floaters)))
     summary = json.loads((out / "summary.json").read_text())
     assert summary["gaussians"]["removed"] == len(floaters)
-    assert {reason: count > 0 for reason, count in summary["reasons"].items()} == dict.fromkeys(
-        KINDS, True
-    )
+    found = {reason for reason, count in summary["reasons"].items() if count > 0}
+    assert found == set(KINDS)
     assert summary["settings"]["config"]["floaters"]["max_gap"] == FloaterConfig().max_gap
     assert torch.equal(load_ply(out / "completed.ply").means, ROOM.means)
     assert run(monkeypatch, "strip", out / "completed.ply", "--out", tmp_path / "back.ply") == 0
     assert (tmp_path / "back.ply").read_bytes() == splat.read_bytes()
     assert run(monkeypatch, "clean", "--scene", splat, "--out", preview, "--dry-run") == 0
-    assert sorted(file.name for file in preview.iterdir()) == ["removed.ply", "summary.json"]
+    written = ["removed.ply", "removed.png", "summary.json"]
+    assert sorted(file.name for file in preview.iterdir()) == written
     assert (preview / "removed.ply").read_bytes() == (out / "removed.ply").read_bytes()
     assert torch.equal(load_splat(preview / "removed.ply").means, floaters.means)
     again = ("--out", out, "--dry-run", "--overwrite")

@@ -94,12 +94,23 @@ FOREIGN = {
     "points.xyz": (b"0 0 0\n", "is a point cloud"),
     "mesh.obj": (b"v 0 0 0\n", "is a mesh"),
     "lod-meta.json": (b'{"lodLevels": 3, "filenames": []}', "index of a streamed scene"),
+    "garden.rad": (b"RAD0" + bytes(60), "is a .rad of Spark, in levels of detail"),
+    "renamed.splat": (b"RAD0" + bytes(60), "is a .rad of Spark, in levels of detail"),
+    "flame.splatv": (b"Kg\0\0" + bytes(60), "is a moving splat of splaTV"),
+    "checkpoint_7000.resume": (b"PKFL" + bytes(60), "is a checkpoint of LichtFeld Studio"),
+    "scene.spx": (b"spx\x01" + bytes(124), "is a .spx of Reall3D"),
+    "meta.lcc": (b'{"version": "4", "totalSplats": 5, "totalLevel": 3}', "a scene of XGRIDS"),
+    "scene.lcc2": (b'{"totalSplats": 5, "splatType": ".sog"}', "a scene of XGRIDS"),
+    "room.psht": (b"\x01\x02" + bytes(60), "is a project of Postshot"),
     "transforms.json": (b'{"frames": []}', "is a JSON file without Gaussians"),
     "cameras.json": (b"[]", "is a JSON file without Gaussians"),
     "page.ply": (b"<!DOCTYPE html><html>", "is a web page; download the file"),
     "other.bin": (b"hello", "holds no Gaussians in a format that is known"),
     "new.spz": (b"NGSP" + struct.pack("<IIBBBB", 9, 1, 0, 12, 0, 0), "is .spz version 9"),
-    "high.spz": (b"NGSP" + struct.pack("<IIBBBB", 3, 1, 4, 12, 0, 0), "SH degree 4"),
+    "high.spz": (
+        b"NGSP" + struct.pack("<IIBBBB", 3, 1, 4, 12, 0, 0),
+        "harmonics of SH degree 4, .* --bands 3",
+    ),
     "new.ksplat": (b"\x09" + bytes(4095), "is .ksplat version 9"),
 }
 
@@ -120,7 +131,28 @@ def test_a_file_of_another_kind_is_named_for_what_it_is(tmp_path, name):
 
 def test_a_folder_of_a_streamed_scene_is_named(tmp_path):
     (tmp_path / "lod-meta.json").write_text('{"lodLevels": 2}')
-    with pytest.raises(InputError, match="is a streamed scene in several levels of detail"):
+    with pytest.raises(InputError, match="is a streamed scene .* in several levels of detail"):
+        load_splat(tmp_path)
+
+
+def test_the_folder_of_a_scene_of_xgrids_is_named(tmp_path):
+    for name in ("meta.lcc", "data.bin", "index.bin"):
+        (tmp_path / name).write_bytes(b"{}")
+    with pytest.raises(InputError, match=r"meta\.lcc, which is the index of a scene of XGRIDS"):
+        load_splat(tmp_path)
+
+
+def test_a_folder_of_pngs_of_gsplat_is_named(tmp_path):
+    entry = {"shape": [9, 3], "dtype": "float32", "mins": [0], "maxs": [1]}
+    (tmp_path / "meta.json").write_text(json.dumps({"means": entry, "scales": entry}))
+    (tmp_path / "means_l.png").write_bytes(b"png")
+    with pytest.raises(InputError, match="that gsplat compressed to PNGs"):
+        load_splat(tmp_path)
+
+
+def test_a_newer_sog_is_named_with_its_version(tmp_path):
+    (tmp_path / "meta.json").write_text(json.dumps({"version": 3, "count": 1, "means": {}}))
+    with pytest.raises(InputError, match=r"is a \.sog of version 3, and versions 1 and 2 are read"):
         load_splat(tmp_path)
 
 

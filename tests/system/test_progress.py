@@ -74,6 +74,39 @@ def test_a_log_has_no_line_for_each_step_that_is_short():
     assert written(console) == "scores 1 of 3\n"
 
 
+def test_a_log_hears_of_what_takes_long_within_a_step(monkeypatch):
+    """A stage without steps, or a step that is slow, says again that it runs, and since when."""
+    monkeypatch.setattr(progress, "LOG_SECONDS", 0.05)
+    console = Console(file=io.StringIO(), width=200)
+    with show_progress(console), stage("clean"):
+        for _ in track(range(2), "Comparing photographs"):
+            time.sleep(0.3)
+    lines = written(console).splitlines()
+    assert lines[0] == "clean"
+    assert "clean: Comparing photographs 2 of 2" in lines
+    assert any(re.fullmatch(r"clean: Comparing photographs 1 of 2 \(\d+ s\)", x) for x in lines)
+    assert not CONTROL.search(written(console))
+
+
+def test_a_log_is_silent_after_its_end(monkeypatch):
+    monkeypatch.setattr(progress, "LOG_SECONDS", 0.01)
+    console = Console(file=io.StringIO(), width=200)
+    with show_progress(console), stage("clean"):
+        pass
+    said = written(console)
+    time.sleep(0.1)
+    assert written(console) == said
+
+
+def test_a_log_does_not_repeat_a_stage_after_its_steps():
+    console = Console(file=io.StringIO(), width=200)
+    with show_progress(console), stage("clean"):
+        for name in ("Searching", "Comparing"):
+            for _ in track(range(2), name):
+                pass
+    assert written(console) == "clean\n"
+
+
 def test_a_log_does_not_hear_of_preparations():
     console = Console(file=io.StringIO(), width=200)
     with show_progress(console), show_preparation("reading"):
@@ -144,7 +177,8 @@ def test_a_loop_that_ends_early_is_over():
 def test_a_completion_names_the_stages_of_the_paper(room, tmp_path, monkeypatch, capfd):
     assert run(monkeypatch, "complete", room, *SMALL, "--out", tmp_path / "out") == 0
     out, log = capfd.readouterr()
-    begun = [line.split(": ")[0:2] for line in log.splitlines()]
+    # Without the lines on what takes long, which a busy machine adds.
+    begun = [line.split(": ")[0:2] for line in log.splitlines() if not line.endswith(" s)")]
     assert "context" in [line[0] for line in begun]
     inside = [line[1] for line in begun if line[0] == "target 1 of 1" and len(line) > 1]
     assert inside[-4:] == ["generate", "lift", "register", "integrate"]

@@ -29,6 +29,14 @@ from gscompleter.apps.inputs.taken_out import (
     hide_taken_out,
 )
 from gscompleter.apps.inputs.task import InputSplatFile
+from gscompleter.apps.report.cleaning_picture import (
+    PICTURE_FILE,
+    RemovalSeen,
+    choose_cameras,
+    draw_removal_rows,
+    look_at_removal,
+    see_removal,
+)
 from gscompleter.apps.report.completion import save_changed, save_completed_splat
 from gscompleter.apps.warmup import compile_kernels
 from gscompleter.editing.cleaning import find_superfluous
@@ -44,15 +52,16 @@ from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import load_splat
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.image import write_image
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.files.writing import COMPLETED_FILE, REMOVED_FILE, SUMMARY_FILE
-from gscompleter.system.progress import show_preparation, show_progress, stage, track
+from gscompleter.system.progress import show_progress, stage, track
 from gscompleter.system.timing import record_seconds, timed_stage
-from gscompleter.types import Gaussians, View
+from gscompleter.types import Camera, Gaussians, View
 
 PHOTOGRAPH_OPTIONS = ("context", "format", "near", "far")
 COMMAND = "clean"
-RESULTS = (COMPLETED_FILE, REMOVED_FILE, SUMMARY_FILE, *EDITS)
+RESULTS = (COMPLETED_FILE, REMOVED_FILE, PICTURE_FILE, SUMMARY_FILE, *EDITS)
 """Files that it may write."""
 
 
@@ -65,6 +74,9 @@ class Cleaning:
     splat_file: InputSplatFile
     run_info: Mapping[str, Any]
     """Further entries of `summary.json`."""
+    cameras: Sequence[Camera]
+    """Cameras that see most of what goes."""
+    renderer: Renderer
 
     @property
     def counts(self) -> dict[str, int]:
@@ -112,11 +124,14 @@ def clean_splat(options: CleanOptions) -> None:
                 )
             elif cleaning.removed.any():
                 save_changed(folder, cleaning.given, cleaning.removed, cleaning.splat_file)
+            if cleaning.removed.any():
+                picture = draw_removal_rows(
+                    cleaning.given, cleaning.removed, cleaning.cameras, cleaning.renderer
+                )
+                write_image(folder / PICTURE_FILE, picture)
             (folder / SUMMARY_FILE).write_bytes(json.dumps(summary, indent=2).encode() + b"\n")
-    line = f"{describe_cleaning(summary)}: {options.out / COMPLETED_FILE}"
-    if options.dry_run:
-        line = f"Dry run: {describe_cleaning(summary)}: {options.out / REMOVED_FILE}"
-    print_answer(options, json.loads((options.out / SUMMARY_FILE).read_bytes()), [line])
+    lines = describe_result(summary, options)
+    print_answer(options, json.loads((options.out / SUMMARY_FILE).read_bytes()), lines)
 
 
 def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
@@ -128,11 +143,11 @@ def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
     # The splat is also read before cameras are searched for, so that a damaged file is refused
     # within seconds: the search takes minutes.
     opened = open_input(options, console, partial(load_given_splat, options))
-    with show_preparation("reading photographs"):
+    with stage("reading photographs"):
         task = read_photographs(opened, options.context, device)
     loaded = load_given_splat(options)
     compile_kernels([device])
-    with show_preparation("aligning the scene"):
+    with stage("aligning the scene"):
         splat_file = locate_splat(options.scene, options.drop_nonfinite)
         task = move_to_splat(task, loaded, splat_file, opened)
 
@@ -149,12 +164,13 @@ def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
     plan += f", written to {quote_value(options.out)}"
     print_lines(console, *describe_opening(opened, task), f"To do: {plan}.")
 
+    config = options.config.strengthen(options.strength)
     with record_seconds(()) as seconds, timed_stage("clean"):
-        removed = find_superfluous(given, task.views, renderer, options.config)
-    run_info = describe_run(options, opened, task, options.config)
-    scores = score_cleaning(given, task.views, removed, renderer, opened.files)
+        removed = find_superfluous(given, task.views, renderer, config)
+    run_info = describe_run(options, opened, task, config, {"strength": options.strength})
+    scores, seen = score_cleaning(given, task.views, removed, renderer, opened.files)
     run_info = {**run_info, "photographs": scores, "seconds": seconds}
-    return Cleaning(given, removed, splat_file, run_info)
+    return Cleaning(given, removed, splat_file, run_info, choose_cameras(seen), renderer)
 
 
 def clean_alone(options: CleanOptions, console: Console) -> Cleaning:
@@ -163,23 +179,39 @@ def clean_alone(options: CleanOptions, console: Console) -> Cleaning:
         if getattr(options, name) is not None:
             raise InputError("There are no photographs to apply this to; name their SCENE.", name)
 
-    given = load_given_splat(options)
-    floaters = options.config.floaters
+    device = choose_device(options.device)
+    given = load_given_splat(options).to(device)
+    renderer = load_renderer(device)
+    compile_kernels([device])
+    floaters = options.config.strengthen(options.strength).floaters
     with record_seconds(()) as seconds, timed_stage("clean"):
-        reasons = find_floaters(given, floaters)
-    run_info = {
-        "settings": {"scene": str(options.scene), "config": {"floaters": asdict(floaters)}},
-        "reasons": {reason: int(mask.sum()) for reason, mask in reasons.items()},
-        "seconds": seconds,
-    }
+        reasons = find_floaters(given, floaters, renderer)
     # A Gaussian can have several reasons, so their counts may exceed the number that goes.
     removed = torch.stack(list(reasons.values())).any(dim=0)
-    return Cleaning(given, removed, locate_splat(options.scene, options.drop_nonfinite), run_info)
+    cameras: list[Camera] = []
+    share = 0.0
+    # Of an empty splat there is no picture, and it is refused.
+    if removed.any() and not removed.all():
+        with stage("looking from outside"):
+            cameras, share = look_at_removal(given, removed, renderer)
+    run_info = {
+        "settings": {
+            "scene": str(options.scene),
+            "strength": options.strength,
+            "device": device,
+            "config": {"floaters": asdict(floaters)},
+        },
+        "reasons": {reason: int(mask.sum()) for reason, mask in reasons.items()},
+        "seen_from_outside": share,
+        "seconds": seconds,
+    }
+    splat_file = locate_splat(options.scene, options.drop_nonfinite)
+    return Cleaning(given, removed, splat_file, run_info, cameras, renderer)
 
 
 def load_given_splat(options: CleanOptions) -> Gaussians:
     """Read the splat to clean."""
-    with show_preparation("reading the scene"):
+    with stage("reading the scene"):
         return load_splat(options.scene, options.drop_nonfinite, options.ignore_properties)
 
 
@@ -189,14 +221,17 @@ def score_cleaning(
     taken: Bool[Tensor, "n"],
     renderer: Renderer,
     files: Mapping[int | None, str],
-) -> list[dict[str, Any]]:
+) -> tuple[list[dict[str, Any]], list[RemovalSeen]]:
     """Compute PSNR (dB) of each photograph before and after, without the pixels of its mask.
 
-    `taken` are the Gaussians that go; `files` has the file of each photograph by frame.
+    `taken` are the Gaussians that go; `files` has the file of each photograph by frame. Also
+    returns what each photograph sees of them.
     """
     kept = given[~taken]
     rows = []
+    seen = []
     for view in track(views, "scores"):
+        seen.append(see_removal(given, taken, view.camera, renderer))
         before = renderer.render(given, view.camera).image
         after = renderer.render(kept, view.camera).image
         rows.append(
@@ -208,7 +243,25 @@ def score_cleaning(
                 "ignored": compute_mask_fraction(view.ignore_mask),
             }
         )
-    return rows
+    return rows, seen
+
+
+def describe_result(summary: Mapping[str, Any], options: CleanOptions) -> list[str]:
+    """Describe what went, and which file is what; the last line names the cleaned splat."""
+    counts = summary["gaussians"]
+    out = options.out
+    if options.dry_run:
+        lines = [f"Dry run: {describe_cleaning(summary)}"]
+    else:
+        lines = [describe_cleaning(summary)]
+    if counts["removed"] > 0:
+        goes = "would go" if options.dry_run else "went"
+        lines.append(f"What {goes}: {out / REMOVED_FILE}; {out / PICTURE_FILE} shows it in red.")
+    if options.dry_run:
+        lines.append(f"Nothing was cleaned; leave out --dry-run to write {COMPLETED_FILE}.")
+    else:
+        lines.append(f"The cleaned splat: {out / COMPLETED_FILE}")
+    return lines
 
 
 def describe_cleaning(summary: Mapping[str, Any]) -> str:
@@ -217,7 +270,9 @@ def describe_cleaning(summary: Mapping[str, Any]) -> str:
     seconds = summary["seconds"]["total"]
     text = f"{counts['removed']:,} of {counts['given']:,} Gaussians removed in {seconds:.1f} s; "
     if "reasons" in summary:
-        return text + ", ".join(f"{count:,} {name}" for name, count in summary["reasons"].items())
+        reasons = ", ".join(f"{count:,} {name}" for name, count in summary["reasons"].items())
+        share = summary["seen_from_outside"]
+        return f"{text}{reasons}; they are {share:.1%} of what is seen from outside"
 
     before = torch.tensor([row["psnr_before"] for row in summary["photographs"]])
     after = torch.tensor([row["psnr_after"] for row in summary["photographs"]])

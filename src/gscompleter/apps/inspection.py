@@ -33,6 +33,7 @@ from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import (
     decode_splat,
     describe_oddities,
+    describe_other_name,
     detect_splat_format,
     read_provenance,
 )
@@ -120,6 +121,9 @@ def inspect_splat(options: InspectOptions) -> Inspection:
         defect = str(error)
     labels = gaussians.generated
     cameras, notes = list_cameras(options, folder, gaussians)
+    other_name = describe_other_name(path)
+    if other_name is not None:
+        notes = (other_name, *notes)
     low, high = gaussians.means.amin(0), gaussians.means.amax(0)
     return Inspection(
         str(path),

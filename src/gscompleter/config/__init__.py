@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -257,7 +258,8 @@ class FloaterConfig(Settings):
     """Settings of the cleaning without photographs.
 
     A size is the largest standard deviation of a Gaussian. A spacing is the median distance of
-    neighbours, around a Gaussian or in the whole scene, whichever is larger.
+    neighbours, around a Gaussian or in the whole scene, whichever is larger. The radius of the
+    scene is half the diagonal of the smallest box around it, without its outliers.
     """
 
     neighbors: Annotated[int, Interval(ge=2, le=1000)] = 16
@@ -276,6 +278,35 @@ class FloaterConfig(Settings):
     min_opacity: Share = 0.01
     """Transparent: its opacity is below this one, or up to ten times this one if it is larger than
     its neighbours: the limit is multiplied by half the ratio of the sizes."""
+    min_length: Weight = 0.02
+    """Streak: its size exceeds this share of the radius of the scene, ..."""
+    min_slenderness: Weight = 4.0
+    """... and this many times its second largest standard deviation, ..."""
+    max_free: Share = 0.5
+    """... and more than this share of it passes through no other Gaussian; or ..."""
+    max_uncovered: Share = 0.25
+    """... more than this share of what it covers in twelve renders from outside is where nothing
+    else is, and more than a third of `max_free` of it passes through no other Gaussian."""
+
+    def strengthen(self, strength: float) -> FloaterConfig:
+        """Divide limits of streaks by `strength`, and others by its root; below 1 fewer go.
+
+        Divided by 2, the limits of neighbours take a twentieth of a good splat (decision 085).
+        """
+        root = math.sqrt(strength)
+        return replace(
+            self,
+            max_gap=self.max_gap / root,
+            max_thickness=self.max_thickness / root,
+            max_size=self.max_size / root,
+            max_remoteness=self.max_remoteness / root,
+            max_elongation=max(self.max_elongation / root, 1.0),
+            min_opacity=min(self.min_opacity * root, 1.0),
+            min_length=self.min_length / strength,
+            min_slenderness=self.min_slenderness / strength,
+            max_free=min(self.max_free / strength, 1.0),
+            max_uncovered=min(self.max_uncovered / strength, 1.0),
+        )
 
 
 @dataclass(frozen=True)
@@ -292,6 +323,16 @@ class CleaningConfig(Settings):
     probes: Annotated[int, Interval(ge=1, le=1000)] = 8
     """Number of random images for the estimate of a Gaussian's influence."""
     floaters: FloaterConfig = FloaterConfig()
+
+    def strengthen(self, strength: float) -> CleaningConfig:
+        """Multiply by `strength` what photographs may lose; of `floaters` likewise."""
+        return replace(
+            self,
+            min_ratio=max(self.min_ratio / strength, 1.0),
+            idle=self.idle * strength,
+            tolerance=self.tolerance * strength,
+            floaters=self.floaters.strengthen(strength),
+        )
 
 
 LIFTED_MARGIN = 0.25

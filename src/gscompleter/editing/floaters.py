@@ -1,49 +1,93 @@
-"""Removal of floaters without photographs, by statistics of neighbouring Gaussians.
+"""Removal of floaters without photographs, by statistics of Gaussians and renders from outside.
 
-A Gaussian is compared with its nearest neighbours only. Far walls and the sky are sparse and large,
-but so are their neighbours, and together they leave no gaps: they stay.
+A Gaussian is compared with its nearest neighbours. Far walls and the sky are sparse and large, but
+so are their neighbours, and together they leave no gaps: they stay. Streaks are measured absolutely
+as well, against the scene (`streaks.py`), because the neighbours of a streak among hundreds are
+streaks.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gscompleter.config import FloaterConfig
+from gscompleter.editing.nearest import NearestGaussians
+from gscompleter.editing.streaks import find_streaks
+from gscompleter.render.loading import load_renderer
+from gscompleter.render.protocols import Renderer
 from gscompleter.system.errors import InputError
+from gscompleter.system.progress import track
 from gscompleter.types import Gaussians
 
 MAX_BREADTH = 10.0
 """Largest factor by which the limit of opacity rises with the size of a Gaussian."""
-QUERIES = 250_000
+BLOCK = 100_000
 """Gaussians whose neighbours are measured at a time, to save memory."""
+NEIGHBORS = "Searching for neighbours"
 
 
-@dataclass(frozen=True)
 class Surroundings:
-    """Statistics of n Gaussians and their nearest neighbours."""
+    """Statistics of the nearest neighbours of each of n Gaussians.
 
-    sigmas: Float[Tensor, "n 3"]
-    """Own standard deviations in descending order, in scene units."""
-    sigma: Float[Tensor, "n"]
-    """Median of the neighbours' largest standard deviations, in scene units."""
-    distance: Float[Tensor, "n"]
-    """Median distance to the neighbours, in scene units."""
-    spacing: Float[Tensor, "n"]
-    """Median of `distance` over the neighbours, at least that of the scene."""
-    gap: Float[Tensor, "n"]
-    """Median distance to the neighbours, relative to the sum of both largest deviations."""
+    When Gaussians are taken away, only those that had one of them near are measured again.
+    """
+
+    def __init__(self, scene: Gaussians, neighbors: int) -> None:
+        """Search for the neighbours, and measure them."""
+        self._means = scene.means
+        self._longest = scene.scales.max(dim=1).values
+        # One more, because the nearest of all to a Gaussian is itself.
+        self._nearest = NearestGaussians(scene.means, scene.means, neighbors + 1, NEIGHBORS)
+        self.sigma = torch.empty_like(self._longest)
+        """Median of the neighbours' largest standard deviations, in scene units."""
+        self.distance = torch.empty_like(self._longest)
+        """Median distance to the neighbours, in scene units."""
+        self.gap = torch.empty_like(self._longest)
+        """Median distance to the neighbours, relative to the sum of both largest deviations."""
+        self._measure(torch.arange(len(scene)).to(scene.means.device))
+
+    def take_away(self, gone: Bool[Tensor, "n"], left: Bool[Tensor, "n"]) -> None:
+        """Take the Gaussians in `gone` away from the neighbours of those in `left`."""
+        lost = self._nearest.take_away(gone, left, asked=left)
+        self._measure(torch.from_numpy(lost).to(left.device))
+
+    def measure_spacing(self, rows: Int64[Tensor, "m"]) -> Float[Tensor, "m"]:
+        """Measure the median of `distance` over the neighbours, at least that of all `rows`."""
+        parts = [self.distance[self._list_neighbors(part)] for part in rows.split(BLOCK)]
+        spacing = torch.cat([part.median(dim=1).values for part in parts])
+        # At least that of the scene, so that nothing is remote in its densest parts.
+        return spacing.clamp_min(self.distance[rows].median())
+
+    def _measure(self, rows: Int64[Tensor, "m"]) -> None:
+        for part in track(rows.split(BLOCK), "Comparing neighbours"):
+            others = self._list_neighbors(part)
+            offsets = self._means[part, None].double() - self._means[others].double()
+            apart = offsets.norm(dim=2).to(self.distance.dtype)
+            longest = self._longest[others]
+            reach = self._longest[part, None] + longest
+            self.sigma[part] = longest.median(dim=1).values
+            self.distance[part] = apart.median(dim=1).values
+            self.gap[part] = (apart / reach).median(dim=1).values
+
+    def _list_neighbors(self, rows: Int64[Tensor, "m"]) -> Int64[Tensor, "m k"]:
+        numbers = self._nearest.rows[rows.cpu().numpy(), 1:]
+        return torch.from_numpy(numbers).long().to(rows.device)
 
 
 def find_floaters(
-    scene: Gaussians, config: FloaterConfig = FloaterConfig()
+    scene: Gaussians,
+    config: FloaterConfig = FloaterConfig(),
+    renderer: Renderer | None = None,
 ) -> dict[str, Bool[Tensor, "n"]]:
     """Find floaters by reason, again without those found until none is left; generated ones stay.
 
-    A Gaussian may have several reasons. Floaters beside others show only after these are found.
+    A Gaussian may have several reasons. Floaters beside others show only after these are found, and
+    streaks are searched for among what is then left.
+    `renderer` is by default that of the scene's device.
     """
     if len(scene) <= config.neighbors:
         raise InputError(
@@ -52,76 +96,58 @@ def find_floaters(
         )
     # Nothing here depends on colours by direction, which are most of the memory of a scene.
     scene = replace(scene, sh=scene.sh[:, :1], encoded=None)
+    left = torch.ones_like(scene.generated, dtype=torch.bool)
     masks: dict[str, Bool[Tensor, "n"]] = {}
-    remaining = torch.arange(len(scene), device=scene.means.device)
-    rest = scene
-    while len(rest) > config.neighbors:
-        is_floater_by_reason = rate_gaussians(rest, config)
-        for reason, is_floater in is_floater_by_reason.items():
-            none = torch.zeros_like(scene.generated, dtype=torch.bool)
-            known = masks.get(reason, none)
-            masks[reason] = known.index_fill(0, remaining[is_floater], True)
-        gone = torch.stack(list(is_floater_by_reason.values())).any(dim=0)
-        if not gone.any():
+
+    def take_out(found: dict[str, Bool[Tensor, "n"]]) -> Bool[Tensor, "n"]:
+        """Take what was found out of those that are left, and return which these are."""
+        gone = torch.stack(list(found.values())).any(dim=0)
+        for reason, mask in found.items():
+            masks[reason] = masks.get(reason, torch.zeros_like(mask)) | mask
+        left.masked_fill_(gone, False)
+        return gone
+
+    around = Surroundings(scene, config.neighbors)
+    while True:
+        gone = take_out(rate_gaussians(scene, left, around, config))
+        if not gone.any() or left.sum() <= config.neighbors:
             break
-        remaining = remaining[~gone]
-        rest = rest[~gone]
+        around.take_away(gone, left)
+    del around  # about 100 bytes a Gaussian
+
+    masks["streaks"] = torch.zeros_like(left)
+    if left.sum() > config.neighbors:
+        renderer = renderer or load_renderer("cuda" if scene.means.is_cuda else "cpu")
+        is_streak = find_streaks(scene[left], config, renderer)
+        take_out({"streaks": torch.zeros_like(left).masked_scatter(left, is_streak)})
     return masks
 
 
-def rate_gaussians(scene: Gaussians, config: FloaterConfig) -> dict[str, Bool[Tensor, "n"]]:
-    """Compare Gaussians with their surroundings, as `find_floaters` does in each round."""
-    around = measure_surroundings(scene, config.neighbors)
-    longest, middle, shortest = around.sigmas.unbind(dim=1)
+def rate_gaussians(
+    scene: Gaussians, left: Bool[Tensor, "n"], around: Surroundings, config: FloaterConfig
+) -> dict[str, Bool[Tensor, "n"]]:
+    """Compare the Gaussians that are left with their surroundings, as each round does."""
+    rows = left.nonzero()[:, 0]
+    longest, middle, shortest = scene.scales[rows].sort(dim=1, descending=True).values.unbind(dim=1)
+    sigma = around.sigma[rows]
+    distance = around.distance[rows]
+    spacing = around.measure_spacing(rows)
     # All sizes and distances are relative to those of the neighbours: walls and the sky are far,
     # large and sparse, but all of their Gaussians are.
-    size = longest / around.sigma
-    remoteness = around.distance / around.spacing
+    size = longest / sigma
     is_large = size > config.max_size
-    is_detached = around.distance > config.max_size * around.sigma
+    is_detached = distance > config.max_size * sigma
     # The larger a Gaussian is beside its neighbours, the more opaque it has to be.
     min_opacity = config.min_opacity * (size / 2).clamp(1, MAX_BREADTH)
     reasons = {
-        "isolated": around.gap > config.max_gap,
-        "huge": (shortest > config.max_thickness * around.spacing)
-        | (is_large & (remoteness > config.max_remoteness)),
+        "isolated": around.gap[rows] > config.max_gap,
+        "huge": (shortest > config.max_thickness * spacing)
+        | (is_large & (distance / spacing > config.max_remoteness)),
         "needles": is_large & is_detached & (longest > config.max_elongation * middle),
-        "transparent": scene.opacities < min_opacity,
+        "transparent": scene.opacities[rows] < min_opacity,
     }
-    return {reason: mask & (scene.generated == 0) for reason, mask in reasons.items()}
-
-
-def measure_surroundings(scene: Gaussians, neighbors: int) -> Surroundings:
-    """Measure each Gaussian and its nearest neighbours."""
-    # Imported here, since SciPy is slow to import.
-    from scipy.spatial import cKDTree
-
-    means = scene.means.double().cpu().numpy()
-    tree = cKDTree(means)
-    sigmas = scene.scales.sort(dim=1, descending=True).values
-    longest = sigmas[:, 0]
-    sigma = torch.empty_like(longest)
-    distance = torch.empty_like(longest)
-    gap = torch.empty_like(longest)
-    # The numbers of all neighbours are kept, in 32 bits, since `spacing` needs all distances. What
-    # else is known of each neighbour is held for some Gaussians at a time.
-    numbers = torch.empty(len(means), neighbors, dtype=torch.int32)
-    for start in range(0, len(means), QUERIES):
-        block = slice(start, start + QUERIES)
-        found = tree.query(means[block], neighbors + 1, workers=torch.get_num_threads())
-        # The first neighbour of a Gaussian is itself.
-        apart, rows = (torch.from_numpy(values[:, 1:]).to(sigmas.device) for values in found)
-        apart = apart.to(sigmas.dtype)
-        numbers[block] = rows.cpu()
-        sigma[block] = longest[rows].median(dim=1).values
-        distance[block] = apart.median(dim=1).values
-        reach = longest[block, None] + longest[rows]
-        gap[block] = (apart / reach).median(dim=1).values
-
-    spacing = torch.empty_like(longest)
-    for start in range(0, len(means), QUERIES):
-        block = slice(start, start + QUERIES)
-        rows = numbers[block].long().to(sigmas.device)
-        spacing[block] = distance[rows].median(dim=1).values
-    # At least that of the scene, so that nothing is remote in its densest parts.
-    return Surroundings(sigmas, sigma, distance, spacing.clamp_min(distance.median()), gap)
+    none = torch.zeros_like(left)
+    return {
+        reason: none.index_put((rows,), mask & (scene.generated[rows] == 0))
+        for reason, mask in reasons.items()
+    }

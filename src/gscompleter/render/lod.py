@@ -9,6 +9,7 @@ mostly neighbours in this order. Completion uses the proxy; all output is made f
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -34,6 +35,10 @@ MAX_DEVIATION = 2.0
 """Largest standard deviation of a Gaussian that shares a run, in pixels."""
 MAX_GROWTH = 8.0
 """Largest factor on MAX_REACH and MAX_DEVIATION, if the proxy would be too large otherwise."""
+FAR_AWAY = 1e4
+"""Distance, in radii of the scene, of a camera to which all of it is equally far."""
+BISECTIONS = 20
+"""Steps of the search for the distance within which Gaussians are merged: to a thousandth."""
 
 
 def build_proxy(scene: Gaussians, cameras: Sequence[Camera]) -> ContextScene:
@@ -49,10 +54,18 @@ def simplify_scene(scene: Gaussians, cameras: Sequence[Camera]) -> ContextScene:
     Runs become longer until their number fits in the memory of the frozen views of `cameras`. In a
     scene in random order adjacent Gaussians are far apart, and almost nothing is merged.
     """
+    arrays = to_arrays(scene)
+    start = find_run_starts(arrays.means, arrays.scales, scene.generated.numpy(), cameras)
+    merged = merge_runs(scene, start)
+    run_of_gaussian = torch.arange(len(merged)).repeat_interleave(torch.from_numpy(np.diff(start)))
+    return ContextScene.build(scene, merged, run_of_gaussian)
+
+
+def merge_runs(scene: Gaussians, start: Int64[ndarray, "bounds"]) -> Gaussians:
+    """Merge runs of adjacent Gaussians to one Gaussian each; `start` is as `find_run_starts`."""
     # Kernels take harmonics as one row per Gaussian.
     arrays = to_arrays(scene)
     arrays = arrays._replace(sh=arrays.sh.reshape(len(scene), -1))
-    start = find_run_starts(arrays.means, arrays.scales, scene.generated.numpy(), cameras)
     num_runs = len(start) - 1
     merged_arrays = GaussianArrays(
         *[np.empty((num_runs, *array.shape[1:]), np.float32) for array in arrays]
@@ -61,8 +74,7 @@ def simplify_scene(scene: Gaussians, cameras: Sequence[Camera]) -> ContextScene:
     share(kernels.merge_runs, num_runs, start, arrays, shares, merged_arrays)
 
     first = torch.from_numpy(start[:-1])
-    sizes = torch.from_numpy(np.diff(start))
-    merged = Gaussians(
+    return Gaussians(
         means=torch.from_numpy(merged_arrays.means),
         quats=torch.from_numpy(merged_arrays.quats),
         scales=torch.from_numpy(merged_arrays.scales),
@@ -71,8 +83,43 @@ def simplify_scene(scene: Gaussians, cameras: Sequence[Camera]) -> ContextScene:
         generated=scene.generated[first],
         is_antialiased=scene.is_antialiased,
     )
-    run_of_gaussian = torch.arange(num_runs).repeat_interleave(sizes)
-    return ContextScene.build(scene, merged, run_of_gaussian)
+
+
+def merge_nearby(scene: Gaussians, max_gaussians: int) -> Gaussians:
+    """Merge adjacent Gaussians of one provenance until about so many are left; on the CPU.
+
+    A run lies within a distance of its first Gaussian, the smallest that is enough. The scene has
+    to be sorted along a Morton curve.
+    """
+    arrays = to_arrays(scene)
+    labels = scene.generated.numpy()
+    centre = scene.means.mean(dim=0)
+    radius = max((scene.means - centre).abs().max().item(), 1e-30)
+
+    def find_starts(distance: float) -> Int64[ndarray, "bounds"]:
+        # A camera that is so far away that its pixel is `distance` everywhere; of Gaussians of any
+        # size.
+        focal = np.array([FAR_AWAY * radius / distance], np.float32)
+        place = to_float32(centre + FAR_AWAY * radius * torch.tensor([0.0, 0.0, 1.0]))[None]
+        begins = np.empty(len(scene), np.bool_)
+        num_blocks = -(-len(scene) // kernels.BLOCK)
+        share(
+            kernels.mark_run_starts,
+            num_blocks,
+            *(arrays.means, arrays.scales, labels, place, focal),
+            *(np.float32(1), np.float32(np.inf), begins),
+        )
+        return np.append(np.flatnonzero(begins), len(scene))
+
+    # Bisection on the logarithm: between a millionth of the extent and all of it.
+    low, high = 1e-6 * radius, 4 * radius
+    for _ in range(BISECTIONS):
+        middle = math.sqrt(low * high)
+        if len(find_starts(middle)) - 1 > max_gaussians:
+            low = middle
+        else:
+            high = middle
+    return merge_runs(scene, find_starts(high))
 
 
 def find_run_starts(

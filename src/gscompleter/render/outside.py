@@ -135,18 +135,30 @@ def look_from_outside(scene: Gaussians, renderer: Renderer, side: int) -> list[O
     Images have `side` pixels along each side, and show twice the extent, too: around an object they
     are empty at their borders.
     """
-    extent = measure_extent(scene)
     small = thin_gaussians(scene, MAX_PREVIEW_GAUSSIANS)
 
-    def look(direction: Float[Tensor, "3"]) -> OutsideView:
-        center = extent.center + DISTANCE * extent.radius * direction
-        half = FIELD / DISTANCE
-        camera = place_camera(center, -direction, half, side, NEAR * extent.radius)
+    def look(camera: Camera) -> OutsideView:
         return OutsideView(camera, renderer.render(small, camera))
 
+    cameras = list_outside_cameras(measure_extent(scene), side)
+    return list(get_view_map(scene.means)(look, cameras))
+
+
+def list_outside_cameras(extent: Extent, side: int) -> list[Camera]:
+    """List the cameras of `look_from_outside`."""
     # Along the sides of the box, not along the axes of the file, which may be turned.
     directions = list_directions().to(extent.center) @ extent.axes
-    return list(get_view_map(scene.means)(look, directions))
+    half = FIELD / DISTANCE
+    return [
+        place_camera(
+            extent.center + DISTANCE * extent.radius * direction,
+            -direction,
+            half,
+            side,
+            NEAR * extent.radius,
+        )
+        for direction in directions
+    ]
 
 
 def place_camera(

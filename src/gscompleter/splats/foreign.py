@@ -24,6 +24,10 @@ GZIP = b"\x1f\x8b"
 SPZ_MAGIC = b"NGSP"
 LOD_META = "lod-meta.json"
 """Index of a streamed scene: one .sog for each level and place."""
+OF_STREAMED = (
+    "in several levels of detail; write one of them to a file (`gscompleter convert FILE B.ply "
+    "--level 0`, the finest), and name that"
+)
 SOG_META = "meta.json"
 MAX_JSON = 1 << 26
 """Largest JSON that is looked into, in bytes."""
@@ -31,6 +35,33 @@ CHECKPOINTS = (".pt", ".pth", ".ckpt")
 POINT_CLOUDS = (".las", ".laz", ".e57", ".pcd", ".xyz", ".pts")
 POINT_CLOUD_STARTS = (b"LASF", b"ASTM-E57", b"# .PCD")
 MESHES = (".obj", ".stl", ".fbx", ".dae", ".off")
+WITH_SPLAT_TRANSFORM = (
+    "write it as .ply with PlayCanvas' splat-transform (`splat-transform FILE --select-lod 0 "
+    "splat.ply`), and name that"
+)
+STARTS = {
+    b"RAD0": (
+        "is a .rad of Spark, in levels of detail that Spark alone reads; name the .ply or .spz "
+        "that it was made of"
+    ),
+    b"Kg\x00\x00": (
+        "is a moving splat of splaTV, which shows it in a browser; name the .ply of one moment"
+    ),
+    b"PKFL": "is a checkpoint of LichtFeld Studio; open it there, export a .ply, and name that",
+    b"spx": "is a .spx of Reall3D; write it as .ply with its converter gsbox, and name that",
+}
+"""Kinds of files by their first bytes."""
+KINDS_BY_ENDING = {
+    ".rad": STARTS[b"RAD0"],
+    ".splatv": STARTS[b"Kg\x00\x00"],
+    ".resume": STARTS[b"PKFL"],
+    ".spx": STARTS[b"spx"],
+    ".lcc": f"is the index of a scene of XGRIDS in levels of detail; {WITH_SPLAT_TRANSFORM}",
+    ".lcc2": f"is the index of a scene of XGRIDS in levels of detail; {WITH_SPLAT_TRANSFORM}",
+    ".psht": "is a project of Postshot; open it there, export a .ply, and name that",
+    ".ssproj": "is a project of SuperSplat; open it there, export a .ply, and name that",
+}
+"""Kinds of files by their endings, where the first bytes do not tell."""
 SPLATS = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".usdz", ".usdc", ".usda")
 """Endings of files that are worth naming in an archive or folder."""
 
@@ -94,18 +125,38 @@ def refuse_folder(path: Path) -> None:
     """Raise InputError for a folder without a splat."""
     name = quote_value(path)
     if os.path.isfile(path / LOD_META):
-        raise InputError(
-            f"{name} is a streamed scene in several levels of detail ({LOD_META}); join one level "
-            "to a .ply (splat-transform does), and name that."
-        )
+        raise InputError(f"{name} is a streamed scene ({LOD_META}) {OF_STREAMED}.")
     with suppress(OSError):
-        inside = sorted(n for n in os.listdir(path) if n.lower().endswith(SPLATS))
+        names = sorted(os.listdir(path))
+        indices = [n for n in names if n.lower().endswith((".lcc", ".lcc2"))]
+        if indices:
+            raise InputError(
+                f"{name} holds {quote_value(indices[0])}, which {KINDS_BY_ENDING['.lcc']}."
+            )
+        inside = [n for n in names if n.lower().endswith(SPLATS)]
         if inside:
             raise InputError(
                 f"{name} is a folder; name one of the splats in it, such as "
                 f"{quote_value(inside[0])}."
             )
     raise InputError(f"{name} is a folder without a splat; name the file of a splat.")
+
+
+def refuse_packed_folder(path: Path) -> None:
+    """Raise InputError for a folder with a `meta.json` that is none of a .sog.
+
+    gsplat compresses checkpoints to PNGs beside a `meta.json` of the same name.
+    """
+    table: object = None
+    with suppress(OSError, ValueError, RecursionError):
+        table = json.loads((path / SOG_META).read_bytes()[:MAX_JSON])
+    properties = list(table.values()) if isinstance(table, dict) else []
+    are_described = [isinstance(entry, dict) and "dtype" in entry for entry in properties]
+    if are_described and all(are_described) and not any("files" in entry for entry in properties):
+        raise InputError(
+            f"{quote_value(path)} is a splat that gsplat compressed to PNGs (PngCompression); "
+            "decompress it with gsplat, export a .ply, and name that."
+        )
 
 
 def refuse_foreign(path: Path, head: bytes) -> None:
@@ -129,6 +180,9 @@ def _describe_by_content(path: Path, head: bytes) -> str | None:
         return _describe_json(path)
     if head.startswith(POINT_CLOUD_STARTS):
         return _describe_points()
+    for first, kind in STARTS.items():
+        if head.startswith(first):
+            return kind
     return None
 
 
@@ -136,6 +190,8 @@ def _describe_by_name(ending: str, head: bytes) -> str | None:
     is_known = head.lstrip().startswith((b"ply", SPZ_MAGIC, b"glTF", b"PXR-USDC", b"#usda"))
     if is_known or head.startswith((ZIP_MAGIC, GZIP)):
         return None
+    if ending in KINDS_BY_ENDING:
+        return KINDS_BY_ENDING[ending]
     if ending in CHECKPOINTS:
         return _describe_checkpoint()
     if ending in POINT_CLOUDS:
@@ -165,10 +221,7 @@ def _describe_zip(path: Path) -> str | None:
     if any(name.endswith("data.pkl") for name in names) or path.suffix.lower() in CHECKPOINTS:
         return _describe_checkpoint()
     if any(Path(name).name == LOD_META for name in names):
-        return (
-            "is a streamed scene in several levels of detail; join one level to a .ply "
-            "(splat-transform does), and name that"
-        )
+        return f"is a streamed scene {OF_STREAMED.replace('convert FILE', 'convert FOLDER')}"
     is_usd = any(name.lower().endswith((".usd", ".usda", ".usdc")) for name in names)
     if SOG_META in names or is_usd:
         return None
@@ -202,11 +255,10 @@ def _describe_json(path: Path) -> str | None:
     ending = path.suffix.lower()
     if ending == ".gltf" or (keys >= {"asset"} and keys & {"meshes", "nodes", "scenes", "buffers"}):
         return "is glTF with its data in other files; export it as one .glb, or as .ply"
+    if ending in KINDS_BY_ENDING:
+        return KINDS_BY_ENDING[ending]
     if path.name.lower() == LOD_META or "lodLevels" in keys:
-        return (
-            "is the index of a streamed scene in several levels of detail; join one level to a "
-            ".ply (splat-transform does), and name that"
-        )
+        return f"is the index of a streamed scene {OF_STREAMED}"
     if path.name.lower() == SOG_META or "means" in keys:
         return None
     return "is a JSON file without Gaussians; name the file of a splat, such as a .ply"

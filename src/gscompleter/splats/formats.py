@@ -14,6 +14,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -26,17 +27,23 @@ from torch import Tensor
 
 from gscompleter.numerics.value_checks import check_gaussians
 from gscompleter.splats.compressed_ply import read_compressed_ply, write_compressed_ply
-from gscompleter.splats.foreign import refuse_folder, refuse_foreign, resolve_splat
+from gscompleter.splats.foreign import (
+    refuse_folder,
+    refuse_foreign,
+    refuse_packed_folder,
+    resolve_splat,
+)
 from gscompleter.splats.glb import read_glb, read_glb_remarks, write_glb
 from gscompleter.splats.ksplat import read_ksplat
 from gscompleter.splats.morton import sort_along_morton
 from gscompleter.splats.origin import measure_distance
-from gscompleter.splats.packing import ZIP_MAGIC, UnsupportedError
+from gscompleter.splats.packing import ZIP_MAGIC, BandError, UnsupportedError
 from gscompleter.splats.ply import (
     copy_ply,
     decode_gaussians,
     describe_values,
     load_ply,
+    make_band_error,
     make_memory_error,
     read_scene,
     require_finite,
@@ -136,7 +143,10 @@ RECORDING = (write_compressed_ply, *LABELLING)
 
 @run_in_plain_torch
 def load_splat(
-    path: Path | str, drop_nonfinite: bool = False, ignore_properties: bool = False
+    path: Path | str,
+    drop_nonfinite: bool = False,
+    ignore_properties: bool = False,
+    leaves_out_band_4: bool = False,
 ) -> Gaussians:
     """Load the Gaussians of a file in any format of `FORMATS`, in the axes of a 3DGS .ply.
 
@@ -144,25 +154,31 @@ def load_splat(
     in the file, or in `NAME.generated.json` beside it. `drop_nonfinite` drops
     Gaussians with NaN, infinity or a zero quaternion instead of refusing the file, and
     `ignore_properties` goes on with one whose further properties change what is seen.
+    `leaves_out_band_4` reads harmonics of degree 4 without the fourth band.
     """
     path = resolve_splat(require_path(path))
-    if detect_splat_format(path) == "ply":
+    if detect_splat_format(path) == "ply" and not leaves_out_band_4:
         return load_ply(path, drop_nonfinite, ignore_properties)
-    return require_finite(decode_splat(path), path, drop_nonfinite)
+    return require_finite(decode_splat(path, leaves_out_band_4), path, drop_nonfinite)
 
 
-def decode_splat(path: Path) -> Gaussians:
+def decode_splat(path: Path, leaves_out_band_4: bool = False) -> Gaussians:
     """Decode all Gaussians of a file with their labels, those included that are not finite."""
     name = detect_splat_format(path)
     if name == "ply":
-        return decode_gaussians(read_scene(path))
+        return decode_gaussians(read_scene(path, leaves_out_band_4))
+    read = SPLAT_FORMATS[name].read
+    if name == "spz":
+        read = partial(read_spz, leaves_out_band_4=leaves_out_band_4)
     has_json = name in ("sog", "sog-folder", "glb", "usd", "usdz")
     errors = DECODING_ERRORS + JSON_ERRORS if has_json else DECODING_ERRORS
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # infinite values are refused below
-            gaussians = SPLAT_FORMATS[name].read(path)
+            gaussians = read(path)
     except InputError:
         raise
+    except BandError as error:
+        raise make_band_error(path) from error
     except UnsupportedError as error:
         raise InputError(f"{quote_value(path)} {error}; export it as .ply.") from error
     except MemoryError as error:
@@ -272,13 +288,18 @@ def convert_splat(
         counts = copy_ply(source, out, drop_nonfinite, keep_labels, made_by, ignore_properties)
         return (*counts, None)
     gaussians = load_splat(source, drop_nonfinite, ignore_properties)
-    generated = gaussians.generated
-    # Without generated Gaussians a writer leaves the labels out altogether.
-    written = generated if keep_labels else torch.zeros_like(generated)
-    save_splat(out, replace(gaussians, generated=written), made_by)
+    num_generated = int((gaussians.generated > 0).sum())
+    if not keep_labels:
+        gaussians = drop_labels(gaussians)
+    save_splat(out, gaussians, made_by)
     notes = [describe_mode_loss(out, gaussians), describe_rounding(out, gaussians)]
     note = " ".join(note for note in notes if note is not None)
-    return len(gaussians), int((generated > 0).sum()), note or None
+    return len(gaussians), num_generated, note or None
+
+
+def drop_labels(gaussians: Gaussians) -> Gaussians:
+    """Take all Gaussians for observed: a writer then leaves the labels out altogether."""
+    return replace(gaussians, generated=torch.zeros_like(gaussians.generated))
 
 
 def describe_mode_loss(path: Path, gaussians: Gaussians) -> str | None:
@@ -312,6 +333,7 @@ def detect_splat_format(path: Path) -> str:
     """Detect the format of a file or folder, by name."""
     if path.is_dir():
         if (path / META).is_file():
+            refuse_packed_folder(path)
             return "sog-folder"
         refuse_folder(path)
     with open_file(path) as file:
@@ -370,6 +392,17 @@ def get_writer(path: Path) -> Callable[..., None]:
             f"{', '.join(f.extensions[0] for f in SPLAT_FORMATS.values() if f.write)}."
         )
     return write
+
+
+def describe_other_name(path: Path) -> str | None:
+    """Describe that a file is named for another format than it has, or return None."""
+    found = detect_splat_format(path)
+    named = _match_extension(path)
+    if path.is_dir() or named is None or named == found:
+        return None
+    ending = next(e for e in SPLAT_FORMATS[named].extensions if path.name.lower().endswith(e))
+    plain = "a plain .ply" if found == "ply" else f"a {SPLAT_FORMATS[found].extensions[0]}"
+    return f"It is named {ending}, and holds {plain}."
 
 
 def has_splat_extension(path: Path) -> bool:

@@ -27,6 +27,10 @@ class UnsupportedError(ValueError):
     """An intact file whose content is not read; its message follows the name of the file."""
 
 
+class BandError(UnsupportedError):
+    """An intact file with harmonics of degree 4."""
+
+
 def unpack_fractions(packed: UInt32[ndarray, "n"], widths: Sequence[int]) -> Float[ndarray, "n k"]:
     """Unpack fields of `widths` bits, the last one in the lowest bits, as fractions in [0, 1]."""
     fractions = np.empty((len(packed), len(widths)), np.float32)

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -74,6 +74,8 @@ SEVERAL_SIZES = 5.0
 """Ratio of the largest to the smallest Gaussian above which they have several sizes."""
 _NUM_REST = (0, 9, 24, 45)
 """Number of properties f_rest_* by SH degree."""
+_NUM_REST_4 = 72
+"""Number of properties f_rest_* of degree 4, which are read without the fourth band on request."""
 
 MODE_COMMENT = "SplatRenderMode: mip"
 """Comment that marks antialiased Gaussians."""
@@ -145,9 +147,13 @@ def find_finite_rows(path: Path) -> Bool[Tensor, "n"]:
     return find_finite(decode_gaussians(read_scene(path)))
 
 
-def read_scene(path: Path) -> SceneFile:
+def read_scene(path: Path, leaves_out_band_4: bool = False) -> SceneFile:
     """Read the rows of a 3DGS .ply, surfels of 2DGS included, and find out how they are stored."""
     scene = read_ply_file(path, _NEEDED, "3DGS scene", describe_other_content, "Gaussians")
+    if count_rest(scene) == _NUM_REST_4:
+        if not leaves_out_band_4:
+            raise make_band_error(path)
+        scene = leave_out_band_4(scene)
     names = scene.rows.dtype.names or ()
     num_rest = count_rest(scene)
     if num_rest not in _NUM_REST or any(f"f_rest_{i}" not in names for i in range(num_rest)):
@@ -298,6 +304,35 @@ def _describe_forms(scene: SceneFile) -> list[str]:
                 "logit that .ply files have; they are read with it."
             )
     return sentences
+
+
+def make_band_error(path: Path) -> InputError:
+    """Make the error of a file with harmonics of degree 4."""
+    return InputError(
+        f"{quote_value(path)} has harmonics of SH degree 4, and degrees 0 to 3 are read; leave the "
+        "fourth band out (`gscompleter convert FILE B.ply --bands 3`), and name that."
+    )
+
+
+def leave_out_band_4(scene: PlyFile) -> PlyFile:
+    """View the rows of a scene of degree 4 without the nine coefficients of the fourth band."""
+    fields: Mapping[str, Any] = scene.rows.dtype.fields or {}
+    kept = {}
+    for name, (dtype, offset) in ((name, field[:2]) for name, field in fields.items()):
+        if not name.startswith("f_rest_"):
+            kept[name] = (dtype, offset)
+            continue
+        # All coefficients of red, then green, then blue.
+        channel, number = divmod(int(name.removeprefix("f_rest_")), _NUM_REST_4 // 3)
+        if number < _NUM_REST[3] // 3:
+            kept[f"f_rest_{channel * (_NUM_REST[3] // 3) + number}"] = (dtype, offset)
+    layout: Any = {
+        "names": list(kept),
+        "formats": [dtype for dtype, _ in kept.values()],
+        "offsets": [offset for _, offset in kept.values()],
+        "itemsize": scene.rows.dtype.itemsize,
+    }
+    return replace(scene, rows=scene.rows.view(np.dtype(layout)))
 
 
 def count_rest(scene: PlyFile) -> int:
@@ -567,44 +602,54 @@ def copy_ply(
     keep_labels: bool = True,
     made_by: Provenance = NOTHING_KNOWN,
     ignore_properties: bool = False,
+    edit: Callable[[Gaussians], Gaussians] | None = None,
 ) -> tuple[int, int]:
     """Write what `load_ply` and `save_ply` would, some Gaussians at a time.
 
-    Returns the numbers of Gaussians written, and of those of them that the file says were
-    generated, whether or not `keep_labels` writes that.
+    `edit` changes or leaves out Gaussians on the way; harmonics of degree 4 are then read, without
+    the fourth band. Returns the numbers of Gaussians written, and of those of them that the file
+    says were generated, whether or not `keep_labels` writes that.
     """
-    scene = read_scene(source)
+    scene = read_scene(source, leaves_out_band_4=edit is not None)
     if not ignore_properties:
         refuse_other_kinds(scene.rows.dtype.names or (), source)
     total = len(scene.rows)
 
-    def decode_chunks() -> Iterator[Gaussians]:
+    def decode_chunks() -> Iterator[tuple[int, Gaussians]]:
+        """Yield the number of finite Gaussians of each chunk, and what is written of them."""
         for start in range(0, total, CHUNK_ROWS):
             chunk = decode_gaussians(replace(scene, rows=scene.rows[start : start + CHUNK_ROWS]))
             good = find_finite(chunk)
-            yield chunk if good.all() else chunk[good]
+            finite = chunk if good.all() else chunk[good]
+            yield len(finite), finite if edit is None else edit(finite)
 
     # The header has the number of Gaussians and says if there are labels, so that both are counted
     # before the first is written. Most files have no labels, and all of them is written.
+    num_finite = total
     count = total
     num_generated = 0
-    if drop_nonfinite or total == 0 or LABEL_COLUMN in (scene.rows.dtype.names or ()):
-        chunks = [(len(chunk), int((chunk.generated > 0).sum())) for chunk in decode_chunks()]
-        count = sum(number for number, _ in chunks)
-        num_generated = sum(number for _, number in chunks)
-        check_finite(count, total, source, drop_nonfinite)
+    has_label_column = LABEL_COLUMN in (scene.rows.dtype.names or ())
+    if drop_nonfinite or total == 0 or has_label_column or edit is not None:
+        numbers = np.zeros(3, np.int64)
+        for finite, chunk in decode_chunks():
+            numbers += [finite, len(chunk), int((chunk.generated > 0).sum())]
+        num_finite, count, num_generated = numbers.tolist()
+        check_finite(num_finite, total, source, drop_nonfinite)
+    if count == 0:
+        raise InputError(f"No Gaussian of {quote_value(source)} is left; change what is cut off.")
 
     has_labels = keep_labels and num_generated > 0
     form = decode_gaussians(replace(scene, rows=scene.rows[:0]))
-    written = 0
+    form = form if edit is None else edit(form)
+    seen = 0
 
     def encode_chunks() -> Iterator[ndarray]:
-        nonlocal written
-        for chunk in decode_chunks():
-            written += len(chunk)
+        nonlocal seen
+        for finite, chunk in decode_chunks():
+            seen += finite
             yield make_rows(chunk, has_labels)
         # Not before the end is known how many are not finite; the file is then left as it was.
-        check_finite(written, count, source, drop_nonfinite)
+        check_finite(seen, num_finite, source, drop_nonfinite)
 
     header = add_comments(make_scene_header(form, has_labels), made_by)
     write_ply_file(path, header, count, encode_chunks())

@@ -109,8 +109,14 @@ def _read_entry(bundle: zipfile.ZipFile, name: str, most: int) -> bytes:
 def _read_files(read: FileReader, meta: str, stored: int) -> Gaussians:
     """Read a scene of `stored` bytes."""
     table = json.loads(read(meta, MAX_META))
-    if "means" not in table or table.get("version", 1) not in (1, 2):
+    version = table.get("version", 1)
+    if "means" not in table or not isinstance(version, int) or version < 1:
         raise UnsupportedError(f"has a {meta} that describes no .sog of version 1 or 2")
+    if version > 2:
+        raise UnsupportedError(
+            f"is a .sog of version {version}, and versions 1 and 2 are read; the program that "
+            "wrote it, such as splat-transform 3.11, reads it"
+        )
     marked = table.get("model") == "antialiased" or table.get("antialias") is True
     return replace(_decode_scene(read, table, stored), is_antialiased=marked)
 

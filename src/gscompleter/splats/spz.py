@@ -24,6 +24,7 @@ from numpy import ndarray
 
 from gscompleter.splats.packing import (
     NUM_SH_REST,
+    BandError,
     UnsupportedError,
     assemble_sh,
     build_gaussians,
@@ -81,7 +82,7 @@ class SpzHeader(NamedTuple):
     @property
     def widths(self) -> list[int]:
         """Bytes of position, opacity, colour, scale, rotation and SH of a Gaussian."""
-        return [9, 1, 3, 3, 3 if self.version == 2 else 4, 3 * NUM_SH_REST[self.degree]]
+        return [9, 1, 3, 3, 3 if self.version == 2 else 4, 3 * ((self.degree + 1) ** 2 - 1)]
 
     @property
     def stream_sizes(self) -> list[int]:
@@ -89,16 +90,16 @@ class SpzHeader(NamedTuple):
         return [width * self.num_gaussians for width in self.widths]
 
 
-def read_spz(path: Path) -> Gaussians:
-    """Read a .spz of SH degree 0 to 3, in the axes of a .ply."""
-    return decode_spz(read_bytes(path))
+def read_spz(path: Path, leaves_out_band_4: bool = False) -> Gaussians:
+    """Read a .spz in the axes of a .ply; of SH degree 4 three bands are read, on request."""
+    return decode_spz(read_bytes(path), 4 if leaves_out_band_4 else 3)
 
 
-def decode_spz(data: bytes) -> Gaussians:
-    """Decode the bytes of a .spz, in the axes of a .ply."""
+def decode_spz(data: bytes, max_degree: int = 3) -> Gaussians:
+    """Decode the bytes of a .spz, in the axes of a .ply; bands above the third are left out."""
     if data.startswith(GZIP):
-        data = _unpack_gzip(data)
-    header = _parse_header(data)
+        data = _unpack_gzip(data, max_degree)
+    header = _parse_header(data, max_degree)
     if header.version < 4:
         ends = np.cumsum([HEADER.size, *header.stream_sizes]).tolist()
         streams = [data[start:end] for start, end in pairwise(ends)]
@@ -108,25 +109,27 @@ def decode_spz(data: bytes) -> Gaussians:
     return replace(turned, is_antialiased=bool(header.flags & ANTIALIASED_FLAG))
 
 
-def _parse_header(data: bytes) -> SpzHeader:
+def _parse_header(data: bytes, max_degree: int) -> SpzHeader:
     if len(data) < HEADER.size:
         raise DamagedError("it ends within its header")
     header = SpzHeader(*HEADER.unpack_from(data))
     if header.magic != MAGIC:
         raise DamagedError("it is no .spz but other data")
-    if header.version not in (2, 3, 4) or header.degree > 3:
+    if header.version not in (2, 3, 4) or header.degree > 4:
         raise UnsupportedError(
             f"is .spz version {header.version} of SH degree {header.degree}, and version 2 to 4 of "
             "degree 0 to 3 are read"
         )
+    if header.degree > max_degree:
+        raise BandError(f"has harmonics of degree {header.degree}")
     return header
 
 
-def _unpack_gzip(data: bytes) -> bytes:
+def _unpack_gzip(data: bytes, max_degree: int) -> bytes:
     # The header says how long the content is; a bomb is refused before it is unpacked.
     unpacker = zlib.decompressobj(wbits=GZIP_BITS)
     start = unpacker.decompress(data, HEADER.size)
-    header = _parse_header(start)
+    header = _parse_header(start, max_degree)
     check_count(header.num_gaussians, len(data))
     size = sum(header.stream_sizes)
     # One byte more than there should be reaches the end, where the checksum is compared. What a cut
@@ -172,13 +175,13 @@ def _decode_streams(header: SpzHeader, streams: list[bytes]) -> Gaussians:
         for stream, width in zip(streams, header.widths, strict=True)
     ]
     colour = 0.5 + SH_C0 * (colours.astype(np.float32) / 255 - 0.5) / COLOR_SCALE
-    higher = REST_VALUES[rest]
+    higher = REST_VALUES[rest].reshape(n, -1, 3)[:, : NUM_SH_REST[min(header.degree, 3)]]
     return build_gaussians(
         np.ldexp(_decode_int24(positions).astype(np.float32), -header.fractional_bits),
         _decode_quats_v2(rotations) if header.version == 2 else _decode_quats_v3(rotations),
         np.exp(scales.astype(np.float32) / 16 - 10),
         opacities[:, 0].astype(np.float32) / 255,
-        assemble_sh(colour, higher.reshape(n, NUM_SH_REST[header.degree], 3)),
+        assemble_sh(colour, higher),
     )
 
 

@@ -7,10 +7,13 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+from annotated_types import Interval
 
 from gscompleter.apps.commands.shared_options import SceneOptions, Words
 from gscompleter.config import CleaningConfig
 from gscompleter.system.process import import_without_collection
+
+Strength = Annotated[float, Interval(ge=0.1, le=10)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -18,7 +21,9 @@ class CleanOptions(SceneOptions):
     """Remove Gaussians of a splat that make its photographs worse or that none of them needs.
 
     No photograph loses more than 0.01 dB. Without SCENE, remove those that stand out from their
-    neighbours: isolated, huge, needles, transparent. `gscompleter strip` puts all back.
+    neighbours (isolated, huge, needles, transparent) and long streaks beside which nothing lies.
+    The cleaned splat is OUT/completed.ply; removed.png shows what went, and `gscompleter strip`
+    puts all back.
 
     Example: gscompleter clean photographs --scene splat.ply --out cleaned
     """
@@ -27,14 +32,17 @@ class CleanOptions(SceneOptions):
     """Folder of the photographs of the splat, in any layout that `complete` reads; if not given,
     neighbours decide."""
     out: Path
-    """Folder for completed.ply, removed.ply and summary.json."""
+    """Folder for completed.ply (the cleaned splat), removed.ply, removed.png and summary.json."""
     scene: Path
     """File of Gaussians to clean."""
     context: Words = None
     """Photographs to compare with: file names, or numbers from 0 in the order of the file paths;
     all of them if not given."""
     dry_run: bool = False
-    """Write only removed.ply, the Gaussians that would go, and summary.json."""
+    """Write only removed.ply, the Gaussians that would go, removed.png, which shows them in red,
+    and summary.json."""
+    strength: Strength = 1.0
+    """How much goes: 2 takes more than 1, and 0.5 less. Look at it with --dry-run."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Device to compare photographs on."""
     config: CleaningConfig = CleaningConfig()

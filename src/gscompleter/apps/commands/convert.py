@@ -1,17 +1,23 @@
-"""The command `convert`: the same Gaussians in another format."""
+"""The command `convert`: another format, and splats joined, cut, turned and reduced."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
+from annotated_types import Interval
 
 from gscompleter.apps.command_line.answers import print_answer
 from gscompleter.apps.commands.shared_options import WritingOptions, list_inputs
 from gscompleter.system.files.overlap import refuse_input_file
 from gscompleter.system.process import import_without_collection
+
+Level = Annotated[int, Interval(ge=0, le=100)]
+Degrees = Annotated[float, Interval(ge=-36_000, le=36_000)]
+Offset = Annotated[float, Interval(ge=-1e9, le=1e9)]
+Factor = Annotated[float, Interval(ge=1e-9, le=1e9)]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -20,7 +26,9 @@ class ConvertOptions(WritingOptions):
 
     Formats are .ply, .compressed.ply, .spz, .splat, .sog, .glb (KHR_gaussian_splatting), and
     .usda, .usdc and .usdz (OpenUSD, with usd-core). It also reads .ksplat, the folder of a .sog,
-    and .glb with a .spz inside.
+    and .glb with a .spz inside. On the way a splat can be joined with others, cut, scaled, turned,
+    moved and reduced, in the order of the options below, whatever their order is when they are
+    given. Numbers are in the axes of a .ply: x right, y down, z forward.
 
     Example: gscompleter convert splat.ply splat.spz
     """
@@ -29,6 +37,38 @@ class ConvertOptions(WritingOptions):
     """File to read, or the folder of a .sog."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="B")]
     """File to write."""
+    level: Level | None = None
+    """Level of detail to read of a streamed .sog (its folder or lod-meta.json); 0 is the finest."""
+    merge: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE [FILE ...]")] = ()
+    """Splats to add to A, in its coordinates; their labels of what is generated follow its own."""
+    bands: Literal[0, 1, 2, 3] | None = None
+    """Leave out harmonics above this degree; 3 also reads files of degree 4."""
+    crop_box: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        tyro.conf.arg(metavar="X0 Y0 Z0 X1 Y1 Z1"),
+    ] = None
+    """Keep Gaussians whose centre lies in this box: its smallest and its largest x, y and z."""
+    crop_sphere: Annotated[
+        tuple[float, float, float, float] | None, tyro.conf.arg(metavar="X Y Z RADIUS")
+    ] = None
+    """Keep Gaussians whose centre lies in this sphere; with a box, in both."""
+    scale: Factor = 1.0
+    """Scale by this factor, about the origin."""
+    rotate: Annotated[tuple[Degrees, Degrees, Degrees], tyro.conf.arg(metavar="X Y Z")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
+    """Turn by these angles in degrees, about the axes x, then y, then z through the origin; colours
+    by direction turn with it."""
+    translate: Annotated[tuple[Offset, Offset, Offset], tyro.conf.arg(metavar="X Y Z")] = (
+        0.0,
+        0.0,
+        0.0,
+    )
+    """Move by this."""
+    decimate: Annotated[str | None, tyro.conf.arg(metavar="N|N%")] = None
+    """Merge neighbours until about this number or share of the Gaussians is left."""
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
     ignore_properties: bool = False
@@ -38,7 +78,7 @@ class ConvertOptions(WritingOptions):
     `generated` in a .ply, no file beside other formats), nor who made them."""
 
     def check_overlap(self) -> None:
-        """Refuse to write over the input."""
+        """Refuse to write over an input."""
         refuse_input_file(self.out, list_inputs(self))
 
 
@@ -46,7 +86,10 @@ def run_convert(options: ConvertOptions) -> None:
     """Convert A to B, and print the number of Gaussians."""
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
-        from gscompleter.splats.formats import convert_splat, describe_oddities, reserve_splat
+        from dataclasses import asdict
+
+        from gscompleter.apps.converting import convert
+        from gscompleter.splats.formats import reserve_splat
         from gscompleter.system.console import make_console
         from gscompleter.system.progress import show_preparation, show_progress
 
@@ -55,20 +98,16 @@ def run_convert(options: ConvertOptions) -> None:
         show_progress(make_console(stderr=True, quiet=options.quiet)),
         show_preparation("converting"),
     ):
-        count, num_generated, note = convert_splat(
-            options.source,
-            options.out,
-            options.drop_nonfinite,
-            not options.plain,
-            options.ignore_properties,
-        )
-    # Some formats cannot say that a scene is antialiased.
-    notes = [*describe_oddities(options.source), *([] if note is None else [note])]
+        done = convert(options)
+    lines = list(done.notes)
+    if done.rounding is not None:
+        lines.append(done.rounding.describe())
     content = {
         "out": str(options.out),
-        "gaussians": count,
-        "generated": num_generated,
-        "notes": notes,
+        "gaussians": done.gaussians,
+        "generated": done.generated,
+        "notes": list(done.notes),
+        "rounding": None if done.rounding is None else asdict(done.rounding),
     }
-    sentence = f"{count:,} Gaussians, {num_generated:,} of them generated: {options.out}"
-    print_answer(options, content, [*notes, sentence])
+    sentence = f"{done.gaussians:,} Gaussians, {done.generated:,} of them generated: {options.out}"
+    print_answer(options, content, [*lines, sentence])

@@ -1,0 +1,265 @@
+"""Conversion of splats: read, joined, cut, turned, reduced, and written in another format."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import torch
+
+from gscompleter.apps.commands.convert import ConvertOptions
+from gscompleter.numerics.value_checks import check_gaussians
+from gscompleter.splats.compressed_ply import write_compressed_ply
+from gscompleter.splats.foreign import resolve_splat
+from gscompleter.splats.formats import (
+    SORTED,
+    decode_splat,
+    describe_mode_loss,
+    describe_oddities,
+    describe_rounding,
+    detect_splat_format,
+    drop_labels,
+    find_origin,
+    get_writer,
+    load_splat,
+    read_provenance,
+    save_splat,
+)
+from gscompleter.splats.morton import sort_along_morton
+from gscompleter.splats.operations import Operations
+from gscompleter.splats.ply import copy_ply, save_ply
+from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, RunRecord
+from gscompleter.splats.sog import write_sog
+from gscompleter.splats.spz import write_spz
+from gscompleter.splats.streamed import is_streamed, load_level
+from gscompleter.splats.upward import USUAL, read_upward
+from gscompleter.state import NEW_PHOTO_ID
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.writing import REMOVED_FILE
+from gscompleter.types import Gaussians, merge
+
+MAX_SHIFT = 1000.0
+"""Longest shift, in scene units, after which coordinates certainly fit float32."""
+ROUNDED = (write_spz, write_sog, write_compressed_ply)
+"""Writers of formats whose rounding is said."""
+CAMERAS_FILE = "cameras.json"
+"""File of a trainer with the cameras of its splat, which lies beside it."""
+UP_TOLERANCE = 1e-3
+"""Difference of a component of two upward directions that count as one."""
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """The largest change of numbers by a format."""
+
+    position: float
+    """Largest change of a coordinate, in scene units."""
+    size: tuple[float, float]
+    """Standard deviation that changed by the largest factor, before and after, likewise."""
+
+    def describe(self) -> str:
+        """Describe it in a line."""
+        before, after = self.size
+        return (
+            f"Largest rounding: {self.position:.2g} of a coordinate, and a size of {before:.3g} "
+            f"became {after:.3g}."
+        )
+
+
+@dataclass(frozen=True)
+class Conversion:
+    """What was written."""
+
+    gaussians: int
+    generated: int
+    notes: tuple[str, ...]
+    rounding: Rounding | None
+    """None for formats that keep positions and sizes as they are."""
+
+
+def convert(options: ConvertOptions) -> Conversion:
+    """Convert one splat or several, and say what the result does not keep."""
+    sources = [resolve_splat(path) for path in (options.source, *options.merge)]
+    operations = make_operations(options)
+    oddities = [line for source in sources for line in describe_oddities(source)]
+    notes = (*oddities, *describe_left_behind(sources, options.out, operations))
+    keep_labels = not options.plain
+    if can_be_streamed(sources, options, operations):
+
+        def edit(rows: Gaussians) -> Gaussians:
+            edited = operations.apply_to_rows(rows)
+            check_gaussians(edited, "The scene to write")
+            return edited
+
+        count, num_generated = copy_ply(
+            sources[0],
+            options.out,
+            options.drop_nonfinite,
+            keep_labels,
+            read_provenance(sources[0]) if keep_labels else NOTHING_KNOWN,
+            options.ignore_properties,
+            edit if operations.changes else None,
+        )
+        return Conversion(count, num_generated, notes, None)
+
+    gaussians, made_by = read_all(sources, options)
+    gaussians = operations.apply(gaussians)
+    if len(gaussians) == 0:
+        raise InputError("No Gaussian is left; change what is cut off.")
+    num_generated = int((gaussians.generated > 0).sum())
+    if not keep_labels:
+        gaussians = drop_labels(gaussians)
+    save_splat(options.out, gaussians, made_by)
+    losses = [describe_mode_loss(options.out, gaussians), describe_rounding(options.out, gaussians)]
+    notes = (*(loss for loss in losses if loss is not None), *notes)
+    return Conversion(
+        len(gaussians), num_generated, notes, measure_rounding(options.out, gaussians)
+    )
+
+
+def make_operations(options: ConvertOptions) -> Operations:
+    """Make the operations that the options name."""
+    return Operations(
+        bands=options.bands,
+        box=options.crop_box,
+        sphere=options.crop_sphere,
+        scale=options.scale,
+        rotate=options.rotate,
+        translate=options.translate,
+        decimate=parse_number(options.decimate),
+    )
+
+
+def parse_number(words: str | None) -> float | int | None:
+    """Parse a number of Gaussians, or a share in percent as a float from 0 to 1."""
+    if words is None:
+        return None
+    try:
+        if words.endswith("%"):
+            share = float(words[:-1]) / 100
+            if 0 < share <= 1:
+                return share
+        elif int(words) > 0:
+            return int(words)
+    except ValueError:
+        pass
+    raise InputError(
+        f"{quote_value(words)} is no number of Gaussians such as 100000, and no share such as 25%.",
+        "decimate",
+    )
+
+
+def can_be_streamed(
+    sources: Sequence[Path], options: ConvertOptions, operations: Operations
+) -> bool:
+    """Check whether some Gaussians can be in memory at a time: from one .ply to another."""
+    if len(sources) > 1 or options.level is not None or not operations.is_by_rows:
+        return False
+    # The origin of a moved splat is chosen by all of its Gaussians.
+    if operations.similarity is not None and (
+        max(map(abs, operations.translate)) > MAX_SHIFT or find_origin(sources[0]) is not None
+    ):
+        return False
+    return get_writer(options.out) is save_ply and detect_splat_format(sources[0]) == "ply"
+
+
+def read_all(sources: Sequence[Path], options: ConvertOptions) -> tuple[Gaussians, Provenance]:
+    """Read all splats as one, with the record of who made them."""
+    if options.level is not None and not any(is_streamed(source) for source in sources):
+        raise InputError(
+            f"{quote_value(sources[0])} has no levels of detail; leave --level out.", "level"
+        )
+    parts = []
+    runs: list[RunRecord] = []
+    labels_used = 0
+    for source in sources:
+        if options.level is not None and is_streamed(source):
+            part = load_level(source, options.level, options.drop_nonfinite)
+            made_by = NOTHING_KNOWN
+        else:
+            part = load_splat(
+                source,
+                options.drop_nonfinite,
+                options.ignore_properties,
+                leaves_out_band_4=options.bands is not None,
+            )
+            made_by = read_provenance(source) if not options.plain else NOTHING_KNOWN
+        if not options.plain:
+            part, made_by = move_labels(part, made_by, labels_used, source)
+            targets = part.generated.where(part.generated < NEW_PHOTO_ID, 0)
+            labels_used = max(labels_used, int(targets.max()))
+        parts.append(part)
+        runs += made_by.runs
+    return merge(parts) if len(parts) > 1 else parts[0], Provenance(tuple(runs))
+
+
+def move_labels(
+    part: Gaussians, made_by: Provenance, labels_used: int, source: Path
+) -> tuple[Gaussians, Provenance]:
+    """Move the numbers of the targets of a splat behind those of the splats before it."""
+    is_target = (part.generated > 0) & (part.generated < NEW_PHOTO_ID)
+    if labels_used == 0 or not is_target.any():
+        return part, made_by
+    moved = part.generated.int() + labels_used * is_target
+    if moved[is_target].max() >= NEW_PHOTO_ID:
+        raise InputError(
+            f"With {quote_value(source)} there are more than {NEW_PHOTO_ID - 1} targets; leave the "
+            "labels out (--plain)."
+        )
+    runs = tuple(
+        run
+        if run.labels is None
+        else replace(run, labels=(run.labels[0] + labels_used, run.labels[1] + labels_used))
+        for run in made_by.runs
+    )
+    return replace(part, generated=moved.to(torch.uint8)), Provenance(runs)
+
+
+def describe_left_behind(
+    sources: Sequence[Path], out: Path, operations: Operations
+) -> Iterator[str]:
+    """Describe what lies beside the splats or is said in them, and does not hold for the result."""
+    similarity = operations.similarity
+    turn = torch.eye(3, dtype=torch.float64)
+    if similarity is not None:
+        turn = similarity[:3, :3] / operations.scale
+    for source in sources:
+        if is_streamed(source):
+            continue
+        up = read_upward(source)
+        if up is not None:
+            turned = turn @ torch.tensor(up, dtype=torch.float64)
+            if (turned - torch.tensor(USUAL, dtype=torch.float64)).abs().max() > UP_TOLERANCE:
+                words = " ".join(f"{x:.4g}" for x in (turned + 0.0).tolist())
+                yield (
+                    f"{quote_value(source.name)} says which way is up, which "
+                    f"{quote_value(out.name)} does not: name it with --up {words}."
+                )
+        if similarity is not None and (source.parent / CAMERAS_FILE).is_file():
+            yield (
+                f"{CAMERAS_FILE} beside {quote_value(source.name)} is for the splat as it was, and "
+                f"does not fit {quote_value(out.name)}."
+            )
+        changes = operations.changes or len(sources) > 1
+        if changes and (source.parent / REMOVED_FILE).is_file():
+            yield (
+                f"`strip` cannot take back what was done to {quote_value(source.name)} from "
+                f"{quote_value(out.name)}, whose Gaussians are others; strip first to undo it."
+            )
+
+
+def measure_rounding(path: Path, gaussians: Gaussians) -> Rounding | None:
+    """Read a file again, and compare it with what was to be written."""
+    write = get_writer(path)
+    # Of a splat with an origin, `describe_rounding` says it.
+    if write not in ROUNDED or gaussians.origin is not None:
+        return None
+    given = gaussians.detach().to("cpu")
+    if write in SORTED:
+        given = sort_along_morton(given)
+    read = decode_splat(path)
+    factors = read.scales.clamp_min(1e-30).log() - given.scales.clamp_min(1e-30).log()
+    worst = factors.abs().flatten().argmax()
+    sizes = given.scales.flatten()[worst].item(), read.scales.flatten()[worst].item()
+    return Rounding((read.means - given.means).abs().max().item(), sizes)

@@ -1,0 +1,124 @@
+"""The picture of a cleaning: the splat before, what goes in red, and the splat after."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+from torch.nn.functional import pad
+
+from gscompleter.apps.report.completion import join_images
+from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, thin_gaussians
+from gscompleter.render.outside import DISTANCE, list_outside_cameras, measure_extent
+from gscompleter.render.protocols import Renderer
+from gscompleter.render.view_map import get_view_map
+from gscompleter.types import Camera, Gaussians, merge
+
+PICTURE_FILE = "removed.png"
+NUM_ROWS = 2
+"""Cameras that the picture shows, those that see most of what goes."""
+SIDE = 384
+"""Width and height of an image from outside, in pixels."""
+ZOOM = 1.5
+"""Factor on the focal length of these images: they show 1.3 times the extent of what stays."""
+PREVIEW_SIDE = 64
+"""Width and height of the images in which cameras from outside are compared."""
+CUT = 0.25
+"""Place of the section through a splat that is seen from outside, before its middle, in radii."""
+GAP = 4
+"""Pixels between rows."""
+RED = (1.0, 0.1, 0.1)
+DIMMING = 0.5
+"""Brightness of what stays beside what goes."""
+
+
+@dataclass(frozen=True)
+class RemovalSeen:
+    """What a camera sees of what goes."""
+
+    camera: Camera
+    removed: float
+    """Sum over the pixels of the weights of what goes."""
+    shown: float
+    """Sum over the pixels of alpha."""
+
+
+def see_removal(
+    given: Gaussians, removed: Bool[Tensor, "n"], camera: Camera, renderer: Renderer
+) -> RemovalSeen:
+    """Measure what a camera sees of what goes."""
+    frozen = renderer.freeze(given, camera)
+    weights = frozen.splat(removed.to(given.means))
+    return RemovalSeen(camera, weights.sum().item(), frozen.render.alpha.sum().item())
+
+
+def look_at_removal(
+    given: Gaussians, removed: Bool[Tensor, "n"], renderer: Renderer
+) -> tuple[list[Camera], float]:
+    """Choose cameras outside of a splat that see most of what goes.
+
+    Of a room they see a section, without the walls in front. Also returns the share of what is seen
+    from twelve directions that goes.
+    """
+    parts = given[~removed], given[removed]
+    small = [thin_gaussians(part, MAX_PREVIEW_GAUSSIANS) for part in parts]
+    both = merge(small)
+    goes = torch.arange(len(both)).to(removed.device) >= len(small[0])
+    extent = measure_extent(small[0])
+    cameras = list_outside_cameras(extent, PREVIEW_SIDE)
+    # Renderers draw nothing nearer than a hundredth of the near plane.
+    section = 100 * (DISTANCE - CUT) * extent.radius
+    cut = [replace(camera, near=section) for camera in cameras]
+
+    def see(camera: Camera) -> RemovalSeen:
+        return see_removal(both, goes, camera, renderer)
+
+    view_map = get_view_map(given.means)
+    whole = list(view_map(see, cameras))
+    pairs = zip(whole, view_map(see, cut), strict=True)
+    best = choose_cameras([max(pair, key=lambda seen: seen.removed) for pair in pairs])
+    share = sum(seen.removed for seen in whole) / max(sum(seen.shown for seen in whole), 1e-12)
+    return [enlarge(camera) for camera in best], share
+
+
+def choose_cameras(seen: Sequence[RemovalSeen]) -> list[Camera]:
+    """Choose the cameras that see most of what goes; the first of equals."""
+    order = sorted(range(len(seen)), key=lambda number: -seen[number].removed)
+    return [seen[number].camera for number in order[:NUM_ROWS]]
+
+
+def enlarge(camera: Camera) -> Camera:
+    """Enlarge the images of a camera from outside to `SIDE`, with less of what is around."""
+    K = camera.K * camera.K.new_tensor([[SIDE / PREVIEW_SIDE], [SIDE / PREVIEW_SIDE], [1.0]])
+    K = K * K.new_tensor([[ZOOM, 1.0, 1.0], [1.0, ZOOM, 1.0], [1.0, 1.0, 1.0]])
+    return replace(camera, K=K, width=SIDE, height=SIDE)
+
+
+def draw_removal_rows(
+    given: Gaussians, removed: Bool[Tensor, "n"], cameras: Sequence[Camera], renderer: Renderer
+) -> Float[Tensor, "h w 3"]:
+    """Draw a row for each camera: before, what goes in red over a dim grey, and after."""
+    kept = given[~removed]
+    rows = []
+    for camera in cameras:
+        frozen = renderer.freeze(given, camera)
+        before = frozen.render.image.clamp(0, 1)
+        # The root, so that what is faint is seen.
+        weights = frozen.splat(removed.to(given.means)).clamp(0, 1).sqrt()[..., None]
+        grey = DIMMING * before.mean(dim=2, keepdim=True)
+        marked = grey * (1 - weights) + weights * torch.tensor(RED).to(grey)
+        after = renderer.render(kept, camera).image
+        rows.append(join_images([before, marked, after]))
+    # Photographs may have several sizes.
+    width = max(row.shape[1] for row in rows)
+    white = torch.ones((GAP, width, 3))
+    parts = [part for row in rows for part in (white, pad_to_width(row, width))]
+    return torch.cat(parts[1:])
+
+
+def pad_to_width(row: Float[Tensor, "h w 3"], width: int) -> Float[Tensor, "h wide 3"]:
+    """Pad an image on the right with white."""
+    return pad(row, (0, 0, 0, width - row.shape[1]), value=1.0)

@@ -1,0 +1,86 @@
+"""One level of detail of a streamed .sog: a `lod-meta.json` and a .sog for each level and place.
+
+The tree in `lod-meta.json` has boxes, of which each names by level the file, the first Gaussian and
+the number of Gaussians that show it. Level 0 is the finest.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from gscompleter.splats.foreign import LOD_META
+from gscompleter.splats.formats import load_splat
+from gscompleter.splats.sog import META
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.reading import read_json
+from gscompleter.system.progress import track
+from gscompleter.types import Gaussians, merge
+
+MAX_NODES = 1_000_000
+"""Most boxes of a tree."""
+Part = tuple[int, int, int]
+"""Number of a file, of its first Gaussian, and of Gaussians."""
+
+
+def is_streamed(path: Path) -> bool:
+    """Check whether a path names a streamed scene: its folder, or its index."""
+    return (path / LOD_META if path.is_dir() else path).name.lower() == LOD_META and (
+        (path / LOD_META).is_file() or path.is_file()
+    )
+
+
+def load_level(path: Path, level: int, drop_nonfinite: bool = False) -> Gaussians:
+    """Load the Gaussians of one level of a streamed scene, a folder or its `lod-meta.json`."""
+    index = path / LOD_META if path.is_dir() else path
+    name = quote_value(index)
+    table = read_json(index, "export the scene again")
+    try:
+        levels = int(table["lodLevels"])
+        files = [str(file) for file in table["filenames"]]
+        parts = sorted(set(_list_parts(table["tree"], level)))
+        fits = all(0 <= file < len(files) and first >= 0 < count for file, first, count in parts)
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise InputError(f"{name} is no index of levels; export the scene again.") from error
+    if not 0 <= level < levels:
+        raise InputError(f"{name} has levels 0 to {levels - 1}, 0 the finest.", "level")
+    if not fits or not parts:
+        raise InputError(f"{name} names no Gaussians of level {level}; export the scene again.")
+
+    gaussians = []
+    by_file: dict[int, list[Part]] = {}
+    for part in parts:
+        by_file.setdefault(part[0], []).append(part)
+    for number, wanted in track(list(by_file.items()), "reading places"):
+        place = _locate(index, files[number])
+        scene = load_splat(place)
+        if any(first + count > len(scene) for _, first, count in wanted):
+            raise InputError(
+                f"{quote_value(place)} has {len(scene):,} Gaussians, fewer than {name} says; "
+                "export the scene again."
+            )
+        gaussians += [scene[first : first + count] for _, first, count in wanted]
+    return merge(gaussians)
+
+
+def _list_parts(tree: Mapping[str, Any], level: int) -> Iterator[Part]:
+    """List what the boxes of a tree name for a level."""
+    nodes = [tree]
+    for _ in range(MAX_NODES):
+        if not nodes:
+            return
+        node = nodes.pop()
+        part = node.get("lods", {}).get(str(level))
+        if part is not None:
+            yield int(part["file"]), int(part["offset"]), int(part["count"])
+        nodes += node.get("children", [])
+    raise ValueError("its tree has too many boxes")
+
+
+def _locate(index: Path, file: str) -> Path:
+    """Locate a .sog that an index names, in its own folder or below."""
+    path = index.parent / file
+    if not path.resolve().is_relative_to(index.parent.resolve()):
+        raise InputError(f"{quote_value(index)} names a file outside of its folder.")
+    return path.parent if path.name == META else path
