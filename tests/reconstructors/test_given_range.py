@@ -95,6 +95,15 @@ def test_given_depths_outside_of_the_range_widen_it():
     assert found.notes[0].startswith("Given depths stand at 2.2, nearer than the near plane")
 
 
+def test_given_depths_that_nothing_confirms_move_no_plane_far():
+    """A damaged file of depth has any values: the sweep would not hold such a plane."""
+    views = see_room(0.5, 20.0)
+    damaged = torch.full((SIZE, SIZE), 1e-20)
+    found = find_depth_range([replace(view, depth=None, given_depth=damaged) for view in views])
+    assert (found.near, found.far) == (0.5, 20.0)
+    assert "times outside of the depth range from 0.5 to 20, which is kept" in found.notes[0]
+
+
 def test_a_trained_network_keeps_its_range_and_the_user_is_told():
     trained = (1.0, 100.0)
     # The range of its authors, as their evaluation gives it

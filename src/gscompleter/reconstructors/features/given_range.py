@@ -35,6 +35,8 @@ NEIGHBOURHOOD = 0.1
 """Half the side of the square, in widths of the image, in which matches confirm each other."""
 SAME_DEPTH = math.log(1.25)
 """Largest difference in the logarithm of depth between matches that confirm each other."""
+MAX_WIDENING = 100.0
+"""Largest factor by which a plane is moved. Depths farther off are damaged, or in another unit."""
 MIN_CONFIRMING = 2
 """Fewest other matches that confirm one."""
 
@@ -108,6 +110,14 @@ def widen_range(views: Sequence[View], given: DepthRange, outcome: str = "") -> 
     notes = given.notes
     for seen in (measure_features(views), measure_given(views)):
         nearest, farthest = seen.find_nearest(near), seen.find_farthest(far)
+        off = max(near / (nearest or near), (farthest or far) / far)
+        if off > MAX_WIDENING:
+            notes = (
+                *notes,
+                f"{seen.source} stand {off:.2g} times outside of the depth range from {near:.3g} to "
+                f"{far:.3g}, which is kept: they are damaged, or in another unit.",
+            )
+            continue
         places = []
         if nearest is not None:
             places.append(f"at {nearest:.2g}, nearer than the near plane at {near:.3g}")
