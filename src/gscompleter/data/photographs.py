@@ -222,7 +222,9 @@ class Photographs:
 
     def _match_names(self, word: str) -> list[int]:
         """List the frames whose photograph a word names, those that it names exactly if any."""
-        wanted = PurePosixPath(fold_name(word.replace("\\", "/"))).parts
+        path_of_word = fold_name(word.replace("\\", "/"))
+        wanted = PurePosixPath(path_of_word).parts
+        wanted_stem = PurePosixPath(os.path.splitext(path_of_word)[0]).parts
         exact = []
         similar = []
         for number, frame in enumerate(self.frames):
@@ -230,8 +232,12 @@ class Photographs:
             if word in (frame.name, frame.file_name, PurePosixPath(path).name):
                 exact.append(number)
             # The word may lack folders, and so may the name: either may be the end of the other.
-            names = fold_name(path), os.path.splitext(fold_name(path))[0]
-            if any(_ends_alike(PurePosixPath(name).parts, wanted) for name in names):
+            stem, ending = os.path.splitext(fold_name(path))
+            names = [(stem + ending, wanted), (stem, wanted)]
+            # A file of cameras may name photographs without the endings of their files.
+            if not ending:
+                names.append((stem, wanted_stem))
+            if any(_ends_alike(PurePosixPath(name).parts, given) for name, given in names):
                 similar.append(number)
         return exact or similar
 
