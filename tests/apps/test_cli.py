@@ -140,7 +140,7 @@ def test_photographs_that_were_not_used_are_scored(scene, tmp_path, monkeypatch,
         assert row["psnr_after"] > row["psnr_before"] + 1
     said = capsys.readouterr().out
     assert "the 8 nearest unused photographs gain " in said
-    assert " dB where it covers them (" in said
+    assert " dB where the scene covers them (" in said
     page = (out / "report.html").read_text()
     assert "At held-out photographs" in page
     assert ">mean<" in page

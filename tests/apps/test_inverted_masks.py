@@ -195,8 +195,8 @@ def test_a_headline_names_the_share_that_was_measured():
         return describe_gain("The scene is completed", rows)
 
     assert describe(0.24) == (
-        "The scene is completed: the unused photograph 0 gains 10.7 dB where it covers them "
-        "(18.69 dB before, 29.43 dB after, over the 24 % of the picture that masks leave)"
+        "The scene is completed: the unused photograph 0 gains 10.7 dB where the scene covers "
+        "it (18.69 dB before, 29.43 dB after, over the 24 % of the picture that masks leave)"
     )
     assert "over the 50 % of the picture that masks leave" in describe(0.2, 0.8)
     assert "masks" not in describe(1.0, 0.95)

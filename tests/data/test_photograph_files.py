@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -141,6 +142,18 @@ def test_photographs_are_found_by_name_or_number(tmp_path):
     for word in ("photo", "photo_02", "002.png", "", "jpg"):
         with pytest.raises(InputError, match="There is no photograph"):
             photographs.find_frame(word)
+
+
+def test_a_photograph_is_found_by_its_file_where_the_cameras_leave_its_ending_out(tmp_path):
+    """As Inria's cameras.json does, whose names are all that an error could tell."""
+    names = [f"images/20240212_{number}.jpg" for number in range(4)]
+    photographs = open_photographs(write_transforms(tmp_path, CAMERAS, names))
+    frames = tuple(replace(f, name=f.name.removesuffix(".jpg")) for f in photographs.frames)
+    bare = replace(photographs, frames=frames)
+    for word in ("20240212_2.jpg", "20240212_2", "20240212_2.JPG", "images/20240212_2.jpg"):
+        assert bare.find_frame(word) == photographs.find_frame("20240212_2.jpg")
+    with pytest.raises(InputError, match="There is no photograph"):
+        bare.find_frame("20240212_9.jpg")
 
 
 @pytest.mark.parametrize("orientation", [5, 6, 7, 8])

@@ -2,7 +2,12 @@
 
 import pytest
 
-from gscompleter.data.photograph_names import describe_offset, name_photograph, name_target
+from gscompleter.data.photograph_names import (
+    describe_offset,
+    name_photograph,
+    name_render,
+    name_target,
+)
 from scenes import camera_at
 
 
@@ -10,6 +15,11 @@ def test_a_photograph_has_its_number_and_its_file():
     assert name_photograph(5, "IMG_0012.jpg") == "5 (IMG_0012.jpg)"
     assert name_photograph(5, None) == "5"
     assert name_photograph(None, None) == "–"
+
+
+def test_a_render_in_place_of_a_photograph_has_one_number():
+    """Its number among the frames, from 0, and that of its name, from 1, told nothing together."""
+    assert name_photograph(0, name_render(1)) == "1"
 
 
 def test_targets_near_one_photograph_are_told_apart():

@@ -6,14 +6,26 @@ import math
 
 from gscompleter.types import Camera
 
+RENDER = "render "
+"""Beginning of the names of renders in place of photographs."""
 MIN_TURN = 0.5
 """Smallest turn of a camera that is said, in degrees."""
 MIN_SHIFT = 1e-3
 """Smallest shift of a camera that is said, relative to the longest of its components and 1."""
 
 
+def name_render(number: int) -> str:
+    """Name a render in place of a photograph; they are counted from 1."""
+    return f"{RENDER}{number}"
+
+
 def name_photograph(frame: int | None, file: str | None) -> str:
-    """Name a photograph by its number and its file, as in "5 (IMG_0012.jpg)"."""
+    """Name a photograph by its number and its file, as in "5 (IMG_0012.jpg)".
+
+    A render in place of one, which has no file, is named by the number in its name alone.
+    """
+    if file is not None and file.startswith(RENDER):
+        return file.removeprefix(RENDER)
     number = "–" if frame is None else str(frame)
     return number if file is None else f"{number} ({file})"
 

@@ -258,7 +258,9 @@ class Photographs:
 
     def _match_names(self, word: str) -> list[int]:
         """List the frames whose photograph a word names, those that it names exactly if any."""
-        wanted = PurePosixPath(fold_name(word.replace("\\", "/"))).parts
+        path_of_word = fold_name(word.replace("\\", "/"))
+        wanted = PurePosixPath(path_of_word).parts
+        wanted_stem = PurePosixPath(os.path.splitext(path_of_word)[0]).parts
         exact = []
         similar = []
         for number, frame in enumerate(self.frames):
@@ -267,8 +269,10 @@ class Photographs:
                 exact.append(number)
             # The word may lack folders, and so may the name: either may be the end of the other.
             full = [fold_name(path), fold_name(frame.file_name)]
-            names = [*full, *(os.path.splitext(name)[0] for name in full)]
-            if any(_ends_alike(PurePosixPath(name).parts, wanted) for name in names):
+            names = [(name, wanted) for name in (*full, *(os.path.splitext(n)[0] for n in full))]
+            # A file of cameras may name photographs without the endings of their files.
+            names += [(name, wanted_stem) for name in full if not os.path.splitext(name)[1]]
+            if any(_ends_alike(PurePosixPath(name).parts, given) for name, given in names):
                 similar.append(number)
         return exact or similar
 

@@ -17,6 +17,7 @@ from gscompleter.apps.inputs.scene_request import LONG_SIDE, SceneRequest
 from gscompleter.config import HoleConfig
 from gscompleter.data.camera_files import NAME, has_camera_list
 from gscompleter.data.mask_reading import MaskReading
+from gscompleter.data.photograph_names import name_render
 from gscompleter.data.photographs import (
     Photographs,
     Resolution,
@@ -226,7 +227,7 @@ def name_capture(
     cameras: Sequence[Camera], source: str, where: str, upward: Upward | None = None
 ) -> Capture:
     """Name cameras that were found."""
-    names = [f"render {number}" for number in range(1, len(cameras) + 1)]
+    names = [name_render(number) for number in range(1, len(cameras) + 1)]
     return Capture(cameras, names, source, where, "; --cameras names others", upward)
 
 

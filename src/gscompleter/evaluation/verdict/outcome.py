@@ -210,9 +210,12 @@ def describe_gain(
     scores += describe_measured([row.unmasked for row in rows])
     if after < before - MIN_LOSS:
         return f"{work}, but it matches {name_unused(rows)} worse than before: {scores}"
-    verb = "gains" if len(rows) == 1 else "gain"
-    gain = f"{format_number(max(0.0, after - before), 1)} dB"
-    return f"{work}: {name_unused(rows)} {verb} {gain} where it covers them ({scores})"
+    is_one = len(rows) == 1
+    gain = f"{'gains' if is_one else 'gain'} {format_number(after - before, 1)} dB"
+    if after < before + MIN_LOSS:
+        gain = "stays as it was" if is_one else "stay as they were"
+    place = f"where the scene covers {'it' if is_one else 'them'}"
+    return f"{work}: {name_unused(rows)} {gain} {place} ({scores})"
 
 
 def compute_gain(row: ScoreRow) -> float:
