@@ -124,3 +124,13 @@ def test_the_model_folder_of_a_trainer_is_a_splat_unless_it_has_photographs(tmp_
     assert is_splat(folder)
     write_photographs(folder / "images", CAMERAS)
     assert not is_splat(folder)
+
+
+def test_depth_that_is_not_used_is_named_where_the_scene_is_opened(tmp_path, monkeypatch, capsys):
+    scene = write_transforms(tmp_path / "scene", CAMERAS)
+    (scene / "depths").mkdir()
+    (scene / "depths" / "0.png").write_bytes(b"")
+    words = ("complete", scene, "--context", 0, 1, "--target", 3, "--dry-run", "--out")
+    assert run(monkeypatch, *words, tmp_path / "out") == 0
+    opened = next(line for line in capsys.readouterr().err.splitlines() if "Opened:" in line)
+    assert opened.endswith("nerfstudio, 4 of 4 photographs; not used: depths (1 files of depth).")

@@ -492,6 +492,13 @@ KINDS: dict[str, Mutation] = {
     "kitti": posed("kitti", "*.txt"),
     "dgp": posed("dgp", "**/*.json"),
     "splits": posed("splits", "*.json"),
+    "scannet": posed("scannet", "*/*.txt"),
+    "scannet-depth": posed("scannet", "depth/*.png"),
+    "replica": posed("replica", "*.txt"),
+    "replica-lens": posed("replica", "*.json"),
+    "mvsnet": posed("mvsnet", "cams/*.txt"),
+    "mvsnet-depth": posed("mvsnet", "rendered_depth_maps/*.pfm"),
+    "idr": posed("idr", "*.npz"),
     "photograph": posed("photographs", "images/*"),
     "one-photograph": in_bytes(
         "scene/0.png", ["complete", "scene/0.png", "--out", "out", "--quiet", "--auto", "1"]

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from PIL import Image
 
 from gscompleter.data.colmap import MODELS
 from gscompleter.data.scene import write_cameras
@@ -238,6 +239,84 @@ def splits(folder: Path) -> Path:
     return folder
 
 
+def write_table(path: Path, table: np.ndarray) -> None:
+    """Write rows of numbers with as many digits as restore them."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    rows = np.atleast_2d(table).tolist()
+    path.write_text("\n".join(" ".join(map(repr, row)) for row in rows) + "\n")
+
+
+def write_millimetres(path: Path, view: View, unit: float = 1e-3) -> None:
+    """Write the depth of a view as a 16-bit PNG."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    values = (view.depth.double().numpy() / unit).round().clip(0, 65535)
+    Image.fromarray(values.astype(np.uint16)).save(path)
+
+
+def get_lens(camera: Camera) -> np.ndarray:
+    """Return the matrix of the lens in float64."""
+    return camera.K.double().numpy()
+
+
+def scannet(folder: Path) -> Path:
+    """Write the layout of ScanNet's reader."""
+    write_photographs(folder / "color")
+    lens = np.eye(4)
+    lens[:3, :3] = get_lens(CAMERAS[0])
+    write_table(folder / "intrinsic/intrinsic_color.txt", lens)
+    for number, (camera, view) in enumerate(zip(CAMERAS, VIEWS, strict=True)):
+        write_table(folder / f"pose/{number}.txt", camera.c2w.double().numpy())
+        write_millimetres(folder / f"depth/{number}.png", view)
+    return folder
+
+
+def replica(folder: Path) -> Path:
+    """Write the layout of Replica as it is rendered for SLAM."""
+    write_photographs(folder / "results", [f"frame{n:06d}.png" for n in range(len(VIEWS))])
+    for number, view in enumerate(VIEWS):
+        write_millimetres(folder / f"results/depth{number:06d}.png", view, 1 / 6553.5)
+    write_table(folder / "traj.txt", np.stack([c.c2w.double().numpy().ravel() for c in CAMERAS]))
+    lens = get_lens(CAMERAS[0])
+    camera = {"w": SIZE, "h": SIZE, "fx": lens[0, 0], "fy": lens[1, 1], "scale": 6553.5}
+    camera |= {"cx": lens[0, 2] - 0.5, "cy": lens[1, 2] - 0.5}  # whole numbers are pixel centres
+    (folder / "cam_params.json").write_text(json.dumps({"camera": camera}))
+    return folder
+
+
+def mvsnet(folder: Path) -> Path:
+    """Write the layout of BlendedMVS and MVSNet."""
+    write_photographs(folder / "blended_images", [f"{n:08d}.png" for n in range(len(VIEWS))])
+    (folder / "cams").mkdir()
+    (folder / "rendered_depth_maps").mkdir()
+    for number, (camera, view) in enumerate(zip(CAMERAS, VIEWS, strict=True)):
+        viewmat = np.linalg.inv(camera.c2w.double().numpy()).tolist()
+        blocks = [
+            "extrinsic\n" + "\n".join(" ".join(map(repr, row)) for row in viewmat),
+            "intrinsic\n" + "\n".join(" ".join(map(repr, r)) for r in get_lens(camera).tolist()),
+            "0.5 0.01 128 6.0",
+        ]
+        (folder / f"cams/{number:08d}_cam.txt").write_text("\n\n".join(blocks) + "\n")
+        depth = view.depth.numpy()[::-1].astype("<f4")
+        head = f"Pf\n{SIZE} {SIZE}\n-1.0\n".encode()
+        file = folder / f"rendered_depth_maps/{number:08d}.pfm"
+        file.write_bytes(head + depth.tobytes())
+    return folder
+
+
+def idr(folder: Path) -> Path:
+    """Write the layout of IDR and NeuS, whose projections have any factor."""
+    write_photographs(folder / "image", [f"{n:06d}.png" for n in range(len(VIEWS))])
+    matrices = {}
+    for number, camera in enumerate(CAMERAS):
+        viewmat = np.linalg.inv(camera.c2w.double().numpy())
+        projection = np.eye(4)
+        projection[:3] = get_lens(camera) @ viewmat[:3] * (-2.0 if number % 2 else 3.0)
+        matrices[f"world_mat_{number}"] = projection
+        matrices[f"scale_mat_{number}"] = np.diag([2.0, 2.0, 2.0, 1.0])
+    np.savez(folder / "cameras_sphere.npz", **matrices)
+    return folder
+
+
 WRITERS: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "colmap-binary": ("colmap", binary),
     "colmap-text": ("colmap", text),
@@ -248,5 +327,9 @@ WRITERS: dict[str, tuple[str, Callable[[Path], Path]]] = {
     "dgp": ("dgp", dgp),
     "transforms": ("nerfstudio", transforms),
     "splits": ("nerfstudio", splits),
+    "scannet": ("scannet", scannet),
+    "replica": ("replica", replica),
+    "mvsnet": ("mvsnet", mvsnet),
+    "idr": ("idr", idr),
 }
 """Writers of each kind of folder, and the names of their formats."""

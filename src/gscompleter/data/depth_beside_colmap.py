@@ -160,6 +160,6 @@ def read_dense(path: Path) -> Float[np.ndarray, "h w"]:
     except ValueError as error:
         raise InputError(
             f"{quote_value(path)} is no depth map of COLMAP, or ends too early; run dense stereo "
-            "again, or use --no-given-depth."
+            "again, or move it away."
         ) from error
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0.0).astype(np.float32)

@@ -24,6 +24,7 @@ from gscompleter.data.frame import FOLDERS, describe_moved, describe_unposed
 from gscompleter.data.limits import check_planes, require
 from gscompleter.data.llff import has_llff, open_llff
 from gscompleter.data.masks import attach_masks
+from gscompleter.data.multi_view_stereo import has_idr, has_mvsnet, open_idr, open_mvsnet
 from gscompleter.data.one_photograph import find_photograph, open_photograph
 from gscompleter.data.phones.apps import POLYCAM, SCANNER_APP, find_recording, open_recording
 from gscompleter.data.photographs import Photographs
@@ -33,8 +34,10 @@ from gscompleter.data.real_estate import (
     open_camera_files,
     open_chunks,
 )
+from gscompleter.data.rgbd import has_replica, has_scannet, open_replica, open_scannet
 from gscompleter.data.sfm.poses import ENDINGS, is_own, list_unplaced
 from gscompleter.data.transforms import has_transforms, open_transforms
+from gscompleter.data.unused_files import list_unused
 from gscompleter.system.errors import InputError, join_names, quote_value, require_path
 from gscompleter.system.files.reading import list_folders
 
@@ -79,6 +82,10 @@ SCENE_FORMATS = {
     "polycam": SceneFormat(POLYCAM.find_frames, POLYCAM.open, "m"),
     "record3d": SceneFormat(find_recording, open_recording, "m"),
     "3d-scanner-app": SceneFormat(SCANNER_APP.find_frames, SCANNER_APP.open, "m"),
+    "scannet": SceneFormat(has_scannet, open_scannet, "m"),
+    "replica": SceneFormat(has_replica, open_replica, "m"),
+    "mvsnet": SceneFormat(has_mvsnet, open_mvsnet),
+    "idr": SceneFormat(has_idr, open_idr),
     "photograph": SceneFormat(find_photograph, open_photograph),
 }
 """Formats by the names that `open_photographs` takes, in the order of detection."""
@@ -113,8 +120,19 @@ def open_photographs(
     if unplaced:
         frames = tuple(sorted([*frames, *unplaced], key=lambda frame: frame.name))
     frames = attach_vehicle_detector(attach_masks(frames))
+    # Poses in layouts that are not known matter only where these had to be found. An archive may
+    # lie anywhere, and what lies beside it is not of the scene.
+    folder = path.parent if path.suffix.lower() == ".json" else path
+    unused = list_unused(folder, frames, has_found_cameras=format_name == "photograph")
     return replace(
-        scene, frames=frames, near=near, far=far, notes=notes, format=format_name, sparse=sparse
+        scene,
+        frames=frames,
+        near=near,
+        far=far,
+        notes=notes,
+        unused=unused,
+        format=format_name,
+        sparse=sparse,
     )
 
 

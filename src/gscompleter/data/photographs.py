@@ -80,6 +80,8 @@ class Photographs:
     """Range of the scene's z-depths, in scene units."""
     notes: tuple[str, ...] = ()
     """Sentences about choices made while opening."""
+    unused: tuple[str, ...] = ()
+    """Phrases on depth, poses and photographs that lie there and are not used."""
     format: str | None = None
     sparse: Callable[[], Float[np.ndarray, "n 3"]] | None = None
     """Reads points on the scene's surfaces, in the files' frame."""

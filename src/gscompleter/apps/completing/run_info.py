@@ -62,7 +62,11 @@ def describe_run(
             "used": len(task.views),
             "splat": splat,
             "renders_from": opened.renders_from,
-            "notes": [*opened.photographs.notes, *describe_missing(opened.photographs)],
+            "notes": [
+                *opened.photographs.notes,
+                *describe_missing(opened.photographs),
+                *(f"Not used: {phrase}." for phrase in opened.photographs.unused),
+            ],
         },
         "frame": {
             "method": task.method,

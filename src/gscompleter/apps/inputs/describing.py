@@ -17,6 +17,8 @@ from gscompleter.system.memory import format_whole_gigabytes, read_memory_bytes
 
 MAX_NAMED = 8
 """Most photographs that a line names."""
+MAX_PHRASE = 120
+"""Longest phrase of the line, in characters."""
 
 
 def describe_task(
@@ -73,6 +75,8 @@ def describe_opening(opened: Opened, task: CompletionTask) -> list[str]:
     source += f"{opened.num_photographs} photographs{splat}"
     if opened.renders_from is not None:
         source = f"{splat.removeprefix('; ')}; no photographs"
+    if photographs.unused:
+        source += f"; not used: {join_names(photographs.unused, MAX_NAMED, MAX_PHRASE)}"
     return [
         f"Opened: {source}.",
         f"Found: {task.frame_description.rstrip('.')}; depths from {camera.near:.3g} to "

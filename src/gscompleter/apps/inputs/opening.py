@@ -23,6 +23,7 @@ from gscompleter.data.mask_checks import read_masks_as_asked, refuse_nothing_to_
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photographs import check_resolution
 from gscompleter.data.sfm.poses import find_poses, has_photographs, list_all_photographs
+from gscompleter.data.unused_files import list_unused
 from gscompleter.data.video import is_video
 from gscompleter.splats.alignment.training_size import find_training_size
 from gscompleter.splats.foreign import holds_splat_alone
@@ -105,6 +106,9 @@ def open_scene(
     assert photographs.format is not None
     if num_photographs is None:
         return Opened(request, photographs, photographs.format, len(photographs))
+    # What lies beside the user's photographs, not beside the copies.
+    unused = list_unused(request.folder, (), has_found_cameras=True)
+    photographs = replace(photographs, unused=unused)
     # The user gave photographs, of which COLMAP may not have found all cameras. Their number is
     # reported, and not the format and number of what COLMAP wrote.
     return Opened(request, photographs, "photographs", num_photographs)

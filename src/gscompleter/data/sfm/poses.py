@@ -35,6 +35,12 @@ from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.masks import MASK_FOLDERS, find_mask, leave_out_masks, load_mask
 from gscompleter.data.panorama import has_panoramas, split_panorama
 from gscompleter.data.photographs import Photographs
+from gscompleter.data.unused_files import (
+    DEPTH_FOLDERS,
+    OTHER_FOLDERS,
+    PHOTOGRAPHS,
+    is_depth_map,
+)
 from gscompleter.data.video import NUM_FRAMES, extract_frames, is_video
 from gscompleter.system.children import run_module
 from gscompleter.system.errors import InputError, join_names, quote_value
@@ -55,11 +61,12 @@ from gscompleter.system.files.writing import SUMMARY_FILE
 from gscompleter.system.progress import stage, track
 from gscompleter.system.threads import get_thread_count
 
-ENDINGS = (
-    ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".avif",
-)  # fmt: skip
+ENDINGS = PHOTOGRAPHS
 """Endings of photographs, in any case."""
-OTHER_FOLDERS = (*MASK_FOLDERS, "depth", "depths", *(f"images_{n}" for n in DOWNSCALE_FACTORS))
+NO_PHOTOGRAPHS = (
+    *(*MASK_FOLDERS, *DEPTH_FOLDERS, *OTHER_FOLDERS),
+    *(f"images_{n}" for n in DOWNSCALE_FACTORS),
+)
 """Folders that hold no photographs of the user."""
 PACKED_INDEX = "meta.json"
 """File beside the images of an unpacked .sog, which says what they hold."""
@@ -344,6 +351,7 @@ def iterate_photographs(folder: Path) -> Iterator[Path]:
             for name in files
             if not name.startswith(".") and Path(name).suffix.lower() in ENDINGS
         ]
+        images = [name for name in images if not is_depth_map(Path(home, name))]
         yield from (Path(home, name) for name in leave_out_masks(images))
 
 
@@ -360,7 +368,7 @@ def holds_packed_splat(folder: Path) -> bool:
 
 def is_own(folder: Path) -> bool:
     """Check that a folder may hold photographs: not hidden, masks, depth, copies or our result."""
-    if folder.name.startswith(".") or folder.name.casefold() in OTHER_FOLDERS:
+    if folder.name.startswith(".") or folder.name.casefold() in NO_PHOTOGRAPHS:
         return False
     return not os.path.isfile(folder / SUMMARY_FILE)
 
