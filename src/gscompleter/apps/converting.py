@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from gscompleter.apps.commands.convert import ConvertOptions
 from gscompleter.numerics.value_checks import check_gaussians
@@ -23,7 +25,7 @@ from gscompleter.splats.formats import (
     read_provenance,
     save_splat,
 )
-from gscompleter.splats.morton import sort_along_morton
+from gscompleter.splats.morton import argsort_morton
 from gscompleter.splats.operations import Operations
 from gscompleter.splats.ply import copy_ply, save_ply
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance
@@ -106,9 +108,11 @@ def convert(options: ConvertOptions) -> Conversion:
     save_splat(options.out, gaussians, made_by)
     loss = describe_mode_loss(options.out, gaussians)
     notes = notes if loss is None else (loss, *notes)
-    return Conversion(
-        len(gaussians), num_generated, notes, measure_rounding(options.out, gaussians)
-    )
+    means, scales = gaussians.means, gaussians.scales
+    # Harmonics are most of the memory, and those of the file are read now.
+    del gaussians
+    rounding = measure_rounding(options.out, means, scales)
+    return Conversion(len(means), num_generated, notes, rounding)
 
 
 def make_operations(options: ConvertOptions) -> Operations:
@@ -232,16 +236,19 @@ def describe_left_behind(
             )
 
 
-def measure_rounding(path: Path, gaussians: Gaussians) -> Rounding | None:
-    """Read a file again, and compare it with what was to be written."""
+def measure_rounding(
+    path: Path, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"]
+) -> Rounding | None:
+    """Read a file again, and compare it with the positions and sizes that were to be written."""
     write = get_writer(path)
     if write not in ROUNDED:
         return None
-    given = gaussians.detach().to("cpu")
     if write in SORTED:
-        given = sort_along_morton(given)
+        places = means.double().numpy()
+        order = argsort_morton(places, places.min(0), places.max(0))
+        means, scales = means[order], scales[order]
     read = decode_splat(path)
-    factors = read.scales.clamp_min(1e-30).log() - given.scales.clamp_min(1e-30).log()
+    factors = read.scales.clamp_min(1e-30).log() - scales.clamp_min(1e-30).log()
     worst = factors.abs().flatten().argmax()
-    sizes = given.scales.flatten()[worst].item(), read.scales.flatten()[worst].item()
-    return Rounding((read.means - given.means).abs().max().item(), sizes)
+    sizes = scales.flatten()[worst].item(), read.scales.flatten()[worst].item()
+    return Rounding((read.means - means).abs().max().item(), sizes)
