@@ -27,8 +27,9 @@ from gscompleter.splats.formats import (
 )
 from gscompleter.splats.morton import argsort_morton
 from gscompleter.splats.operations import Operations
+from gscompleter.splats.packing import DegreeError
 from gscompleter.splats.ply import copy_ply, save_ply
-from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance
+from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, RunRecord
 from gscompleter.splats.sog import write_sog
 from gscompleter.splats.spz import write_spz
 from gscompleter.splats.streamed import is_streamed, load_level
@@ -79,6 +80,27 @@ def convert(options: ConvertOptions) -> Conversion:
     """Convert one splat or several, and say what the result does not keep."""
     sources = [resolve_splat(path) for path in (options.source, *options.merge)]
     operations = make_operations(options)
+    for source in sources:
+        if options.level is None and is_streamed(source):
+            raise InputError(
+                f"{quote_value(source)} is a streamed scene in several levels of detail; choose "
+                "one, of which 0 is the finest.",
+                "level",
+            )
+    try:
+        return convert_sources(sources, options, operations)
+    except DegreeError as error:
+        raise InputError(
+            "A splat has harmonics of SH degree 4, and degrees 0 to 3 are read; say that the "
+            "fourth band is to be left out: 3.",
+            "bands",
+        ) from error
+
+
+def convert_sources(
+    sources: Sequence[Path], options: ConvertOptions, operations: Operations
+) -> Conversion:
+    """Convert splats whose folders are resolved."""
     notes = tuple(describe_left_behind(sources, options.out, operations))
     keep_labels = not options.plain
     if can_be_streamed(sources, options, operations):
@@ -163,7 +185,7 @@ def read_all(sources: Sequence[Path], options: ConvertOptions) -> tuple[Gaussian
             f"{quote_value(sources[0])} has no levels of detail; leave --level out.", "level"
         )
     parts = []
-    runs = []
+    runs: list[RunRecord] = []
     labels_used = 0
     for source in sources:
         if options.level is not None and is_streamed(source):
