@@ -15,6 +15,7 @@ from gscompleter.apps import converting
 from gscompleter.splats.formats import read_provenance
 from gscompleter.splats.provenance import Provenance, RunRecord
 from scenes import random_gaussians
+from splat_files import plausible, sog_files, write_degree_4_ply, write_sog
 
 SCENE = random_gaussians(400, seed=1, sh_degree=2)
 
@@ -169,6 +170,31 @@ def test_wrong_options_get_a_sentence(tmp_path, monkeypatch, capsys, options, se
     assert sentence in said
     assert said.count("\n") == 1
     assert not (tmp_path / "out.spz").exists()
+
+
+def test_a_level_and_three_bands_have_to_be_asked_for(tmp_path, monkeypatch, capsys):
+    """Other commands name `convert`, and it names its options."""
+    index = {"lodLevels": 1, "filenames": ["0_0/meta.json"]}
+    index["tree"] = {"lods": {"0": {"file": 0, "offset": 0, "count": 40}}}
+    folder = tmp_path / "garden"
+    folder.mkdir()
+    write_sog(folder / "0_0", sog_files(plausible(40)))
+    (folder / "lod-meta.json").write_text(json.dumps(index))
+    out = tmp_path / "out.ply"
+    assert run(monkeypatch, "convert", folder, out, "--quiet") == 2
+    assert "is the finest (--level)" in capsys.readouterr().err
+    assert run(monkeypatch, "inspect", folder) == 2
+    assert "with `gscompleter convert`" in capsys.readouterr().err
+    assert run(monkeypatch, "convert", folder, out, "--level", 0, "--quiet") == 0
+    assert len(load_splat(out)) == 40
+
+    wide = tmp_path / "wide.ply"
+    write_degree_4_ply(wide, random_gaussians(20, sh_degree=3))
+    assert run(monkeypatch, "convert", wide, tmp_path / "b.ply", "--quiet") == 2
+    assert "left out: 3 (--bands)" in capsys.readouterr().err
+    for name in ("b.ply", "b.spz"):
+        assert run(monkeypatch, "convert", wide, tmp_path / name, "--bands", 3, "--quiet") == 0
+        assert load_splat(tmp_path / name).sh_degree == 3
 
 
 def test_a_plain_ply_of_another_name_is_named(tmp_path, monkeypatch, capsys):

@@ -3,43 +3,24 @@
 from __future__ import annotations
 
 import gzip
-import re
 import struct
 
 import numpy as np
 import pytest
 import torch
 
-from gscompleter import InputError, load_splat, save_ply, save_splat
+from gscompleter import InputError, load_splat, save_splat
 from gscompleter.splats.ply import copy_ply
 from scenes import random_gaussians
+from splat_files import write_degree_4_ply
 
 SCENE = random_gaussians(50, sh_degree=3)
 
 
-def write_degree_4_ply(path):
-    """Insert nine coefficients of the fourth band after those of each channel."""
-    plain = path.with_name("plain.ply")
-    save_ply(plain, SCENE)
-    header, _, data = plain.read_bytes().partition(b"end_header\n")
-    names = re.findall(rb"property float (\w+)", header)
-    rows = np.frombuffer(data, "<f4").reshape(len(SCENE), len(names))
-    first = names.index(b"f_rest_0")
-    rest = rows[:, first : first + 45].reshape(-1, 3, 15)
-    fourth = np.full((len(SCENE), 3, 9), 7.0, "<f4")
-    wide = np.concatenate([rest, fourth], axis=2).reshape(len(SCENE), 72)
-    rows = np.concatenate([rows[:, :first], wide, rows[:, first + 45 :]], axis=1)
-    lines = b"".join(b"property float f_rest_%d\n" % i for i in range(72))
-    start = header.index(b"property float f_rest_0")
-    end = header.index(b"property float opacity")
-    content = header[:start] + lines + header[end:] + b"end_header\n"
-    path.write_bytes(content + rows.astype("<f4").tobytes())
-
-
-def write_degree_4_spz(path):
+def write_degree_4_spz(path, scene):
     """Append nine coefficients of the fourth band to those of each Gaussian."""
     plain = path.with_name("plain.spz")
-    save_splat(plain, SCENE)
+    save_splat(plain, scene)
     raw = gzip.decompress(plain.read_bytes())
     magic, version, n, _, bits, flags, _ = struct.unpack_from("<4sIIBBBB", raw)
     rest = np.frombuffer(raw, np.uint8)[-45 * n :].reshape(n, 15, 3)
@@ -53,8 +34,8 @@ def write_degree_4_spz(path):
 )
 def test_the_fourth_band_is_named_and_left_out_on_request(tmp_path, name, write):
     path = tmp_path / name
-    write(path)
-    with pytest.raises(InputError, match=r"harmonics of SH degree 4, .* --bands 3"):
+    write(path, SCENE)
+    with pytest.raises(InputError, match=r"harmonics of SH degree 4, .* convert"):
         load_splat(path)
     plain = load_splat(tmp_path / f"plain{path.suffix}")
     loaded = load_splat(path, leaves_out_band_4=True)
@@ -63,6 +44,6 @@ def test_the_fourth_band_is_named_and_left_out_on_request(tmp_path, name, write)
 
 
 def test_rows_of_degree_4_are_copied_without_the_fourth_band(tmp_path):
-    write_degree_4_ply(tmp_path / "wide.ply")
+    write_degree_4_ply(tmp_path / "wide.ply", SCENE)
     copy_ply(tmp_path / "wide.ply", tmp_path / "narrow.ply", edit=lambda gaussians: gaussians)
     assert (tmp_path / "narrow.ply").read_bytes() == (tmp_path / "plain.ply").read_bytes()

@@ -109,7 +109,7 @@ FOREIGN = {
     "new.spz": (b"NGSP" + struct.pack("<IIBBBB", 9, 1, 0, 12, 0, 0), "is .spz version 9"),
     "high.spz": (
         b"NGSP" + struct.pack("<IIBBBB", 3, 1, 4, 12, 0, 0),
-        "harmonics of SH degree 4, .* --bands 3",
+        "harmonics of SH degree 4, .* convert",
     ),
     "new.ksplat": (b"\x09" + bytes(4095), "is .ksplat version 9"),
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import json
+import re
 import struct
 import zipfile
 from dataclasses import replace
@@ -15,7 +16,7 @@ import torch
 import zstandard
 from PIL import Image
 
-from gscompleter import Render, load_renderer, save_splat
+from gscompleter import Render, load_renderer, save_ply, save_splat
 from gscompleter.splats.transform import HALF_TURN_Z, rotate_half_turn
 from gscompleter.types import SH_C0, Gaussians
 from scenes import camera_at, random_gaussians
@@ -266,6 +267,25 @@ def write_glb(path: Path, table: dict, binary: bytes) -> Path:
     chunks += struct.pack("<I4s", len(binary), b"BIN\0") + binary
     path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
     return path
+
+
+def write_degree_4_ply(path: Path, scene: Gaussians) -> None:
+    """Write a .ply of degree 4 beside one of degree 3: nine more coefficients for each channel."""
+    plain = path.with_name("plain.ply")
+    save_ply(plain, scene)
+    header, _, data = plain.read_bytes().partition(b"end_header\n")
+    names = re.findall(rb"property float (\w+)", header)
+    rows = np.frombuffer(data, "<f4").reshape(len(scene), len(names))
+    first = names.index(b"f_rest_0")
+    rest = rows[:, first : first + 45].reshape(-1, 3, 15)
+    fourth = np.full((len(scene), 3, 9), 7.0, "<f4")
+    wide = np.concatenate([rest, fourth], axis=2).reshape(len(scene), 72)
+    rows = np.concatenate([rows[:, :first], wide, rows[:, first + 45 :]], axis=1)
+    lines = b"".join(b"property float f_rest_%d\n" % i for i in range(72))
+    start = header.index(b"property float f_rest_0")
+    end = header.index(b"property float opacity")
+    content = header[:start] + lines + header[end:] + b"end_header\n"
+    path.write_bytes(content + rows.astype("<f4").tobytes())
 
 
 def plausible(n: int = 200, degree: int = 3) -> Gaussians:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from gscompleter.apps.commands.convert import ConvertOptions
 from gscompleter.numerics.value_checks import check_gaussians
@@ -26,8 +28,9 @@ from gscompleter.splats.formats import (
     read_provenance,
     save_splat,
 )
-from gscompleter.splats.morton import sort_along_morton
+from gscompleter.splats.morton import argsort_morton
 from gscompleter.splats.operations import Operations
+from gscompleter.splats.packing import DegreeError
 from gscompleter.splats.ply import copy_ply, save_ply
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, RunRecord
 from gscompleter.splats.sog import write_sog
@@ -82,6 +85,27 @@ def convert(options: ConvertOptions) -> Conversion:
     """Convert one splat or several, and say what the result does not keep."""
     sources = [resolve_splat(path) for path in (options.source, *options.merge)]
     operations = make_operations(options)
+    for source in sources:
+        if options.level is None and is_streamed(source):
+            raise InputError(
+                f"{quote_value(source)} is a streamed scene in several levels of detail; choose "
+                "one, of which 0 is the finest.",
+                "level",
+            )
+    try:
+        return convert_sources(sources, options, operations)
+    except DegreeError as error:
+        raise InputError(
+            "A splat has harmonics of SH degree 4, and degrees 0 to 3 are read; say that the "
+            "fourth band is to be left out: 3.",
+            "bands",
+        ) from error
+
+
+def convert_sources(
+    sources: Sequence[Path], options: ConvertOptions, operations: Operations
+) -> Conversion:
+    """Convert splats whose folders are resolved."""
     oddities = [line for source in sources for line in describe_oddities(source)]
     notes = (*oddities, *describe_left_behind(sources, options.out, operations))
     keep_labels = not options.plain
@@ -113,9 +137,14 @@ def convert(options: ConvertOptions) -> Conversion:
     save_splat(options.out, gaussians, made_by)
     losses = [describe_mode_loss(options.out, gaussians), describe_rounding(options.out, gaussians)]
     notes = (*(loss for loss in losses if loss is not None), *notes)
-    return Conversion(
-        len(gaussians), num_generated, notes, measure_rounding(options.out, gaussians)
-    )
+    # Of a splat with an origin, `describe_rounding` says it.
+    if gaussians.origin is not None:
+        return Conversion(len(gaussians), num_generated, notes, None)
+    means, scales = gaussians.means, gaussians.scales
+    # Harmonics are most of the memory, and those of the file are read now.
+    del gaussians
+    rounding = measure_rounding(options.out, means, scales)
+    return Conversion(len(means), num_generated, notes, rounding)
 
 
 def make_operations(options: ConvertOptions) -> Operations:
@@ -249,17 +278,19 @@ def describe_left_behind(
             )
 
 
-def measure_rounding(path: Path, gaussians: Gaussians) -> Rounding | None:
-    """Read a file again, and compare it with what was to be written."""
+def measure_rounding(
+    path: Path, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"]
+) -> Rounding | None:
+    """Read a file again, and compare it with the positions and sizes that were to be written."""
     write = get_writer(path)
-    # Of a splat with an origin, `describe_rounding` says it.
-    if write not in ROUNDED or gaussians.origin is not None:
+    if write not in ROUNDED:
         return None
-    given = gaussians.detach().to("cpu")
     if write in SORTED:
-        given = sort_along_morton(given)
+        places = means.double().numpy()
+        order = argsort_morton(places, places.min(0), places.max(0))
+        means, scales = means[order], scales[order]
     read = decode_splat(path)
-    factors = read.scales.clamp_min(1e-30).log() - given.scales.clamp_min(1e-30).log()
+    factors = read.scales.clamp_min(1e-30).log() - scales.clamp_min(1e-30).log()
     worst = factors.abs().flatten().argmax()
-    sizes = given.scales.flatten()[worst].item(), read.scales.flatten()[worst].item()
-    return Rounding((read.means - given.means).abs().max().item(), sizes)
+    sizes = scales.flatten()[worst].item(), read.scales.flatten()[worst].item()
+    return Rounding((read.means - means).abs().max().item(), sizes)

@@ -88,7 +88,7 @@ class Frame:
         """Path of the photograph below the folder of all, as users know it."""
         path = PurePosixPath(self.name.replace("\\", "/"))
         # Trainers list photographs without the ending that the file has.
-        if isinstance(self.image, Path) and self.image.stem == path.name:
+        if path.name and isinstance(self.image, Path) and self.image.stem == path.name:
             path = path.with_name(self.image.name)
         # "images" in front of a name is the folder of all, which users do not name.
         inside = len(path.parts) > 1 and path.parts[0].casefold() in FOLDERS

@@ -25,8 +25,8 @@ SPZ_MAGIC = b"NGSP"
 LOD_META = "lod-meta.json"
 """Index of a streamed scene: one .sog for each level and place."""
 OF_STREAMED = (
-    "in several levels of detail; write one of them to a file (`gscompleter convert FILE B.ply "
-    "--level 0`, the finest), and name that"
+    "in several levels of detail; write one of them to a .ply with `gscompleter convert`, and name "
+    "that"
 )
 SOG_META = "meta.json"
 MAX_JSON = 1 << 26
@@ -36,8 +36,8 @@ POINT_CLOUDS = (".las", ".laz", ".e57", ".pcd", ".xyz", ".pts")
 POINT_CLOUD_STARTS = (b"LASF", b"ASTM-E57", b"# .PCD")
 MESHES = (".obj", ".stl", ".fbx", ".dae", ".off")
 WITH_SPLAT_TRANSFORM = (
-    "write it as .ply with PlayCanvas' splat-transform (`splat-transform FILE --select-lod 0 "
-    "splat.ply`), and name that"
+    "write one of them to a .ply with PlayCanvas' splat-transform (its option select-lod), and "
+    "name that"
 )
 STARTS = {
     b"RAD0": (
@@ -221,7 +221,7 @@ def _describe_zip(path: Path) -> str | None:
     if any(name.endswith("data.pkl") for name in names) or path.suffix.lower() in CHECKPOINTS:
         return _describe_checkpoint()
     if any(Path(name).name == LOD_META for name in names):
-        return f"is a streamed scene {OF_STREAMED.replace('convert FILE', 'convert FOLDER')}"
+        return f"is a streamed scene {OF_STREAMED}, once it is unpacked"
     is_usd = any(name.lower().endswith((".usd", ".usda", ".usdc")) for name in names)
     if SOG_META in names or is_usd:
         return None

@@ -11,7 +11,7 @@ from jaxtyping import Float, Integer, Shaped, UInt32
 from numpy import ndarray
 
 from gscompleter.system.damage import DamagedError
-from gscompleter.system.errors import quote_value
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.types import SH_C0, Gaussians, make_observed
 
 NUM_SH_REST = (0, 3, 8, 15)
@@ -28,7 +28,11 @@ class UnsupportedError(ValueError):
 
 
 class BandError(UnsupportedError):
-    """An intact file with harmonics of degree 4."""
+    """Intact bytes with harmonics of degree 4."""
+
+
+class DegreeError(InputError):
+    """An intact file with harmonics of degree 4, which can be read without its fourth band."""
 
 
 def unpack_fractions(packed: UInt32[ndarray, "n"], widths: Sequence[int]) -> Float[ndarray, "n k"]:

@@ -33,6 +33,7 @@ from gscompleter.numerics.kernels import splat_rows as kernels
 from gscompleter.numerics.kernels.parallel import run_calls, share
 from gscompleter.numerics.value_checks import LARGEST, check_gaussians, find_finite
 from gscompleter.splats.origin import choose_origin, find_step, is_too_far
+from gscompleter.splats.packing import DegreeError
 from gscompleter.splats.properties import refuse_other_kinds
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, add_comments
 from gscompleter.system.errors import InputError, quote_value, require_path
@@ -306,11 +307,11 @@ def _describe_forms(scene: SceneFile) -> list[str]:
     return sentences
 
 
-def make_band_error(path: Path) -> InputError:
+def make_band_error(path: Path) -> DegreeError:
     """Make the error of a file with harmonics of degree 4."""
-    return InputError(
+    return DegreeError(
         f"{quote_value(path)} has harmonics of SH degree 4, and degrees 0 to 3 are read; leave the "
-        "fourth band out (`gscompleter convert FILE B.ply --bands 3`), and name that."
+        "fourth band out with `gscompleter convert`, and name its result."
     )
 
 

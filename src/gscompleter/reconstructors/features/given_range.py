@@ -114,8 +114,8 @@ def widen_range(views: Sequence[View], given: DepthRange, outcome: str = "") -> 
         if off > MAX_WIDENING:
             notes = (
                 *notes,
-                f"{seen.source} stand {off:.2g} times outside of the depth range from {near:.3g} to "
-                f"{far:.3g}, which is kept: they are damaged, or in another unit.",
+                f"{seen.source} stand {off:.2g} times outside of the depth range from {near:.3g} "
+                f"to {far:.3g}, which is kept: they are damaged, or in another unit.",
             )
             continue
         places = []
