@@ -200,7 +200,7 @@ def test_inspect_prints_digits_that_tell_the_ends_apart(tmp_path, monkeypatch, c
     found = json.loads(capsys.readouterr().out)
     assert np.abs(np.array(found["extent"])[:, 0] - means.min(0)).max() < EXACT
     assert np.abs(np.array(found["extent"])[:, 1] - means.max(0)).max() < EXACT
-    assert any("are read relative to (50" in note for note in found["notes"])
+    assert any("is read relative to (50" in note for note in found["notes"])
     assert describe_range(4649775.512, 4649777.489) == "4649775.512 to 4649777.489"
     assert describe_range(-1.25, 2.5) == "-1.25 to 2.5"
     assert describe_range(0.0, 0.0) == "0 to 0"
