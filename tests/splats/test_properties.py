@@ -201,6 +201,7 @@ def test_commands_say_what_they_ignore(tmp_path, monkeypatch, capsys):
     assert "looks like a moving splat" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_complete_refuses_a_moving_splat(tmp_path, monkeypatch, capsys):
     path = make(tmp_path / "moving.ply", **MOVING)
     assert run(monkeypatch, "complete", str(path), "--auto", "--out", str(tmp_path / "OUT")) == 2

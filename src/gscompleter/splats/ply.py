@@ -296,8 +296,8 @@ def _describe_forms(scene: SceneFile) -> list[str]:
         opacities = read_columns(scene.rows, ("opacity",))
         if opacities.min() < opacities.max():
             sentences.append(
-                "All opacities of the splat are from 50 to 73 %, as if they had been stored without "
-                "the logit that .ply files have; they are read with it."
+                "All opacities of the splat are from 50 to 73 %, as if they had been stored "
+                "without the logit that .ply files have; they are read with it."
             )
     return sentences
 
