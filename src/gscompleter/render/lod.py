@@ -70,6 +70,7 @@ def simplify_scene(scene: Gaussians, cameras: Sequence[Camera]) -> ContextScene:
         sh=torch.from_numpy(merged_arrays.sh).unflatten(1, scene.sh.shape[1:]),
         generated=scene.generated[first],
         is_antialiased=scene.is_antialiased,
+        origin=scene.origin,
     )
     run_of_gaussian = torch.arange(num_runs).repeat_interleave(sizes)
     return ContextScene.build(scene, merged, run_of_gaussian)
