@@ -140,6 +140,13 @@ def test_boxes_are_in_the_coordinates_of_the_file(folders, tmp_path, monkeypatch
     assert out.read_bytes() == (folders[1] / "splat.ply").read_bytes()
 
 
+def test_a_box_beside_a_map_is_told_where_the_map_is(folders, tmp_path, monkeypatch, capsys):
+    scene = ("--scene", folders[1] / "splat.ply", "--out", tmp_path / "OUT")
+    words = ("--box", -1, -1, -1, 1, 1, 1, "--resolution", SIZE, SIZE)
+    assert run(monkeypatch, "remove", folders[1] / "room", *scene, *words) == 2
+    assert "reaches from 499" in capsys.readouterr().err
+
+
 def test_selected_gaussians_are_found_in_the_map(folders, tmp_path, monkeypatch):
     scene = load_splat(folders[1] / "splat.ply")
     # A selection has a middle of its own, and so another origin.

@@ -14,6 +14,7 @@ from gscompleter import InputError, load_ply, load_splat, merge, save_ply, save_
 from gscompleter.apps.inspection import describe_range
 from gscompleter.splats.formats import convert_splat, describe_oddities
 from gscompleter.splats.layout import is_same_scene, save_like, save_removed, strip
+from gscompleter.splats.origin import format_corners
 from gscompleter.splats.transform import HALF_TURN_X, rotate_half_turn, transform_gaussians
 from gscompleter.system.files.writing import REMOVED_FILE
 from map_scene import PLACE, small_gaussians, write_map_ply
@@ -200,10 +201,16 @@ def test_inspect_prints_digits_that_tell_the_ends_apart(tmp_path, monkeypatch, c
     found = json.loads(capsys.readouterr().out)
     assert np.abs(np.array(found["extent"])[:, 0] - means.min(0)).max() < EXACT
     assert np.abs(np.array(found["extent"])[:, 1] - means.max(0)).max() < EXACT
-    assert any("are read relative to (50" in note for note in found["notes"])
+    assert any("is read relative to (50" in note for note in found["notes"])
     assert describe_range(4649775.512, 4649777.489) == "4649775.512 to 4649777.489"
     assert describe_range(-1.25, 2.5) == "-1.25 to 2.5"
     assert describe_range(0.0, 0.0) == "0 to 0"
+
+
+def test_corners_have_digits_that_tell_their_sides():
+    corners = format_corners((499999.5, 4649775.5, 303.0), (500000.5, 4649776.5, 306.0))
+    assert corners == ("499999.5 4649775.5 303", "500000.5 4649776.5 306")
+    assert format_corners((-0.5, 0.0, 1.0), (0.5, 0.0, 1234.5)) == ("-0.5 0 1", "0.5 0 1234.5")
 
 
 def test_convert_says_how_far_it_rounds(tmp_path, monkeypatch, capsys):

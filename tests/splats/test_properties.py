@@ -156,7 +156,7 @@ def test_what_is_not_certain_is_named_and_read_as_it_stands(tmp_path):
     large = {f"scale_{i}": np.full(COUNT, math.log(0.6)) for i in range(3)}
     path = make(tmp_path / "b.ply", **large)
     assert (load_splat(path).scales - 0.6).abs().max() < 1e-6
-    assert any("Half of its Gaussians are larger" in line for line in describe_oddities(path))
+    assert any("Half of the Gaussians are larger" in line for line in describe_oddities(path))
 
 
 def test_scenes_in_millimetres_are_no_raw_sizes(tmp_path):
@@ -199,5 +199,10 @@ def test_commands_say_what_they_ignore(tmp_path, monkeypatch, capsys):
     assert "(--ignore-properties)" in capsys.readouterr().err
     assert run(monkeypatch, "convert", str(path), str(out), "--ignore-properties") == 0
     assert "looks like a moving splat" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_complete_refuses_a_moving_splat(tmp_path, monkeypatch, capsys):
+    path = make(tmp_path / "moving.ply", **MOVING)
     assert run(monkeypatch, "complete", str(path), "--auto", "--out", str(tmp_path / "OUT")) == 2
     assert "all of its moments would be shown at once" in capsys.readouterr().err

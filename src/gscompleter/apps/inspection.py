@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -37,6 +36,7 @@ from gscompleter.splats.formats import (
     detect_splat_format,
     read_provenance,
 )
+from gscompleter.splats.origin import count_digits
 from gscompleter.splats.provenance import ModelRecord, RunRecord
 from gscompleter.state import NEW_PHOTO_ID
 from gscompleter.system.console import make_console
@@ -46,9 +46,6 @@ from gscompleter.types import Camera, Gaussians, Origin, sh_from_rgb
 
 MIDDLE = (0.01, 0.99)
 """Quantiles of the coordinates that floaters leave alone."""
-
-MOST_DIGITS = 15
-"""Digits that float64 holds."""
 
 Bounds = tuple[tuple[float, float], ...]
 """Smallest and largest x, y and z."""
@@ -288,11 +285,7 @@ def describe_bounds(bounds: Bounds) -> str:
 
 def describe_range(low: float, high: float) -> str:
     """Describe a range with as many digits as tell its ends apart to a thousandth of it."""
-    largest = max(abs(low), abs(high))
-    digits = 4
-    if 0 < high - low < largest:
-        digits += math.ceil(math.log10(largest / (high - low)))
-    digits = min(digits, MOST_DIGITS)
+    digits = count_digits(low, high)
     return f"{low:.{digits}g} to {high:.{digits}g}"
 
 

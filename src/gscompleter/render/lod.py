@@ -82,6 +82,7 @@ def merge_runs(scene: Gaussians, start: Int64[ndarray, "bounds"]) -> Gaussians:
         sh=torch.from_numpy(merged_arrays.sh).unflatten(1, scene.sh.shape[1:]),
         generated=scene.generated[first],
         is_antialiased=scene.is_antialiased,
+        origin=scene.origin,
     )
 
 

@@ -323,8 +323,10 @@ def describe_rounding(path: Path, gaussians: Gaussians) -> str | None:
     written = gaussians.detach().to("cpu")
     written = sort_along_morton(written) if write in SORTED else written
     distance = measure_distance(written, decode_splat(path))
+    name = _match_extension(path)
+    ending = path.suffix if name is None else SPLAT_FORMATS[name].extensions[0]
     return (
-        f"A {path.suffix} file cannot hold coordinates this large: the largest rounding of a "
+        f"A {ending} file cannot hold coordinates this large: the largest rounding of a "
         f"position is {distance:.3g}; a .ply, .glb or .usdz holds them."
     )
 

@@ -9,6 +9,7 @@ file lies at the origin.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -17,6 +18,9 @@ from numpy import ndarray
 
 from gscompleter.types import Gaussians, Origin
 
+LEAST_DIGITS = 4
+MOST_DIGITS = 15
+"""Digits that float64 holds."""
 MAX_STEP = 0.01
 """Largest step of positions, relative to the size of the median Gaussian."""
 
@@ -26,13 +30,30 @@ def find_step(coordinate: float) -> float:
     return float(np.spacing(np.float32(abs(coordinate))))
 
 
+def count_digits(low: float, high: float) -> int:
+    """Count the digits that tell the ends of a range apart to a thousandth of it, at least four."""
+    largest = max(abs(low), abs(high))
+    digits = LEAST_DIGITS
+    if 0 < high - low < largest:
+        digits += math.ceil(math.log10(largest / (high - low)))
+    return min(digits, MOST_DIGITS)
+
+
+def format_corners(low: Sequence[float], high: Sequence[float]) -> tuple[str, str]:
+    """Format the smallest and the largest corner of a box with digits that tell its sides."""
+    pairs = list(zip(low, high, strict=True))
+    corners = [" ".join(f"{pair[end]:.{count_digits(*pair)}g}" for pair in pairs) for end in (0, 1)]
+    return corners[0], corners[1]
+
+
 def is_too_far(middle: Float[ndarray, "3"], size: float) -> bool:
     """Return True if float32 would round positions near `middle` visibly.
 
     `size` is that of the median Gaussian, in scene units.
     """
     farthest = float(np.abs(middle).max())
-    return math.isfinite(farthest) and find_step(farthest) > MAX_STEP * size
+    # A size of zero tells nothing of what is visible.
+    return math.isfinite(farthest) and 0 < MAX_STEP * size < find_step(farthest)
 
 
 def choose_origin(middle: Float[ndarray, "3"], size: float) -> Origin | None:

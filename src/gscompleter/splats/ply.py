@@ -263,7 +263,9 @@ def _describe_positions(scene: SceneFile) -> list[str]:
     """Describe positions that are far from zero, relative to the size of Gaussians."""
     if scene.origin is not None:
         place = ", ".join(f"{x:.12g}" for x in scene.origin)
-        return [f"Its coordinates are too large for float, and are read relative to ({place})."]
+        return [
+            f"Coordinates of the splat are too large for float; it is read relative to ({place})."
+        ]
     rows = scene.rows
     if len(rows) == 0 or has_doubles(rows):
         return []
@@ -274,9 +276,9 @@ def _describe_positions(scene: SceneFile) -> list[str]:
         return []
     step = find_step(float(np.abs(middle).max()))
     return [
-        f"Its positions are floats in steps of {step:.3g}, and half of its Gaussians are smaller "
-        f"than {size:.3g}: they were rounded when it was written; export it with positions of "
-        "double, or near zero."
+        f"Positions of the splat are floats in steps of {step:.3g}, and half of its Gaussians are "
+        f"smaller than {size:.3g}: they were rounded when it was written; export it with positions "
+        "of double, or near zero."
     ]
 
 
@@ -289,20 +291,22 @@ def _describe_forms(scene: SceneFile) -> list[str]:
     median = math.exp(min(_measure_scales(scene.rows)[1], 80))
     share = median / max(_measure_extent(scene.rows), 1e-30)
     if scene.has_linear_scales:
-        sentences.append("Its scales are sizes, not their logarithms, and are read as such.")
+        sentences.append(
+            "Scales of the splat are sizes, not their logarithms, and are read as such."
+        )
     elif share > LARGE_SIZE:
         sentences.append(
-            f"Half of its Gaussians are larger than {100 * share:.3g} % of the scene; its scales "
+            f"Half of the Gaussians are larger than {100 * share:.3g} % of the scene; their scales "
             "may be no logarithms of sizes, as a .ply has them."
         )
     if scene.has_plain_opacities:
-        sentences.append("Its opacities are fractions, not logits, and are read as such.")
+        sentences.append("Opacities of the splat are fractions, not logits, and are read as such.")
     elif _are_within(scene.rows, ["opacity"], 1.0):
         opacities = read_columns(scene.rows, ("opacity",))
         if opacities.min() < opacities.max():
             sentences.append(
-                "All of its opacities are from 50 to 73 %, as if they had been stored without the "
-                "logit that .ply files have; they are read with it."
+                "All opacities of the splat are from 50 to 73 %, as if they had been stored "
+                "without the logit that .ply files have; they are read with it."
             )
     return sentences
 

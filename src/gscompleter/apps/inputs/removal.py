@@ -22,6 +22,7 @@ from gscompleter.editing.removal import sum_in_mask
 from gscompleter.numerics.geometry import quats_to_rotations
 from gscompleter.render.protocols import Renderer
 from gscompleter.splats.formats import load_splat, load_splat_at
+from gscompleter.splats.origin import format_corners
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.progress import track
 from gscompleter.types import Camera, Gaussians
@@ -158,8 +159,7 @@ def refuse_nothing(
     if not chosen.any():
         points = scene.means.double() + torch.from_numpy(origin).to(scene.means.device)
         smallest, largest = points.aminmax(dim=0)
-        low = " ".join(f"{x:.4g}" for x in smallest)
-        high = " ".join(f"{x:.4g}" for x in largest)
+        low, high = format_corners(smallest.tolist(), largest.tolist())
         raise InputError(
             f"No Gaussian of the splat, which reaches from {low} to {high} in its own frame, is "
             "selected; name another place, or selected Gaussians that were not moved."

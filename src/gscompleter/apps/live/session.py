@@ -24,6 +24,7 @@ from gscompleter.completer import GSCompleter
 from gscompleter.data.photographs import Resolution
 from gscompleter.data.scene import describe_camera, parse_camera
 from gscompleter.splats.alignment.similarity import transform_camera_exactly
+from gscompleter.splats.origin import format_corners
 from gscompleter.state import NOTHING_ADDED, Completion, TargetResult
 from gscompleter.system.errors import InputError
 from gscompleter.types import Camera
@@ -146,7 +147,7 @@ def remove_step(session: Session, step: Step, camera: Camera) -> tuple[Completio
     changed, count = remove_in_box(
         completer, session.latest, step.box, step.box_rotation, session.splat_origin
     )
-    corners = " ".join(f"{number:.4g}" for number in step.box)
+    corners = " ".join(format_corners(step.box[:3], step.box[3:]))
     rotation = " ".join(f"{number:.4g}" for number in step.box_rotation)
     return changed, (
         f"{count:,} Gaussians are removed; complete the hole, or undo.\n"
