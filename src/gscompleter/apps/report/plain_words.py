@@ -117,7 +117,8 @@ def list_notes(summary: CompletionSummary) -> Iterator[Note]:
         text = f"The splat is {FRAME_NOTES[frame.method]}; summary.json lists the transform."
         yield Note("frame", text)
     if any(frame.origin):
-        yield Note("coordinates", ORIGIN_NOTE)
+        # Whoever joins the result with other data has to shift it.
+        yield Note("coordinates", ORIGIN_NOTE, is_warning=True)
     if scene.renders_from is not None:
         yield Note("check", BARE_NOTE)
         is_seen = summary.kept is not None and not summary.kept.is_unseen
