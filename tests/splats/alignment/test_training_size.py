@@ -10,11 +10,12 @@ import pytest
 from PIL import Image
 from rich.console import Console
 
+from gscompleter import save_ply
 from gscompleter.apps.completing.preparation import open_input
 from gscompleter.cli import parse_command
 from gscompleter.data.formats import open_photographs
 from gscompleter.splats.alignment.training_size import TrainingSize, find_training_size
-from scenes import camera_at, photographed
+from scenes import camera_at, photographed, random_gaussians
 
 SIDE = 64
 
@@ -111,6 +112,7 @@ def test_gsplat_says_it_beside_the_folder_of_its_files(scene, tmp_path):
 )
 def test_the_working_size_follows_unless_it_is_given(scene, tmp_path, side, words, expected, said):
     splat = tmp_path / "splat.ply"
+    save_ply(splat, random_gaussians(3))
     write_list(splat.with_name("cameras.json"), side)
     options = parse_command(
         ["complete", str(scene), "--scene", str(splat), "--out", str(tmp_path / "o"), *words]

@@ -277,6 +277,9 @@ def render_batch_page(out: Path, rows: Sequence[Mapping[str, Any]]) -> str:
 
 def find_median_gain(rows: Sequence[Mapping[str, Any]], score: str) -> float | None:
     """Return the median gain of a score in dB over the jobs that have it, or None."""
-    pairs = [(row.get(f"{score}_before"), row.get(f"{score}_after")) for row in rows]
-    gains = [after - before for before, after in pairs if before is not None and after is not None]
+    gains = []
+    for row in rows:
+        before, after = row.get(f"{score}_before"), row.get(f"{score}_after")
+        if before is not None and after is not None:
+            gains.append(after - before)
     return median(gains) if gains else None

@@ -122,7 +122,8 @@ def list_notes(summary: CompletionSummary) -> Iterator[Note]:
     # A splat with positions of double is written where it was.
     place = np.array(frame.transform) @ [*frame.origin, 1.0]
     if any(frame.origin) and np.abs(place[:3]).max() < 0.5 * np.abs(frame.origin).max():
-        yield Note("coordinates", ORIGIN_NOTE)
+        # Whoever joins the result with other data has to shift it.
+        yield Note("coordinates", ORIGIN_NOTE, is_warning=True)
     if scene.renders_from is not None:
         yield Note("check", BARE_NOTE)
         is_seen = summary.kept is not None and not summary.kept.is_unseen
