@@ -799,6 +799,9 @@ class ContextScene:
     removed: Gaussians
     """The Gaussians that were removed, cut where they reached out of the place that was chosen; to
     save memory, without their colours by direction."""
+    piece_means: Float[Tensor, "_p 3"]
+    """Means of the pieces that stayed where a removed Gaussian reached out of that place. They are
+    among the additions, and were given."""
 
     @staticmethod
     def whole(gaussians: Gaussians) -> ContextScene:
@@ -811,7 +814,8 @@ class ContextScene:
     ) -> ContextScene:
         """Return a context from which nothing was removed yet."""
         none = gaussians[:0]
-        return ContextScene(gaussians, rendered, index, replace(none, sh=none.sh[:, :1]))
+        none = replace(none, sh=none.sh[:, :1])
+        return ContextScene(gaussians, rendered, index, none, none.means)
 
     @cached_property
     def removed_pixels(self) -> dict[Hashable, Bool[Tensor, "h w"]]:
@@ -824,6 +828,16 @@ class ContextScene:
         if self.rendered is not self.gaussians:
             return self.proxy_index
         return torch.arange(len(self.gaussians), device=self.gaussians.means.device)
+
+    def find_pieces(self, gaussians: Gaussians) -> Bool[Tensor, "_n"]:
+        """Find the pieces of cut Gaussians among others, by their exact positions."""
+        count = len(self.piece_means)
+        if count == 0:
+            return torch.zeros_like(gaussians.opacities, dtype=torch.bool)
+        # Equal positions get equal numbers, which can be compared as single values.
+        points = torch.cat([self.piece_means, gaussians.means])
+        _, numbers = torch.unique(points, dim=0, return_inverse=True)
+        return torch.isin(numbers[count:], numbers[:count])
 
     @property
     def chosen_mask(self) -> Bool[Tensor, "n"]:

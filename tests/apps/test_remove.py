@@ -25,6 +25,7 @@ from gscompleter.apps.report.removal_pictures import find_largest
 from gscompleter.data.formats import open_photographs
 from gscompleter.numerics.geometry import axis_angle_to_matrix, rotations_to_quats
 from gscompleter.render.loading import load_renderer
+from gscompleter.state import NEW_PHOTO_ID
 from gscompleter.system.files.image import read_image, write_image
 from gscompleter.types import merge
 from scenes import Room, camera_at, cast, gaussians_of, photographed, random_gaussians, view_of
@@ -109,6 +110,11 @@ def test_the_crate_goes_its_place_is_filled_and_strip_brings_it_back(scene, tmp_
     left = completed[completed.generated == 0]
     assert not find_in_boxes(left.means, CRATE, UPRIGHT).any()
     counts = json.loads((out / "summary.json").read_text())["gaussians"]
+    # Pieces of what was cut at the border of the box have the label of photographs, and are counted
+    # apart from what these showed.
+    num_labelled = int((completed.generated == NEW_PHOTO_ID).sum())
+    assert counts["pieces"] > 0
+    assert counts["from_photographs"] + counts["pieces"] == num_labelled
     assert counts["removed"] == len(given) - len(left) == len(load_ply(out / "removed.ply")) > 100
     assert (out / "context.ply").read_bytes() == (scene / "splat.ply").read_bytes()
     summary = json.loads((out / "summary.json").read_text())

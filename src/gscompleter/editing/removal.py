@@ -65,17 +65,18 @@ def remove_gaussians(
     if gone.all():
         raise InputError("Nothing would be left of the splat; choose fewer Gaussians.")
 
+    # Outer pieces are no Gaussians of the file: they are added to it, with a label of their own.
+    rest = replace(outer, generated=torch.full_like(outer.generated, NEW_PHOTO_ID))
+    rest = rest[~is_outer_revealed]
     remaining = replace(
         source,
         rendered=source.rendered[~gone],
         proxy_index=number_left(source, chosen, unused, gone),
         removed=merge([source.removed, replace(inner, sh=inner.sh[:, :1])]),
+        piece_means=torch.cat([source.piece_means, rest.means]),
     )
     # As long as nothing is recoloured, the state has that of its source itself, which tells so.
     context = remaining.rendered if first is source.rendered else first[~gone]
-    # Outer pieces are no Gaussians of the file: they are added to it, with a label of their own.
-    rest = replace(outer, generated=torch.full_like(outer.generated, NEW_PHOTO_ID))
-    rest = rest[~is_outer_revealed]
     parts = (context, *state.parts[1:])
     if len(rest):
         parts = (*parts, rest)
@@ -129,7 +130,8 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
     if len(source.removed) == 0:
         return state
 
-    # Outer pieces of what was cut are among the additions, but were not generated.
+    # Outer pieces of what was cut, and what photographs showed before, are among the additions, but
+    # were not generated.
     is_rest = state.added.generated == NEW_PHOTO_ID
     rest = state.added[is_rest]
     known = merge([state.rendered_context, rest])

@@ -55,7 +55,7 @@ from gscompleter.splats.edits import EditDraft, record_edit
 from gscompleter.splats.layout import save_like, save_removed
 from gscompleter.splats.ply import save_parts, save_ply
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, RunRecord
-from gscompleter.state import Completion, TargetResult
+from gscompleter.state import NEW_PHOTO_ID, Completion, TargetResult
 from gscompleter.system.files.image import write_image, write_pixels
 from gscompleter.system.files.result_format import MARK
 from gscompleter.system.files.writing import (
@@ -337,9 +337,15 @@ def make_target_row(
 
 def count_changes(completion: Completion) -> dict[str, Any]:
     """Count the Gaussians and, of a splat, the photographs that it was not trained on."""
-    counts = {"context": len(completion.context), "added": len(completion.added)}
+    # What was added by one step may have been removed by another.
+    added = completion.added
+    is_piece = completion.source.find_pieces(added)
+    counts = {"context": len(completion.context), "added": len(added)}
     if completion.is_given:
-        counts["from_photographs"] = completion.num_observed
+        is_observed = (added.generated == NEW_PHOTO_ID) & ~is_piece
+        counts["from_photographs"] = int(is_observed.sum())
+    if is_piece.any():
+        counts["pieces"] = int(is_piece.sum())
     num_removed = int(completion.source.gone_mask.sum())
     if num_removed:
         counts["removed"] = num_removed

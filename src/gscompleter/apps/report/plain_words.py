@@ -262,7 +262,8 @@ def list_splat_notes(summary: CompletionSummary) -> Iterator[Note]:
     from_photographs = summary.gaussians.get("from_photographs")
     num_recolored = summary.gaussians.get("recolored")
     if from_photographs:
-        invented = summary.gaussians["added"] - from_photographs
+        pieces = summary.gaussians.get("pieces", 0)
+        invented = summary.gaussians["added"] - from_photographs - pieces
         painters = {row.painter for row in summary.targets if row.painter}
         maker = " and ".join(sorted(painters)) or "the generator"
         yield Note(
