@@ -197,6 +197,7 @@ def test_a_hole_is_what_the_target_shows_whatever_its_padding():
     assert 0.05 < result.hole_fraction < 0.08
 
 
+@pytest.mark.slow
 def test_targets_are_synthesized_together_where_the_generator_can():
     """Each target has a hole at its border, whether or not the ones before are completed.
 

@@ -104,6 +104,7 @@ def is_alive(pids: list[str]) -> bool:
         return False
 
 
+@pytest.mark.slow
 @pytest.mark.linux
 def test_what_is_killed_goes_on_and_every_job_is_done_once(tmp_path):
     killed_and_started_again("local", tmp_path, 8, 0.4)

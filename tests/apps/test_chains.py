@@ -105,6 +105,7 @@ def test_lines_say_what_is_kept_and_what_is_not_known(without_crate, tmp_path):
     assert "What was removed is not known" in line
 
 
+@pytest.mark.slow
 def test_strip_gives_each_earlier_state_back(
     room, camera, without_crate, tmp_path, monkeypatch, capsys
 ):

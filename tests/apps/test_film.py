@@ -218,6 +218,7 @@ def test_no_film_without_a_target(completion, tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.slow
 def test_the_same_completion_gives_the_same_bytes(completion, tmp_path):
     renderer, photographs = load_renderer("cpu"), [view.camera for view in completion.views]
     for name in ("a", "b"):

@@ -375,6 +375,7 @@ def test_a_video_passes_the_targets(filmed):
     assert sorted(file.name for file in filmed.iterdir()) == listed
 
 
+@pytest.mark.slow
 def test_a_repaired_video_completes_the_targets(scene, filmed, tmp_path, monkeypatch, capsys):
     """It has another size and rate; a painted image of a target counts more."""
     holes = Path(shutil.copytree(filmed, tmp_path / "holes"))

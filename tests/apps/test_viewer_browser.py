@@ -323,6 +323,7 @@ def test_a_link_plays_the_path_until_it_is_paused(saved, played_browser):
     assert distance(eyes[2], eyes[0]) > 0.001
 
 
+@pytest.mark.slow
 def test_the_parts_of_a_large_scene_are_put_together(
     browser, exhibit, libraries, tmp_path, monkeypatch
 ):
@@ -334,6 +335,7 @@ def test_the_parts_of_a_large_scene_are_put_together(
     tab.context.close()
 
 
+@pytest.mark.slow
 def test_antialiased_gaussians_are_those_of_our_renderer(browser, libraries, tmp_path):
     """Both pictures differ from those of the classic mode."""
     room = room_exhibit()
@@ -425,6 +427,7 @@ def test_what_is_painted_is_saved_with_its_camera_and_repaired(
     assert summary["targets"][0]["added"] > 0
 
 
+@pytest.mark.slow
 def test_fingers_paint_and_move(browser, saved):
     """One finger paints; with a second one both move the camera, and nothing is painted."""
     options = {"viewport": {"width": 420, "height": 700}, "has_touch": True, "is_mobile": True}

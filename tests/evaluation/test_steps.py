@@ -287,6 +287,7 @@ def test_the_drift_is_that_between_the_largest_and_the_smallest_scale():
 # Runs
 
 
+@pytest.mark.slow
 def test_a_stopped_sequence_goes_on_after_its_last_whole_step(finished, tmp_path, monkeypatch):
     out = tmp_path / "out"
     original = store.save_prediction

@@ -87,12 +87,8 @@ def undo_edits(path: Path, edits: Edits, numbers: Collection[int], out: Path) ->
     check_undone(path, edits, numbers, out)
     layout = read_scene(path)
     all_edits = edits.edits
-    states, left_out = compute_keys(path, edits)
-    if len(states[-1]) != len(layout.rows):
-        raise InputError(
-            f"{quote_value(path)} has {len(layout.rows):,} Gaussians, and by edits.json beside it "
-            f"{len(states[-1]):,}; fetch both files again."
-        )
+    check_counts(path, edits, len(layout.rows))
+    states, left_out = compute_keys(edits)
 
     remaining = [index for index in range(len(all_edits)) if index + 1 not in numbers]
     appended = [make_keys(0, all_edits[0].rows)]
@@ -151,20 +147,34 @@ def make_keys(number: int, count: int) -> Keys:
     return (np.int64(number) << PLACE_BITS) + np.arange(count, dtype=np.int64)
 
 
-def compute_keys(path: Path, edits: Edits) -> tuple[list[Keys], list[Originals]]:
+def check_counts(path: Path, edits: Edits, total: int) -> None:
+    """Refuse a record whose numbers of rows do not lead to the `total` of the splat.
+
+    They may come from elsewhere, and arrays of their size are made.
+    """
+    count = edits.edits[0].rows
+    is_right = count >= 0
+    for edit in edits.edits:
+        gone = 0
+        if edit.originals is not None:
+            gone = len(read_scene(edits.find(edit.originals)).rows)
+        is_right &= edit.rows == count and 0 <= gone <= count and edit.added >= 0
+        count += edit.added - gone
+    if not is_right or count != total:
+        raise InputError(
+            f"{quote_value(path)} has {total:,} Gaussians, to which the numbers of {EDITS_FILE} "
+            "beside it do not lead; fetch all files of its folder again."
+        )
+
+
+def compute_keys(edits: Edits) -> tuple[list[Keys], list[Originals]]:
     """Compute the keys of the rows of all states, and of those that each edit left out."""
     states = [make_keys(0, edits.edits[0].rows)]
     left_out = []
     for number, edit in enumerate(edits.edits, start=1):
-        before = states[-1]
-        if len(before) != edit.rows:
-            raise InputError(
-                f"By edits.json beside {quote_value(path)}, edit {number} began with "
-                f"{edit.rows:,} Gaussians, and there were {len(before):,}; fetch it again."
-            )
-        gone = read_originals(edits, edit, before)
+        gone = read_originals(edits, edit, states[-1])
         left_out.append(gone)
-        kept = np.setdiff1d(before, gone.keys, assume_unique=True)
+        kept = np.setdiff1d(states[-1], gone.keys, assume_unique=True)
         states.append(np.concatenate([kept, make_keys(number, edit.added)]))
     return states, left_out
 

@@ -1,0 +1,134 @@
+"""Edits of a splat, taken off one by one: rows, columns and headers of each earlier state."""
+
+from __future__ import annotations
+
+import json
+import random
+from contextlib import suppress
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from gscompleter import load_ply, save_ply
+from gscompleter.apps.inputs.task import InputSplatFile
+from gscompleter.apps.report.completion import save_completed_splat
+from gscompleter.splats.edits import EditDraft, read_edits, record_edit
+from gscompleter.splats.provenance import RunRecord
+from gscompleter.splats.undo import strip_edits
+from gscompleter.system.errors import InputError
+from gscompleter.system.files.ply import read_ply_file, write_ply_file
+from gscompleter.types import Gaussians
+from scenes import random_gaussians
+
+NUM_EDITS = 6
+
+
+def edit(splat: Path, folder: Path, number: int, has_record: bool = True) -> Path:
+    """Remove some Gaussians of a splat at random, and add others."""
+    context = load_ply(splat)
+    generator = torch.Generator().manual_seed(number)
+    # The third edit only adds, and the fourth only removes.
+    changed = torch.rand(len(context), generator=generator) < (0.0 if number == 3 else 0.2)
+    added = random_gaussians(0 if number == 4 else 5 * number, seed=number)
+    added = replace(added, generated=torch.full_like(added.generated, number))
+    run = RunRecord("gscompleter", "x", (number, number), seed=number) if has_record else None
+    folder.mkdir()
+    save_completed_splat(folder, context, changed, added, InputSplatFile(splat), run)
+    draft = EditDraft("complete" if has_record else "clean", seed=number)
+    record_edit(folder, draft, len(context), len(added), splat, has_record)
+    return folder / "completed.ply"
+
+
+@pytest.fixture(scope="module")
+def states(tmp_path_factory) -> list[Path]:
+    """Write a splat with a column of its own, and edit it again and again."""
+    folder = tmp_path_factory.mktemp("edits")
+    splat = folder / "splat.ply"
+    save_ply(splat, random_gaussians(60))
+    layout = read_ply_file(splat, (), "scene")
+    header = layout.header.replace(b"end_header", b"comment of its owner\nend_header")
+    write_ply_file(splat, header, len(layout.rows), [layout.rows], layout.trailer)
+    states = [splat]
+    for number in range(1, NUM_EDITS + 1):
+        # Cleanings name nobody who made the file.
+        states.append(edit(states[-1], folder / str(number), number, has_record=number != 4))
+    return states
+
+
+def test_the_last_edits_are_taken_off_byte_for_byte(states, tmp_path):
+    for number in range(1, NUM_EDITS + 1):
+        out = tmp_path / f"{number}.ply"
+        undone = strip_edits(states[-1], out, range(number, NUM_EDITS + 1))
+        assert out.read_bytes() == states[number - 1].read_bytes()
+        assert undone.is_same_file
+        assert undone.kept == len(load_ply(out))
+    undone = strip_edits(states[-1], tmp_path / "all.ply")
+    assert (tmp_path / "all.ply").read_bytes() == states[0].read_bytes()
+    assert undone.is_same_file
+
+
+def find_rows(scene: Gaussians) -> set[tuple[float, ...]]:
+    return {tuple(row) for row in scene.means.tolist()}
+
+
+@pytest.mark.parametrize("numbers", [[2], [1, 3], [2, 5], [1, 2, 4, 6]])
+def test_edits_from_the_middle_are_taken_off(states, numbers, tmp_path):
+    out = tmp_path / "out.ply"
+    strip_edits(states[-1], out, numbers)
+    # What is left is what the other edits added, without what they removed.
+    expected = find_rows(load_ply(states[0]))
+    for number in range(1, NUM_EDITS + 1):
+        before, after = (find_rows(load_ply(states[index])) for index in (number - 1, number))
+        if number not in numbers:
+            expected |= after - before
+    for number in range(1, NUM_EDITS + 1):
+        before, after = (find_rows(load_ply(states[index])) for index in (number - 1, number))
+        if number not in numbers:
+            expected -= before - after
+    assert find_rows(load_ply(out)) == expected
+
+
+def test_a_record_that_does_not_fit_is_refused(states, tmp_path):
+    record = states[-1].with_name("edits.json")
+    text = record.read_text()
+    try:
+        for change, sentence in (
+            (lambda c: c["edits"][0].update(rows=7), "do not lead"),
+            (lambda c: c["edits"][0].update(rows=10**15), "do not lead"),
+            (lambda c: c["edits"][-1].update(added=7), "do not lead"),
+            (lambda c: c["edits"][-1].update(added=-7), "do not lead"),
+            (lambda c: c["edits"][0].update(originals="../x.ply"), r"names \.\./x\.ply"),
+            (lambda c: c["edits"][0].update(originals="edits/9_originals.ply"), "is missing"),
+            (lambda c: c.update(edits=3), "edits"),
+            (lambda c: c.update(format=99), "later version"),
+        ):
+            content = json.loads(text)
+            change(content)
+            record.write_text(json.dumps(content))
+            with pytest.raises(InputError, match=sentence):
+                strip_edits(states[-1], tmp_path / "out.ply", [NUM_EDITS - 1])
+    finally:
+        record.write_text(text)
+
+
+def test_random_bytes_of_a_record_end_in_a_sentence(states):
+    record = states[-1].with_name("edits.json")
+    given = record.read_bytes()
+    generator = random.Random(0)
+    sentences = []
+    try:
+        for _ in range(60):
+            content = bytearray(given)
+            for _ in range(3):
+                content[generator.randrange(len(content))] = generator.randrange(256)
+            record.write_bytes(content[: generator.choice([len(content), len(content) // 2])])
+            # Some changes are within a text, and read.
+            with suppress(InputError):
+                read_edits(states[-1])
+                continue
+            sentences.append(1)
+    finally:
+        record.write_bytes(given)
+    assert len(sentences) > 20
