@@ -90,7 +90,7 @@ def test_a_rotation_may_be_rounded_and_planes_may_be_unknown():
     ("change", "sentence"),
     [
         ({"image": torch.zeros(32, 31, 3)}, r"shape \[32, 31, 3\], and its camera has 32 × 32"),
-        ({"image": torch.zeros(32, 32)}, r"has to be a tensor of float32 and shape \[n, k, 3\]"),
+        ({"image": torch.zeros(32, 32)}, r"has to be a tensor of float32 and shape \[h, w, 3\]"),
         ({"image": torch.zeros(32, 32, 3, dtype=torch.uint8)}, "is a tensor of uint8"),
         ({"image": np.zeros((32, 32, 3))}, "is of type ndarray"),
         ({"image": torch.zeros(32, 32, 3).requires_grad_()}, "requires a gradient"),

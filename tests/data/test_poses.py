@@ -67,6 +67,18 @@ def test_the_cameras_of_a_room_are_found_up_to_a_similarity(tmp_path, monkeypatc
     assert focal == pytest.approx(float(CAMERAS[0].K[0, 0]), rel=0.03)
 
 
+def test_a_jpeg_with_further_pictures_keeps_its_name(tmp_path):
+    image = Image.new("RGB", (64, 48), "grey")
+    image.save(tmp_path / "IMG_1.jpg", format="MPO", save_all=True, append_images=[image])
+    with Image.open(tmp_path / "IMG_1.jpg") as opened:
+        assert opened.format == "MPO"
+    (tmp_path / "out").mkdir()
+    copy = write_upright(tmp_path, "IMG_1.jpg", tmp_path / "out")
+    assert copy.name == "IMG_1.jpg"
+    with Image.open(tmp_path / "out" / "images" / "IMG_1.jpg") as written:
+        assert written.size == (64, 48)
+
+
 def test_photographs_that_are_not_placed_keep_the_numbers_of_the_others(tmp_path, monkeypatch):
     given, out = blank(tmp_path / "photos", 4), tmp_path / "poses"
     stand_in(monkeypatch, tmp_path, model_script(["0.png", "2.png", "3.png"]))

@@ -595,9 +595,11 @@ def load_config(
     source: Path | str, is_splat: bool = False, has_photographs: bool = True
 ) -> CompleterConfig:
     """Return a config by name, or read the changes to its `base` from a YAML file."""
-    path = require_path(source)
-    if path.suffix not in {".yaml", ".yml"}:
+    # A name is no path, and may be longer than one.
+    is_given = isinstance(source, (str, os.PathLike)) and bool(os.fspath(source))
+    if is_given and Path(source).suffix not in {".yaml", ".yml"}:
         return get_named_config(os.fspath(source), is_splat, has_photographs)
+    path = require_path(source)
     changes = read_yaml(path)
     base_name = str(changes.pop("base", "default"))
     base = get_named_config(base_name, is_splat, has_photographs)

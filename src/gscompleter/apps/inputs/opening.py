@@ -121,7 +121,7 @@ def choose_working_size(opened: Opened, splat: Path, console: Console) -> Opened
     done where a splat is rendered smaller than it was trained.
     """
     photographs = opened.photographs
-    numbers = range(min(len(photographs), NUM_SIZE_PHOTOGRAPHS))
+    numbers = photographs.posed[:NUM_SIZE_PHOTOGRAPHS]
     usable = collect_usable_cameras(photographs, numbers, LONG_SIDE)
     trained = find_training_size(splat, opened.request.folder, photographs, list(usable))
     if trained is None:

@@ -466,7 +466,8 @@ def write_upright(
     path = root / source
     with open_image(path) as image:
         exif = image.getexif()
-        kind = image.format
+        # A phone's JPEG with further pictures behind it, such as a map of gains for HDR.
+        kind = "JPEG" if image.format == "MPO" else image.format
         is_known = kind in ("JPEG", "PNG")
         is_upright = exif.get(ORIENTATION, 1) == 1 and max(image.size) <= MAX_SIDE
         is_ready = is_known and is_upright and image.mode in ("RGB", "L")
