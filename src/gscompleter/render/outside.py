@@ -129,18 +129,20 @@ def list_directions() -> Float[Tensor, "12 3"]:
     return normalize(torch.tensor(corners), dim=1)
 
 
-def look_from_outside(scene: Gaussians, renderer: Renderer, side: int) -> list[OutsideView]:
+def look_from_outside(
+    scene: Gaussians, renderer: Renderer, side: int, extent: Extent | None = None
+) -> list[OutsideView]:
     """Render a splat from twelve directions about its box, at twice its extent.
 
     Images have `side` pixels along each side, and show twice the extent, too: around an object they
-    are empty at their borders.
+    are empty at their borders. The extent is measured if it is not given.
     """
     small = thin_gaussians(scene, MAX_PREVIEW_GAUSSIANS)
 
     def look(camera: Camera) -> OutsideView:
         return OutsideView(camera, renderer.render(small, camera))
 
-    cameras = list_outside_cameras(measure_extent(scene), side)
+    cameras = list_outside_cameras(extent or measure_extent(scene), side)
     return list(get_view_map(scene.means)(look, cameras))
 
 

@@ -63,6 +63,7 @@ def look_at_removal(
     Of a room they see a section, without the walls in front. Also returns the share of what is seen
     from twelve directions that goes.
     """
+    given = replace(given, sh=given.sh[:, :1], encoded=None)
     parts = given[~removed], given[removed]
     small = [thin_gaussians(part, MAX_PREVIEW_GAUSSIANS) for part in parts]
     both = merge(small)
@@ -101,6 +102,8 @@ def draw_removal_rows(
     given: Gaussians, removed: Bool[Tensor, "n"], cameras: Sequence[Camera], renderer: Renderer
 ) -> Float[Tensor, "h w 3"]:
     """Draw a row for each camera: before, what goes in red over a dim grey, and after."""
+    # Without colours by direction, which are most of the memory of a scene.
+    given = replace(given, sh=given.sh[:, :1], encoded=None)
     kept = given[~removed]
     rows = []
     for camera in cameras:
