@@ -61,6 +61,7 @@ def test_a_room_full_of_streaks_is_freed():
     assert gone[len(CLOSED_ROOM) :].float().mean() > 0.85
 
 
+@pytest.mark.slow
 def test_more_strength_takes_more_of_them_and_nothing_of_the_object():
     shares = []
     for strength in (0.5, 1.0, 2.0):

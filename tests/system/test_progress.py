@@ -196,7 +196,9 @@ def test_results_of_other_commands_are_alone_in_the_standard_output(tmp_path, mo
     save_ply(tmp_path / "a.ply", random_gaussians(50))
     assert run(monkeypatch, "convert", tmp_path / "a.ply", tmp_path / "b.spz") == 0
     out, log = capfd.readouterr()
-    assert out.count("\n") == 1
+    rounding, sentence = out.splitlines()
+    assert rounding.startswith("Largest rounding: ")
+    assert sentence.endswith("b.spz")
     assert log == ""
 
 

@@ -25,7 +25,7 @@ from gscompleter.types import Gaussians
 
 MAX_BREADTH = 10.0
 """Largest factor by which the limit of opacity rises with the size of a Gaussian."""
-BLOCK = 100_000
+BLOCK = 25_000
 """Gaussians whose neighbours are measured at a time, to save memory."""
 NEIGHBORS = "Searching for neighbours"
 

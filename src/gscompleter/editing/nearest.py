@@ -54,7 +54,8 @@ class NearestGaussians:
 
         if len(points) == 0:
             return
-        tree = cKDTree(self._means[among])
+        # The tree holds what it is given; a copy is only made of a part.
+        tree = cKDTree(self._means if len(among) == len(self._means) else self._means[among])
         blocks = [points[start : start + QUERIES] for start in range(0, len(points), QUERIES)]
         count = self.rows.shape[1]
         for block in track(blocks, self._name):

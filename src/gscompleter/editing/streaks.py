@@ -18,7 +18,7 @@ from torch import Tensor
 from gscompleter.config import FloaterConfig
 from gscompleter.editing.nearest import NearestGaussians
 from gscompleter.numerics.geometry import quats_to_rotations
-from gscompleter.render.outside import look_from_outside, measure_extent
+from gscompleter.render.outside import Extent, look_from_outside, measure_extent
 from gscompleter.render.protocols import Renderer
 from gscompleter.system.progress import track
 from gscompleter.types import Gaussians
@@ -54,8 +54,8 @@ class LongGaussians:
 def find_streaks(scene: Gaussians, config: FloaterConfig, renderer: Renderer) -> Bool[Tensor, "n"]:
     """Find the streaks of a scene, in rounds: what is found lies along no other Gaussian."""
     left = torch.ones_like(scene.generated, dtype=torch.bool)
-    radius = measure_extent(scene).radius
-    long = list_long_gaussians(scene, radius, config)
+    extent = measure_extent(scene)
+    long = list_long_gaussians(scene, extent.radius, config)
     if len(long.rows) == 0:
         return ~left
 
@@ -75,7 +75,7 @@ def find_streaks(scene: Gaussians, config: FloaterConfig, renderer: Renderer) ->
     suspects = long.rows[left[long.rows] & (free > SUSPECT_SHARE * config.max_free)]
     others = left.index_fill(0, suspects, False)
     if len(suspects) > 0 and others.any():
-        uncovered = measure_uncovered(scene[others], scene[suspects], renderer)
+        uncovered = measure_uncovered(scene[others], scene[suspects], extent, renderer)
         left[suspects[uncovered > config.max_uncovered]] = False
     return ~left
 
@@ -119,12 +119,12 @@ def measure_free_length(
 
 
 def measure_uncovered(
-    others: Gaussians, suspects: Gaussians, renderer: Renderer
+    others: Gaussians, suspects: Gaussians, extent: Extent, renderer: Renderer
 ) -> Float[Tensor, "m"]:
     """Measure the share of what suspects cover, seen from outside, where no others are."""
     beside = torch.zeros_like(suspects.opacities)
     total = torch.zeros_like(suspects.opacities)
-    views = look_from_outside(others, renderer, SIDE)
+    views = look_from_outside(others, renderer, SIDE, extent)
     for view in track(views, "Comparing renders"):
         empty = (~view.silhouette).to(beside)
         counted = torch.stack([empty, torch.ones_like(empty), torch.zeros_like(empty)], dim=-1)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -115,9 +116,23 @@ def measure_volumes(
     points: Float[Tensor, "n 3"], turns: Float[Tensor, "t 3 3"]
 ) -> Float[Tensor, "t"]:
     """Measure the volume of the box that holds points, along each triple of axes."""
-    turned = torch.einsum("tij,nj->tni", turns, points)
-    low, high = turned.quantile(torch.tensor(CORE), dim=1)
+    turned = torch.einsum("tij,nj->tin", turns, points)
+    low, high = compute_quantiles(turned, CORE)
     return (high - low).prod(dim=1)
+
+
+def compute_quantiles(
+    values: Float[Tensor, "t i n"], shares: Sequence[float]
+) -> list[Float[Tensor, "t i"]]:
+    """Compute quantiles of the last axis on the CPU, to the bit as `torch.quantile`.
+
+    NumPy sorts in a tenth of its time.
+    """
+    ordered = torch.from_numpy(np.sort(values.contiguous().numpy(), axis=-1))
+    ranks = torch.tensor(shares) * (values.shape[-1] - 1)
+    below = ordered[..., ranks.floor().long()]
+    above = ordered[..., ranks.ceil().long()]
+    return list(below.lerp(above, ranks - ranks.floor()).unbind(dim=-1))
 
 
 def list_directions() -> Float[Tensor, "12 3"]:
@@ -129,18 +144,20 @@ def list_directions() -> Float[Tensor, "12 3"]:
     return normalize(torch.tensor(corners), dim=1)
 
 
-def look_from_outside(scene: Gaussians, renderer: Renderer, side: int) -> list[OutsideView]:
+def look_from_outside(
+    scene: Gaussians, renderer: Renderer, side: int, extent: Extent | None = None
+) -> list[OutsideView]:
     """Render a splat from twelve directions about its box, at twice its extent.
 
     Images have `side` pixels along each side, and show twice the extent, too: around an object they
-    are empty at their borders.
+    are empty at their borders. The extent is measured if it is not given.
     """
     small = thin_gaussians(scene, MAX_PREVIEW_GAUSSIANS)
 
     def look(camera: Camera) -> OutsideView:
         return OutsideView(camera, renderer.render(small, camera))
 
-    cameras = list_outside_cameras(measure_extent(scene), side)
+    cameras = list_outside_cameras(extent or measure_extent(scene), side)
     return list(get_view_map(scene.means)(look, cameras))
 
 

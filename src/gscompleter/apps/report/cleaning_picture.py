@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gscompleter.apps.report.completion import join_images
-from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, thin_gaussians
+from gscompleter.render.lod import MAX_GAUSSIANS, MAX_PREVIEW_GAUSSIANS, thin_gaussians
 from gscompleter.render.outside import DISTANCE, list_outside_cameras, measure_extent
 from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
@@ -63,11 +63,10 @@ def look_at_removal(
     Of a room they see a section, without the walls in front. Also returns the share of what is seen
     from twelve directions that goes.
     """
-    parts = given[~removed], given[removed]
-    small = [thin_gaussians(part, MAX_PREVIEW_GAUSSIANS) for part in parts]
-    both = merge(small)
-    goes = torch.arange(len(both)).to(removed.device) >= len(small[0])
-    extent = measure_extent(small[0])
+    kept, gone = split_thinned(given, removed, MAX_PREVIEW_GAUSSIANS)
+    both = merge([kept, gone])
+    goes = torch.arange(len(both)).to(removed.device) >= len(kept)
+    extent = measure_extent(kept)
     cameras = list_outside_cameras(extent, PREVIEW_SIDE)
     # Renderers draw nothing nearer than a hundredth of the near plane.
     section = 100 * (DISTANCE - CUT) * extent.radius
@@ -82,6 +81,16 @@ def look_at_removal(
     best = choose_cameras([max(pair, key=lambda seen: seen.removed) for pair in pairs])
     share = sum(seen.removed for seen in whole) / max(sum(seen.shown for seen in whole), 1e-12)
     return [enlarge(camera) for camera in best], share
+
+
+def split_thinned(
+    given: Gaussians, removed: Bool[Tensor, "n"], max_gaussians: int
+) -> tuple[Gaussians, Gaussians]:
+    """Split a splat into what stays and what goes, each thinned to about so many Gaussians."""
+    # Without colours by direction, which are most of the memory of a scene.
+    plain = replace(given, sh=given.sh[:, :1], encoded=None)
+    kept, gone = (thin_gaussians(plain[mask], max_gaussians) for mask in (~removed, removed))
+    return kept, gone
 
 
 def choose_cameras(seen: Sequence[RemovalSeen]) -> list[Camera]:
@@ -101,13 +110,15 @@ def draw_removal_rows(
     given: Gaussians, removed: Bool[Tensor, "n"], cameras: Sequence[Camera], renderer: Renderer
 ) -> Float[Tensor, "h w 3"]:
     """Draw a row for each camera: before, what goes in red over a dim grey, and after."""
-    kept = given[~removed]
+    kept, gone = split_thinned(given, removed, MAX_GAUSSIANS)
+    both = merge([kept, gone])
+    goes = (torch.arange(len(both)) >= len(kept)).to(both.means)
     rows = []
     for camera in cameras:
-        frozen = renderer.freeze(given, camera)
+        frozen = renderer.freeze(both, camera)
         before = frozen.render.image.clamp(0, 1)
         # The root, so that what is faint is seen.
-        weights = frozen.splat(removed.to(given.means)).clamp(0, 1).sqrt()[..., None]
+        weights = frozen.splat(goes).clamp(0, 1).sqrt()[..., None]
         grey = DIMMING * before.mean(dim=2, keepdim=True)
         marked = grey * (1 - weights) + weights * torch.tensor(RED).to(grey)
         after = renderer.render(kept, camera).image
