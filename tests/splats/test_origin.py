@@ -12,6 +12,7 @@ import gscompleter as gsc
 from command import run
 from gscompleter import InputError, load_ply, load_splat, merge, save_ply, save_splat
 from gscompleter.apps.inspection import describe_range
+from gscompleter.splats import ply
 from gscompleter.splats.formats import convert_splat, describe_oddities
 from gscompleter.splats.layout import is_same_scene, save_like, save_removed, strip
 from gscompleter.splats.origin import format_corners
@@ -64,6 +65,17 @@ def test_files_near_zero_and_of_floats_stay_as_they_are(tmp_path):
     # Large Gaussians are not hurt.
     write_map_ply(tmp_path / "large.ply", replace(gaussians, scales=gaussians.scales * 1e4))
     assert load_splat(tmp_path / "large.ply").origin is None
+
+
+def test_of_a_large_file_a_sample_tells(tmp_path, monkeypatch):
+    means = write_map_ply(tmp_path / "map.ply", small_gaussians())
+    whole = load_splat(tmp_path / "map.ply")
+    monkeypatch.setattr(ply, "SAMPLE_BLOCKS", 10)
+    monkeypatch.setattr(ply, "SAMPLE_ROWS", 5)
+    assert len(ply.sample_rows(ply.read_scene(tmp_path / "map.ply").rows)) == 50
+    loaded = load_splat(tmp_path / "map.ply")
+    assert np.abs(np.array(loaded.origin) - np.array(whole.origin)).max() <= 1
+    assert np.abs(places_of(loaded) - means).max() < EXACT
 
 
 def test_texts_keep_their_digits(tmp_path):

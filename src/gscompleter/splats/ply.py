@@ -61,6 +61,9 @@ FILTER = "filter_3D"
 """Standard deviation of the smoothing filter of Mip-Splatting and GOF, in scene units."""
 SURFEL_THICKNESS = 1e-3
 """Thickness of a surfel of 2DGS, relative to its smaller scale."""
+SAMPLE_BLOCKS = 64
+SAMPLE_ROWS = 1024
+"""Rows of each block of a sample."""
 MIN_TELLING = 100
 """Fewest Gaussians whose numbers tell how they are stored."""
 MIDDLE = (0.01, 0.99)
@@ -176,8 +179,9 @@ def find_origin(rows: ndarray, has_linear_scales: bool) -> Origin | None:
     if not has_doubles(rows):
         return None
     middle = []
+    sample = sample_rows(rows)
     for name in MEANS:
-        values = rows[name].astype(np.float64)
+        values = sample[name].astype(np.float64)
         finite = values[np.isfinite(values)]
         if len(finite) == 0:
             return None
@@ -220,16 +224,26 @@ def find_linear_scales(rows: ndarray) -> bool:
     return is_large or (high <= math.log(ONE_SIZE) and high >= SEVERAL_SIZES * low)
 
 
+def sample_rows(rows: ndarray) -> ndarray:
+    """Take rows from all over a file, in blocks, so that little of a large mapped file is read."""
+    if len(rows) <= SAMPLE_BLOCKS * SAMPLE_ROWS:
+        return rows
+    starts = np.linspace(0, len(rows) - SAMPLE_ROWS, SAMPLE_BLOCKS).astype(np.int64)
+    return np.concatenate([rows[start : start + SAMPLE_ROWS] for start in starts])
+
+
 def _measure_scales(rows: ndarray) -> tuple[float, float, float]:
     """Measure the largest scale of Gaussians as it is stored: low, median and high quantile."""
     names = tuple(name for name in _SCALES if name in (rows.dtype.names or ()))
-    low, median, high = np.quantile(read_columns(rows, names).max(axis=1), (0.01, 0.5, 0.99))
+    largest = read_columns(sample_rows(rows), names).max(axis=1)
+    low, median, high = np.quantile(largest, (0.01, 0.5, 0.99))
     return float(low), float(median), float(high)
 
 
 def _measure_extent(rows: ndarray) -> float:
     """Measure the largest side of the box around nearly all Gaussians, in scene units."""
-    return float(np.ptp(np.quantile(read_columns(rows, MEANS), MIDDLE, axis=0), axis=0).max())
+    means = read_columns(sample_rows(rows), MEANS)
+    return float(np.ptp(np.quantile(means, MIDDLE, axis=0), axis=0).max())
 
 
 def find_plain_opacities(rows: ndarray, has_linear_scales: bool) -> bool:
@@ -269,7 +283,7 @@ def _describe_positions(scene: SceneFile) -> list[str]:
     rows = scene.rows
     if len(rows) == 0 or has_doubles(rows):
         return []
-    middle = np.median(read_columns(rows, MEANS), axis=0).astype(np.float64)
+    middle = np.median(read_columns(sample_rows(rows), MEANS), axis=0).astype(np.float64)
     size = _measure_scales(rows)[1]
     size = size if scene.has_linear_scales else math.exp(min(size, 80))
     if not is_too_far(middle, size):
