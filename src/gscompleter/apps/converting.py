@@ -36,11 +36,12 @@ from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, RunRecord
 from gscompleter.splats.sog import write_sog
 from gscompleter.splats.spz import write_spz
 from gscompleter.splats.streamed import is_streamed, load_level
+from gscompleter.splats.transform import merge_placed
 from gscompleter.splats.upward import USUAL, read_upward
 from gscompleter.state import NEW_PHOTO_ID
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import REMOVED_FILE
-from gscompleter.types import Gaussians, merge
+from gscompleter.types import Gaussians
 
 MAX_SHIFT = 1000.0
 """Longest shift, in scene units, after which coordinates certainly fit float32."""
@@ -220,7 +221,7 @@ def read_all(sources: Sequence[Path], options: ConvertOptions) -> tuple[Gaussian
             labels_used = max(labels_used, int(targets.max()))
         parts.append(part)
         runs += made_by.runs
-    return merge(parts) if len(parts) > 1 else parts[0], Provenance(tuple(runs))
+    return merge_placed(parts) if len(parts) > 1 else parts[0], Provenance(tuple(runs))
 
 
 def move_labels(
