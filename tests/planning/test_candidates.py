@@ -135,3 +135,17 @@ def test_a_small_image_sees_the_same():
     assert (small.width, small.height) == (48, 48)
     assert compute_field_of_view(small) == pytest.approx(compute_field_of_view(camera_at(size=96)))
     assert shrink_camera(camera_at(size=40), 48).width == 40
+
+
+def test_turns_up_and_down_in_place_are_told():
+    camera = camera_at()
+    turns = [
+        candidate.camera
+        for candidate in propose_candidates([camera], [seen_by(camera)], 0.3)
+        if candidate.looks_up_or_down
+    ]
+    assert len(turns) == 2
+    for turned in turns:
+        assert torch.equal(turned.center, camera.center)
+        assert (turned.forward - camera.forward)[1].abs() > 0.05
+        assert (turned.forward - camera.forward)[0].abs() < 1e-6

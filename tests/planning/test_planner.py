@@ -14,9 +14,12 @@ from gscompleter.evaluation.metrics.coverage import (
     render_pairs,
     sample_held_out_cameras,
 )
+from gscompleter.planning.candidates import Candidate
 from gscompleter.planning.planner import (
+    Choice,
     ViewPlanner,
     add_free_space_cameras,
+    choose_best,
     compute_gain,
     compute_remoteness,
     make_placeholders,
@@ -96,6 +99,19 @@ def test_overlap_is_what_the_anchor_sees_too():
     assert 0.2 < aside < 0.8
     covered_by_a_wall = replace(here[1], depth=torch.full_like(here[1].depth, 0.5))
     assert compute_overlap(*here, here[0], covered_by_a_wall) < 0.02
+
+
+def test_steps_ahead_come_before_turns_up_and_down():
+    """A ceiling gains most, and nobody walks there."""
+    here = camera_at()
+    turned = Choice(Candidate(here, 0, 1.0, looks_up_or_down=True), 0.4, gain=0.3)
+    aside = Choice(Candidate(here, 0, 1.0), 0.2, gain=0.1)
+    little = Choice(Candidate(here, 0, 1.0), 0.1, gain=0.05)
+    assert choose_best([turned, little, aside], [here], 1.0) is aside
+    assert choose_best([turned, little], [here], 1.0) is turned
+    assert choose_best([replace(turned, gain=0.005)], [here], 1.0) is None
+    assert aside.describe() == "Chosen because 20% of its image is empty, beside what is known."
+    assert "up or down" in turned.describe()
 
 
 def test_cameras_are_found_until_little_is_left_and_the_scene_covers_more(begun):

@@ -31,6 +31,8 @@ FREE_SPACE_MARGIN = 0.1
 """Least distance in front of a surface, relative to its depth, of a point in free space."""
 MOVES_ASIDE = (0, 1, 10, 11)
 """Moves of `make_moves` to the right and left, straight and around what the camera looks at."""
+TURNS_UP_AND_DOWN = (8, 9)
+"""Moves of `make_moves` that stand still and look at the floor or the ceiling."""
 MIN_COVERAGE = 0.05
 """Fraction of its image that must show the scene for a camera to have a known depth."""
 
@@ -46,6 +48,8 @@ class Candidate:
     """5 % quantile of the z-depths that the base camera sees, in scene units."""
     region: Bool[Tensor, "*size"] = torch.tensor(True)
     """Pixels of its small image that may be completed; all by default."""
+    looks_up_or_down: bool = False
+    """True for a turn up or down in place."""
 
 
 def propose_candidates(
@@ -77,7 +81,15 @@ def propose_candidates(
         if stays_beside:
             between = [interpolate_camera(base, bases[other], 0.5) for other in similar[index]]
             moved = [*(moved[move] for move in MOVES_ASIDE), *between]
-        candidates += [Candidate(camera, index, nearest[index]) for camera in moved]
+        candidates += [
+            Candidate(
+                camera,
+                index,
+                nearest[index],
+                looks_up_or_down=not stays_beside and move in TURNS_UP_AND_DOWN,
+            )
+            for move, camera in enumerate(moved)
+        ]
 
     small = [
         resize_camera(base, *render.alpha.T.shape)

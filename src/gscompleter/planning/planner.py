@@ -40,6 +40,11 @@ from gscompleter.system.progress import stage, track
 from gscompleter.system.timing import record_seconds
 from gscompleter.types import Camera, Gaussians, Render, make_observed
 
+MIN_AHEAD = 0.25
+"""Gain of cameras that look ahead, relative to that of turns up and down, from which they come
+first."""
+MIN_TOLD = 0.005
+"""Share of an image in holes that is worth a word."""
 MAX_FREE_SPACE_CAMERAS = 40
 """Most cameras of photographs, besides the context views, whose free space is kept empty."""
 
@@ -57,6 +62,13 @@ class Choice:
     def camera(self) -> Camera:
         """Camera of the candidate."""
         return self.candidate.camera
+
+    def describe(self) -> str:
+        """Say in a sentence why it was chosen."""
+        if self.hole_fraction < MIN_TOLD:
+            return "Chosen because what it sees contradicts the photographs."
+        where = "up or down" if self.candidate.looks_up_or_down else "beside what is known"
+        return f"Chosen because {self.hole_fraction:.0%} of its image is empty, {where}."
 
 
 @dataclass(frozen=True)
@@ -269,10 +281,18 @@ def choose_best(
     step: float,
     config: NextBestViewConfig = NextBestViewConfig(),
 ) -> Choice | None:
-    """Choose the camera to complete next, or None if little is left; `step` is in scene units."""
+    """Choose the camera to complete next, or None if little is left; `step` is in scene units.
+
+    Turns up and down in place come last, unless they gain several times as much.
+    """
     largest = max((choice.gain for choice in choices), default=0.0)
     if largest < config.min_gain:
         return None
+    # A person walks to the side and forward, and seldom looks at the ceiling or the floor alone.
+    ahead = [choice for choice in choices if not choice.candidate.looks_up_or_down]
+    most_ahead = max((choice.gain for choice in ahead), default=0.0)
+    if most_ahead >= max(config.min_gain, MIN_AHEAD * largest):
+        choices, largest = ahead, most_ahead
     good = [choice for choice in choices if choice.gain >= config.enough * largest]
 
     def order(choice: Choice) -> tuple[int, float]:

@@ -107,7 +107,9 @@ class Prepared:
         for choice in choices:
             frame = frames[choice.candidate.base]
             offset = describe_offset(choice.camera, self.cameras[frame])
-            targets.append(Target(choice.camera, derived_from=frame, offset=offset))
+            targets.append(
+                Target(choice.camera, derived_from=frame, offset=offset, reason=choice.describe())
+            )
         return replace(self, task=replace(self.task, targets=targets))
 
 

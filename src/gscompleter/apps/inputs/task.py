@@ -35,6 +35,8 @@ class Target:
     """Frame number that a planned camera was derived from; None if the user gave the camera."""
     offset: str | None = None
     """Move and turn of a planned camera from that frame, in words."""
+    reason: str = ""
+    """Sentence why a planned camera was chosen; empty for one that the user gave."""
     is_in_splat_frame: bool = False
     """True if the camera is in the frame of the input splat's file."""
     painting: Painting | None = None

@@ -329,6 +329,7 @@ def make_target_row(
         warnings=result.warnings,
         refused=result.refusal,
         offset=target.offset,
+        reason=target.reason or None,
         thin_gaps=gaps.share,
         flight_thin_gaps=gaps.flight_share,
         painter=result.painter or None,

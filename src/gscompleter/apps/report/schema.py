@@ -101,6 +101,8 @@ class TargetRow(ScoreRow):
     """File of the photograph that a planned camera was derived from."""
     offset: str | None = None
     """Move and turn from that photograph, in words."""
+    reason: str | None = None
+    """Sentence why a planned camera was chosen."""
     anchor_file: str | None = None
     """File of the anchor's photograph."""
     thin_gaps: float = 0.0
