@@ -54,8 +54,8 @@ def choose_config(
 ) -> CompleterConfig:
     """Choose the preset that fits the input, unless settings are given.
 
-    A scene that was completed before is not recoloured again: one file keeps the originals of one
-    run.
+    A scene that was completed before is not recoloured again, so that its labels alone still tell
+    what was given.
     """
     # Without check views nothing tells how far a given scene can be trusted.
     is_splat = scene is not None and check_views is not None
