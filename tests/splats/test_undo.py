@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import random
+import shutil
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -111,6 +112,21 @@ def test_a_record_that_does_not_fit_is_refused(states, tmp_path):
                 strip_edits(states[-1], tmp_path / "out.ply", [NUM_EDITS - 1])
     finally:
         record.write_text(text)
+
+
+def test_other_splats_of_the_folder_have_no_edits(states, tmp_path):
+    folder = tmp_path / "out"
+    shutil.copytree(states[-1].parent, folder)
+    save_ply(folder / "context.ply", load_ply(states[0]))
+    assert len(read_edits(folder / "completed.ply").edits) == NUM_EDITS
+    assert not read_edits(folder / "context.ply")
+    # The same bytes under another name are the same splat; others under its name are a later state.
+    (folder / "completed.ply").rename(folder / "mine.ply")
+    assert read_edits(folder / "mine.ply").is_unchanged
+    (folder / "context.ply").rename(folder / "completed.ply")
+    changed = read_edits(folder / "completed.ply")
+    assert len(changed.edits) == NUM_EDITS
+    assert not changed.is_unchanged
 
 
 def test_random_bytes_of_a_record_end_in_a_sentence(states):

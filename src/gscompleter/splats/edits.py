@@ -31,7 +31,7 @@ from gscompleter.types import Gaussians
 EDITS_FOLDER = "edits"
 EDITS = (EDITS_FILE, f"{EDITS_FOLDER}/*.ply")
 """Globs of the files that are written."""
-ADVICE = "take it from the folder of results again, or leave it out with --forget-edits"
+ADVICE = "take all files of its folder again, or move it away to do without the record"
 _LABEL_LINE = re.compile(rb"^property\s+(\w+)\s+generated\s*$", re.M)
 _NAME = re.compile(r"removed\.ply|edits/\d{1,5}_(originals|taken_out)\.ply")
 
@@ -78,6 +78,8 @@ class EditsFile:
     sha256: str
     """SHA-256 of the splat as it was written."""
     edits: tuple[Edit, ...]
+    file: str = COMPLETED_FILE
+    """Name of the splat. In the folder of results lie others, such as the scene before."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +115,7 @@ class EditDraft:
 
 
 def read_edits(splat: Path) -> Edits:
-    """Read the edits of a splat; none without a record beside it."""
+    """Read the edits of a splat; none without a record beside it that is about this splat."""
     path = splat.with_name(EDITS_FILE)
     if not path.is_file() or not splat.is_file():
         return Edits(splat.parent)
@@ -123,7 +125,10 @@ def read_edits(splat: Path) -> Edits:
         for name in edit.files:
             if not _NAME.fullmatch(name):
                 raise InputError(f"{quote_value(path)} names {quote_value(name)}; {ADVICE}.")
-    return Edits(splat.parent, content.edits, content.sha256 == hash_file(splat))
+    is_unchanged = content.sha256 == hash_file(splat)
+    if not is_unchanged and splat.name != content.file:
+        return Edits(splat.parent)
+    return Edits(splat.parent, content.edits, is_unchanged)
 
 
 def assume_edit(splat: Path) -> Edits:
@@ -222,7 +227,7 @@ def write_edits(folder: Path, splat: Path, earlier: Edits, edit: Edit) -> None:
             edits[index] = replace(known, originals=REMOVED_FILE)
             break
 
-    content = asdict(EditsFile(hash_file(splat), tuple(edits)))
+    content = asdict(EditsFile(hash_file(splat), tuple(edits), splat.name))
     text = json.dumps({**MARK, **content}, indent=2, default=str)
     (folder / EDITS_FILE).write_bytes(text.encode() + b"\n")
     remove_empty(folder / EDITS_FOLDER)
@@ -232,7 +237,7 @@ def rename_edited(folder: Path, splat: Path) -> None:
     """Let the record in a folder be that of a splat in another format."""
     path = folder / EDITS_FILE
     content = json.loads(path.read_bytes())
-    text = json.dumps({**content, "sha256": hash_file(splat)}, indent=2)
+    text = json.dumps({**content, "sha256": hash_file(splat), "file": splat.name}, indent=2)
     path.write_bytes(text.encode() + b"\n")
 
 
