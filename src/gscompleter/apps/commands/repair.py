@@ -25,14 +25,15 @@ class RepairOptions(CompletingOptions):
     it. Photographs of the splat help. `gscompleter live` marks and repairs in the browser.
     `gscompleter strip` gives the splat back as it was.
 
-    Example: gscompleter repair splat.ply --camera camera.json --mask wrong.png --out repaired
+    Example: gscompleter repair splat.ply --target camera.json --mask wrong.png --out repaired
     """
 
     folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = None
     """The splat; or the folder of its photographs, in any layout that `complete` reads, if
     `--scene` names the splat."""
-    camera: Path | None = None
-    """File with the camera of each mask, as in `complete --target`."""
+    target: tuple[str, ...] = ()
+    """Cameras of the masks: file names or numbers of photographs, or a file of cameras as in
+    `complete --target`."""
     mask: tuple[Path, ...] = ()
     """Images of the splat from these cameras, in the same order: white where it is wrong."""
     invert_masks: bool = False
@@ -57,9 +58,8 @@ class RepairOptions(CompletingOptions):
     def make_completion(self) -> CompleteOptions:
         """Make the options of the completion, at the cameras of the masks, that a repair is."""
         shared = {**vars(self)}
-        camera = shared.pop("camera")
         del shared["strokes"]
-        return CompleteOptions(**shared, target=(str(camera),))
+        return CompleteOptions(**shared)
 
 
 def run_repair(options: RepairOptions) -> int:
@@ -78,17 +78,17 @@ def run_repair(options: RepairOptions) -> int:
 def check_marks_named(options: RepairOptions) -> None:
     """Refuse options that do not say what is wrong, or say it twice."""
     if options.strokes is not None:
-        if options.camera is not None or options.mask:
+        if options.target or options.mask:
             raise InputError(
-                "Strokes have cameras and masks of their own; leave --camera and --mask out.",
+                "Strokes have cameras and masks of their own; leave --target and --mask out.",
                 "strokes",
             )
-    elif options.camera is None and not options.mask:
+    elif not options.target and not options.mask:
         raise InputError(
-            "Nothing is named that is wrong; give --camera and --mask, or the --strokes of a "
+            "Nothing is named that is wrong; give --target and --mask, or the --strokes of a "
             "session of `live`."
         )
-    elif options.camera is None:
-        raise InputError("A mask is painted at a camera; name the file of it.", "camera")
+    elif not options.target:
+        raise InputError("A mask is painted at a camera; name it.", "target")
     elif not options.mask:
-        raise InputError("A camera alone marks nothing; name the masks painted there.", "mask")
+        raise InputError("A camera alone marks nothing; name the mask painted there.", "mask")
