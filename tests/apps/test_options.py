@@ -16,6 +16,10 @@ from gscompleter.system.errors import InputError
             ("repair", "splat.ply", "--camera", "camera.json", "--mask", "wrong.png"),
             "repair has no option --camera any more; the cameras of masks are named by --target",
         ),
+        (
+            ("complete", "room", "--scene", "splat.ply", "--from-photographs-only"),
+            "any more; `gscompleter update` adds what photographs show and a splat lacks, and",
+        ),
         (("repair", "splat.ply", "--camera=camera.json"), "are named by --target"),
     ],
 )

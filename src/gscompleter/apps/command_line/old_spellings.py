@@ -6,10 +6,14 @@ from collections.abc import Sequence
 
 from gscompleter.system.errors import InputError
 
+UPDATE = "`gscompleter update` adds what photographs show and a splat lacks, and invents nothing"
+
 OLD_SPELLINGS = {
+    ("complete", "from-photographs-only"): UPDATE,
+    ("remove", "from-photographs-only"): UPDATE,
     ("repair", "camera"): "the cameras of masks are named by --target",
 }
-"""What took the place of an option, by its command and its name without dashes.
+"""What took the place of an option, by the command and the name of the option without dashes.
 
 Such an option is not read under its old name as well: one name with two spellings would be two
 rows of the table of options, and scripts would never be changed.

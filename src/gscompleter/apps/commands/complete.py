@@ -41,9 +41,6 @@ class CompleteOptions(CompletingOptions):
     meant so."""
     auto: Annotated[int, Interval(ge=1, le=254)] | None = None
     """Most cameras to search for if no target is given; 4 if no number follows."""
-    from_photographs_only: bool = False
-    """Add only what photographs show and the splat of `--scene` lacks. The generator invents
-    nothing, and there are no targets."""
     dry_run: bool = False
     """Only print the plan, write its cameras to targets.json, which `--target` reads, and what they
     see to images."""
@@ -98,10 +95,13 @@ class CompleteOptions(CompletingOptions):
         return self.mask
 
     @property
+    def from_photographs_only(self) -> bool:
+        """True if nothing is invented and there are no targets, as `update` has it."""
+        return False
+
+    @property
     def max_targets(self) -> int:
         """Number of targets to search for."""
-        if self.from_photographs_only:
-            return 0
         return DEFAULT_NUM_TARGETS if self.auto is None else self.auto
 
 

@@ -60,7 +60,6 @@ PHOTOGRAPH_OPTIONS = {
     "format": None,
     "frames": 40,
     "no_masks": False,
-    "from_photographs_only": False,
 }
 """Options that only photographs can follow, with their defaults."""
 
@@ -304,25 +303,11 @@ def check_targets(options: CompleteOptions) -> None:
             "with the other.",
             "auto",
         )
-    if not options.from_photographs_only:
-        return
-    if options.scene is None:
-        raise InputError(
-            "Without --scene the whole scene is reconstructed from photographs already; name the "
-            "splat that lacks what they show.",
-            "from-photographs-only",
-        )
-    if not options.config.add_observed:
+    if options.from_photographs_only and not options.config.add_observed:
         raise InputError(
             "With config.add_observed off nothing is added from photographs, as in the config "
             "paper; choose another config.",
             "config",
-        )
-    if options.target or options.auto is not None or options.dry_run:
-        raise InputError(
-            "With --from-photographs-only no target is completed; leave --target, --auto and "
-            "--dry-run out.",
-            "from-photographs-only",
         )
 
 
