@@ -145,6 +145,9 @@ class SceneOptions(ComputeOptions, WritingOptions):
     """Ignore the depth that SCENE holds: depth maps, laser sweeps and COLMAP's points."""
     no_masks: bool = False
     """Use also what masks (black) or alpha channels of SCENE hide, instead of ignoring it."""
+    ignore: Path | None = None
+    """Folder of masks of what to leave out of photographs: images named as these, white there. They
+    take the place of masks that lie beside photographs, which are black there."""
     invert_masks: bool = False
     """Read the masks of SCENE the other way round: white is ignored, not black."""
     large_masks: bool = False
@@ -171,6 +174,7 @@ class SceneOptions(ComputeOptions, WritingOptions):
                 self.invert_masks and not self.has_marks,
                 self.large_masks,
                 is_turned_by_option=not self.has_marks,
+                folder=self.ignore,
             ),
         )
 

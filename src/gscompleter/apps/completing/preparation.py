@@ -60,6 +60,7 @@ PHOTOGRAPH_OPTIONS = {
     "format": None,
     "frames": 40,
     "no_masks": False,
+    "ignore": None,
 }
 """Options that only photographs can follow, with their defaults."""
 
