@@ -32,21 +32,19 @@ class RepairOptions(CompletingOptions):
     """The splat; or the folder of its photographs, in any layout that `complete` reads, if
     `--scene` names the splat."""
     target: tuple[str, ...] = ()
-    """Cameras of the masks: file names or numbers of photographs, or a file of cameras as in
-    `complete --target`."""
+    """Target cameras: file names or numbers of photographs, or a file of cameras (transforms.json,
+    cameras.json, nerfstudio's camera_path.json, COLMAP's images.txt, SuperSplat poses).
+    One for each mask."""
     mask: tuple[Path, ...] = ()
-    """Images of the splat from these cameras, in the same order: white where it is wrong."""
-    invert_masks: bool = False
-    """Read masks the other way round: those of `--mask`, of which black then goes, or without it
-    those of SCENE, of which white is then ignored."""
-    large_masks: bool = False
-    """Go on with masks that take away more than half of most images, or of the splat: they are
-    meant so."""
+    """Masks of what goes, white there. An image for each target camera, in their order: what it
+    marks is wrong, goes, is a hole whatever stands behind it, and is filled; `strip` puts it
+    back."""
     strokes: Path | None = None
     """The strokes.json that `live` saved, in place of cameras and masks: its steps are done again,
     at its resolution and with its photographs unless others are named."""
     out: Path
-    """Folder for completed.ply, the report (report.html), images and summary.json."""
+    """Where results go. A folder, for completed.ply, the report (report.html), images and
+    summary.json."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = REPAIR_CONFIG
     """Settings of the method, which change those of `--config NAME`."""
 

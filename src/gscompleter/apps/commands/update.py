@@ -44,7 +44,7 @@ class UpdateOptions(SceneOptions, ReconstructorOptions):
     """
 
     scene: Path = field()  # without the default of `complete`
-    """File of Gaussians (a splat) to update; all are kept."""
+    """File of Gaussians (a splat) to work on. All are kept."""
     photos: Path | None = None
     """Folder of new photographs without cameras. COLMAP places them among those of SCENE, whose
     cameras stay as they are; the new cameras are kept in OUT/colmap."""
