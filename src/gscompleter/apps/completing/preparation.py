@@ -358,7 +358,7 @@ def read_splat_alone(
 ) -> tuple[CompleteOptions, Opened, CompletionTask]:
     """Read a splat without photographs, and render it in their place; compile the kernels.
 
-    Returns the options with what a hole of this splat is.
+    Returns the options with what a hole of this splat is, and with its padding.
     """
     assert options.scene is not None
     device = options.device
@@ -388,7 +388,8 @@ def read_splat_alone(
         opened, task, kind = open_renders(request, splat_file, gaussians, renderer, device)
         if device == "cpu":
             check_scene(task, gaussians)
-    return with_holes(options, kind), opened, task
+    options = replace(options, config=options.config.choose_margin(kind.is_lifted))
+    return with_holes(options, kind.holes), opened, task
 
 
 def with_holes(options: CompleteOptions, kind: Literal["all", "enclosed"]) -> CompleteOptions:
