@@ -179,7 +179,7 @@ def test_new_photographs_are_placed_and_update_a_splat(tmp_path, monkeypatch):
 
 @pytest.mark.slow
 def test_what_a_mask_marks_is_repaired_with_photographs(room, tmp_path, monkeypatch):
-    marked = ("--camera", room / "aside.json", "--mask", room / "mask.png")
+    marked = ("--target", room / "aside.json", "--mask", room / "mask.png")
     words = ("repair", room, "--scene", room / "splat.ply", *marked, "--context", 0, 2, 4)
     assert run(monkeypatch, *words, *FEW, *COMMON, "--out", tmp_path / "out") == 0
     summary = check_result(tmp_path / "out", 10)

@@ -68,8 +68,7 @@ def test_the_generator_invents_only_what_no_photograph_shows(
 
 def test_without_the_generator_there_are_no_targets(room, cut, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
-    words = ("complete", room, "--scene", cut, *SMALL, "--out", out)
-    assert run(monkeypatch, *words, "--from-photographs-only") == 0
+    assert run(monkeypatch, "update", room, "--scene", cut, *SMALL, "--out", out) == 0
     summary = read_summary(out)
     assert summary["targets"] == []
     assert summary["gaussians"]["from_photographs"] == summary["gaussians"]["added"] > 100
@@ -79,20 +78,3 @@ def test_without_the_generator_there_are_no_targets(room, cut, tmp_path, monkeyp
     assert "show and the splat lacks by plane-sweep on cpu" in printed.err
     rows = plyfile.PlyData.read(str(out / "completed.ply"))["vertex"].data
     assert set(np.unique(rows["generated"])) == {0, NEW_PHOTO_ID}
-
-
-@pytest.mark.parametrize(
-    ("more", "sentence"),
-    [
-        ((), "name the splat that lacks what they show (--from-photographs-only)"),
-        (("--scene", "x.ply", "--target", 1), "leave --target, --auto and --dry-run out"),
-        (("--scene", "x.ply", "--auto", 2), "leave --target, --auto and --dry-run out"),
-        (("--scene", "x.ply", "--dry-run"), "leave --target, --auto and --dry-run out"),
-    ],
-)
-def test_what_does_not_go_together_is_refused(room, tmp_path, monkeypatch, capsys, more, sentence):
-    out = tmp_path / "out"
-    words = ("complete", room, "--out", out, "--from-photographs-only", *more)
-    assert run(monkeypatch, *words) == 2
-    assert sentence in capsys.readouterr().err
-    assert not out.exists()

@@ -26,7 +26,7 @@ SOURCES = ROOT / "src" / "gscompleter"
 NEGATIONS = ("ignore", "instead of", "keep", "without", "leave out")
 """Words of which the help of an option `--no-X` has one."""
 OF_OTHERS = {
-    *("--index-url", "--pre", "--help", "--help-all", "--version", "--config"),
+    *("--index-url", "--pre", "--force-reinstall", "--help", "--help-all", "--version", "--config"),
 }
 """Options in texts that belong to pip, to every command, or to the name of a config."""
 

@@ -62,7 +62,7 @@ COMMANDS = {
     "update": ("update", "masked", *SPLAT),
     "clean": ("clean", "masked", *SPLAT),
     "remove": ("remove", "masked", *SPLAT, "--sphere", 0, 0, 3, 1),
-    "repair": ("repair", "masked", *SPLAT, "--camera", "camera.json", "--mask", "right/1.png"),
+    "repair": ("repair", "masked", *SPLAT, "--target", "camera.json", "--mask", "right/1.png"),
     "evaluate": ("evaluate", "masked", "--protocol", "n-1"),
 }
 
@@ -116,8 +116,7 @@ def test_masks_of_what_goes_stop_a_removal(kind, sentence, home, monkeypatch, ca
 )
 def test_marks_stop_a_repair(command, kind, sentence, home, monkeypatch, capsys, tmp_path):
     monkeypatch.chdir(home)
-    camera = "--target" if command == "complete" else "--camera"
-    words = (command, "splat.ply", camera, "camera.json", "--mask", f"{kind}/1.png")
+    words = (command, "splat.ply", "--target", "camera.json", "--mask", f"{kind}/1.png")
     assert run(monkeypatch, *words, "--out", tmp_path / "out") == 2
     assert sentence in capsys.readouterr().err
 
@@ -128,7 +127,7 @@ def test_inverted_masks_remove_and_repair_what_right_ones_do(home, monkeypatch, 
     near = ("--near", 0.5, "--far", 20, "--quiet")
     commands = {
         "remove": ("remove", "plain", *SPLAT, "--target", 1, *near, "--mask"),
-        "repair": ("repair", "splat.ply", "--camera", "camera.json", *near, "--mask"),
+        "repair": ("repair", "splat.ply", "--target", "camera.json", *near, "--mask"),
     }
     for name, words in commands.items():
         place = "{}/1.png" if name == "repair" else "{}"
@@ -149,7 +148,7 @@ def test_a_selection_of_most_of_the_splat_is_asked_about(home, monkeypatch, caps
     small = gaussians_of(view_of(Room(), camera))
     rows = torch.arange(len(small)).reshape(SIZE, SIZE)[10:38, 10:40].flatten()
     save_ply(tmp_path / "small.ply", small[rows])
-    words = ("repair", tmp_path / "small.ply", "--camera", "camera.json", "--mask", "half.png")
+    words = ("repair", tmp_path / "small.ply", "--target", "camera.json", "--mask", "half.png")
     mask = torch.zeros(SIZE, SIZE)
     mask[8:38, 12:40] = 1.0
     write_image(home / "half.png", mask)

@@ -935,7 +935,7 @@ def test_strokes_that_are_none_are_refused(splat, tmp_path, monkeypatch, capsys,
     ("words", "said"),
     [
         ((), "Nothing is named that is wrong"),
-        (("--camera", "c.json"), "A camera alone"),
+        (("--target", "c.json"), "A camera alone"),
         (("--mask", "m.png"), "painted at a camera"),
         (("--strokes", "s.json", "--mask", "m.png"), "of their own"),
     ],

@@ -236,7 +236,7 @@ def test_marks_of_a_camera_in_the_map_remove_the_same(folders, completed, tmp_pa
     counts = []
     for name, folder, out in zip("ab", folders, completed, strict=True):
         shutil.copyfile(out / "targets.json", tmp_path / f"{name}.json")
-        words = ("--camera", tmp_path / f"{name}.json", "--mask", tmp_path / "mask.png")
+        words = ("--target", tmp_path / f"{name}.json", "--mask", tmp_path / "mask.png")
         scene = (folder / "room", "--scene", folder / "splat.ply", "--out", tmp_path / name)
         more = ("--resolution", SIZE, SIZE, "--quiet")
         assert run(monkeypatch, "repair", *scene, *words, *more) == 0

@@ -48,7 +48,7 @@ def read_summary(out: Path) -> dict:
 def repaired(folder, tmp_path_factory) -> Path:
     """Return the output of a repair of what one mask marks."""
     out = tmp_path_factory.mktemp("repaired") / "out"
-    words = ("--camera", folder / "one.json", "--mask", folder / "first.png", "--quiet")
+    words = ("--target", folder / "one.json", "--mask", folder / "first.png", "--quiet")
     with pytest.MonkeyPatch.context() as monkeypatch:
         assert run(monkeypatch, "repair", folder / "splat.ply", *words, "--out", out) == 0
     return out
@@ -92,7 +92,7 @@ def test_several_masks_are_repaired_with_photographs(folder, tmp_path, monkeypat
     out = tmp_path / "out"
     words = ("repair", folder / "photographs", "--scene", folder / "splat.ply", "--quiet")
     masks = ("--mask", folder / "first.png", folder / "second.png")
-    assert run(monkeypatch, *words, "--camera", folder / "two.json", *masks, "--out", out) == 0
+    assert run(monkeypatch, *words, "--target", folder / "two.json", *masks, "--out", out) == 0
     summary = read_summary(out)
     assert summary["scene"]["renders_from"] is None
     assert len(summary["context"]) == 2
@@ -101,6 +101,16 @@ def test_several_masks_are_repaired_with_photographs(folder, tmp_path, monkeypat
     assert first["added"] > 40
     assert first["hole_fraction"] > 0.05 > second["hole_fraction"]
     assert summary["settings"]["mask"] == [str(folder / "first.png"), str(folder / "second.png")]
+
+
+def test_a_mask_of_a_photograph_is_repaired_at_its_number(folder, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    words = ("repair", folder / "photographs", "--scene", folder / "splat.ply", "--target", 1)
+    assert run(monkeypatch, *words, "--mask", folder / "first.png", "--out", out, "--quiet") == 0
+    (target,) = read_summary(out)["targets"]
+    assert target["frame"] == 1
+    assert target["hole_fraction"] > 0.03
+    assert target["added"] > 20
 
 
 @pytest.mark.parametrize(
@@ -116,7 +126,7 @@ def test_wrong_masks_are_refused_with_a_sentence(
 ):
     paths = [folder / word if word.endswith(".png") else word for word in words]
     out = tmp_path / "out"
-    given = ("repair", folder / "splat.ply", "--camera", folder / "one.json", *paths)
+    given = ("repair", folder / "splat.ply", "--target", folder / "one.json", *paths)
     assert run(monkeypatch, *given, "--out", out, "--quiet") == 2
     assert sentence in capsys.readouterr().err
     assert not out.exists()

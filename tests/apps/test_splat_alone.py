@@ -13,7 +13,8 @@ from command import run
 from gscompleter import load_cameras, load_ply, save_ply
 from gscompleter.data.scene import write_cameras
 from gscompleter.system.files.image import read_image, write_image
-from gscompleter.types import Camera
+from gscompleter.trust.lifted import find_pixel_center
+from gscompleter.types import Camera, Gaussians
 from scenes import Room, camera_at, gaussians_of, photographed, random_gaussians, view_of
 
 SIZE = 64
@@ -152,8 +153,7 @@ def test_cameras_alone_let_targets_be_found(folder, tmp_path, monkeypatch):
         (("splat.ply", "--target", "target.json", "--context", "0"), "there is none"),
         (("splat.ply", "--target", "opaque.json"), "opaque everywhere in the image of the target"),
         (("splat.ply", "--target", "away.json"), "sees surfaces of the scene in 0.0%"),
-        (("splat.ply", "--target", "target.json", "--no-masks"), r"apply this to.*\(--masks\)"),
-        (("splat.ply", "--from-photographs-only"), "There are no photographs to apply this to"),
+        (("splat.ply", "--target", "target.json", "--no-masks"), r"apply this to.*\(--no-masks\)"),
         (("photographs", "--cameras", "around.json"), "photographs of SCENE have cameras"),
         (("splat.ply", "--cameras", "nothing.json"), "nothing.json"),
     ],
@@ -239,6 +239,20 @@ def test_with_nothing_named_the_camera_of_a_pixel_aligned_splat_is_found(
     first = load_cameras(out / "renders.json")[0]
     assert first.center.norm() < 0.5
     assert first.forward[2] > 0.98
+
+
+def test_whether_a_splat_is_trained_is_decided_once(folder, tmp_path, monkeypatch):
+    searches = []
+
+    def search(scene: Gaussians) -> torch.Tensor | None:
+        searches.append(len(scene))
+        return find_pixel_center(scene)
+
+    for place in ("apps.inputs.renders.find_pixel_center", "trust.lifted.find_pixel_center"):
+        monkeypatch.setattr(f"gscompleter.{place}", search)
+    words = ("complete", folder / "splat.ply", "--auto", 1, "--dry-run", "--quiet")
+    assert run(monkeypatch, *words, "--out", tmp_path / "out") == 0
+    assert len(searches) == 1
 
 
 def test_around_an_object_no_target_is_found(folder, tmp_path, monkeypatch, capsys):

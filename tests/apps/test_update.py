@@ -115,6 +115,7 @@ def test_a_splat_that_lacks_nothing_stays(room, tmp_path, monkeypatch, capsys):
         (("--hold-out", 6), "there are 6 to choose from, and at least 2 of 6 have to be left"),
         (("--photos", "nowhere"), "There are no photographs in nowhere"),
         (("--config", "paper"), "nothing is added from photographs, as in the config paper"),
+        (("--config", "paper"), "With config.add_observed off nothing is added from photographs"),
         (("--target", 1), "update has no option --target, which belongs to"),
     ],
 )

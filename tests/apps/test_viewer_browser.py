@@ -419,7 +419,7 @@ def test_what_is_painted_is_saved_with_its_camera_and_repaired(
 
     after = exhibit.after
     save_ply(tmp_path / "splat.ply", replace(after, generated=torch.zeros_like(after.generated)))
-    words = ("repair", tmp_path / "splat.ply", "--camera", tmp_path / "camera.json", "--quiet")
+    words = ("repair", tmp_path / "splat.ply", "--target", tmp_path / "camera.json", "--quiet")
     out = tmp_path / "out"
     assert run(monkeypatch, *words, "--mask", tmp_path / "mask.png", "--out", out) == 0
     summary = json.loads((out / "summary.json").read_text())

@@ -230,3 +230,17 @@ def test_copies_for_colmap_take_their_masks_and_alpha_along(tmp_path):
     assert np.array_equal(written, upper_quarter())
     image.save(tmp_path / "whole.png")
     assert not write_upright(tmp_path, "whole.png", tmp_path).is_masked
+
+
+def test_a_mask_of_a_named_folder_lies_there_by_path_or_by_name(tmp_path):
+    for name in ("a/x.png", "y.jpg.png"):
+        save(tmp_path / name, np.zeros((4, 4), np.uint8))
+    found = {
+        name: find_mask(tmp_path / "images" / name, name, FolderListings(), tmp_path)
+        for name in ("a/x.jpg", "b/y.jpg", "z.jpg")
+    }
+    assert found == {
+        "a/x.jpg": tmp_path / "a/x.png",
+        "b/y.jpg": tmp_path / "y.jpg.png",
+        "z.jpg": None,
+    }

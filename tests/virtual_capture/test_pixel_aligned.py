@@ -5,12 +5,9 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gscompleter.trust.lifted import measure_core
+from gscompleter.trust.lifted import find_pixel_center, measure_core
 from gscompleter.types import merge
-from gscompleter.virtual_capture.pixel_aligned import (
-    find_pixel_camera,
-    move_beside,
-)
+from gscompleter.virtual_capture.pixel_aligned import aim_pixel_camera, move_beside
 from scenes import Room, camera_at, gaussians_of, view_of
 
 SIZE = 48
@@ -23,7 +20,9 @@ def test_the_camera_is_where_sizes_are_proportional_to_distances(places, unit):
     cameras = [camera_at(x, yaw=10, size=SIZE) for x in places]
     scene = merge([gaussians_of(view_of(Room(), camera)) for camera in cameras])
     scene = replace(scene, means=unit * scene.means, scales=unit * scene.scales)
-    found = find_pixel_camera(scene, UP, SIZE)
+    center = find_pixel_center(scene)
+    assert center is not None
+    found = aim_pixel_camera(scene, center, UP, SIZE)
     middle = unit * torch.stack([camera.center for camera in cameras]).mean(dim=0)
     assert (found.center - middle).norm() < 0.15 * measure_core(scene.means).radius
     # It looks where they do, and its horizon is level.

@@ -8,6 +8,7 @@ import torch
 
 from gscompleter.numerics.geometry import compute_field_of_view, resize_camera
 from gscompleter.render.loading import load_renderer
+from gscompleter.trust.lifted import find_pixel_center
 from gscompleter.types import Camera, Gaussians, merge
 from gscompleter.virtual_capture.witnesses import (
     MAX_WITNESSES,
@@ -60,15 +61,15 @@ def test_every_fourth_tests_and_the_others_guard():
 
 def test_cameras_of_a_file_are_witnesses_and_of_many_those_that_are_spread(trained):
     known = path_of(20)
-    witnesses = choose_witnesses(trained, [], known, UP, RENDERER)
+    witnesses = choose_witnesses(trained, None, [], known, UP, RENDERER)
     assert places_of(witnesses) == {tuple(camera.center.tolist()) for camera in known}
-    many = choose_witnesses(trained, [], path_of(200), UP, RENDERER)
+    many = choose_witnesses(trained, None, [], path_of(200), UP, RENDERER)
     assert len(many.guarding) + len(many.testing) == MAX_WITNESSES
 
 
 def test_with_few_known_cameras_others_are_found_all_over_the_splat(trained):
     (known,) = path_of(1)
-    witnesses = choose_witnesses(trained, [], [known], UP, RENDERER)
+    witnesses = choose_witnesses(trained, None, [], [known], UP, RENDERER)
     found = [*witnesses.guarding, *witnesses.testing]
     assert tuple(known.center.tolist()) in places_of(witnesses)
     assert len(found) > 12
@@ -79,8 +80,8 @@ def test_with_few_known_cameras_others_are_found_all_over_the_splat(trained):
 
 
 def test_renders_are_no_witnesses_of_themselves(trained):
-    first, *others = find_witnesses(trained, UP, RENDERER)
-    witnesses = choose_witnesses(trained, [resize_camera(first, 64, 64)], [], UP, RENDERER)
+    first, *others = find_witnesses(trained, None, UP, RENDERER)
+    witnesses = choose_witnesses(trained, None, [resize_camera(first, 64, 64)], [], UP, RENDERER)
     found = [*witnesses.guarding, *witnesses.testing]
     assert len(found) == len(others)
     assert tuple(first.center.tolist()) not in places_of(witnesses)
@@ -88,7 +89,7 @@ def test_renders_are_no_witnesses_of_themselves(trained):
 
 def test_witnesses_of_a_lifted_splat_stand_beside_its_camera():
     scene = gaussians_of(view_of(Room(), camera_at(size=SIZE)))
-    found = find_witnesses(scene, UP, RENDERER)
+    found = find_witnesses(scene, find_pixel_center(scene), UP, RENDERER)
     assert len(found) > 12
     for camera in found:
         assert (camera.width, camera.height) == (SIDE, SIDE)

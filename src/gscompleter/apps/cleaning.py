@@ -59,7 +59,7 @@ from gscompleter.system.progress import show_progress, stage, track
 from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.types import Camera, Gaussians, View
 
-PHOTOGRAPH_OPTIONS = ("context", "format", "near", "far")
+PHOTOGRAPH_OPTIONS = ("context", "format", "near", "far", "ignore")
 COMMAND = "clean"
 RESULTS = (COMPLETED_FILE, REMOVED_FILE, PICTURE_FILE, SUMMARY_FILE, *EDITS)
 """Files that it may write."""

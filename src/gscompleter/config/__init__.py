@@ -525,6 +525,15 @@ class CompleterConfig(Settings):
         holes = replace(self.holes, kind="enclosed")
         return replace(self, guards=(*others, "hull"), holes=holes)
 
+    def choose_margin(self, is_lifted: bool) -> CompleterConfig:
+        """Return the same settings with a padding for what the scene is, unless it is given.
+
+        A trained splat is opaque beyond what was photographed, and needs no padding.
+        """
+        if self.margin is not None:
+            return self
+        return replace(self, margin=LIFTED_MARGIN if is_lifted else 0.0)
+
     def without_guard(self, name: GuardName) -> CompleterConfig:
         """Return the same settings without one guard."""
         return replace(self, guards=tuple(guard for guard in self.guards if guard != name))

@@ -65,10 +65,10 @@ class GeneratorOptions(Settings):
     """Model that synthesizes images, and its settings."""
 
     generator: str = "warp-inpaint"
-    """Model that synthesizes the image at a target: warp-inpaint (warped photographs, holes filled
-    by patches), oracle (the real photograph), painted (by `complete --images`), pe-field (the
-    paper's), diffusers-inpaint, one of the other models that docs/generators.md lists, or a
-    function of yours as file.py:function."""
+    """Model that synthesizes the image at a target. It is warp-inpaint (warped photographs,
+    holes filled by patches), oracle (the real photograph), painted (by `complete --images`),
+    pe-field (the paper's), diffusers-inpaint, one of the other models that docs/generators.md
+    lists, or a function of yours as file.py:function."""
     generator_weights: str | None = None
     """Weights, by default those published: a folder saved by diffusers, USER/NAME or
     USER/NAME@COMMIT on the Hugging Face hub for pe-field and diffusers-inpaint (which has no

@@ -45,7 +45,7 @@ def read_masks_as_asked(photographs: Photographs, reading: MaskReading) -> Photo
     What an alpha channel hides is certain, so that neither the check nor the inversion is for it.
     """
     check_hiding_masks(photographs.list_masks(), reading, len(photographs))
-    return photographs.invert_masks() if reading.is_inverted else photographs
+    return photographs.invert_masks() if reading.ignores_white else photographs
 
 
 def refuse_nothing_to_invert(masks: Sequence[Path], reading: MaskReading) -> None:
@@ -66,10 +66,10 @@ def check_hiding_masks(masks: Sequence[Path], reading: MaskReading, num_photogra
     if reading.may_be_large or not masks:
         return
     sampled = sample_evenly(masks)
-    ignored = [float(read_ignored(path, reading.is_inverted).mean()) for path in sampled]
+    ignored = [float(read_ignored(path, reading.ignores_white).mean()) for path in sampled]
     shares = [share for share in ignored if share < 1.0]
     places = name_masks(path.parent for path in masks)
-    color = "white" if hides_white(masks[0], reading.is_inverted) else "black"
+    color = "white" if hides_white(masks[0], reading.ignores_white) else "black"
     if not shares and len(masks) < num_photographs:
         return
     if not shares:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 
 @dataclass(frozen=True)
@@ -15,3 +16,10 @@ class MaskReading:
     """True to take masks that look as if they were the other way round as they are."""
     is_turned_by_option: bool = True
     """False if `--invert-masks` is for the masks of another option."""
+    folder: Path | None = None
+    """Folder of masks in place of those that lie beside photographs; white there is ignored."""
+
+    @property
+    def ignores_white(self) -> bool:
+        """True if masks of photographs are white, not black, where a photograph is ignored."""
+        return self.is_inverted != (self.folder is not None)

@@ -47,8 +47,36 @@ def attach_masks(frames: Sequence[Frame]) -> tuple[Frame, ...]:
     return tuple(attached)
 
 
-def find_mask(photograph: Path, name: str, listings: FolderListings) -> Path | None:
-    """Find the mask of a photograph; `name` is its path below the scene or its image folder."""
+def find_mask_in(folder: Path, name: str, listings: FolderListings) -> Path | None:
+    """Find the mask of the photograph `name` in a folder of masks that the user named."""
+    path = PurePosixPath(name)
+    # Of a/x.jpg: in the folder a of the masks, or else in their folder itself.
+    names = [*list_mask_names(path, is_beside=False)]
+    names += list_mask_names(PurePosixPath(path.name), is_beside=False)
+    found = (listings.find(folder, mask) for mask in names)
+    return next((mask for mask in found if mask is not None and os.path.isfile(mask)), None)
+
+
+def make_no_mask_error(folder: Path, names: Sequence[str]) -> InputError:
+    """Make the error for a folder of `--ignore` without a mask of a photograph of these names."""
+    example = f", such as {quote_value(PurePosixPath(names[0]).stem)}.png" if names else ""
+    return InputError(
+        f"{quote_value(folder)} has no mask that is named as a photograph{example}; name the "
+        "folder of the masks.",
+        "ignore",
+    )
+
+
+def find_mask(
+    photograph: Path, name: str, listings: FolderListings, named: Path | None = None
+) -> Path | None:
+    """Find the mask of a photograph; `name` is its path below the scene or its image folder.
+
+    A folder of masks that the user `named` takes the place of all others.
+    """
+    if named is not None:
+        return find_mask_in(named, name, listings)
+
     # The folder that `name` counts from: as many levels above the photograph as it has parts.
     parts = PurePosixPath(name).parts
     is_plain = not PurePosixPath(name).is_absolute() and ".." not in parts

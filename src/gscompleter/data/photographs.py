@@ -21,9 +21,10 @@ from PIL import Image
 from torch import Tensor
 
 from gscompleter.data.cameras import compute_fov, compute_undistortion_map, find_pose_defect, remap
+from gscompleter.data.file_names import FolderListings
 from gscompleter.data.frame import Frame
 from gscompleter.data.local_origin import choose_local_origin, is_near
-from gscompleter.data.masks import fill_hidden, find_masked
+from gscompleter.data.masks import fill_hidden, find_mask_in, find_masked, make_no_mask_error
 from gscompleter.data.moving_boxes import mask_moving
 from gscompleter.numerics.geometry import compute_sparse_depth
 from gscompleter.system.errors import InputError, join_names, quote_value
@@ -132,6 +133,19 @@ class Photographs:
     def list_masks(self) -> list[Path]:
         """List the mask images that hide something, without alpha channels."""
         return [f.mask for f in self.frames if f.mask is not None] if self.is_masked else []
+
+    def take_masks_of(self, folder: Path) -> Photographs:
+        """Return a copy with the masks of a folder in place of its own; alpha stays as it is.
+
+        Raises InputError if none is named as a photograph.
+        """
+        listings = FolderListings()
+        masks = [find_mask_in(folder, frame.name, listings) for frame in self.frames]
+        if not any(masks):
+            raise make_no_mask_error(folder, [frame.name for frame in self.frames])
+        pairs = zip(self.frames, masks, strict=True)
+        frames = [replace(frame, mask=mask, has_inverted_mask=False) for frame, mask in pairs]
+        return replace(self, frames=tuple(frames))
 
     def invert_masks(self) -> Photographs:
         """Return a copy whose mask images are read the other way round; alpha stays as it is."""

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, max_pool2d
 
-from gscompleter.config import LIFTED_MARGIN, CompleterConfig, get_named_config
+from gscompleter.config import CompleterConfig, get_named_config
 from gscompleter.numerics.geometry import add_near_plane, compute_z_depths, project_mask
 from gscompleter.reconstructors import (
     DepthAware,
@@ -61,9 +61,7 @@ def choose_config(
     is_splat = scene is not None and check_views is not None
     config = config or get_named_config("default", is_splat)
     if config.margin is None:
-        # A trained splat is opaque beyond what was photographed, and needs no padding.
-        needs_padding = scene is None or is_lifted(scene)
-        config = replace(config, margin=LIFTED_MARGIN if needs_padding else 0.0)
+        config = config.choose_margin(scene is None or is_lifted(scene))
     if scene and bool((scene.generated > 0).any()):
         config = replace(config, recolor=replace(config.recolor, iterations=0))
     return config

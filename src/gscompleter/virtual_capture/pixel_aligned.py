@@ -13,7 +13,6 @@ from torch.nn.functional import normalize
 
 from gscompleter.numerics.geometry import look_along
 from gscompleter.planning.candidates import move_camera
-from gscompleter.trust.lifted import find_pixel_center
 from gscompleter.types import Camera, Gaussians
 
 INNER = 0.93
@@ -30,14 +29,14 @@ MOVES = (
 """Moves of the camera that is found: right, down and forward, relative to the depth of its view."""
 
 
-def find_pixel_camera(scene: Gaussians, up: Float[Tensor, "3"], side: int) -> Camera | None:
-    """Find the camera of a pixel-aligned splat, with a square image; None for other splats.
+def aim_pixel_camera(
+    scene: Gaussians, center: Float[Tensor, "3"], up: Float[Tensor, "3"], side: int
+) -> Camera:
+    """Aim the camera of a pixel-aligned splat, with a square image.
 
-    `up` is the upward direction; `side` the width and height of the image, in pixels.
+    `center` is that of `find_pixel_center`, `up` the upward direction, and `side` the width and
+    height of the image, in pixels.
     """
-    center = find_pixel_center(scene)
-    if center is None:
-        return None
     rays = normalize(scene.means - center, dim=1)
     forward = normalize(rays.mean(dim=0), dim=0)
     camera = Camera(torch.eye(4).to(rays), torch.eye(3).to(rays), side, side)

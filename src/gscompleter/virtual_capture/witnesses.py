@@ -23,7 +23,7 @@ from gscompleter.numerics.geometry import (
 )
 from gscompleter.render.protocols import Renderer
 from gscompleter.types import Camera, Gaussians
-from gscompleter.virtual_capture.pixel_aligned import find_pixel_camera, move_beside
+from gscompleter.virtual_capture.pixel_aligned import aim_pixel_camera, move_beside
 from gscompleter.virtual_capture.standpoints import find_standpoints
 
 MAX_WITNESSES = 64
@@ -68,6 +68,7 @@ def widen(camera: Camera) -> Camera:
 
 def choose_witnesses(
     scene: Gaussians,
+    pixel_center: Float[Tensor, "3"] | None,
     context: Sequence[Camera],
     others: Sequence[Camera],
     up: Float[Tensor, "3"],
@@ -76,7 +77,8 @@ def choose_witnesses(
     """Choose the witnesses of a splat among its known cameras, and find others if these are few.
 
     `context` are the cameras at which it is rendered, which guard it in any case; `others` are
-    further ones from which it is known to look well. `up` is the upward direction.
+    further ones from which it is known to look well. `up` is the upward direction, and
+    `pixel_center` the centre of the camera of a pixel-aligned splat.
     """
     if len(others) > MAX_WITNESSES:
         others = [others[index] for index in select_spread_cameras(others, MAX_WITNESSES)]
@@ -84,16 +86,21 @@ def choose_witnesses(
         # Not where renders are taken: the same splat has the same witnesses, whether its cameras
         # were found or come from the file of an earlier run.
         small = [resize_camera(camera, SIDE, SIDE) for camera in context]
-        found = find_witnesses(scene, up, renderer)
+        found = find_witnesses(scene, pixel_center, up, renderer)
         others = [*others, *(c for c in found if not any(is_same_camera(c, s) for s in small))]
     return divide_witnesses(others)
 
 
-def find_witnesses(scene: Gaussians, up: Float[Tensor, "3"], renderer: Renderer) -> list[Camera]:
+def find_witnesses(
+    scene: Gaussians,
+    pixel_center: Float[Tensor, "3"] | None,
+    up: Float[Tensor, "3"],
+    renderer: Renderer,
+) -> list[Camera]:
     """Find cameras from which a splat looks well, by the splat alone."""
-    pixel_camera = find_pixel_camera(scene, up, SIDE)
-    if pixel_camera is None:
+    if pixel_center is None:
         return find_standpoints(scene, up, SIDE, renderer, MAX_WITNESSES)
+    pixel_camera = aim_pixel_camera(scene, pixel_center, up, SIDE)
     seen = renderer.render(scene, add_near_plane(pixel_camera, scene.means)).depth_map()
     if not seen.valid.any():
         return []

@@ -27,7 +27,7 @@ FOLDER = "folder"
 """Column of the scene folder."""
 NAME = "name"
 """Column of the job name."""
-PATHS = (FOLDER, "scene", "cameras", "weights", "depth_weights", "images")
+PATHS = (FOLDER, "scene", "cameras", "weights", "depth_weights", "images", "ignore")
 """Options that are paths."""
 MARKERS = ("batch.json", "run.json")
 """Files that mark the output folders of `batch` and `evaluate`."""

@@ -21,6 +21,7 @@ from gscompleter.apps.command_line.help_pages import (
     make_help_rule,
     make_program,
 )
+from gscompleter.apps.command_line.old_spellings import refuse_old_spellings
 from gscompleter.apps.commands.shared_options import DEFAULT_NUM_TARGETS, CompletingOptions
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.system.errors import InputError, join_names, quote_value
@@ -55,6 +56,7 @@ def parse_words(words: Sequence[str], kinds: Mapping[str, type]) -> Any:
             "(see gscompleter --help)."
         )
     refuse_empty_words(words)
+    refuse_old_spellings(words)
 
     # The rule for help pages changes the fields, so that no option could be parsed with it.
     rules: list[Rule] = []

@@ -29,13 +29,13 @@ class BatchOptions(EngineOptions):
     """A .csv or .jsonl file with a row per scene, whose columns are `folder` (SCENE, relative to
     the file), `name` and options of `complete`; or a folder of scenes."""
     out: Path
-    """Folder for the results; a folder of an earlier run is continued."""
+    """Where results go. A folder; that of an earlier run is continued."""
     engine: EngineName = "local"
-    """Engine that runs the jobs: processes of this machine, Ray, or SLURM."""
+    """Engine that runs jobs or cases: processes of this machine, Ray, or SLURM."""
     retries: Annotated[int, Interval(ge=0, le=100)] = 2
     """Further attempts for a job that was killed or that failed unexpectedly."""
     rerun: Literal["nothing", "failures"] = "nothing"
-    """Jobs of an earlier run to repeat: none, or those that failed."""
+    """What of an earlier run to repeat. Jobs: none, or those that failed."""
     each: tuple[str, ...] = ()
     """Options of `complete` for every row that does not set them, as in --each resolution=256."""
 

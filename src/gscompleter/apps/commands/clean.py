@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import tyro
 from annotated_types import Interval
 
-from gscompleter.apps.commands.shared_options import SceneOptions, Words
+from gscompleter.apps.commands.shared_options import DeviceOptions, SceneOptions, Words
 from gscompleter.config import CleaningConfig
 from gscompleter.system.process import import_without_collection
 
@@ -17,7 +17,7 @@ Strength = Annotated[float, Interval(ge=0.1, le=10)]
 
 
 @dataclass(frozen=True, kw_only=True)
-class CleanOptions(SceneOptions):
+class CleanOptions(SceneOptions, DeviceOptions):
     """Remove Gaussians of a splat that make its photographs worse or that none of them needs.
 
     No photograph loses more than 0.01 dB. Without SCENE, remove those that stand out from their
@@ -32,19 +32,18 @@ class CleanOptions(SceneOptions):
     """Folder of the photographs of the splat, in any layout that `complete` reads; if not given,
     neighbours decide."""
     out: Path
-    """Folder for completed.ply (the cleaned splat), removed.ply, removed.png and summary.json."""
-    scene: Path
-    """File of Gaussians to clean."""
-    context: Words = None
-    """Photographs to compare with: file names, or numbers from 0 in the order of the file paths;
-    all of them if not given."""
-    dry_run: bool = False
-    """Write only removed.ply, the Gaussians that would go, removed.png, which shows them in red,
+    """Where results go. A folder, for completed.ply (the cleaned splat), removed.ply, removed.png
     and summary.json."""
+    scene: Path
+    """File of Gaussians (a splat) to work on. It is cleaned."""
+    context: Words = None
+    """Photographs to work with: file names, or numbers from 0 in the order of the file paths. The
+    splat is compared with them; all of them if not given."""
+    dry_run: bool = False
+    """Only show what would be done. removed.ply has the Gaussians that would go, and removed.png
+    shows them in red; summary.json is written, too."""
     strength: Strength = 1.0
     """How much goes: 2 takes more than 1, and 0.5 less. Look at it with --dry-run."""
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Device to compare photographs on."""
     config: CleaningConfig = CleaningConfig()
 
 

@@ -27,26 +27,18 @@ class CompleteOptions(CompletingOptions):
     """
 
     target: tuple[str, ...] = ()
-    """Cameras to complete the scene for: file names or numbers of photographs, or a file of cameras
-    (transforms.json, cameras.json, nerfstudio's camera_path.json, COLMAP's images.txt, SuperSplat
-    poses). If not given, cameras that see holes are searched for and written to targets.json."""
+    """Target cameras: file names or numbers of photographs, or a file of cameras (transforms.json,
+    cameras.json, nerfstudio's camera_path.json, COLMAP's images.txt, SuperSplat poses).
+    If not given, cameras that see holes are searched for and written to targets.json."""
     mask: tuple[Path, ...] = ()
-    """Images that mark what is wrong at the targets, white there: one for each target camera. What
-    they show goes, is a hole whatever stands behind it, and is filled; `strip` puts it back."""
-    invert_masks: bool = False
-    """Read masks the other way round: those of `--mask`, of which black then goes, or without it
-    those of SCENE, of which white is then ignored."""
-    large_masks: bool = False
-    """Go on with masks that take away more than half of most images, or of the splat: they are
-    meant so."""
+    """Masks of what goes, white there. An image for each target camera, in their order: what it
+    marks is wrong, goes, is a hole whatever stands behind it, and is filled; `strip` puts it
+    back."""
     auto: Annotated[int, Interval(ge=1, le=254)] | None = None
     """Most cameras to search for if no target is given; 4 if no number follows."""
-    from_photographs_only: bool = False
-    """Add only what photographs show and the splat of `--scene` lacks. The generator invents
-    nothing, and there are no targets."""
     dry_run: bool = False
-    """Only print the plan, write its cameras to targets.json, which `--target` reads, and what they
-    see to images."""
+    """Only show what would be done. The plan is printed, its cameras are written to targets.json,
+    which `--target` reads, and what they see to images."""
     export_holes: Path | None = None
     """Only write to this folder what another program needs to paint the holes of the targets. The
     same command with `--images` completes the scene."""
@@ -58,7 +50,8 @@ class CompleteOptions(CompletingOptions):
     painter: str | None = None
     """Name of their painter, for the report."""
     out: Path
-    """Folder for completed.ply, the report (report.html), images and summary.json."""
+    """Where results go. A folder, for completed.ply, the report (report.html), images and
+    summary.json."""
     save_as: Literal[".ply", ".spz", ".sog"] | None = None
     """Keep results small: write the completed scene in this format, with its labels, and
     context.ply only if it differs from the input splat. `.spz` and `.sog` round, so that `strip`
@@ -98,10 +91,13 @@ class CompleteOptions(CompletingOptions):
         return self.mask
 
     @property
+    def from_photographs_only(self) -> bool:
+        """True if nothing is invented and there are no targets, as `update` has it."""
+        return False
+
+    @property
     def max_targets(self) -> int:
         """Number of targets to search for."""
-        if self.from_photographs_only:
-            return 0
         return DEFAULT_NUM_TARGETS if self.auto is None else self.auto
 
 

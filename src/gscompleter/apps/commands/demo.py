@@ -17,7 +17,7 @@ class DemoOptions(RunOptions, WritingOptions):
     """
 
     out: Path = Path("demo")
-    """Folder for the scene, its completion and before_after.png."""
+    """Where results go. A folder, for the scene, its completion and before_after.png."""
 
 
 def run_demo(options: DemoOptions) -> None:

@@ -11,6 +11,7 @@ from annotated_types import Interval
 
 from gscompleter.apps.commands.shared_options import (
     EngineOptions,
+    MaskOptions,
     Size,
     SynthesisOptions,
     list_inputs,
@@ -40,12 +41,12 @@ class PresetGeneratorOptions(GeneratorOptions):
     """Model that synthesizes images, and its settings."""
 
     generator: str = AUTO
-    """Model that synthesizes the image at a target, as in `complete`; `auto` is that of the preset,
+    """Model that synthesizes the image at a target. As in `complete`; `auto` is that of the preset,
     or else warp-inpaint."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class EvaluateOptions(SynthesisOptions, EngineOptions):
+class EvaluateOptions(SynthesisOptions, EngineOptions, MaskOptions):
     """Run methods on cases with known target photographs, and score them.
 
     Run the same command again to continue. `gscompleter tables OUT` writes the tables at any time.
@@ -60,9 +61,9 @@ class EvaluateOptions(SynthesisOptions, EngineOptions):
     folders, pixelSplat chunks, RealEstate10K camera files, or drives (Waymo, nuScenes, KITTI, DDAD,
     PandaSet; front camera)."""
     out: Path
-    """Folder for the results; a folder of an earlier run is continued."""
+    """Where results go. A folder; that of an earlier run is continued."""
     protocol: tuple[str, ...] = ()
-    """Choice of context and target frames; one or several of: n-10 (frames n and n + 10 for n + 20,
+    """Choice of context and target frames. One or several of: n-10 (frames n and n + 10 for n + 20,
     then n + 20 and n + 10 for n, for n = 0, 21, 42, …); stress (0 and 30 for 99) or stress-12-39
     (0 and 12 for 39); sequence-4 or sequence-4-steps-6 (start from frames 0 and 4, then complete 8,
     12, … one after the other); or an evaluation index, by its path or as dl3dv-n-10, re10k-n-30,
@@ -86,37 +87,35 @@ class EvaluateOptions(SynthesisOptions, EngineOptions):
     crops: bool = False
     """Show the widest hole of each case in figures magnified."""
     reconstructor: tuple[str, ...] = ()
-    """Models that turn photographs into Gaussians: plane-sweep (the default), or one or several of
-    `gscompleter models`, or functions of yours as file.py:function."""
+    """Model that turns photographs into Gaussians. It is plane-sweep (the default), or one or
+    several of `gscompleter models`, or functions of yours as file.py:function."""
     depth: tuple[str, ...] = ("none",)  # type: ignore[assignment]
-    """Monocular depths that help plane-sweep where stereo measures nothing: none, moge-2, or
-    functions of yours as file.py:function. Several are compared in one table."""
+    """Monocular depth that helps plane-sweep where stereo measures nothing. It is none, moge-2, or
+    a function of yours as file.py:function; several are compared in one table."""
     depth_weights: tuple[Path, ...] = ()  # type: ignore[assignment]
-    """Weights file of each depth, or NAME=FILE for some of them; others are downloaded."""
+    """Weights of that depth. A file for each, or NAME=FILE for some of them; others are
+    downloaded."""
     weights: tuple[Path, ...] = ()
-    """Weights file of each reconstructor, or NAME=FILE for some of them, as in
+    """Weights of the reconstructor. A file for each, or NAME=FILE for some of them, as in
     mvsplat-re10k=re10k.ckpt; others are downloaded."""
     synthesis: Annotated[PresetGeneratorOptions, tyro.conf.OmitArgPrefixes] = (
         PresetGeneratorOptions()
     )
     near: float | None = None
-    """Smallest depth in the scenes, in the unit of their cameras; by default that of the data, or
-    else of the model's authors."""
+    """Smallest depth in the scene, in the unit of its cameras. By default that of the data, or else
+    of the model's authors."""
     far: float | None = None
-    """Largest depth in the scenes; by default as for near."""
+    """Largest depth in the scene, in the unit of its cameras. By default as for near."""
     rerun: Literal["nothing", "failures", "scores"] = "nothing"
-    """Cases of an earlier run to repeat: those that failed, or all scores."""
+    """What of an earlier run to repeat. Cases: none, those that failed, or all scores."""
     engine: EngineName | None = None
-    """Engine of `batch` that runs the cases; this process if not given."""
+    """Engine that runs jobs or cases: processes of this machine, Ray, or SLURM. This process if not
+    given."""
     resolution: Size | None = None
-    """Working size as in `complete`; by default that of the cases."""
+    """Size of images in pixels. The working size as in `complete`; by default that of the cases."""
     no_masks: bool = False
-    """Use also the pixels that masks (black) or alpha channels (transparent) hide, in the methods
-    and in the scores, instead of ignoring them."""
-    invert_masks: bool = False
-    """Read masks the other way round: white is ignored, not black."""
-    large_masks: bool = False
-    """Go on with masks that hide more than half of most photographs."""
+    """Use also what masks (black) or alpha channels of photographs hide, instead of ignoring it. In
+    the methods and in the scores."""
     ignore_moving: bool = False
     """Ignore boxes of moving objects in the same way (Waymo, nuScenes)."""
     one_per_scene: bool = False

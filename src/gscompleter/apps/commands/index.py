@@ -23,9 +23,9 @@ class IndexOptions(WritingOptions):
     path: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """Scenes as in `evaluate`."""
     protocol: str
-    """Protocol as in `evaluate`."""
+    """Choice of context and target frames. One, as in `evaluate`."""
     out: Path
-    """JSON file for the evaluation index."""
+    """Where results go. A JSON file, for the evaluation index."""
 
     def check_overlap(self) -> None:
         """Refuse to write over an input."""

@@ -8,12 +8,12 @@ from typing import Annotated
 
 import tyro
 
-from gscompleter.config.settings import Device, Settings
+from gscompleter.apps.commands.shared_options import DeviceOptions
 from gscompleter.system.process import import_without_collection
 
 
 @dataclass(frozen=True, kw_only=True)
-class InspectOptions(Settings):
+class InspectOptions(DeviceOptions):
     """Print what is in a splat, what of it is invented, by what, and how much of pictures that is.
 
     Cameras are those of `--cameras`, or of the completion in whose folder FILE lies.
@@ -24,13 +24,11 @@ class InspectOptions(Settings):
     file: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
     """File of Gaussians in any format that `convert` reads, or output folder of `complete`."""
     cameras: Path | None = None
-    """Cameras whose pictures are measured: a file as in `complete --target`, or a folder with a
-    transforms.json or a COLMAP model; in the coordinates of the photographs if FILE lies in an
-    output folder, else of FILE."""
+    """Cameras to look at the splat from: a file as in `complete --target`. Or a folder with a
+    transforms.json or a COLMAP model. Their pictures are measured. They are in the coordinates of
+    the photographs if FILE lies in an output folder, else of FILE."""
     resolution: tuple[int, int] | None = None
-    """Image size (height and width) of cameras whose file has none."""
-    device: Device = "auto"
-    """Device that draws the pictures."""
+    """Size of images in pixels. Height and width, of cameras whose file has none."""
     json: bool = False
     """Print the result as JSON."""
 

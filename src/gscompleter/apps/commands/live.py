@@ -27,9 +27,9 @@ class LiveOptions(CompletingOptions):
     """The splat; or the folder of photographs, in any layout that `complete` reads: those of the
     splat that `--scene` names, or of a scene to reconstruct."""
     out: Path = Path("live")
-    """Output folder of the Save button."""
+    """Where results go. The folder of the Save button."""
     resolution: Size = (256, 256)
-    """Working size as in `complete`; smaller is faster."""
+    """Size of images in pixels. The working size as in `complete`; smaller is faster."""
     port: Port = 0
     """Port of the page; a free one if not given."""
     host: str = "127.0.0.1"

@@ -18,7 +18,7 @@ class ModelsOptions(Settings):
     download: tuple[str, ...] = ()
     """Names of the list, whose files are downloaded and verified first."""
     json: bool = False
-    """Print all details as JSON."""
+    """Print the result as JSON."""
 
 
 def run_models(options: ModelsOptions) -> None:

@@ -9,13 +9,18 @@ from typing import Annotated
 import tyro
 
 from gscompleter.apps.command_line.answers import print_answer
-from gscompleter.apps.commands.shared_options import ComputeOptions, NumFrames, WritingOptions
+from gscompleter.apps.commands.shared_options import (
+    ComputeOptions,
+    MaskOptions,
+    NumFrames,
+    WritingOptions,
+)
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.system.process import import_without_collection
 
 
 @dataclass(frozen=True, kw_only=True)
-class PosesOptions(ComputeOptions, WritingOptions):
+class PosesOptions(ComputeOptions, WritingOptions, MaskOptions):
     """Find the cameras of photographs with COLMAP, and write a COLMAP folder.
 
     A second run with the same photographs or video keeps the result.
@@ -28,12 +33,9 @@ class PosesOptions(ComputeOptions, WritingOptions):
     not changed."""
     frames: NumFrames = 40
     """Most frames of a video to take as photographs, sharp ones at even steps of the camera."""
-    invert_masks: bool = False
-    """Read the masks of the photographs the other way round: white is ignored, not black."""
-    large_masks: bool = False
-    """Go on with masks that hide more than half of most photographs."""
     out: Path
-    """Output folder: upright copies in images, cameras and points in sparse/0."""
+    """Where results go. A folder, for upright copies in images, and cameras and points in
+    sparse/0."""
 
 
 def run_poses(options: PosesOptions) -> None:

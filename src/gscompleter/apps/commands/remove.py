@@ -30,7 +30,7 @@ class RemoveOptions(CompleteOptions):
     """Folder of the photographs of the splat, in any layout that `complete` reads; leave it out if
     there are none."""
     scene: Path = field()  # without the default of `complete`
-    """File of Gaussians (a splat) to remove something from."""
+    """File of Gaussians (a splat) to work on. Something is removed from it."""
     box: tuple[float, ...] = ()
     """Remove Gaussians inside of boxes: smallest x, y and z of each, then largest."""
     box_rotation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
@@ -38,8 +38,8 @@ class RemoveOptions(CompleteOptions):
     sphere: tuple[float, float, float, float] | None = None
     """Remove Gaussians inside of a sphere: x, y, z of its centre, and its radius."""
     mask: Path | None = None  # type: ignore[assignment]
-    """Remove what masks show: a folder of images named as photographs, white there (or opaque, if
-    the object is cut out)."""
+    """Masks of what goes, white there. A folder of images named as photographs; if the object is
+    cut out, what is opaque goes."""
     select: Path | None = None
     """Remove the Gaussians of this file, a selection that another program saved."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = REMOVAL_CONFIG

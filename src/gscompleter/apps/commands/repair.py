@@ -25,27 +25,26 @@ class RepairOptions(CompletingOptions):
     it. Photographs of the splat help. `gscompleter live` marks and repairs in the browser.
     `gscompleter strip` gives the splat back as it was.
 
-    Example: gscompleter repair splat.ply --camera camera.json --mask wrong.png --out repaired
+    Example: gscompleter repair splat.ply --target camera.json --mask wrong.png --out repaired
     """
 
     folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = None
     """The splat; or the folder of its photographs, in any layout that `complete` reads, if
     `--scene` names the splat."""
-    camera: Path | None = None
-    """File with the camera of each mask, as in `complete --target`."""
+    target: tuple[str, ...] = ()
+    """Target cameras: file names or numbers of photographs, or a file of cameras (transforms.json,
+    cameras.json, nerfstudio's camera_path.json, COLMAP's images.txt, SuperSplat poses).
+    One for each mask."""
     mask: tuple[Path, ...] = ()
-    """Images of the splat from these cameras, in the same order: white where it is wrong."""
-    invert_masks: bool = False
-    """Read masks the other way round: those of `--mask`, of which black then goes, or without it
-    those of SCENE, of which white is then ignored."""
-    large_masks: bool = False
-    """Go on with masks that take away more than half of most images, or of the splat: they are
-    meant so."""
+    """Masks of what goes, white there. An image for each target camera, in their order: what it
+    marks is wrong, goes, is a hole whatever stands behind it, and is filled; `strip` puts it
+    back."""
     strokes: Path | None = None
     """The strokes.json that `live` saved, in place of cameras and masks: its steps are done again,
     at its resolution and with its photographs unless others are named."""
     out: Path
-    """Folder for completed.ply, the report (report.html), images and summary.json."""
+    """Where results go. A folder, for completed.ply, the report (report.html), images and
+    summary.json."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = REPAIR_CONFIG
     """Settings of the method, which change those of `--config NAME`."""
 
@@ -57,9 +56,8 @@ class RepairOptions(CompletingOptions):
     def make_completion(self) -> CompleteOptions:
         """Make the options of the completion, at the cameras of the masks, that a repair is."""
         shared = {**vars(self)}
-        camera = shared.pop("camera")
         del shared["strokes"]
-        return CompleteOptions(**shared, target=(str(camera),))
+        return CompleteOptions(**shared)
 
 
 def run_repair(options: RepairOptions) -> int:
@@ -78,17 +76,17 @@ def run_repair(options: RepairOptions) -> int:
 def check_marks_named(options: RepairOptions) -> None:
     """Refuse options that do not say what is wrong, or say it twice."""
     if options.strokes is not None:
-        if options.camera is not None or options.mask:
+        if options.target or options.mask:
             raise InputError(
-                "Strokes have cameras and masks of their own; leave --camera and --mask out.",
+                "Strokes have cameras and masks of their own; leave --target and --mask out.",
                 "strokes",
             )
-    elif options.camera is None and not options.mask:
+    elif not options.target and not options.mask:
         raise InputError(
-            "Nothing is named that is wrong; give --camera and --mask, or the --strokes of a "
+            "Nothing is named that is wrong; give --target and --mask, or the --strokes of a "
             "session of `live`."
         )
-    elif options.camera is None:
-        raise InputError("A mask is painted at a camera; name the file of it.", "camera")
+    elif not options.target:
+        raise InputError("A mask is painted at a camera; name it.", "target")
     elif not options.mask:
-        raise InputError("A camera alone marks nothing; name the masks painted there.", "mask")
+        raise InputError("A camera alone marks nothing; name the mask painted there.", "mask")

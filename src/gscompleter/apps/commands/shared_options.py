@@ -39,7 +39,7 @@ class Options(Settings):
     quiet: bool = False
     """Print errors only, and what --json asks for."""
     json: bool = False
-    """Print the result as one JSON object."""
+    """Print the result as JSON."""
 
     def check_overlap(self) -> None:
         """Raise an InputError if the output of the command is, holds or lies in an input."""
@@ -61,16 +61,22 @@ class ComputeOptions(Options):
     """Options of every command that computes for long."""
 
     threads: Threads | None = None
-    """CPU threads to compute with; all available cores if not given."""
+    """CPU threads to compute with. All available cores if not given."""
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunOptions(ComputeOptions):
-    """Options of every command that completes scenes."""
+class DeviceOptions(Settings):
+    """The option of every command that draws."""
 
     device: Device = "auto"
     """Device to compute on. `auto` draws on an NVIDIA GPU if gsplat can, and runs networks on any
     GPU that torch sees; `mps` runs networks on the GPU of a Mac and draws on the CPU."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunOptions(ComputeOptions, DeviceOptions):
+    """Options of every command that completes scenes."""
+
     seed: Seed = 0
     """Seed of all random numbers. The same seed gives the same files on CPUs of one type."""
 
@@ -80,10 +86,10 @@ class DepthOptions(RunOptions):
     """Options of every command with a choice of monocular depth."""
 
     depth: str = "none"
-    """Monocular depth that helps plane-sweep where stereo measures nothing: none, moge-2, another
-    of docs/models.md, or a function of yours as file.py:function."""
+    """Monocular depth that helps plane-sweep where stereo measures nothing. It is none, moge-2,
+    another of docs/models.md, or a function of yours as file.py:function."""
     depth_weights: Path | None = None
-    """Weights file of that depth; downloaded if not given."""
+    """Weights of that depth. A file; downloaded if not given."""
     renderer_device: Literal["cpu", "cuda"] | None = None
     """Device of the renderer alone, and of the photographs; as `--device` if not given."""
     network_device: Literal["cpu", "cuda", "mps"] | None = None
@@ -103,10 +109,10 @@ class ReconstructorOptions(DepthOptions):
     """Options of every command with a choice of one reconstructor."""
 
     reconstructor: str = "plane-sweep"
-    """Model that turns photographs into Gaussians: plane-sweep, one of `gscompleter models`, or a
-    function of yours as file.py:function."""
+    """Model that turns photographs into Gaussians. It is plane-sweep, one of `gscompleter models`,
+    or a function of yours as file.py:function."""
     weights: Path | None = None
-    """Weights file of the reconstructor; downloaded if not given."""
+    """Weights of the reconstructor. A file; downloaded if not given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,7 +121,19 @@ class ModelOptions(ReconstructorOptions, SynthesisOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class SceneOptions(ComputeOptions, WritingOptions):
+class MaskOptions(Settings):
+    """Options of every command that reads masks."""
+
+    invert_masks: bool = False
+    """Read masks the other way round: those of what goes if some are given, of which black then
+    goes, or else those of photographs, of which white is then ignored."""
+    large_masks: bool = False
+    """Go on with masks that take away more than half of most images, or of the splat: they are
+    meant so."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneOptions(ComputeOptions, WritingOptions, MaskOptions):
     """Options of every command that opens photographs with cameras."""
 
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
@@ -126,29 +144,30 @@ class SceneOptions(ComputeOptions, WritingOptions):
     """Photographs to work with: file names, or numbers from 0 in the order of the file paths. If
     not given, those that help most; photographs of targets are never used."""
     out: Path
+    """Where results go. A folder, for completed.ply, the report (report.html), images and
+    summary.json."""
     format: str | None = None
     """Format of SCENE: colmap, nerfstudio, cameras-json, llff, kitti, kitti-raw, dgp, waymo,
     mmdet3d, pandaset, chunks, real-estate-10k, polycam, record3d, 3d-scanner-app or photograph.
     Detected if not given."""
     scene: Path | None
     resolution: Size | None = None
-    """Working size: the longest side in pixels (photographs are never enlarged), or height and
-    width (photographs are scaled and cropped), or `full`. If not given, 640, or the size that the
-    splat was trained at if that is smaller."""
+    """Size of images in pixels. The working size: the longest side (photographs are never
+    enlarged), or height and width (photographs are scaled and cropped), or `full`. If not given,
+    640, or the size that the splat was trained at if that is smaller."""
     near: float | None = None
-    """Smallest depth in the scene, in the unit of its cameras; if not given, that of the data or of
+    """Smallest depth in the scene, in the unit of its cameras. If not given, that of the data or of
     the model's authors, or else estimated. It is brought forward, and a line says so, if the
     photographs show nearer surfaces."""
     far: float | None = None
-    """Largest depth in the scene, in the unit of its cameras; else as for near."""
+    """Largest depth in the scene, in the unit of its cameras. If not given, as for near."""
     no_given_depth: bool = False
     """Ignore the depth that SCENE holds: depth maps, laser sweeps and COLMAP's points."""
     no_masks: bool = False
-    """Use also what masks (black) or alpha channels of SCENE hide, instead of ignoring it."""
-    invert_masks: bool = False
-    """Read the masks of SCENE the other way round: white is ignored, not black."""
-    large_masks: bool = False
-    """Go on with masks that hide more than half of most photographs: they are meant so."""
+    """Use also what masks (black) or alpha channels of photographs hide, instead of ignoring it."""
+    ignore: Path | None = None
+    """Folder of masks of what to leave out of photographs: images named as these, white there. They
+    take the place of masks that lie beside photographs, which are black there."""
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
     forget_edits: bool = False
@@ -171,6 +190,7 @@ class SceneOptions(ComputeOptions, WritingOptions):
                 self.invert_masks and not self.has_marks,
                 self.large_masks,
                 is_turned_by_option=not self.has_marks,
+                folder=self.ignore,
             ),
         )
 
@@ -200,15 +220,16 @@ class CompletingOptions(SceneOptions, ModelOptions):
     also of 360° panoramas (2:1) and of a video (.mp4, .mov, .mkv). One image needs none. A splat
     without photographs may be SCENE itself."""
     scene: Path | None = None
-    """File of Gaussians (a splat) of these photographs, to complete instead of reconstructing the
-    scene; all are kept."""
+    """File of Gaussians (a splat) to work on. It is of these photographs, and completed instead of
+    reconstructing the scene; all are kept."""
     cameras: Path | None = None
-    """File of cameras for a splat without photographs, as in `complete --target`: renders at some
-    of them take the place of photographs. If not given, a cameras.json beside the splat, or cameras
-    that are found around the targets."""
+    """Cameras to look at the splat from: a file as in `complete --target`. If there are no
+    photographs, renders at some of them take their place. If not given, a cameras.json beside the
+    splat, or cameras that are found around the targets."""
     up: tuple[float, float, float] | None = None
-    """Upward direction of a splat whose cameras are found: x, y and z in its file (in the axes of a
-    .ply). If not given, what its file or the cameras beside it say, else its floor, else -y."""
+    """Upward direction of the splat: x, y and z in its file (in the axes of a .ply). For cameras
+    that are found. If not given, what its file or the cameras beside it say, else its floor, else
+    -y."""
     holes: Literal["auto", "all", "enclosed"] = "auto"
     """Holes to fill: all that is empty, or only what the splat encloses, as in an object that
     stands on nothing, outside of which nothing is added. `auto` tells an object without photographs
@@ -242,7 +263,8 @@ class EngineOptions(Options):
     workers: Annotated[int, Interval(ge=1, le=100_000)] | None = None
     """Number of workers; as many as fit if not given (one with SLURM)."""
     threads: Threads | None = None
-    """CPU threads of each worker; an equal share of this machine's cores, or one elsewhere."""
+    """CPU threads to compute with. Of each worker; an equal share of this machine's cores if not
+    given, or one elsewhere."""
     address: str | None = None
     """Address of a running Ray cluster; a cluster is started here if not given."""
     gpus: Annotated[float, Interval(ge=0, le=1024)] = 0.0

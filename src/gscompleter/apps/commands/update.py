@@ -16,6 +16,25 @@ from gscompleter.system.process import import_without_collection
 
 
 @dataclass(frozen=True, kw_only=True)
+class PhotographsOnlyOptions(CompleteOptions):
+    """Options of the completion that an update is: nothing is invented, and there are no targets.
+
+    On the command line `complete` has no such option: `update` is the one way to it, and looks at
+    all photographs.
+    """
+
+    @property
+    def from_photographs_only(self) -> bool:
+        """True: nothing is invented."""
+        return True
+
+    @property
+    def max_targets(self) -> int:
+        """No target is searched for."""
+        return 0
+
+
+@dataclass(frozen=True, kw_only=True)
 class UpdateOptions(SceneOptions, ReconstructorOptions):
     """Add to a splat what its photographs show and it lacks, and correct what they contradict.
 
@@ -25,7 +44,7 @@ class UpdateOptions(SceneOptions, ReconstructorOptions):
     """
 
     scene: Path = field()  # without the default of `complete`
-    """File of Gaussians (a splat) to update; all are kept."""
+    """File of Gaussians (a splat) to work on. All are kept."""
     photos: Path | None = None
     """Folder of new photographs without cameras. COLMAP places them among those of SCENE, whose
     cameras stay as they are; the new cameras are kept in OUT/colmap."""
@@ -37,12 +56,12 @@ class UpdateOptions(SceneOptions, ReconstructorOptions):
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()
     """Settings of the method, which change those of `--config NAME`."""
 
-    def make_completion(self) -> CompleteOptions:
+    def make_completion(self) -> PhotographsOnlyOptions:
         """Make the options of the completion without targets that an update is."""
         shared = {**vars(self)}
         for name in ("photos", "hold_out"):
             del shared[name]
-        return CompleteOptions(**shared, from_photographs_only=True)
+        return PhotographsOnlyOptions(**shared)
 
 
 def run_update(options: UpdateOptions) -> int:

@@ -27,17 +27,19 @@ class ViewOptions(WritingOptions):
     other: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="B")] = None
     """The scene after, if A is the one before; by default A with its generated Gaussians."""
     cameras: Path | None = None
-    """Cameras to jump to: a file as in `complete --target`, or a folder with a transforms.json or a
-    COLMAP model; in the coordinates of the photographs if A is an output folder, else of A."""
+    """Cameras to look at the splat from: a file as in `complete --target`. Or a folder with a
+    transforms.json or a COLMAP model. The page jumps to them. They are in the coordinates of the
+    photographs if A is an output folder, else of A."""
     resolution: tuple[int, int] | None = None
-    """Image size (height and width) of cameras whose file has none."""
+    """Size of images in pixels. Height and width, of cameras whose file has none."""
     up: tuple[float, float, float] | None = None
-    """Upward direction of the page: x, y and z in the file of A (in the axes of a .ply). If not
-    given, that of most cameras; without any, what the file says, else its floor, else -y."""
+    """Upward direction of the splat: x, y and z in its file (in the axes of a .ply). That of A,
+    which the page takes. If not given, that of most cameras; without any, what the file says, else
+    its floor, else -y."""
     save: Path | None = None
     """Write the page to this file instead of serving it."""
     port: Port = 0
-    """Port of the page on 127.0.0.1; a free one if not given."""
+    """Port of the page; a free one if not given. The page is on 127.0.0.1."""
     no_open: bool = False
     """Print the address without opening a browser."""
     drop_nonfinite: bool = False

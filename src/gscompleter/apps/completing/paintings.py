@@ -63,16 +63,14 @@ def refuse_combinations(options: CompleteOptions) -> None:
             "--images takes the place of a generator; leave --generator and its options out.",
             "generator",
         )
-    elif options.auto is not None or options.from_photographs_only:
+    elif options.auto is not None:
         raise InputError(
-            "--images needs the targets that the images were painted for; leave --auto and "
-            "--from-photographs-only out.",
+            "--images needs the targets that the images were painted for; leave --auto out.",
             "images",
         )
-    if is_export and (options.dry_run or options.from_photographs_only or options.video):
+    if is_export and (options.dry_run or options.video):
         raise InputError(
-            "--export-holes completes nothing; leave --dry-run, --from-photographs-only and "
-            "--video out.",
+            "--export-holes completes nothing; leave --dry-run and --video out.",
             "export-holes",
         )
 

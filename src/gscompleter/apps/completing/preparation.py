@@ -60,7 +60,7 @@ PHOTOGRAPH_OPTIONS = {
     "format": None,
     "frames": 40,
     "no_masks": False,
-    "from_photographs_only": False,
+    "ignore": None,
 }
 """Options that only photographs can follow, with their defaults."""
 
@@ -306,25 +306,11 @@ def check_targets(options: CompleteOptions) -> None:
             "with the other.",
             "auto",
         )
-    if not options.from_photographs_only:
-        return
-    if options.scene is None:
-        raise InputError(
-            "Without --scene the whole scene is reconstructed from photographs already; name the "
-            "splat that lacks what they show.",
-            "from-photographs-only",
-        )
-    if not options.config.add_observed:
+    if options.from_photographs_only and not options.config.add_observed:
         raise InputError(
             "With config.add_observed off nothing is added from photographs, as in the config "
             "paper; choose another config.",
             "config",
-        )
-    if options.target or options.auto is not None or options.dry_run:
-        raise InputError(
-            "With --from-photographs-only no target is completed; leave --target, --auto and "
-            "--dry-run out.",
-            "from-photographs-only",
         )
 
 
@@ -374,7 +360,7 @@ def read_splat_alone(
 ) -> tuple[CompleteOptions, Opened, CompletionTask]:
     """Read a splat without photographs, and render it in their place; compile the kernels.
 
-    Returns the options with what a hole of this splat is.
+    Returns the options with what a hole of this splat is, and with its padding.
     """
     assert options.scene is not None
     device = options.device
@@ -404,7 +390,8 @@ def read_splat_alone(
         opened, task, kind = open_renders(request, splat_file, gaussians, renderer, device)
         if device == "cpu":
             check_scene(task, gaussians)
-    return with_holes(options, kind), opened, task
+    options = replace(options, config=options.config.choose_margin(kind.is_lifted))
+    return with_holes(options, kind.holes), opened, task
 
 
 def with_holes(options: CompleteOptions, kind: Literal["all", "enclosed"]) -> CompleteOptions:

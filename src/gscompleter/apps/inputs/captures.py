@@ -28,10 +28,7 @@ from gscompleter.render.protocols import Renderer
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.types import Camera, Gaussians
 from gscompleter.virtual_capture.around_target import NUM_CAMERAS, choose_cameras_around
-from gscompleter.virtual_capture.pixel_aligned import (
-    find_pixel_camera,
-    move_beside,
-)
+from gscompleter.virtual_capture.pixel_aligned import aim_pixel_camera, move_beside
 from gscompleter.virtual_capture.standpoints import choose_cameras_around_place, find_standpoints
 from gscompleter.virtual_capture.upward import Upward, find_upward
 from gscompleter.virtual_capture.witnesses import MAX_WITNESSES
@@ -124,20 +121,25 @@ def take_from_file(path: Path, known: Photographs, request: RenderRequest) -> Ca
     return Capture(cameras, names, "cameras", where, more)
 
 
-def find_cameras_alone(scene: Gaussians, renderer: Renderer, request: RenderRequest) -> Capture:
+def find_cameras_alone(
+    scene: Gaussians,
+    pixel_center: Float[Tensor, "3"] | None,
+    renderer: Renderer,
+    request: RenderRequest,
+) -> Capture:
     """Find cameras by the splat alone.
 
-    That of a pixel-aligned splat is taken with small moves of it; a trained splat tells no more
-    than from where it looks well.
+    That of a pixel-aligned splat, at `pixel_center`, is taken with small moves of it; a trained
+    splat tells no more than from where it looks well.
     """
     resolution = request.reading.resolution
     # Two photographs are the fewest, so that no image had more pixels than half of the Gaussians.
     side = max(MIN_FOUND_SIDE, round((len(scene) / 2) ** 0.5))
     sides = (side,) if resolution is None else (side, *np.ravel(resolution).tolist())
     upward = request.find_up(scene, renderer)
-    camera = find_pixel_camera(scene, upward.direction, min(sides))
-    if camera is None:
+    if pixel_center is None:
         return find_standing_cameras(scene, renderer, upward, request)
+    camera = aim_pixel_camera(scene, pixel_center, upward.direction, min(sides))
     ranged = add_near_plane(camera, scene.means)
     seen = renderer.render(scene, ranged).depth_map()
     covered = seen.valid.float().mean().item()

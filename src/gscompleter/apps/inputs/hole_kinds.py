@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -21,11 +22,22 @@ from gscompleter.render.protocols import Renderer
 from gscompleter.stages.enclosed_holes import keep_enclosed
 from gscompleter.stages.target_view import compute_hole_mask, explain_little_covered
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.trust.lifted import is_lifted
 from gscompleter.types import Camera, Gaussians
 from gscompleter.virtual_capture.kind import is_object
 
 HoleKind = Literal["all", "enclosed"]
+
+
+@dataclass(frozen=True)
+class SplatKind:
+    """What a splat without photographs is, which is decided once from its Gaussians."""
+
+    is_lifted: bool
+    """True if it was lifted from pixels, beside which everything is empty; False if trained."""
+    holes: HoleKind
+    """What a hole of it is."""
+
+
 OPAQUE = (
     "The splat is opaque everywhere in the image of the target, and nothing in it tells what is "
     "wrong; mark that with --mask, or name the photographs of the scene as SCENE."
@@ -41,15 +53,16 @@ OBJECT_NOTE = (
 
 
 def choose_kind(
-    kind: str, scene: Gaussians, given: Sequence[Camera], renderer: Renderer
+    kind: str, scene: Gaussians, is_lifted: bool, given: Sequence[Camera], renderer: Renderer
 ) -> HoleKind:
     """Choose what a hole is: of an object on nothing, only what it encloses.
 
-    `given` are the cameras that the user named, none that was found.
+    A scene that was lifted from pixels has nothing around it either, and is no object. `given` are
+    the cameras that the user named, none that was found.
     """
     if kind == "enclosed" or (
         kind == "auto"
-        and not is_lifted(scene)
+        and not is_lifted
         and is_object(scene, renderer, [camera.to(scene.means.device) for camera in given])
     ):
         return "enclosed"

@@ -21,8 +21,14 @@ from gscompleter.data.frame import FOLDERS
 from gscompleter.data.limits import check_planes
 from gscompleter.data.mask_checks import read_masks_as_asked, refuse_nothing_to_invert
 from gscompleter.data.mask_reading import MaskReading
+from gscompleter.data.masks import make_no_mask_error
 from gscompleter.data.photographs import check_resolution
-from gscompleter.data.sfm.poses import find_poses, has_photographs, list_all_photographs
+from gscompleter.data.sfm.poses import (
+    find_poses,
+    has_photographs,
+    list_all_photographs,
+    list_given_masks,
+)
 from gscompleter.data.unused_files import list_unused
 from gscompleter.data.video import is_video
 from gscompleter.splats.alignment.training_size import find_training_size
@@ -65,6 +71,13 @@ def open_scene(
             "invert-masks",
         )
 
+    if request.masks.folder is not None and not request.uses_masks:
+        raise InputError(
+            "--no-masks uses all pixels of the photographs, and --ignore names masks of some to "
+            "leave out; give one of both.",
+            "ignore",
+        )
+
     # Photographs without cameras: COLMAP finds them once, and a later run reads them again.
     num_photographs = None
     reading = request.masks
@@ -77,6 +90,8 @@ def open_scene(
         if request.removal_masks is not None and not is_video(folder):
             names = list_all_photographs(folder)
             check_removal_masks(request.removal_masks, names, request.removal_reading)
+        if reading.folder is not None:
+            check_ignoring_masks(reading.folder, folder)
         check()
         # A folder of poses with a summary was written by us, and may be continued or replaced.
         kept = search.out / POSES
@@ -99,6 +114,8 @@ def open_scene(
         names = [frame.name for frame in photographs.frames]
         check_removal_masks(request.removal_masks, names, request.removal_reading)
         photographs = photographs.leave_out_masks_in(request.removal_masks)
+    if reading.folder is not None:
+        photographs = photographs.take_masks_of(reading.folder)
     refuse_nothing_to_invert(photographs.list_masks(), reading)
     photographs = read_masks_as_asked(photographs, reading)
     print_lines(console, *photographs.notes)
@@ -112,6 +129,25 @@ def open_scene(
     # The user gave photographs, of which COLMAP may not have found all cameras. Their number is
     # reported, and not the format and number of what COLMAP wrote.
     return Opened(request, photographs, "photographs", num_photographs)
+
+
+def check_ignoring_masks(masks: Path, folder: Path) -> None:
+    """Refuse a folder of masks that is of no photograph in `folder`, or would be taken for some."""
+    if is_video(folder):
+        raise InputError(
+            "The photographs of a video have no names before they are taken; run `gscompleter "
+            "poses` first, and name its folder as SCENE and masks of its images.",
+            "ignore",
+        )
+    names = list_all_photographs(folder)
+    if any(masks.resolve() in (folder / name).resolve().parents for name in names):
+        raise InputError(
+            f"{quote_value(masks)} lies among the photographs, and would be taken for some; move "
+            "it out of their folder.",
+            "ignore",
+        )
+    if not list_given_masks(folder, names, masks):
+        raise make_no_mask_error(masks, names)
 
 
 def choose_working_size(opened: Opened, splat: Path, console: Console) -> Opened:

@@ -28,6 +28,7 @@ from gscompleter.apps.inputs.captures import (
 from gscompleter.apps.inputs.hole_kinds import (
     OBJECT_NOTE,
     HoleKind,
+    SplatKind,
     choose_kind,
     find_target_holes,
     pair_masks,
@@ -56,6 +57,7 @@ from gscompleter.render.protocols import Renderer
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import convert_to_pixels
 from gscompleter.system.memory import check_memory
+from gscompleter.trust.lifted import find_pixel_center
 from gscompleter.types import Camera, Gaussians, View
 from gscompleter.virtual_capture.render_views import render_views
 from gscompleter.virtual_capture.upward import estimate_axis_up, require_direction
@@ -75,10 +77,10 @@ def open_renders(
     scene: Gaussians,
     renderer: Renderer,
     device: str,
-) -> tuple[Opened, CompletionTask, HoleKind]:
+) -> tuple[Opened, CompletionTask, SplatKind]:
     """Choose cameras, and render the splat there in place of photographs.
 
-    Also returns what a hole of this splat is.
+    Also returns what kind of splat it is.
     """
     reading = request.reading
     check_planes(reading.near, reading.far)
@@ -103,7 +105,11 @@ def open_renders(
     scene, _ = place_scene(scene, origin, all_cameras)
     scene = scene.to(device)
 
-    capture, kind, holes = choose_capture(request, path, known, targets, scene, renderer)
+    # The search for this centre takes a second, and decides several things below.
+    pixel_center = find_pixel_center(scene)
+    capture, kind, holes = choose_capture(
+        request, path, known, targets, scene, pixel_center, renderer
+    )
     if capture is None:
         capture = search_around([t.camera.to(device) for t in targets], holes, scene, renderer)
     photographs = replace(
@@ -131,7 +137,7 @@ def open_renders(
         up = estimate_axis_up(named)
     else:
         up = capture.upward.direction
-    witnesses = choose_witnesses(scene, list(cameras.values()), others, up, renderer)
+    witnesses = choose_witnesses(scene, pixel_center, list(cameras.values()), others, up, renderer)
     check_images([*cameras.values(), *(target.camera for target in targets)])
     opened = Opened(
         reading,
@@ -151,7 +157,7 @@ def open_renders(
         frame_description="the frame of the splat",
         witnesses=witnesses,
     )
-    return opened, task, kind
+    return opened, task, SplatKind(pixel_center is not None, kind)
 
 
 def choose_capture(
@@ -160,6 +166,7 @@ def choose_capture(
     known: Photographs,
     targets: Sequence[Target],
     scene: Gaussians,
+    pixel_center: Float[Tensor, "3"] | None,
     renderer: Renderer,
 ) -> tuple[Capture | None, HoleKind, list[Bool[Tensor, "h w"]]]:
     """Choose cameras, what a hole is, and the holes of the targets.
@@ -174,10 +181,11 @@ def choose_capture(
     elif request.place is not None:
         capture = search_around_place(scene, known.origin, renderer, request)
     elif not targets:
-        capture = find_cameras_alone(scene, renderer, request)
+        capture = find_cameras_alone(scene, pixel_center, renderer, request)
     # Cameras that were found say nothing: they are chosen for images that the splat fills.
     named = [] if path is None or capture is None else capture.cameras
-    kind = choose_kind(request.kind, scene, [*target_cameras, *named], renderer)
+    is_lifted = pixel_center is not None
+    kind = choose_kind(request.kind, scene, is_lifted, [*target_cameras, *named], renderer)
 
     # What is marked or removed is the hole, and need not be empty yet.
     if request.masks:

@@ -160,9 +160,10 @@ def place_photographs(
             "photos",
         )
 
-    check_hiding_masks(list_given_masks(folder, names), reading, len(names))
-    identity = identify_input(folder, names, photographs)
-    if reading.is_inverted:
+    masks = list_given_masks(folder, names, reading.folder)
+    check_hiding_masks(masks, reading, len(names))
+    identity = identify_input(folder, names, photographs, reading.folder)
+    if reading.ignores_white:
         identity["inverted masks"] = True
     earlier = read_earlier(out, "placed", identity)
     if earlier is not None:
@@ -170,7 +171,7 @@ def place_photographs(
     else:
         require_pycolmap()
         with reserve_output(out, overwrite, COMMAND, RESULTS) as output, output.write() as draft:
-            placed = place_copies(folder, names, photographs, draft, reading.is_inverted)
+            placed = place_copies(folder, names, photographs, draft, reading)
             content = {"placed": asdict(placed), "photographs": identity}
             (draft / SUMMARY_FILE).write_bytes(json.dumps(content, indent=1).encode())
     placed = replace(placed, skipped=len(found) - len(names))
@@ -195,14 +196,19 @@ def find_stored_file(frame: Frame) -> Path | None:
     return stored if isinstance(stored, Path) else None
 
 
-def identify_input(folder: Path, names: Sequence[str], photographs: Photographs) -> dict[str, Any]:
-    """Identify new photographs as files, and the known cameras by a hash."""
+def identify_input(
+    folder: Path, names: Sequence[str], photographs: Photographs, masks: Path | None = None
+) -> dict[str, Any]:
+    """Identify new photographs as files, and the known cameras by a hash.
+
+    `masks` is a folder of masks that takes the place of those beside the new photographs.
+    """
     digest = hashlib.sha256()
     for frame in photographs.frames:
         digest.update(frame.name.encode(errors="surrogateescape"))
         digest.update(frame.c2w.tobytes())
     return {
-        "new": identify_files(folder, names),
+        "new": identify_files(folder, names, masks),
         "known": digest.hexdigest(),
     }
 
@@ -212,13 +218,13 @@ def place_copies(
     names: Sequence[str],
     photographs: Photographs,
     draft: Path,
-    has_inverted_masks: bool = False,
+    reading: MaskReading,
 ) -> Placed:
     """Write `images` and `sparse/0` of the photographs that can be placed into `draft`."""
     with tempfile.TemporaryDirectory(dir=draft) as work:
         home = Path(work)
         known, sources = write_known(photographs, home)
-        new = write_new(folder, names, photographs, home, has_inverted_masks)
+        new = write_new(folder, names, photographs, home, reading)
         job = {
             "images": str(home / IMAGES),
             "masks": str(home / MASKS),
@@ -317,7 +323,7 @@ def write_new(
     names: Sequence[str],
     photographs: Photographs,
     home: Path,
-    has_inverted_masks: bool,
+    reading: MaskReading,
 ) -> list[NewCopy]:
     """Write copies of new photographs, undistorted if their lens is a known one."""
     lenses = collect_lenses(photographs)
@@ -325,9 +331,7 @@ def write_new(
     copies = []
     for name in track(names, "Reading new photographs"):
         key = read_lens_key(folder / name)
-        copies.append(
-            write_copy(folder, name, key, lenses.get(key), home, listings, has_inverted_masks)
-        )
+        copies.append(write_copy(folder, name, key, lenses.get(key), home, listings, reading))
     return copies
 
 
@@ -356,7 +360,7 @@ def write_copy(
     known: Intrinsics | None,
     home: Path,
     listings: FolderListings,
-    has_inverted_mask: bool,
+    reading: MaskReading,
 ) -> NewCopy:
     """Write the copy of a new photograph, which is undistorted if its lens is `known`."""
     path = folder / name
@@ -364,7 +368,7 @@ def write_copy(
     # Without a known lens the intrinsics are not used, but for the size that makes it upright.
     width, height, lens = key
     guess = Intrinsics((width, height), (float(width), float(width)))
-    mask = find_mask(path, name, listings)
+    mask = find_mask(path, name, listings, reading.folder)
     frame = Frame(
         name,
         title,
@@ -372,7 +376,7 @@ def write_copy(
         known or guess,
         path,
         mask=mask,
-        has_inverted_mask=has_inverted_mask,
+        has_inverted_mask=reading.ignores_white,
     )
     (view,) = build_photographs(name, title, [frame]).views([0], MAX_SIDE)
 

@@ -188,12 +188,12 @@ def find_poses(
     that are written are black where something is hidden, however they are read.
     """
     names = [] if is_video(photographs) else list_all_photographs(photographs)
-    masks = list_given_masks(photographs, names)
+    masks = list_given_masks(photographs, names, reading.folder)
     refuse_nothing_to_invert(masks, reading)
     check_hiding_masks(masks, reading, len(names))
     # The same photographs in the same folder have the same cameras: minutes of work are reused.
-    known = _identify_input(photographs, num_frames)
-    if reading.is_inverted:
+    known = _identify_input(photographs, num_frames, reading.folder)
+    if reading.ignores_white:
         known["inverted masks"] = []
     earlier = read_earlier(out, "poses", known)
     if earlier is not None:
@@ -204,32 +204,37 @@ def find_poses(
         output.write() as folder,
         _open_images(photographs, num_frames, folder) as images,
     ):
-        poses = _run(images, folder, photographs, reading.is_inverted)
+        poses = _run(images, folder, photographs, reading)
         content = {"poses": asdict(poses), "photographs": known}
         (folder / SUMMARY_FILE).write_bytes(json.dumps(content, indent=1).encode())
     return replace(poses, kept=" ".join(output.describe_others()))
 
 
-def list_given_masks(folder: Path, names: Sequence[str]) -> list[Path]:
-    """List the masks of photographs in a folder."""
+def list_given_masks(folder: Path, names: Sequence[str], named: Path | None = None) -> list[Path]:
+    """List the masks of photographs in a folder; `named` is as in `find_mask`."""
     listings = FolderListings()
-    masks = (find_mask(folder / name, name, listings) for name in names)
+    masks = (find_mask(folder / name, name, listings, named) for name in names)
     return [mask for mask in masks if mask is not None]
 
 
-def _identify_input(path: Path, num_frames: int) -> dict[str, list[int]]:
+def _identify_input(path: Path, num_frames: int, masks: Path | None) -> dict[str, list[int]]:
     """Identify photographs by size and time of change, a video also by the number of frames."""
     if is_video(path):
         stat = path.stat()
         return {path.name: [stat.st_size, stat.st_mtime_ns, num_frames]}
-    return identify_files(path, list_photograph_files(path))
+    return identify_files(path, list_photograph_files(path), masks)
 
 
-def identify_files(folder: Path, names: Sequence[str]) -> dict[str, list[int]]:
-    """Identify photographs and their masks by size and time of change."""
+def identify_files(
+    folder: Path, names: Sequence[str], named: Path | None = None
+) -> dict[str, list[int]]:
+    """Identify photographs and their masks by size and time of change.
+
+    A folder of masks that the user `named` is as in `find_mask`.
+    """
     files = {name: folder / name for name in names}
     listings = FolderListings()
-    masks = {name: find_mask(file, name, listings) for name, file in files.items()}
+    masks = {name: find_mask(file, name, listings, named) for name, file in files.items()}
     files |= {f"mask of {name}": mask for name, mask in masks.items() if mask is not None}
     stats = {name: file.stat() for name, file in files.items()}
     return {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
@@ -373,7 +378,7 @@ def is_own(folder: Path) -> bool:
     return not os.path.isfile(folder / SUMMARY_FILE)
 
 
-def _run(photographs: Path, folder: Path, given: Path, has_inverted_masks: bool) -> FoundPoses:
+def _run(photographs: Path, folder: Path, given: Path, reading: MaskReading) -> FoundPoses:
     """Write `images` and `sparse/0` of photographs, made from what was `given`, into `folder`."""
     names = list_photograph_files(photographs)
     is_panoramic = has_panoramas([photographs / name for name in names])
@@ -381,9 +386,7 @@ def _run(photographs: Path, folder: Path, given: Path, has_inverted_masks: bool)
     copies = [
         copy
         for name in track(names, "Turning photographs upright")
-        for copy in write_copies(
-            photographs, name, folder, is_panoramic, listings, has_inverted_masks
-        )
+        for copy in write_copies(photographs, name, folder, is_panoramic, listings, reading)
     ]
     result = _map(copies, folder, is_panoramic)
     missing = [copy.source for copy in copies if copy.name not in result["registered"]]
@@ -426,18 +429,18 @@ def write_copies(
     folder: Path,
     is_panoramic: bool,
     listings: FolderListings,
-    has_inverted_mask: bool = False,
+    reading: MaskReading,
 ) -> list[UprightCopy]:
     """Write the upright copy of a photograph, or the views of a panorama, into `folder`/images.
 
     The views of all panoramas with the same direction are in one folder, as COLMAP's rigs need it.
     What masks hide is written into `folder`/masks. `listings` are of the folders of `root`.
     """
-    mask = find_mask(root / source, source, listings)
+    mask = find_mask(root / source, source, listings, reading.folder)
     if not is_panoramic:
-        return [write_upright(root, source, folder, mask, has_inverted_mask)]
+        return [write_upright(root, source, folder, mask, reading.ignores_white)]
     copies = []
-    hidden = read_hidden(root / source, mask, has_inverted_mask)
+    hidden = read_hidden(root / source, mask, reading.ignores_white)
     for number, (pixels, shade) in enumerate(split_panorama(root / source, hidden)):
         kind = f"view_{number}"
         name = Path(re.sub(SEPARATORS, "_", source)).with_suffix(".jpg")

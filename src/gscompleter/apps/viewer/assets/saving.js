@@ -47,6 +47,6 @@ async function saveMask() {
     return;
   }
   download("mask.png", png);
-  say("Save the camera, too, then: gscompleter repair SPLAT --camera camera.json --mask mask.png --out OUT");
+  say("Save the camera, too, then: gscompleter repair SPLAT --target camera.json --mask mask.png --out OUT");
 }
 

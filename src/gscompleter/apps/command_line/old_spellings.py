@@ -1,0 +1,30 @@
+"""Options that have another name by now, each refused with the sentence that names it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from gscompleter.system.errors import InputError
+
+UPDATE = "`gscompleter update` adds what photographs show and a splat lacks, and invents nothing"
+
+OLD_SPELLINGS = {
+    ("complete", "from-photographs-only"): UPDATE,
+    ("remove", "from-photographs-only"): UPDATE,
+    ("repair", "camera"): "the cameras of masks are named by --target",
+}
+"""What took the place of an option, by the command and the name of the option without dashes.
+
+Such an option is not read under its old name as well: one name with two spellings would be two
+rows of the table of options, and scripts would never be changed.
+"""
+
+
+def refuse_old_spellings(words: Sequence[str]) -> None:
+    """Refuse an option of the command `words[0]` by the name that it had; raises InputError."""
+    for word in words[1:]:
+        # As in `--camera=FILE`, and with the underscore of the rows of a batch.
+        name = word.partition("=")[0].removeprefix("--").replace("_", "-")
+        new = OLD_SPELLINGS.get((words[0], name)) if word.startswith("--") else None
+        if new is not None:
+            raise InputError(f"{words[0]} has no option --{name} any more; {new}.")

@@ -1,0 +1,93 @@
+"""Options of all commands: one name has one meaning, and an old one is refused with the new one."""
+
+import sys
+from collections import defaultdict
+from dataclasses import dataclass
+from importlib.util import module_from_spec, spec_from_file_location
+from types import ModuleType
+
+import pytest
+
+from command import run
+from gscompleter.apps.command_line.old_spellings import OLD_SPELLINGS
+from gscompleter.apps.command_line.words import list_options
+from gscompleter.cli import OptionClasses, parse_command
+from gscompleter.config.settings import Settings
+from gscompleter.system.errors import InputError
+from paths import TESTS
+
+DOCS = TESTS.parent / "docs"
+
+
+@pytest.fixture(scope="module")
+def table() -> ModuleType:
+    """Return the script that makes the page of all options."""
+    spec = spec_from_file_location("make_option_table", DOCS / "make_option_table.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = module_from_spec(spec)
+    # Dataclasses look their module up by its name.
+    sys.modules[spec.name] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_one_name_has_one_kind_of_value_and_one_sentence_in_every_command(table):
+    by_name = defaultdict(list)
+    for option in table.list_all_options():
+        by_name[option.name].append(option)
+    assert len(by_name["--out"]) > 10
+    for name, same in by_name.items():
+        assert {option.sentence for option in same} == {same[0].sentence}, name
+        assert same[0].sentence, name
+        # A command may offer fewer of the choices than the one that offers most.
+        widest = max(same, key=lambda option: len(option.kinds)).kinds
+        assert all(option.kinds <= widest for option in same), (name, same)
+
+
+def test_the_page_of_options_is_that_of_the_commands(table):
+    said = (DOCS / "options.md").read_text(encoding="utf-8")
+    assert said == table.make_page(), "run `python docs/make_option_table.py`"
+
+
+def test_another_meaning_under_the_same_name_is_found(table, monkeypatch):
+    @dataclass(frozen=True, kw_only=True)
+    class DemoOptions(Settings):
+        """Options of a command that reads a word in another way."""
+
+        out: int = 0
+        """Number of results."""
+
+    monkeypatch.setattr("gscompleter.apps.commands.demo.DemoOptions", DemoOptions)
+    with pytest.raises(AssertionError, match="--out"):
+        test_one_name_has_one_kind_of_value_and_one_sentence_in_every_command(table)
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            ("repair", "splat.ply", "--camera", "camera.json", "--mask", "wrong.png"),
+            "repair has no option --camera any more; the cameras of masks are named by --target",
+        ),
+        (
+            ("complete", "room", "--scene", "splat.ply", "--from-photographs-only"),
+            "any more; `gscompleter update` adds what photographs show and a splat lacks, and",
+        ),
+        (("repair", "splat.ply", "--camera=camera.json"), "are named by --target"),
+    ],
+)
+def test_an_old_spelling_is_refused_with_the_new_one(
+    words, sentence, tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / "out"
+    assert run(monkeypatch, *words, "--out", out) == 2
+    assert sentence in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize(("command", "name"), OLD_SPELLINGS)
+def test_an_old_spelling_is_no_option_of_its_command(command, name):
+    assert name not in list_options(OptionClasses()[command])
+    with pytest.raises(InputError, match=f"{command} has no option --{name} any more; "):
+        parse_command([command, f"--{name.replace('-', '_')}", "x"])
