@@ -95,7 +95,7 @@ def build_page(
 ) -> LivePage:
     """Build the page of a session."""
     scene = session.latest.context
-    kind = "Photograph" if ready.opened.renders_from is None else "Render"
+    kind = "Photograph" if ready.opened.renders_from is None else "View"
     shots = [
         ViewerCamera(
             f"photograph-{view.frame}",
