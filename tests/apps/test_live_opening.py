@@ -7,11 +7,13 @@ import io
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,17 +22,21 @@ import torch
 from PIL import Image
 from rich.console import Console
 
+from command import run
 from gscompleter import save_ply
 from gscompleter.apps.commands.live import LiveOptions
 from gscompleter.apps.live import saving, serving
 from gscompleter.apps.live.journal import Journal
 from gscompleter.apps.live.opening import Opening, find_opening
 from gscompleter.apps.live.page import LivePage
-from gscompleter.apps.live.session import Session, Step, apply_step
+from gscompleter.apps.live.session import Session, Step, apply_step, redo_step, undo_step
+from gscompleter.apps.live.strokes import list_steps
 from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.cli import parse_command
 from gscompleter.data.scene import describe_camera
-from gscompleter.system.files.output_folder import read_listing, reserve_output
+from gscompleter.splats.edits import read_edits
+from gscompleter.system.errors import InputError
+from gscompleter.system.files.output_folder import list_session, read_listing, reserve_output
 from gscompleter.types import Camera, Gaussians, merge
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 
@@ -145,6 +151,182 @@ def test_each_step_is_kept_at_once_and_a_session_goes_on(room, splat, tmp_path):
     assert third.ask("redo")["steps"] == 2
     third.ask("redo")
     assert is_same(third.scene, begun.scene)
+
+
+@pytest.fixture(scope="module")
+def program(room, splat, tmp_path_factory) -> Program:
+    """Return a program that saved its session, and did a further step."""
+    out = tmp_path_factory.mktemp("saved") / "out"
+    program = Program(room, "--scene", splat, "--out", out, *SMALL)
+    program.do(STEPS[0])
+    assert "Saved in" in program.ask("save")["text"]
+    assert program.page.channel.latest["saved"] is True
+    program.do(STEPS[1])
+    return program
+
+
+@pytest.fixture(scope="module")
+def saved(program) -> Path:
+    """Return the folder of the session."""
+    return program.opening.out
+
+
+@pytest.fixture
+def begun(program) -> Session:
+    """Return the session without steps."""
+    session = program.session
+    return replace(session, completions=session.completions[:1], steps=())
+
+
+def test_a_completed_splat_of_a_session_is_opened_as_the_session(saved, tmp_path):
+    for name in (saved, saved / "completed.ply", saved / "strokes.json"):
+        words = ("--strokes", name) if name.suffix == ".json" else (name,)
+        opening = find_opening(parse_live(*words))
+        assert opening.out == saved
+        assert len(opening.steps) == 2
+        assert opening.options.resolution == (SIZE, SIZE)
+        assert opening.options.context == (0, 1)
+    # Elsewhere, what is saved there is not what the new folder has.
+    elsewhere = find_opening(parse_live(saved, "--out", tmp_path / "new"))
+    assert (len(elsewhere.steps), elsewhere.saved) == (2, None)
+    assert find_opening(parse_live(saved)).saved is not None
+
+
+def test_what_a_session_saved_and_did_since_is_told_apart(saved, program, begun):
+    opening = find_opening(parse_live(saved))
+    assert read_listing(saved) >= {"completed.ply", "strokes.json", "images/stroke2.png"}
+    files = json.loads((saved / "summary.json").read_text())["files"]
+    assert "images/stroke2.png" not in files
+    steps = opening.steps
+    journal = Journal(saved, program.journal._began, opening.saved)
+    assert not journal.is_saved(begun)
+    assert journal.is_saved(replace(begun, steps=steps[:1]))
+    assert not journal.is_saved(replace(begun, steps=steps))
+    state, command = serving.describe_end(replace(begun, steps=steps), journal)
+    assert "Not saved" in state
+    assert command == f"To go on: gscompleter live {saved}"
+    assert serving.describe_end(replace(begun, steps=steps[:1]), journal)[0].startswith("Saved")
+    assert serving.describe_end(begun, Journal(saved / "other", program.journal._began)) == []
+
+
+def copy_of(saved: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(saved, tmp_path / "copy"))
+
+
+def test_a_splat_that_was_changed_since_is_a_splat_of_its_own(saved, tmp_path):
+    out = copy_of(saved, tmp_path)
+    with (out / "completed.ply").open("r+b") as file:
+        file.seek(-1, os.SEEK_END)
+        file.write(b"\x01")
+    opening = find_opening(parse_live(out / "completed.ply", "--out", tmp_path / "new"))
+    assert (opening.steps, opening.options.folder) == ((), out / "completed.ply")
+    notes = find_opening(parse_live(out)).notes
+    assert any("changed by another program" in note for note in notes)
+
+
+def test_a_completed_splat_without_steps_is_opened_itself(saved, tmp_path):
+    out = copy_of(saved, tmp_path)
+    (out / "strokes.json").unlink()
+    for name in (out, out / "completed.ply"):
+        opening = find_opening(parse_live(name, "--out", tmp_path / "new"))
+        assert (opening.steps, opening.options.folder) == ((), out / "completed.ply")
+    assert len(read_edits(opening.options.folder).edits) == 1
+
+
+def test_steps_are_done_on_a_scene_that_is_named(saved, room, splat, tmp_path):
+    words = (room, "--scene", splat, "--strokes", saved, "--out", tmp_path / "new")
+    opening = find_opening(parse_live(*words))
+    assert (len(opening.steps), opening.options.folder) == (2, room)
+    assert opening.options.context == (0, 1)
+    with pytest.raises(InputError, match="steps of its own"):
+        other = tmp_path / "strokes.json"
+        shutil.copyfile(saved / "strokes.json", other)
+        find_opening(parse_live(saved, "--strokes", other))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--near", 0.7), "began with"),
+        (("--resolution", 64, 64), "began with"),
+        (("--no-recolor",), "began with"),
+        (("--seed", 3), "began with"),
+        (("--generator", "smooth"), "began with"),
+        (("--config", "paper"), "began with"),
+    ],
+)
+def test_a_session_goes_on_with_its_own_settings(saved, words, said):
+    with pytest.raises(InputError, match=said):
+        find_opening(parse_live(saved, *words))
+    find_opening(parse_live(saved, "--near", 0.5, "--device", "cpu", "--threads", 1))
+
+
+def change(out: Path, **session: object) -> None:
+    content = json.loads((out / "strokes.json").read_text())
+    content["session"].update(session)
+    (out / "strokes.json").write_text(json.dumps(content))
+
+
+def test_a_session_from_elsewhere_runs_no_program(saved, tmp_path):
+    out = copy_of(saved, tmp_path)
+    change(out, reconstructor="evil.py:run")
+    with pytest.raises(InputError, match="a program"):
+        find_opening(parse_live(out))
+    opening = find_opening(parse_live(out, "--reconstructor", "evil.py:run"))
+    assert opening.options.reconstructor == "evil.py:run"
+
+
+def test_what_is_missing_or_damaged_is_said(saved, tmp_path):
+    out = copy_of(saved, tmp_path)
+    change(out, scene=str(tmp_path / "moved.ply"))
+    with pytest.raises(InputError, match=r"moved\.ply is missing"):
+        find_opening(parse_live(out))
+    change(out, seed="x")
+    with pytest.raises(InputError, match="damaged"):
+        find_opening(parse_live(out))
+    content = json.loads((out / "strokes.json").read_text())
+    del content["session"]
+    (out / "strokes.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="does not tell of which scene"):
+        find_opening(parse_live(out))
+
+
+def test_a_session_is_not_begun_over(saved, splat, tmp_path, monkeypatch, capsys):
+    words = ("live", splat, "--out", saved, "--no-open")
+    assert run(monkeypatch, *words) == 2
+    assert f"go on with it by `gscompleter live {saved}`" in capsys.readouterr().err
+    assert find_opening(parse_live(splat, "--out", saved, "--overwrite")).steps == ()
+    with pytest.raises(InputError, match="holds the input"):
+        find_opening(parse_live(splat, "--out", splat.parent))
+
+
+def test_a_program_that_is_killed_while_it_writes_leaves_whole_steps(begun, tmp_path, monkeypatch):
+    """Another mask takes the place of one that was undone."""
+    began = saving.Began(parse_live("splat.ply"), None, None)
+    journal = Journal(tmp_path / "out", began)
+    two = begun.extended(begun.latest, STEPS[1]).extended(begun.latest, STEPS[2])
+    journal.write(two)
+    back = undo_step(two)
+    journal.write(back)
+    assert (actions_in(tmp_path / "out"), actions_in(tmp_path / "out", "undone")) == (
+        ["remove"],
+        ["remove"],
+    )
+
+    def die(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gscompleter.apps.live.journal.write_masks", die)
+    with pytest.raises(KeyboardInterrupt):
+        journal.write(back.extended(begun.latest, Step("fill", CAMERAS[1], SPOT)))
+    # The step that was undone is given up before its mask is.
+    assert actions_in(tmp_path / "out") == ["remove"]
+    assert actions_in(tmp_path / "out", "undone") == []
+    monkeypatch.undo()
+    journal.write(undo_step(back))
+    assert list_session(tmp_path / "out") >= {"strokes.json", "images/stroke1.png"}
+    assert redo_step(undo_step(back)).steps == back.steps
+    assert list_steps(undo_step(back)) == list_steps(two)[:2]
 
 
 @contextmanager
