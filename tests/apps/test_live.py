@@ -537,6 +537,7 @@ def test_a_step_is_asked_for_shown_undone_and_done_again(server, page):
     said = do(page, request_for("repair", mask=mask))
     assert "are removed" in said["text"]
     assert (said["busy"], said["revision"], said["steps"]) == (False, 1, 1)
+    assert said["saved"] is False
     told = json.loads(ask(server, "GET", "/difference")[1])
     assert told["revision"] == 1
     name = told["chunks"][-1]["name"]
@@ -547,7 +548,8 @@ def test_a_step_is_asked_for_shown_undone_and_done_again(server, page):
     assert json.loads(page.difference)["chunks"][-1]["hidden"] is None
     said = do(page, request_for("redo"))
     assert (said["steps"], said["undone"]) == (1, 0)
-    assert do(page, request_for("save"))["text"] == "Saved."
+    said = do(page, request_for("save"))
+    assert (said["text"], said["saved"]) == ("Saved.", True)
     # The page's box is where the page has it.
     said = do(page, request_for("remove", box=CRATE, box_rotation=(1.0, 0.0, 0.0, 0.0)))
     assert "--box -0.6 0.2 2.1 0.4 1.47 3.1" in said["text"]
@@ -580,6 +582,17 @@ def test_a_hole_is_told_to_the_page_that_asks(page):
     said = do(page, request_for("find"))
     assert said["camera"] is None
     assert "No large hole" in said["text"]
+
+
+def test_a_step_that_is_not_kept_is_done_and_says_so(page, monkeypatch):
+    def fail(_: Session) -> None:
+        raise InputError("The disk is full.")
+
+    monkeypatch.setattr(page._journal, "write", fail)
+    said = do(page, request_for("remove", box=CRATE))
+    assert said["steps"] == 1
+    assert "are removed" in said["text"]
+    assert said["text"].endswith("This step is not kept on the disk: The disk is full.")
 
 
 def test_an_error_is_a_sentence_and_ends_nothing(page, monkeypatch, capsys):

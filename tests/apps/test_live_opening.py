@@ -123,6 +123,7 @@ def actions_in(out: Path, key: str = "frames") -> list[str]:
     return [row["action"] for row in json.loads((out / "strokes.json").read_text())[key]]
 
 
+@pytest.mark.slow
 def test_each_step_is_kept_at_once_and_a_session_goes_on(room, splat, tmp_path):
     out = tmp_path / "out"
     begun = Program(room, "--scene", splat, "--out", out, *SMALL)
@@ -130,7 +131,6 @@ def test_each_step_is_kept_at_once_and_a_session_goes_on(room, splat, tmp_path):
     for count, step in enumerate(STEPS, start=1):
         begun.do(step)
         assert len(actions_in(out)) == count
-    assert begun.page.channel.latest["saved"] is True  # the last message came before the steps
 
     # Nothing of the first program ended: it may have been killed.
     again = Program(out)
@@ -211,6 +211,27 @@ def test_what_a_session_saved_and_did_since_is_told_apart(saved, program, begun)
 
 def copy_of(saved: Path, tmp_path: Path) -> Path:
     return Path(shutil.copytree(saved, tmp_path / "copy"))
+
+
+def test_a_session_goes_on_and_undo_reaches_back_to_the_input(program, saved, begun, tmp_path):
+    """Nothing of the first program ended: it may have been killed."""
+    out = copy_of(saved, tmp_path)
+    again = Program(out)
+    assert [(step.box, step.mask) for step in again.session.steps] == [(CRATE, None), (None, SPOT)]
+    assert is_same(again.scene, program.scene)
+    said = again.page.channel.latest
+    assert (said["steps"], said["revision"], said["saved"]) == (2, 1, False)
+    assert "2 steps" in said["text"]
+    again.do(STEPS[2])
+    assert len(actions_in(out)) == 3
+    for left, is_saved in ((2, False), (1, True), (0, False)):
+        said = again.ask("undo")
+        assert (said["steps"], said["saved"]) == (left, is_saved)
+        assert (len(actions_in(out)), len(actions_in(out, "undone"))) == (left, 3 - left)
+    assert is_same(again.scene, begun.latest.scene)
+    assert "All steps are undone" in again.ask("save")["text"]
+    opening = find_opening(parse_live(out))
+    assert [step.mask for step in opening.undone] == [None, SPOT, OTHER]
 
 
 def test_a_splat_that_was_changed_since_is_a_splat_of_its_own(saved, tmp_path):

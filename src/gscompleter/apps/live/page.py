@@ -32,6 +32,7 @@ from gscompleter.system.progress import notify_of_stages
 from gscompleter.types import Camera
 
 GOES_ON = "{} of the session are done again; go on, or undo them."
+ALL_UNDONE = "All steps are undone: there is nothing to save, and the last Save stays as it is."
 NOT_KEPT = "This step is not kept on the disk: {}"
 WELCOME = "Fly to a hole and press “Complete here”, or paint over what is wrong and press “Repair”."
 BUSY = "The last request is still running; press the button again when it is done."
@@ -167,6 +168,8 @@ class LivePage:
 
     def save(self, request: PageRequest) -> Outcome:
         """Write the completed scene."""
+        if not self.session.steps and self._journal.has_saved:
+            raise InputError(ALL_UNDONE)
         text = self._save(self.session)
         self._journal.set_saved(self.session)
         return Outcome(text)
