@@ -25,9 +25,11 @@ from scipy.spatial.transform import Rotation
 from command import run
 from gscompleter import load_cameras, load_ply, save_ply
 from gscompleter.apps.commands.live import LiveOptions
-from gscompleter.apps.live import serving
+from gscompleter.apps.live import saving, serving
 from gscompleter.apps.live.addresses import Address, resolve_host
 from gscompleter.apps.live.difference import PageScene
+from gscompleter.apps.live.journal import Journal
+from gscompleter.apps.live.opening import find_opening
 from gscompleter.apps.live.page import BUSY, LivePage
 from gscompleter.apps.live.request import parse_request
 from gscompleter.apps.live.server import LiveServer
@@ -474,8 +476,13 @@ def test_only_what_changed_is_sent(splat_begun, repaired_spot, tmp_path):
 
 
 @pytest.fixture
-def page(splat_ready, splat_begun, monkeypatch) -> LivePage:
-    built = serving.build_page(splat_ready, splat_begun, Libraries({}, {}), QUIET)
+def journal(splat_ready, tmp_path) -> Journal:
+    return Journal(tmp_path / "kept", saving.describe_began(splat_ready))
+
+
+@pytest.fixture
+def page(splat_ready, splat_begun, journal, monkeypatch) -> LivePage:
+    built = serving.build_page(splat_ready, splat_begun, Libraries({}, {}), QUIET, journal)
     monkeypatch.setattr(built, "_save", lambda _: "Saved.")
     return built
 
@@ -530,6 +537,7 @@ def test_a_step_is_asked_for_shown_undone_and_done_again(server, page):
     said = do(page, request_for("repair", mask=mask))
     assert "are removed" in said["text"]
     assert (said["busy"], said["revision"], said["steps"]) == (False, 1, 1)
+    assert said["saved"] is False
     told = json.loads(ask(server, "GET", "/difference")[1])
     assert told["revision"] == 1
     name = told["chunks"][-1]["name"]
@@ -540,7 +548,8 @@ def test_a_step_is_asked_for_shown_undone_and_done_again(server, page):
     assert json.loads(page.difference)["chunks"][-1]["hidden"] is None
     said = do(page, request_for("redo"))
     assert (said["steps"], said["undone"]) == (1, 0)
-    assert do(page, request_for("save"))["text"] == "Saved."
+    said = do(page, request_for("save"))
+    assert (said["text"], said["saved"]) == ("Saved.", True)
     # The page's box is where the page has it.
     said = do(page, request_for("remove", box=CRATE, box_rotation=(1.0, 0.0, 0.0, 0.0)))
     assert "--box -0.6 0.2 2.1 0.4 1.47 3.1" in said["text"]
@@ -573,6 +582,17 @@ def test_a_hole_is_told_to_the_page_that_asks(page):
     said = do(page, request_for("find"))
     assert said["camera"] is None
     assert "No large hole" in said["text"]
+
+
+def test_a_step_that_is_not_kept_is_done_and_says_so(page, monkeypatch):
+    def fail(_: Session) -> None:
+        raise InputError("The disk is full.")
+
+    monkeypatch.setattr(page._journal, "write", fail)
+    said = do(page, request_for("remove", box=CRATE))
+    assert said["steps"] == 1
+    assert "are removed" in said["text"]
+    assert said["text"].endswith("This step is not kept on the disk: The disk is full.")
 
 
 def test_an_error_is_a_sentence_and_ends_nothing(page, monkeypatch, capsys):
@@ -801,7 +821,7 @@ def test_a_malformed_request_leaves_no_traceback(server, capfd):
 def test_the_options_of_complete_are_those_of_live(room, tmp_path):
     words = ["live", str(room), "--out", str(tmp_path / "out"), "--config", "paper"]
     options = parse_command([*words, "--config.paper-registration.iterations", "7", "--seed", "3"])
-    asked = serving.make_complete_options(options)
+    asked = saving.make_complete_options(find_opening(options).options)
     paper = CompleterConfig.paper()
     registration = replace(paper.paper_registration, iterations=7)
     assert asked.config == replace(paper, paper_registration=registration)
@@ -873,7 +893,11 @@ def test_a_saved_session_is_replayed_to_the_same_bytes(
 
     words = ("repair", room, "--scene", splat, "--strokes", saved, "--out", other, "--quiet")
     assert run(monkeypatch, *words) == 0
-    names = ("completed.ply", "removed.ply", "generated.ply", "strokes.json", "targets.json")
+    # What a session began with is not the same: `repair` has settings of its own.
+    again = json.loads((other / "strokes.json").read_text())
+    for name in strokes.keys() - {"session"}:
+        assert again[name] == strokes[name], name
+    names = ("completed.ply", "removed.ply", "generated.ply", "targets.json")
     for name in (*names, "images/stroke1.png", "images/stroke4.png"):
         assert (saved / name).read_bytes() == (other / name).read_bytes(), name
     restored = tmp_path / "restored.ply"

@@ -16,7 +16,9 @@ import pytest
 
 from browsing import PATIENCE, SWITCHES, launched, pixels_of
 from command import run
-from scenes import camera_at, photographed
+from gscompleter import save_ply
+from gscompleter.types import merge
+from scenes import Room, camera_at, gaussians_of, photographed, view_of
 
 pytestmark = pytest.mark.browser
 
@@ -26,7 +28,7 @@ SMALL = ("--resolution", SIZE, SIZE, "--near", 0.5, "--far", 20, "--quiet")
 
 
 @contextmanager
-def served(*words: object) -> Iterator[str]:
+def served(*words: object, end: signal.Signals = signal.SIGTERM) -> Iterator[str]:
     """Serve the page in a process, which ends silently on SIGTERM, and return its address."""
     program = "from gscompleter.cli import main; main()"
     process = subprocess.Popen(
@@ -39,9 +41,10 @@ def served(*words: object) -> Iterator[str]:
     try:
         yield process.stdout.readline().split()[0]
     finally:
-        process.send_signal(signal.SIGTERM)
+        process.send_signal(end)
         rest, errors = process.communicate(timeout=30)
-    assert (process.returncode, rest, errors) == (0, "", "")
+    code = 0 if end == signal.SIGTERM else -end
+    assert (process.returncode, rest, errors) == (code, "", "")
 
 
 class LiveTab:
@@ -98,6 +101,34 @@ class LiveTab:
         assert [url for url in self.asked if not url.startswith(allowed)] == []
 
 
+def check_places(tab: LiveTab) -> None:
+    """Check that no tool moves anything, and that on a phone what it needs can be reached."""
+
+    def places() -> list[Any]:
+        parts = ("#stage", "#drags", "#live", "#save-camera", "#shots")
+        return [tab.page.locator(part).bounding_box() for part in parts]
+
+    for width in (1280, 640):
+        tab.page.set_viewport_size({"width": width, "height": 560})
+        before = places()
+        for key in "mlxf":
+            tab.key(key)
+            # On a narrow page the buttons are those of the tool, in the same place.
+            assert [place["y"] for place in places()] == [place["y"] for place in before], key
+            assert width < 720 or places() == before, key
+    tab.page.set_viewport_size({"width": 390, "height": 700})
+    for key, actions in (("m", ("repair", "remove", "fill")), ("x", ("remove",)), ("f", ("find",))):
+        tab.key(key)
+        for action in (*actions, "undo", "redo", "save"):
+            place = tab.page.locator(f"[data-ask={action}]").bounding_box()
+            assert place["x"] >= 0
+            assert place["x"] + place["width"] <= 390, (key, action)
+    tab.key("m")
+    tab.page.set_viewport_size({"width": 1280, "height": 560})
+    tab.key("f")
+    tab.page.set_viewport_size({"width": 640, "height": 560})
+
+
 @pytest.fixture
 def fox_splat(shared) -> Path:
     path = shared / "splats" / "fox" / "splat.ply"
@@ -117,11 +148,15 @@ def test_a_hole_that_is_flown_to_closes_opens_again_and_is_saved(tmp_path, monke
         assert "Fly to a hole" in tab.page.inner_text("#message")
         assert tab.ask("undo").startswith("There is nothing to undo")
         tab.drag((-60, 40), (0, 40))
+        assert not tab.page.is_visible("#unsaved")
         assert "Gaussians are added" in tab.ask("complete")
+        assert tab.page.is_visible("#unsaved")
+        check_places(tab)
         assert tab.ask("undo") == "Undone. Steps left: 0."
         assert "The scene has a hole here" in tab.ask("find")
         assert "Gaussians are added" in tab.ask("complete")
         assert "Saved in" in tab.ask("save")
+        assert not tab.page.is_visible("#unsaved")
         # A page that is opened again shows the scene as it is.
         again = LiveTab(browser, address)
         again.page.evaluate("gsc.settled()")
@@ -135,6 +170,47 @@ def test_a_hole_that_is_flown_to_closes_opens_again_and_is_saved(tmp_path, monke
     assert run(monkeypatch, *words) == 0
     for name in ("completed.ply", "context.ply", "generated.ply", "images/target1_after.png"):
         assert (out / name).read_bytes() == (other / name).read_bytes(), name
+
+
+@pytest.mark.slow
+def test_a_killed_program_shows_its_steps_again(tmp_path):
+    """SIGKILL after each of three steps; then undo three times gives the input."""
+    cameras = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in PLACES]
+    room, out, splat = (
+        photographed(tmp_path / "room", cameras),
+        tmp_path / "out",
+        tmp_path / "s.ply",
+    )
+    save_ply(splat, merge([gaussians_of(view_of(Room(), camera)) for camera in cameras]))
+    words: tuple[object, ...] = (room, "--scene", splat, "--context", 0, 1, "--out", out)
+    words = (*words, *SMALL[:-1])
+    corners = ([-0.6, 0.2, 2.1, 0.4, 1.47, 3.1], [-2, -1, 2, -1.2, 2, 6], [1.2, -1, 2, 2, 2, 6])
+    shown = []
+    with launched(SWITCHES) as browser:
+        for count, box in enumerate(corners, start=1):
+            with served(*words, end=signal.SIGKILL) as address:
+                tab = LiveTab(browser, address)
+                if count == 1:
+                    shown.append(tab.picture())
+                tab.key("x")
+                tab.page.evaluate(f"gsc.placeBox({box})")
+                assert "are removed" in tab.ask("remove")
+                tab.key("f")
+                assert tab.stats()["live"]["steps"] == count
+                assert tab.page.is_visible("#unsaved")
+                shown.append(tab.picture())
+            words = (out,)
+        with served(out) as address:
+            tab = LiveTab(browser, address)
+            tab.page.evaluate("gsc.settled()")
+            assert "3 steps of the session are done again" in tab.page.inner_text("#message")
+            for count in (3, 2, 1, 0):
+                assert tab.stats()["live"]["steps"] == count
+                assert np.abs(tab.picture() - shown[count]).max() < 0.02
+                if count:
+                    tab.ask("undo")
+            assert not tab.page.is_visible("#unsaved")
+            tab.check_quiet()
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import contextlib
 import errno
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -478,6 +479,49 @@ def test_so_is_one_that_replaces_the_results_of_a_version_that_listed_no_files(r
         "mine.txt": "old",
         SUMMARY: "new",
     }
+
+
+def keep_session(out: Path) -> None:
+    """Write the steps of a session, which no summary lists, to a folder."""
+    (out / "images").mkdir(parents=True, exist_ok=True)
+    (out / "images" / "stroke1.png").write_text("old")
+    (out / "strokes.json").write_text('{"program": "gscompleter", "format": 1}')
+
+
+def test_the_steps_of_a_session_are_files_of_a_run(results, tmp_path):
+    alone = tmp_path / "alone"
+    keep_session(results)
+    keep_session(alone)
+    (results / "images" / "stroke_mine.png").write_text("mine")
+    files = {"strokes.json", "images/stroke1.png"}
+    assert read_listing(alone) == files
+    assert files < read_listing(results)
+    assert "images/stroke_mine.png" not in read_listing(results)
+    # Those of another program, or elsewhere, are not.
+    (alone / "strokes.json").write_text("{}")
+    assert read_listing(alone) == frozenset()
+    shutil.rmtree(alone)
+    keep_session(alone)
+    (alone / "images").rename(tmp_path / "images")
+    (alone / "images").symlink_to(tmp_path / "images")
+    assert read_listing(alone) == {"strokes.json"}
+
+
+@pytest.mark.linux
+@pytest.mark.parametrize("renames", range(8))
+def test_a_run_that_replaces_a_session_is_finished_too(results, tmp_path, renames):
+    keep_session(results)
+    outs = [results]
+    if renames < 5:
+        outs.append(tmp_path / "alone")
+        keep_session(outs[1])
+    for out in outs:
+        with writing(out, renames) as process:
+            stopped(process, signal.SIGKILL)
+        check_output(out, overwrite=True)
+        others = {"mine.txt": "old"} if out == results else {}
+        written = {"completed.ply": "new", "images/new.png": "new", SUMMARY: "new"}
+        assert tree(out) == {**written, **others}
 
 
 @pytest.mark.linux

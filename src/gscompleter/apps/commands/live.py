@@ -8,8 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from gscompleter.apps.commands.shared_options import CompletingOptions, Port, Size, list_inputs
-from gscompleter.system.files.overlap import refuse_overlap
+from gscompleter.apps.commands.shared_options import CompletingOptions, Port, Size
 from gscompleter.system.process import import_without_collection
 
 
@@ -17,19 +16,25 @@ from gscompleter.system.process import import_without_collection
 class LiveOptions(CompletingOptions):
     """Complete and repair a scene in the browser: paint over what is wrong, or fly to a hole.
 
-    The page is that of `view`. What is painted or boxed is removed, filled or repaired, and undone;
-    Save also writes strokes.json, which `repair --strokes` does again.
+    The page is that of `view`. What is painted or boxed is removed, filled or repaired, and undone.
+    Each step is kept in OUT/strokes.json at once: `gscompleter live OUT` does them again and goes
+    on, and undo reaches back into them. Save writes the result.
 
     Example: gscompleter live splat.ply --out repaired
     """
 
     folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = None
     """The splat; or the folder of photographs, in any layout that `complete` reads: those of the
-    splat that `--scene` names, or of a scene to reconstruct."""
-    out: Path = Path("live")
-    """Where results go. The folder of the Save button."""
-    resolution: Size = (256, 256)
-    """Size of images in pixels. The working size as in `complete`; smaller is faster."""
+    splat that `--scene` names, or of a scene to reconstruct. Or the OUT of a session, or its
+    completed.ply, to go on where it was."""
+    strokes: Path | None = None
+    """The strokes.json that `live` saved. The session goes on from it, on SCENE if it is given."""
+    out: Path | None = None  # type: ignore[assignment]
+    """Where results go. The folder that keeps the steps, and the results of the Save button. If not
+    given, that of the session which goes on, or else `live`."""
+    resolution: Size | None = None
+    """Size of images in pixels. The working size as in `complete`; smaller is faster. If not given,
+    that of the session which goes on, or else 256 x 256."""
     port: Port = 0
     """Port of the page; a free one if not given."""
     host: str = "127.0.0.1"
@@ -38,9 +43,7 @@ class LiveOptions(CompletingOptions):
     """Print the address without opening a browser."""
 
     def check_overlap(self) -> None:
-        """Refuse an output that is, holds or lies in an input."""
-        # A session saves several times, and reads its splat each time.
-        refuse_overlap(self.out, list_inputs(self), may_continue=False)
+        """Leave it to `find_opening`, which knows the inputs of a session that goes on."""
 
 
 def run_live(options: LiveOptions) -> None:

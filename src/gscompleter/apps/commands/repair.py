@@ -40,8 +40,8 @@ class RepairOptions(CompletingOptions):
     marks is wrong, goes, is a hole whatever stands behind it, and is filled; `strip` puts it
     back."""
     strokes: Path | None = None
-    """The strokes.json that `live` saved, in place of cameras and masks: its steps are done again,
-    at its resolution and with its photographs unless others are named."""
+    """The strokes.json that `live` saved. It stands in place of cameras and masks: its steps are
+    done again, at its resolution and with its photographs unless others are named."""
     out: Path
     """Where results go. A folder, for completed.ply, the report (report.html), images and
     summary.json."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from gscompleter.apps.live.channel import Channel
 from gscompleter.apps.live.difference import PageScene
+from gscompleter.apps.live.journal import Journal
 from gscompleter.apps.live.request import BusyError, PageRequest, parse_request
 from gscompleter.apps.live.session import (
     PERFORM,
@@ -30,6 +31,9 @@ from gscompleter.system.errors import InputError
 from gscompleter.system.progress import notify_of_stages
 from gscompleter.types import Camera
 
+GOES_ON = "{} of the session are done again; go on, or undo them."
+ALL_UNDONE = "All steps are undone: there is nothing to save, and the last Save stays as it is."
+NOT_KEPT = "This step is not kept on the disk: {}"
 WELCOME = "Fly to a hole and press “Complete here”, or paint over what is wrong and press “Repair”."
 BUSY = "The last request is still running; press the button again when it is done."
 NO_HOLE = "No large hole is left around the cameras."
@@ -68,18 +72,30 @@ class LivePage:
     """
 
     def __init__(
-        self, session: Session, content: bytes, scene: PageScene, find_hole: FindHole, save: Save
+        self,
+        session: Session,
+        content: bytes,
+        scene: PageScene,
+        find_hole: FindHole,
+        save: Save,
+        journal: Journal,
     ) -> None:
-        """Begin with the page as it is first shown; `find_hole` finds the most to gain, if any."""
+        """Begin with the page as it is first shown; `find_hole` finds the most to gain, if any.
+
+        `journal` keeps each step as it is done.
+        """
         self.session = session
         self.content = content
         self.channel = Channel()
         self._scene = scene
         self._find_hole = find_hole
         self._save = save
+        self._journal = journal
         self._requests: SimpleQueue[PageRequest] = SimpleQueue()
         self._busy = Lock()
-        self._revision = 0
+        # What was done before is a difference to the page, which has the scene as it was given.
+        count = len(session.steps)
+        self._revision = 0 if count == 0 else 1
         self._actions: dict[str, Callable[[PageRequest], Outcome]] = {
             **dict.fromkeys(PERFORM, self.do_step),
             "undo": self.undo,
@@ -88,7 +104,8 @@ class LivePage:
             "save": self.save,
         }
         self._describe_scene()
-        self.tell(WELCOME, is_busy=False)
+        done = f"{count} step{'s' if count > 1 else ''}"
+        self.tell(WELCOME if count == 0 else GOES_ON.format(done), is_busy=False)
 
     def get_chunk(self, name: str) -> bytes | None:
         """Return Gaussians that a step brought, as .spz; None if there is no such chunk."""
@@ -130,18 +147,19 @@ class LivePage:
         action: Any = request.action  # one of `PERFORM`
         step = Step(action, camera, request.read_mask(), box, request.box_rotation)
         session, text = apply_step(self.session, step)
-        self._change_session(session)
-        return Outcome(text)
+        return Outcome(self._change_session(session, text))
 
     def undo(self, request: PageRequest) -> Outcome:
         """Take the last step back."""
-        self._change_session(undo_step(self.session))
-        return Outcome(f"Undone. Steps left: {len(self.session.steps)}.")
+        session = undo_step(self.session)
+        text = f"Undone. Steps left: {len(session.steps)}."
+        return Outcome(self._change_session(session, text))
 
     def redo(self, request: PageRequest) -> Outcome:
         """Do the last step that was undone again."""
-        self._change_session(redo_step(self.session))
-        return Outcome(f"Done again. Steps: {len(self.session.steps)}.")
+        session = redo_step(self.session)
+        text = f"Done again. Steps: {len(session.steps)}."
+        return Outcome(self._change_session(session, text))
 
     def find(self, request: PageRequest) -> Outcome:
         """Find the camera with the most to gain, for the page that asks."""
@@ -150,7 +168,11 @@ class LivePage:
 
     def save(self, request: PageRequest) -> Outcome:
         """Write the completed scene."""
-        return Outcome(self._save(self.session))
+        if not self.session.steps and self._journal.has_saved:
+            raise InputError(ALL_UNDONE)
+        text = self._save(self.session)
+        self._journal.set_saved(self.session)
+        return Outcome(text)
 
     def tell(
         self, text: str, is_busy: bool = True, camera: Camera | None = None, client: str = ""
@@ -163,16 +185,25 @@ class LivePage:
                 "revision": self._revision,
                 "steps": len(self.session.steps),
                 "undone": len(self.session.undone),
+                "saved": self._journal.is_saved(self.session),
                 "camera": None if camera is None else describe_camera(camera),
                 "client": client,
             }
         )
 
-    def _change_session(self, session: Session) -> None:
+    def _change_session(self, session: Session, text: str) -> str:
+        """Show and keep a session; return the text on it, with what went wrong on the disk."""
+        if session is self.session:
+            return text
         if session.latest is not self.session.latest:
             self._revision += 1
         self.session = session
         self._describe_scene()
+        try:
+            self._journal.write(session)
+        except InputError as error:
+            return f"{text}\n{NOT_KEPT.format(error)}"
+        return text
 
     def _describe_scene(self) -> None:
         difference = self._scene.describe(self.session.latest)

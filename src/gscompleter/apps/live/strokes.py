@@ -1,4 +1,7 @@
-"""`strokes.json`: the steps of a session, which `repair --strokes` does again.
+"""`strokes.json`: the steps of a session.
+
+`live` goes on with them, and `repair --strokes` does them again. The file also has what the session
+began with, so that `live OUT` needs nothing else.
 
 Every step has a camera, with the keys of nerfstudio's `transforms.json`, so that `--target` reads
 the file, too. Masks are images beside it. There is no `file_path`: readers would take the size of a
@@ -8,31 +11,44 @@ mask for that of its camera.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
+from hashlib import sha256
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 import torch
 
 from gscompleter import __version__
-from gscompleter.apps.commands.shared_options import SceneOptions, Size
+from gscompleter.apps.commands.shared_options import (
+    WORDS_OR_PATHS,
+    CompletingOptions,
+    Size,
+)
 from gscompleter.apps.inputs.removal import Selection, check_selection
 from gscompleter.apps.live.session import UPRIGHT, Action, Session, Step
 from gscompleter.data.scene import describe_camera
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.reading import read_bytes
+from gscompleter.system.files.output_folder import STROKES_FOLDER
+from gscompleter.system.files.reading import hash_file, read_bytes
 from gscompleter.system.files.result_format import MARK
 from gscompleter.system.files.typed_json import read_typed_json
-from gscompleter.system.files.writing import replace_file
+from gscompleter.system.files.writing import STROKES_FILE
 from gscompleter.types import Camera
 
-STROKES_FILE = "strokes.json"
-MASK_FOLDER = "images"
-STROKES = (STROKES_FILE, f"{MASK_FOLDER}/stroke*.png")
+STROKES = (STROKES_FILE, f"{STROKES_FOLDER}/stroke*.png")
 """Globs of the files that are written."""
 ADVICE = "save the session again"
+OF_STROKES = ("resolution", "near", "far", "context")
+"""Options that `repair --strokes` reads, too, which are entries of their own."""
+OF_MACHINE = (
+    *("out", "overwrite", "quiet", "json", "threads"),
+    *("device", "renderer_device", "network_device"),
+)
+"""Options that each run chooses anew."""
 
 Row = tuple[float, float, float, float]
 
@@ -76,48 +92,137 @@ class StrokesFile:
     context: tuple[int, ...] | None = None
     """Frames of the photographs of the session, or of the cameras of a file; None if its cameras
     were found."""
+    saved: str | None = None
+    """Digest of the steps that the completed scene beside the file has; None without one."""
+    session: dict[str, Any] | None = None
+    """Options that the session began with; None in files of early versions."""
+    scene_sha256: str | None = None
+    """SHA-256 of the splat that it began with."""
+    undone: tuple[StrokeRow, ...] = ()
+    """Steps that were undone, the next to be done again first."""
 
 
-def write_strokes(
-    folder: Path, session: Session, options: SceneOptions, context: Sequence[int] | None
-) -> None:
-    """Write the steps of a session, their masks, and what its scene was made of, to a folder."""
-    frames = []
-    for number, step in enumerate(session.steps, start=1):
-        mask_path = None
-        if step.mask is not None:
-            mask_path = f"{MASK_FOLDER}/stroke{number}.png"
-            (folder / MASK_FOLDER).mkdir(exist_ok=True)
-            (folder / mask_path).write_bytes(step.mask)
-        frames.append(
-            {
-                "action": step.action,
-                "mask_path": mask_path,
-                "box": step.box,
-                "box_rotation": step.box_rotation,
-                **describe_camera(step.camera),
-            }
-        )
+@dataclass(frozen=True)
+class Began:
+    """What a session began with, for its `strokes.json`."""
+
+    options: CompletingOptions
+    context: tuple[int, ...] | None
+    """Photographs that it works with; None if its cameras were found, and are found again."""
+    scene_sha256: str | None
+    """SHA-256 of the splat; None if the scene was reconstructed."""
+
+
+def describe_beginning(options: CompletingOptions, context: Sequence[int] | None) -> Began:
+    """Describe what a session began with; its splat is read to know it again."""
+    scene = options.scene
+    known = None if scene is None or not scene.is_file() else hash_file(scene)
+    return Began(options, None if context is None else tuple(context), known)
+
+
+def write_strokes(folder: Path, session: Session, began: Began) -> None:
+    """Write the steps of a session that is saved, and their masks, to a folder."""
+    write_masks(folder, list_steps(session))
+    content = encode_strokes(session, began, digest_steps(session.steps))
+    (folder / STROKES_FILE).write_bytes(content)
+
+
+def list_steps(session: Session) -> tuple[Step, ...]:
+    """List the steps of a session, then those that were undone, the next to be done again first."""
+    return (*session.steps, *(step for _, step in reversed(session.undone)))
+
+
+def write_masks(folder: Path, steps: Sequence[Step], first: int = 0) -> None:
+    """Write the masks of steps, from the step at the index `first` on."""
+    for index, step in enumerate(steps):
+        if index >= first and step.mask is not None:
+            (folder / STROKES_FOLDER).mkdir(exist_ok=True)
+            (folder / name_mask(index)).write_bytes(step.mask)
+
+
+def name_mask(index: int) -> str:
+    """Name the mask of a step; names are counted from 1."""
+    return f"{STROKES_FOLDER}/stroke{index + 1}.png"
+
+
+def encode_strokes(
+    session: Session, began: Began, saved: str | None, count: int | None = None
+) -> bytes:
+    """Encode `strokes.json`, with the first `count` steps alone or all.
+
+    `saved` is the digest of the steps that the completed scene in the folder has.
+    """
+    steps = list_steps(session)[:count]
+    rows = [
+        describe_step(step, None if step.mask is None else name_mask(index))
+        for index, step in enumerate(steps)
+    ]
+    options = began.options
     content = {
         **MARK,
         "version": __version__,
         "resolution": options.resolution,
         "near": options.near,
         "far": options.far,
-        "context": None if context is None else list(context),
+        "context": began.context,
+        "saved": saved,
+        "session": describe_options(options),
+        "scene_sha256": began.scene_sha256,
         "camera_model": "PINHOLE",
-        "frames": frames,
+        "frames": rows[: len(session.steps)],
+        "undone": rows[len(session.steps) :],
     }
-    with replace_file(folder / STROKES_FILE) as file:
-        file.write((json.dumps(content, indent=1) + "\n").encode())
+    return (json.dumps(content, indent=1) + "\n").encode()
+
+
+def describe_step(step: Step, mask_path: str | None) -> dict[str, Any]:
+    """Describe a step as a row of `strokes.json`."""
+    return {
+        "action": step.action,
+        "mask_path": mask_path,
+        "box": step.box,
+        "box_rotation": step.box_rotation,
+        **describe_camera(step.camera),
+    }
+
+
+def digest_steps(steps: Sequence[Step]) -> str:
+    """Return a digest of steps, by which those of a saved scene are known again."""
+    digest = sha256()
+    for step in steps:
+        mask = None if step.mask is None else sha256(step.mask).hexdigest()
+        digest.update(json.dumps(describe_step(step, mask)).encode())
+    return digest.hexdigest()
+
+
+def describe_options(options: CompletingOptions) -> dict[str, Any]:
+    """Describe the options that a session goes on with, without those of a machine."""
+    names = [field.name for field in fields(CompletingOptions)]
+    chosen = [name for name in names if name not in (*OF_STROKES, *OF_MACHINE)]
+    return {name: describe_value(name, getattr(options, name)) for name in chosen}
+
+
+def describe_value(name: str, value: Any) -> Any:
+    """Describe the value of an option as JSON; paths are absolute, as a later run is elsewhere."""
+    if is_dataclass(value):
+        names = [field.name for field in fields(value)]
+        return {inner: describe_value(inner, getattr(value, inner)) for inner in names}
+    if isinstance(value, tuple | list):
+        return [describe_value(name, part) for part in value]
+    is_path = isinstance(value, Path)
+    is_path |= name in WORDS_OR_PATHS and isinstance(value, str) and os.path.exists(value)
+    return os.path.abspath(value) if is_path else value
+
+
+def find_strokes_file(path: Path) -> Path:
+    """Find the file that `--strokes` names, or that is in the folder that it names."""
+    return path / STROKES_FILE if path.is_dir() else path
 
 
 def read_strokes(path: Path) -> StrokesFile:
     """Read and validate a `strokes.json`, without its masks."""
     strokes = read_typed_json(StrokesFile, path, ADVICE)
-    if not strokes.frames:
-        raise InputError(f"{quote_value(path)} has no steps; {ADVICE}.", "strokes")
-    for row in strokes.frames:
+    for row in (*strokes.frames, *strokes.undone):
         # What is read lies beside the file, whatever it says.
         if row.mask_path is not None and not is_beside(row.mask_path):
             raise InputError(
@@ -129,9 +234,9 @@ def read_strokes(path: Path) -> StrokesFile:
     return strokes
 
 
-def read_steps(strokes: StrokesFile, folder: Path) -> list[Step]:
-    """Make the steps of a `strokes.json`, with cameras in its frame; read masks from `folder`."""
-    return [
+def read_steps(rows: Sequence[StrokeRow], folder: Path) -> tuple[Step, ...]:
+    """Make the steps of rows, with cameras in the frame of the file; read masks from `folder`."""
+    return tuple(
         Step(
             row.action,
             row.make_camera(),
@@ -139,8 +244,8 @@ def read_steps(strokes: StrokesFile, folder: Path) -> list[Step]:
             row.box,
             row.box_rotation,
         )
-        for row in strokes.frames
-    ]
+        for row in rows
+    )
 
 
 def is_beside(name: str) -> bool:

@@ -184,7 +184,7 @@ def load_render_cameras(
     return tuple(
         ViewerCamera(
             f"photograph-{row.frame}",
-            f"Render {row.photograph}",
+            f"View {row.photograph}",
             camera,
             make_thumbnail(folder / "images" / f"context{number}_render.png"),
         )

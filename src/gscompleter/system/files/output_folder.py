@@ -7,6 +7,9 @@ is refused.
 A folder may come from elsewhere, in an archive or a repository. So its names lead to nothing
 outside of it, links in it are not followed, and what a killed run seems to have left is finished
 only as far as that run could have done it.
+
+A session of `live` writes its steps before it saves anything: `strokes.json`, beside which its
+masks are. These files count as listed, too.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ import errno
 import json
 import os
 import random
+import re
 import shutil
 import stat
 import time
@@ -39,6 +43,7 @@ from gscompleter.system.files.unfinished import (
     remove_left_behind,
 )
 from gscompleter.system.files.writing import (
+    STROKES_FILE,
     SUMMARY_FILE,
     convert_write_errors,
     defer_interrupts,
@@ -54,6 +59,10 @@ COMMANDS = frozenset({"bench", "clean", "complete", "demo", "poses"})
 formats had numbers, which do not name the program."""
 POSES = "colmap"
 """Folder of the cameras that a completion found for its photographs; it has its own summary."""
+
+STROKES_FOLDER = "images"
+STROKE_MASK = re.compile(r"stroke\d{1,6}\.png")
+"""Name of a mask of a session, in `STROKES_FOLDER`."""
 
 MAX_SUMMARY_BYTES = 10**9
 MAX_NAME_LENGTH = 60
@@ -168,9 +177,28 @@ def read_listing(folder: Path) -> frozenset[str]:
     content = _read_own_summary(folder)
     names = None if content is None else content.get(FILES)
     if not isinstance(names, list) or SUMMARY_FILE not in names:
-        return frozenset()
+        names = []
     inside = [name for name in names if isinstance(name, str) and _is_inside(name)]
-    return frozenset(name for name in inside if _find_obstacle(folder, name) is None)
+    listed = frozenset(name for name in inside if _find_obstacle(folder, name) is None)
+    return listed | list_session(folder)
+
+
+def holds_session(folder: Path) -> bool:
+    """Return True if a session of `live` wrote its steps to a folder."""
+    return is_marked(_read_content(folder / STROKES_FILE))
+
+
+def list_session(folder: Path) -> frozenset[str]:
+    """List the files in which a session keeps its steps, as relative paths; empty without one."""
+    if not holds_session(folder):
+        return frozenset()
+    masks = list[str]()
+    with suppress(OSError):
+        masks = [
+            name for name in os.listdir(folder / STROKES_FOLDER) if STROKE_MASK.fullmatch(name)
+        ]
+    names = (STROKES_FILE, *(f"{STROKES_FOLDER}/{name}" for name in masks))
+    return frozenset(name for name in names if _find_obstacle(folder, name) is None)
 
 
 def holds_results(folder: Path) -> bool:
@@ -211,7 +239,11 @@ def refuse_link(folder: Path) -> None:
 
 def _read_summary(folder: Path) -> dict[str, Any]:
     """Read the summary of a folder; empty if there is none."""
-    path = folder / SUMMARY_FILE
+    return _read_content(folder / SUMMARY_FILE)
+
+
+def _read_content(path: Path) -> dict[str, Any]:
+    """Read a JSON file of a folder; empty if there is none, or if it is a link."""
     try:
         if not stat.S_ISREG(path.lstat().st_mode) or path.stat().st_size > MAX_SUMMARY_BYTES:
             return {}
@@ -523,7 +555,9 @@ def _list_replaced(target: Path, replaced: Path) -> frozenset[str]:
         return read_listing(target)
     # That of an early version lists nothing: what is still in its place is told by its name.
     early = describe_early(target, _read_summary(replaced))
-    return read_listing(replaced).union([] if early is None else early.files)
+    # Steps after the last save are in no summary; `strokes.json` leaves after their masks.
+    session = list_session(target)
+    return read_listing(replaced).union(session, [] if early is None else early.files)
 
 
 def _list_left(draft: Path, target: Path, replaced: Path) -> frozenset[str]:

@@ -35,6 +35,8 @@ REMOVED_FILE = "removed.ply"
 """Originals of changed and removed Gaussians of a given scene, beside the completed one."""
 EDITS_FILE = "edits.json"
 """What commands did to the scene, in their order."""
+STROKES_FILE = "strokes.json"
+"""Steps of a session of `live`, which is written after each of them, before anything is saved."""
 
 ACCESS_LIST = "system.posix_acl_access"
 """Attribute of a file that lists further users who may read or write it."""

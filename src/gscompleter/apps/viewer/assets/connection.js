@@ -7,7 +7,7 @@ const FILLING = ["repair", "fill"];
 const SILENT = "The program does not answer: it was ended, its machine sleeps, or it was started again and printed another address.";
 /* This page among all that the program serves. */
 const client = Math.random().toString(36).slice(2);
-/* The latest message of the program: text, busy, revision, steps, undone, camera, client. */
+/* The latest message of the program: text, busy, revision, steps, undone, saved, camera, client. */
 let latest = null;
 /* The revision of the scene that is shown, and what this page asked for last. */
 let shownRevision = 0;
@@ -29,7 +29,10 @@ async function connect() {
   const isHeard = new Promise((resolve) => {
     events.addEventListener("message", (event) => hear(JSON.parse(event.data)).then(resolve));
   });
-  events.addEventListener("error", () => say(SILENT));
+  events.addEventListener("error", () => {
+    say(SILENT);
+    for (const button of document.querySelectorAll("button[data-ask]")) button.disabled = true;
+  });
   await isHeard;
 }
 
@@ -44,7 +47,9 @@ async function hear(message) {
 }
 
 /* One thing is done at a time. */
-function showButtons({ busy, steps, undone }) {
+function showButtons({ busy, steps, undone, saved }) {
+  byId("unsaved").dataset.saved = String(saved);
+  document.title = saved ? content.title : `• ${content.title}`;
   byId("live").setAttribute("aria-busy", String(busy));
   for (const button of document.querySelectorAll("button[data-ask]")) button.disabled = busy;
   byId("step-undo").disabled ||= steps === 0;

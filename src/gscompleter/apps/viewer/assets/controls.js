@@ -213,6 +213,8 @@ function listen() {
   stage.addEventListener("pointercancel", onPointerEnd);
   stage.addEventListener("wheel", onWheel, { passive: false });
   stage.addEventListener("contextmenu", (event) => event.preventDefault());
+  // What lies over the picture is no part of it.
+  for (const kind of ["pointerdown", "wheel"]) byId("options").addEventListener(kind, (event) => event.stopPropagation());
   const divider = byId("divider");
   divider.addEventListener("pointerdown", (event) => {
     event.stopPropagation();

@@ -1,0 +1,437 @@
+"""A session of `live` that ended, or was killed, is opened again and goes on."""
+
+from __future__ import annotations
+
+import http.client
+import io
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from rich.console import Console
+
+from command import run
+from gscompleter import save_ply
+from gscompleter.apps.commands.live import LiveOptions
+from gscompleter.apps.live import saving, serving
+from gscompleter.apps.live.journal import Journal
+from gscompleter.apps.live.opening import Opening, find_opening
+from gscompleter.apps.live.page import LivePage
+from gscompleter.apps.live.session import Session, Step, apply_step, redo_step, undo_step
+from gscompleter.apps.live.strokes import list_steps
+from gscompleter.apps.viewer.packages import Libraries
+from gscompleter.cli import parse_command
+from gscompleter.data.scene import describe_camera
+from gscompleter.splats.edits import read_edits
+from gscompleter.system.errors import InputError
+from gscompleter.system.files.output_folder import list_session, read_listing, reserve_output
+from gscompleter.types import Camera, Gaussians, merge
+from scenes import Room, camera_at, gaussians_of, photographed, view_of
+
+SIZE = 48
+CAMERAS = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in ((-0.3, 0), (0.1, 0), (0.4, 4))]
+QUIET = Console(quiet=True)
+CRATE = (-0.6, 0.2, 2.1, 0.4, 1.47, 3.1)
+LEFT = (-2.0, -1.0, 2.0, -1.2, 2.0, 6.0)
+SMALL = ("--resolution", SIZE, SIZE, "--near", 0.5, "--far", 20, "--context", 0, 1)
+
+
+def mark(rows: slice, columns: slice) -> bytes:
+    """Make the PNG of a mask that is white there."""
+    pixels = np.zeros((SIZE, SIZE), dtype=np.uint8)
+    pixels[rows, columns] = 255
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, format="PNG")
+    return file.getvalue()
+
+
+SPOT = mark(slice(18, 30), slice(20, 32))
+OTHER = mark(slice(2, 9), slice(34, 44))
+STEPS = (
+    Step("remove", CAMERAS[0], box=CRATE),
+    Step("remove", CAMERAS[1], SPOT),
+    Step("remove", CAMERAS[1], OTHER),
+)
+"""Three steps that only remove, which takes no time."""
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory) -> Path:
+    return photographed(tmp_path_factory.mktemp("opening") / "room", CAMERAS)
+
+
+@pytest.fixture(scope="module")
+def splat(tmp_path_factory) -> Path:
+    path = tmp_path_factory.mktemp("splat") / "splat.ply"
+    save_ply(path, merge([gaussians_of(view_of(Room(), camera)) for camera in CAMERAS]))
+    return path
+
+
+def parse_live(*words: object) -> LiveOptions:
+    return parse_command(["live", *map(str, words), "--no-open", "--quiet"])
+
+
+class Program:
+    """A session without its server, as `serve_live` runs it."""
+
+    def __init__(self, *words: object) -> None:
+        self.opening: Opening = find_opening(parse_live(*words))
+        options = self.opening.options
+        with reserve_output(options.out, options.overwrite, "complete", saving.LIVE_RESULTS):
+            self.ready = saving.prepare(options, QUIET)
+            begun = serving.open_session(self.ready, self.opening, QUIET)
+            self.journal: Journal = serving.open_journal(self.ready, self.opening, begun)
+        libraries = Libraries({}, {})
+        self.page: LivePage = serving.build_page(self.ready, begun, libraries, QUIET, self.journal)
+
+    @property
+    def session(self) -> Session:
+        return self.page.session
+
+    def do(self, step: Step) -> None:
+        session, text = apply_step(self.session, step)
+        self.page._change_session(session, text)
+
+    def ask(self, action: str) -> dict:
+        self.page.submit(json.dumps({"action": action}).encode())
+        self.page.handle(self.page._requests.get())
+        return self.page.channel.latest
+
+    @property
+    def scene(self) -> Gaussians:
+        return self.session.latest.scene
+
+
+def is_same(one: Gaussians, other: Gaussians) -> bool:
+    names = ("means", "scales", "quats", "opacities", "sh", "generated")
+    return all(torch.equal(getattr(one, name), getattr(other, name)) for name in names)
+
+
+def actions_in(out: Path, key: str = "frames") -> list[str]:
+    return [row["action"] for row in json.loads((out / "strokes.json").read_text())[key]]
+
+
+@pytest.mark.slow
+def test_each_step_is_kept_at_once_and_a_session_goes_on(room, splat, tmp_path):
+    out = tmp_path / "out"
+    begun = Program(room, "--scene", splat, "--out", out, *SMALL)
+    assert not out.exists()
+    for count, step in enumerate(STEPS, start=1):
+        begun.do(step)
+        assert len(actions_in(out)) == count
+
+    # Nothing of the first program ended: it may have been killed.
+    again = Program(out)
+    assert [step.box for step in again.session.steps] == [CRATE, None, None]
+    assert [step.mask for step in again.session.steps] == [None, SPOT, OTHER]
+    assert is_same(again.scene, begun.scene)
+    said = again.page.channel.latest
+    assert (said["steps"], said["revision"], said["saved"]) == (3, 1, False)
+    assert "3 steps" in said["text"]
+    for left in (2, 1, 0):
+        assert again.ask("undo")["steps"] == left
+        assert len(actions_in(out)) == left
+    assert is_same(again.scene, begun.session.completions[0].scene)
+    # What was undone can be done again by the next program, too.
+    again.ask("redo")
+    third = Program(out)
+    assert (len(third.session.steps), len(third.session.undone)) == (1, 2)
+    assert third.ask("redo")["steps"] == 2
+    third.ask("redo")
+    assert is_same(third.scene, begun.scene)
+
+
+@pytest.fixture(scope="module")
+def program(room, splat, tmp_path_factory) -> Program:
+    """Return a program that saved its session, and did a further step."""
+    out = tmp_path_factory.mktemp("saved") / "out"
+    program = Program(room, "--scene", splat, "--out", out, *SMALL)
+    program.do(STEPS[0])
+    assert "Saved in" in program.ask("save")["text"]
+    assert program.page.channel.latest["saved"] is True
+    program.do(STEPS[1])
+    return program
+
+
+@pytest.fixture(scope="module")
+def saved(program) -> Path:
+    """Return the folder of the session."""
+    return program.opening.out
+
+
+@pytest.fixture
+def begun(program) -> Session:
+    """Return the session without steps."""
+    session = program.session
+    return replace(session, completions=session.completions[:1], steps=())
+
+
+def test_a_completed_splat_of_a_session_is_opened_as_the_session(saved, tmp_path):
+    for name in (saved, saved / "completed.ply", saved / "strokes.json"):
+        words = ("--strokes", name) if name.suffix == ".json" else (name,)
+        opening = find_opening(parse_live(*words))
+        assert opening.out == saved
+        assert len(opening.steps) == 2
+        assert opening.options.resolution == (SIZE, SIZE)
+        assert opening.options.context == (0, 1)
+    # Elsewhere, what is saved there is not what the new folder has.
+    elsewhere = find_opening(parse_live(saved, "--out", tmp_path / "new"))
+    assert (len(elsewhere.steps), elsewhere.saved) == (2, None)
+    assert find_opening(parse_live(saved)).saved is not None
+
+
+def test_what_a_session_saved_and_did_since_is_told_apart(saved, program, begun):
+    opening = find_opening(parse_live(saved))
+    assert read_listing(saved) >= {"completed.ply", "strokes.json", "images/stroke2.png"}
+    files = json.loads((saved / "summary.json").read_text())["files"]
+    assert "images/stroke2.png" not in files
+    steps = opening.steps
+    journal = Journal(saved, program.journal._began, opening.saved)
+    assert not journal.is_saved(begun)
+    assert journal.is_saved(replace(begun, steps=steps[:1]))
+    assert not journal.is_saved(replace(begun, steps=steps))
+    state, command = serving.describe_end(replace(begun, steps=steps), journal)
+    assert "Not saved" in state
+    assert command == f"To go on: gscompleter live {saved}"
+    assert serving.describe_end(replace(begun, steps=steps[:1]), journal)[0].startswith("Saved")
+    assert serving.describe_end(begun, Journal(saved / "other", program.journal._began)) == []
+
+
+def copy_of(saved: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(saved, tmp_path / "copy"))
+
+
+def test_a_session_goes_on_and_undo_reaches_back_to_the_input(program, saved, begun, tmp_path):
+    """Nothing of the first program ended: it may have been killed."""
+    out = copy_of(saved, tmp_path)
+    again = Program(out)
+    assert [(step.box, step.mask) for step in again.session.steps] == [(CRATE, None), (None, SPOT)]
+    assert is_same(again.scene, program.scene)
+    said = again.page.channel.latest
+    assert (said["steps"], said["revision"], said["saved"]) == (2, 1, False)
+    assert "2 steps" in said["text"]
+    again.do(STEPS[2])
+    assert len(actions_in(out)) == 3
+    for left, is_saved in ((2, False), (1, True), (0, False)):
+        said = again.ask("undo")
+        assert (said["steps"], said["saved"]) == (left, is_saved)
+        assert (len(actions_in(out)), len(actions_in(out, "undone"))) == (left, 3 - left)
+    assert is_same(again.scene, begun.latest.scene)
+    assert "All steps are undone" in again.ask("save")["text"]
+    opening = find_opening(parse_live(out))
+    assert [step.mask for step in opening.undone] == [None, SPOT, OTHER]
+
+
+def test_a_splat_that_was_changed_since_is_a_splat_of_its_own(saved, tmp_path):
+    out = copy_of(saved, tmp_path)
+    with (out / "completed.ply").open("r+b") as file:
+        file.seek(-1, os.SEEK_END)
+        file.write(b"\x01")
+    opening = find_opening(parse_live(out / "completed.ply", "--out", tmp_path / "new"))
+    assert (opening.steps, opening.options.folder) == ((), out / "completed.ply")
+    notes = find_opening(parse_live(out)).notes
+    assert any("changed by another program" in note for note in notes)
+
+
+def test_a_completed_splat_without_steps_is_opened_itself(saved, tmp_path):
+    out = copy_of(saved, tmp_path)
+    (out / "strokes.json").unlink()
+    for name in (out, out / "completed.ply"):
+        opening = find_opening(parse_live(name, "--out", tmp_path / "new"))
+        assert (opening.steps, opening.options.folder) == ((), out / "completed.ply")
+    assert len(read_edits(opening.options.folder).edits) == 1
+
+
+def test_steps_are_done_on_a_scene_that_is_named(saved, room, splat, tmp_path):
+    words = (room, "--scene", splat, "--strokes", saved, "--out", tmp_path / "new")
+    opening = find_opening(parse_live(*words))
+    assert (len(opening.steps), opening.options.folder) == (2, room)
+    assert opening.options.context == (0, 1)
+    with pytest.raises(InputError, match="steps of its own"):
+        other = tmp_path / "strokes.json"
+        shutil.copyfile(saved / "strokes.json", other)
+        find_opening(parse_live(saved, "--strokes", other))
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--near", 0.7), "began with"),
+        (("--resolution", 64, 64), "began with"),
+        (("--no-recolor",), "began with"),
+        (("--seed", 3), "began with"),
+        (("--generator", "smooth"), "began with"),
+        (("--config", "paper"), "began with"),
+    ],
+)
+def test_a_session_goes_on_with_its_own_settings(saved, words, said):
+    with pytest.raises(InputError, match=said):
+        find_opening(parse_live(saved, *words))
+    find_opening(parse_live(saved, "--near", 0.5, "--device", "cpu", "--threads", 1))
+
+
+def change(out: Path, **session: object) -> None:
+    content = json.loads((out / "strokes.json").read_text())
+    content["session"].update(session)
+    (out / "strokes.json").write_text(json.dumps(content))
+
+
+def test_a_session_from_elsewhere_runs_no_program(saved, tmp_path):
+    out = copy_of(saved, tmp_path)
+    change(out, reconstructor="evil.py:run")
+    with pytest.raises(InputError, match="a program"):
+        find_opening(parse_live(out))
+    opening = find_opening(parse_live(out, "--reconstructor", "evil.py:run"))
+    assert opening.options.reconstructor == "evil.py:run"
+
+
+def test_what_is_missing_or_damaged_is_said(saved, tmp_path):
+    out = copy_of(saved, tmp_path)
+    change(out, scene=str(tmp_path / "moved.ply"))
+    with pytest.raises(InputError, match=r"moved\.ply is missing"):
+        find_opening(parse_live(out))
+    change(out, seed="x")
+    with pytest.raises(InputError, match="damaged"):
+        find_opening(parse_live(out))
+    content = json.loads((out / "strokes.json").read_text())
+    del content["session"]
+    (out / "strokes.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="does not tell of which scene"):
+        find_opening(parse_live(out))
+
+
+def test_a_session_is_not_begun_over(saved, splat, tmp_path, monkeypatch, capsys):
+    words = ("live", splat, "--out", saved, "--no-open")
+    assert run(monkeypatch, *words) == 2
+    assert f"go on with it by `gscompleter live {saved}`" in capsys.readouterr().err
+    assert find_opening(parse_live(splat, "--out", saved, "--overwrite")).steps == ()
+    with pytest.raises(InputError, match="holds the input"):
+        find_opening(parse_live(splat, "--out", splat.parent))
+
+
+def test_a_program_that_is_killed_while_it_writes_leaves_whole_steps(begun, tmp_path, monkeypatch):
+    """Another mask takes the place of one that was undone."""
+    began = saving.Began(parse_live("splat.ply"), None, None)
+    journal = Journal(tmp_path / "out", began)
+    two = begun.extended(begun.latest, STEPS[1]).extended(begun.latest, STEPS[2])
+    journal.write(two)
+    back = undo_step(two)
+    journal.write(back)
+    assert (actions_in(tmp_path / "out"), actions_in(tmp_path / "out", "undone")) == (
+        ["remove"],
+        ["remove"],
+    )
+
+    def die(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("gscompleter.apps.live.journal.write_masks", die)
+    with pytest.raises(KeyboardInterrupt):
+        journal.write(back.extended(begun.latest, Step("fill", CAMERAS[1], SPOT)))
+    # The step that was undone is given up before its mask is.
+    assert actions_in(tmp_path / "out") == ["remove"]
+    assert actions_in(tmp_path / "out", "undone") == []
+    monkeypatch.undo()
+    journal.write(undo_step(back))
+    assert list_session(tmp_path / "out") >= {"strokes.json", "images/stroke1.png"}
+    assert redo_step(undo_step(back)).steps == back.steps
+    assert list_steps(undo_step(back)) == list_steps(two)[:2]
+
+
+@contextmanager
+def served(*words: object) -> Iterator[tuple[subprocess.Popen, Callable[[str, bytes], dict]]]:
+    """Serve a page in a process, and ask it as the page does, until the block kills it."""
+    # The page itself is not looked at, so that it needs no libraries.
+    program = (
+        "from gscompleter.apps.viewer import packages as p; from gscompleter.cli import main;"
+        "p.load_libraries = lambda: p.Libraries({}, {}); main()"
+    )
+    process = subprocess.Popen(
+        [sys.executable, "-c", program, "live", *map(str, words), "--no-open"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    found = re.match(r"http://(.*)/\?token=(\S+)", process.stdout.readline())
+    assert found is not None
+    host, token = found.groups()
+
+    def ask(action: str, body: bytes) -> dict:
+        """Ask for an action, and wait for its last message."""
+        events = http.client.HTTPConnection(host, timeout=120)
+        events.request("GET", f"/events?token={token}")
+        heard = events.getresponse()
+        last = json.loads(next_data(heard))
+        if action:
+            asking = http.client.HTTPConnection(host, timeout=120)
+            headers = {"Content-Type": "application/json"}
+            asking.request("POST", f"/do?token={token}", body, headers)
+            assert asking.getresponse().status == 202
+            last = json.loads(next_data(heard))
+            while last["busy"]:
+                last = json.loads(next_data(heard))
+        events.close()
+        return last
+
+    try:
+        yield process, ask
+    finally:
+        process.kill()
+        process.communicate()
+
+
+def next_data(response: http.client.HTTPResponse) -> bytes:
+    line = response.readline()
+    while not line.startswith(b"data: "):
+        line = response.readline()
+    return line.removeprefix(b"data: ")
+
+
+def request_for(action: str, camera: Camera, **more: object) -> bytes:
+    told = {"camera_model": "PINHOLE", "frames": [describe_camera(camera)]}
+    return json.dumps({"action": action, "client": "me", "camera": told, **more}).encode()
+
+
+@pytest.mark.slow
+def test_a_killed_program_loses_no_step(room, splat, tmp_path):
+    """SIGKILL after each of three steps; then undo three times gives the input."""
+    out = tmp_path / "out"
+    words: tuple[object, ...] = (room, "--scene", splat, "--out", out, *SMALL)
+    boxes = (CRATE, LEFT, (1.2, -1.0, 2.0, 2.0, 2.0, 6.0))
+    for count, box in enumerate(boxes, start=1):
+        with served(*words) as (process, ask):
+            assert ask("", b"")["steps"] == count - 1
+            said = ask("remove", request_for("remove", CAMERAS[0], box=box))
+            assert (said["steps"], said["saved"]) == (count, False), said["text"]
+            os.kill(process.pid, signal.SIGKILL)
+        words = (out,)
+    with served(out) as (process, ask):
+        assert ask("", b"")["steps"] == 3
+        for left in (2, 1, 0):
+            said = ask("undo", b'{"action": "undo"}')
+            assert said["steps"] == left
+        assert ask("redo", b'{"action": "redo"}')["steps"] == 1
+        assert "Saved in" in ask("save", b'{"action": "save"}')["text"]
+        assert ask("undo", b'{"action": "undo"}')["saved"] is False
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    *_, state, command = errors.splitlines()
+    assert state.startswith("Not saved")
+    assert command == f"To go on: gscompleter live {out}"
+    # Nothing is left in the way.
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
+    assert not [path for path in out.iterdir() if path.name.startswith(".")]
+    assert read_listing(out) >= {"completed.ply", "strokes.json"}
