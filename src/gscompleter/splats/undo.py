@@ -117,8 +117,8 @@ def check_undone(path: Path, edits: Edits, numbers: Collection[int], out: Path) 
     count = len(edits.edits)
     if not edits:
         raise InputError(
-            f"There is no {EDITS_FILE} beside {quote_value(path)}, which lists its edits; leave "
-            "--last and --edit out."
+            f"There is no {EDITS_FILE} beside {quote_value(path)}, which lists its edits; take it "
+            "from the folder of results, or undo all edits at once."
         )
     for number in numbers:
         if not 1 <= number <= count:
@@ -131,7 +131,7 @@ def check_undone(path: Path, edits: Edits, numbers: Collection[int], out: Path) 
     if not can_undo(edits, first):
         raise InputError(
             f"{quote_value(path)} was changed by another program after edit {first}, so that it "
-            "cannot be taken off alone; leave --last and --edit out."
+            "cannot be taken off alone; undo all edits at once."
         )
     if get_writer(out) is not save_ply:
         raise InputError("An earlier state is a .ply; name such a file.", "out")
@@ -273,5 +273,5 @@ def check_columns(scene: SceneFile, layout: SceneFile) -> None:
     if columns[0] != columns[1] or not is_same_mode:
         raise InputError(
             "An edit changed the properties of the splat, such as the degree of its harmonics, so "
-            "that edits cannot be taken off one by one; leave --last and --edit out."
+            "that edits cannot be taken off one by one; undo all at once."
         )
