@@ -58,6 +58,7 @@ def test_out_holds_all_that_the_contract_names(completed):
     assert {p.name for p in completed.iterdir()} == {
         "completed.ply",
         "context.ply",
+        "edits.json",
         "generated.ply",
         "images",
         "report.html",
