@@ -91,7 +91,7 @@ class DepthOptions(RunOptions):
     depth_weights: Path | None = None
     """Weights of that depth. A file; downloaded if not given."""
     renderer_device: Literal["cpu", "cuda"] | None = None
-    """Device of the renderer alone, and of the photographs; as `--device` if not given."""
+    """Device of the renderer and the photographs; as `--device` if not given."""
     network_device: Literal["cpu", "cuda", "mps"] | None = None
     """Device of the networks alone: cuda for GPUs of NVIDIA and AMD, mps for those of a Mac; as
     `--device` if not given."""
