@@ -161,7 +161,7 @@ class SceneOptions(ComputeOptions, WritingOptions, MaskOptions):
     far: float | None = None
     """Largest depth in the scene, in the unit of its cameras. Else as for near."""
     no_given_depth: bool = False
-    """Ignore the depth that SCENE holds: depth maps, laser sweeps and COLMAP's points."""
+    """Ignore the depth that SCENE holds: depth maps, laser sweeps, COLMAP's points."""
     no_masks: bool = False
     """Use what masks and alpha channels of photographs hide instead of ignoring it."""
     ignore: Path | None = None
