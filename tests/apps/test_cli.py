@@ -341,7 +341,7 @@ def test_what_is_no_command_gets_a_sentence_too(monkeypatch, capsys, words):
         ),
         (
             ("evaluate", "a", "--target=3"),
-            "evaluate has no option --target, which belongs to complete, remove (see",
+            "evaluate has no option --target, which belongs to complete, remove, repair (see",
         ),
         (("view", "a", "--out", "b"), "view has no option --out, which belongs to complete, "),
         (

@@ -76,7 +76,7 @@ class GeneratorOptions(Settings):
     generator_retries: int | None = None
     """Further seeds to try if the image disagrees with the photographs (0)."""
     generator_offload: bool = False
-    """Keep only the active part of the model on the GPU, which needs less GPU memory."""
+    """Keep only the active part of the model on the GPU, to need less GPU memory."""
     generator_steps: int | None = None
     """Denoising steps: for pe-field 4, as in the paper (its authors' demo has 28), for
     diffusers-inpaint the pipeline's own number."""

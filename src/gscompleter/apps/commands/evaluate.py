@@ -114,8 +114,8 @@ class EvaluateOptions(SynthesisOptions, EngineOptions, MaskOptions):
     resolution: Size | None = None
     """Size of images in pixels. The working size as in `complete`; by default that of the cases."""
     no_masks: bool = False
-    """Use also what masks (black) or alpha channels of photographs hide, instead of ignoring it. In
-    the methods and in the scores."""
+    """Use what masks and alpha channels of photographs hide instead of ignoring it. In the
+    methods and in the scores."""
     ignore_moving: bool = False
     """Ignore boxes of moving objects in the same way (Waymo, nuScenes)."""
     one_per_scene: bool = False

@@ -30,7 +30,7 @@ class RemoveOptions(CompleteOptions):
     """Folder of the photographs of the splat, in any layout that `complete` reads; leave it out if
     there are none."""
     scene: Path = field()  # without the default of `complete`
-    """File of Gaussians (a splat) to work on. Something is removed from it."""
+    """File of Gaussians (a splat) to work on."""
     box: tuple[float, ...] = ()
     """Remove Gaussians inside of boxes: smallest x, y and z of each, then largest."""
     box_rotation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)

@@ -91,7 +91,7 @@ class DepthOptions(RunOptions):
     depth_weights: Path | None = None
     """Weights of that depth. A file; downloaded if not given."""
     renderer_device: Literal["cpu", "cuda"] | None = None
-    """Device of the renderer alone, and of the photographs; as `--device` if not given."""
+    """Device of the renderer and the photographs; as `--device` if not given."""
     network_device: Literal["cpu", "cuda", "mps"] | None = None
     """Device of the networks alone: cuda for GPUs of NVIDIA and AMD, mps for those of a Mac; as
     `--device` if not given."""
@@ -109,8 +109,8 @@ class ReconstructorOptions(DepthOptions):
     """Options of every command with a choice of one reconstructor."""
 
     reconstructor: str = "plane-sweep"
-    """Model that turns photographs into Gaussians. It is plane-sweep, one of `gscompleter models`,
-    or a function of yours as file.py:function."""
+    """Model that turns photographs into Gaussians. Also one of `gscompleter models`, or a function
+    of yours as file.py:function."""
     weights: Path | None = None
     """Weights of the reconstructor. A file; downloaded if not given."""
 
@@ -125,11 +125,10 @@ class MaskOptions(Settings):
     """Options of every command that reads masks."""
 
     invert_masks: bool = False
-    """Read masks the other way round: those of what goes if some are given, of which black then
-    goes, or else those of photographs, of which white is then ignored."""
+    """Read masks the other way round: those of what goes if there are any, or else those of
+    photographs (white is then ignored)."""
     large_masks: bool = False
-    """Go on with masks that take away more than half of most images, or of the splat: they are
-    meant so."""
+    """Go on with masks that take away more than half of images or of the splat."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -152,22 +151,22 @@ class SceneOptions(ComputeOptions, WritingOptions, MaskOptions):
     Detected if not given."""
     scene: Path | None
     resolution: Size | None = None
-    """Size of images in pixels. The working size: the longest side (photographs are never
-    enlarged), or height and width (photographs are scaled and cropped), or `full`. If not given,
-    640, or the size that the splat was trained at if that is smaller."""
+    """Size of images in pixels. The working size: longest side (photographs are never enlarged),
+    or height and width (scaled and cropped), or `full`. If not given, 640, or that of the splat's
+    training if smaller."""
     near: float | None = None
     """Smallest depth in the scene, in the unit of its cameras. If not given, that of the data or of
     the model's authors, or else estimated. It is brought forward, and a line says so, if the
     photographs show nearer surfaces."""
     far: float | None = None
-    """Largest depth in the scene, in the unit of its cameras. If not given, as for near."""
+    """Largest depth in the scene, in the unit of its cameras. Else as for near."""
     no_given_depth: bool = False
-    """Ignore the depth that SCENE holds: depth maps, laser sweeps and COLMAP's points."""
+    """Ignore the depth that SCENE holds: depth maps, laser sweeps, COLMAP's points."""
     no_masks: bool = False
-    """Use also what masks (black) or alpha channels of photographs hide, instead of ignoring it."""
+    """Use what masks and alpha channels of photographs hide instead of ignoring it."""
     ignore: Path | None = None
-    """Folder of masks of what to leave out of photographs: images named as these, white there. They
-    take the place of masks that lie beside photographs, which are black there."""
+    """Folder of masks of what to leave out of photographs: images named as these, white there. In
+    place of masks beside photographs (black there)."""
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
     forget_edits: bool = False
