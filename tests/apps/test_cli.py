@@ -244,7 +244,7 @@ def refused(monkeypatch, capsys, out: Path, arguments, sentence: str) -> None:
         ({"target": (9,)}, "no frame 9"),
         ({"target": (-1,)}, "-1"),
         ({"target": ("nowhere.json",)}, "nowhere.json"),
-        ({"target": ("abc",)}, "is no target: name a photograph, such as "),
+        ({"target": ("abc",)}, "is no target: name a photograph or its number"),
         ({"target": ("²",)}, "²"),
         ({"target": ("--2",)}, "--2"),
         ({"target": ("9" * 5000,)}, "9' is no target"),

@@ -81,12 +81,15 @@ def test_files_of_a_completion_answer(completed_room, tmp_path, answer, monkeypa
         "gaussians": len(completed),
         "generated": count,
         "notes": [],
+        "rounding": None,
     }
     given = tmp_path / "given.ply"
     assert answer("strip", out / "completed.ply", "--out", given) == {
         "out": str(given),
         "gaussians": len(completed) - count,
         "generated_removed": count,
+        # The scene was reconstructed, so that no file was given.
+        "is_same_file": False,
     }
     assert hash_file(given) == hash_file(out / "context.ply")
     page = tmp_path / "page.html"

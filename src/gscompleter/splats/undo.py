@@ -73,7 +73,9 @@ def strip_edits(path: Path, out: Path, numbers: Collection[int] | None = None) -
     path = resolve_splat(path)
     edits = read_edits(path)
     if numbers is None and (len(edits.edits) <= 1 or not can_undo(edits, 1)):
-        return Undone(*strip(path, out))
+        counts = strip(path, out)
+        given = edits.edits[0].given if edits else None
+        return Undone(*counts, given is not None and hash_file(out) == given)
     return undo_edits(path, edits, numbers or range(1, len(edits.edits) + 1), out)
 
 
