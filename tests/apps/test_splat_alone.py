@@ -15,7 +15,7 @@ from gscompleter.data.scene import write_cameras
 from gscompleter.system.files.image import read_image, write_image
 from gscompleter.trust.lifted import find_pixel_center
 from gscompleter.types import Camera, Gaussians
-from scenes import Room, camera_at, gaussians_of, photographed, random_gaussians, view_of
+from scenes import Room, camera_at, gaussians_of, photographed, view_of
 
 SIZE = 64
 
