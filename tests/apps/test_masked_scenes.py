@@ -106,9 +106,9 @@ def test_the_page_shows_what_is_ignored(completed):
     page = (completed["masks"] / "report.html").read_text()
     assert "Photograph 1 (photo_001.png): 25.0 % of the image is ignored" in page
     # The headline says what its scores were measured on.
-    measured = "dB after, over the 75 % of the picture that masks leave."
+    measured = "dB after, over the 75 % of the picture that masks leave"
     assert measured in page
-    assert read_summary(completed["masks"])["outcome"]["headline"].endswith(measured)
+    assert measured in read_summary(completed["masks"])["outcome"]["headline"]
     assert "masks leave" not in (completed["whole"] / "report.html").read_text()
     assert "Photograph" in page
     ignored = read_pixels(completed["masks"] / "images" / "context1_ignored.png")

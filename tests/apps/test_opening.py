@@ -112,7 +112,9 @@ def test_a_streamed_scene_is_named_where_photographs_are_expected(tmp_path, monk
     (scene / "lod-meta.json").write_text('{"lodLevels": 2}')
     write_packed(scene / "0_0")
     assert run(monkeypatch, "complete", scene, "--out", tmp_path / "out") == 2
-    assert "is a streamed scene in several levels of detail" in capsys.readouterr().err
+    assert (
+        "is a streamed scene (lod-meta.json) in several levels of detail" in capsys.readouterr().err
+    )
 
 
 def test_the_model_folder_of_a_trainer_is_a_splat_unless_it_has_photographs(tmp_path):

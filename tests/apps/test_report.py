@@ -374,7 +374,7 @@ def test_depth_maps_beside_a_colmap_model_are_no_points(completed_room):
     notes = ("4 of 4 photographs have inverse depth of 3DGS (depth_params.json).",)
     scene = replace(summary.scene, format="colmap", notes=notes)
     (note,) = list_photograph_notes(replace(summary, scene=scene, context=(row,)))
-    assert "have a measured or predicted depth, which" in note
+    assert "have a measured or predicted depth, which" in note.text
 
 
 def test_what_is_ignored_is_told_with_its_cause(completed_room):

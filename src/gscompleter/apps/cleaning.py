@@ -55,7 +55,7 @@ from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import write_image
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.files.writing import COMPLETED_FILE, REMOVED_FILE, SUMMARY_FILE
-from gscompleter.system.progress import show_progress, stage, track
+from gscompleter.system.progress import show_preparation, show_progress, stage, track
 from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.types import Camera, Gaussians, View
 
@@ -211,7 +211,7 @@ def clean_alone(options: CleanOptions, console: Console) -> Cleaning:
 
 def load_given_splat(options: CleanOptions) -> Gaussians:
     """Read the splat to clean."""
-    with stage("reading the scene"):
+    with show_preparation("reading the scene"):
         return load_splat(options.scene, options.drop_nonfinite, options.ignore_properties)
 
 
