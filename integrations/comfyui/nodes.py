@@ -26,6 +26,7 @@ from gscompleter.data.mask_checks import read_masks_as_asked, refuse_nothing_to_
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photographs import Photographs
 from gscompleter.generators.painted import Painted, fit_painting
+from gscompleter.splats.edits import EditDraft
 from gscompleter.system.files.image import write_image
 from gscompleter.system.files.output_folder import open_output_folder
 from gscompleter.system.files.writing import SUMMARY_FILE
@@ -211,7 +212,7 @@ class RegisterPainting:
             place = next(p for n in count(1) if not (p := Path(out) / f"{n:05}").exists())
             with open_output_folder(place) as folder:
                 splat = None if holes.splat is None else InputSplatFile(holes.splat)
-                write_scenes(folder, completion, splat)
+                write_scenes(folder, completion, splat, None, EditDraft("complete"))
                 write_image(folder / "before.png", result.before.image)
                 write_image(folder / "painted.png", painting.image)
                 write_image(folder / "after.png", result.after.image)

@@ -107,7 +107,8 @@ def convert_sources(
     sources: Sequence[Path], options: ConvertOptions, operations: Operations
 ) -> Conversion:
     """Convert splats whose folders are resolved."""
-    oddities = [line for source in sources for line in describe_oddities(source)]
+    plain = [source for source in sources if not is_streamed(source)]
+    oddities = [line for source in plain for line in describe_oddities(source)]
     notes = (*oddities, *describe_left_behind(sources, options.out, operations))
     keep_labels = not options.plain
     if can_be_streamed(sources, options, operations):

@@ -222,7 +222,8 @@ def describe_oddities(path: Path) -> list[str]:
     path = resolve_splat(path)
     if detect_splat_format(path) != "ply":
         return []
-    scene = read_scene(path)
+    # Harmonics of a higher degree are refused, or left out, by those who read them.
+    scene = read_scene(path, leaves_out_band_4=True)
     further = describe_further(scene.rows.dtype.names or ())
     return [*describe_values(scene), *([] if further is None else [further])]
 
