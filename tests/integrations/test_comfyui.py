@@ -111,8 +111,8 @@ def test_the_painted_image_ends_in_the_splat(found, tmp_path):
     assert summary["target_id"] == 1
     assert summary["added"] == len(generated)
     assert sorted(file.name for file in Path(path).parent.iterdir()) == [
-        *("after.png", "before.png", "completed.ply", "context.ply", "generated.ply"),
-        *("painted.png", "summary.json"),
+        *("after.png", "before.png", "completed.ply", "context.ply", "edits.json"),
+        *("generated.ply", "painted.png", "summary.json"),
     ]
 
 
