@@ -1,5 +1,7 @@
 """Inverse depth beside a COLMAP model, as 3DGS is regularised by: how far it is believed."""
 
+import json
+
 import numpy as np
 import pytest
 
@@ -51,7 +53,9 @@ def test_the_command_uses_the_maps_or_says_why_not(scene, tmp_path, monkeypatch,
     said = capsys.readouterr()
     assert "4 of 4 photographs have inverse depth of 3DGS" in said.err
     assert "photo_001.png agrees with the points of the scene" in said.err
-    assert "predicted depth is" in said.out + said.err  # of photograph 2: used, or why not
+    # Of photograph 2: used, or why not.
+    notes = json.loads((tmp_path / "out" / "summary.json").read_text())["context_notes"]
+    assert any("predicted depth is" in note for note in notes)
     rows = read_summary(tmp_path / "out").context
     assert rows[0].given_depth > 0.8
     assert run(monkeypatch, *words, "--no-given-depth", "--out", tmp_path / "without") == 0
