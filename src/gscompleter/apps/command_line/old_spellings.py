@@ -13,7 +13,7 @@ OLD_SPELLINGS = {
     ("remove", "from-photographs-only"): UPDATE,
     ("repair", "camera"): "the cameras of masks are named by --target",
 }
-"""What took the place of an option, by the command and the name of the option without dashes.
+"""Replacement of each option, by the command and the name of the option without dashes.
 
 Such an option is not read under its old name as well: one name with two spellings would be two
 rows of the table of options, and scripts would never be changed.

@@ -29,13 +29,13 @@ class BatchOptions(EngineOptions):
     """A .csv or .jsonl file with a row per scene, whose columns are `folder` (SCENE, relative to
     the file), `name` and options of `complete`; or a folder of scenes."""
     out: Path
-    """Where results go. A folder; that of an earlier run is continued."""
+    """Write results here. A folder; that of an earlier run is continued."""
     engine: EngineName = "local"
     """Engine that runs jobs or cases: processes of this machine, Ray, or SLURM."""
     retries: Annotated[int, Interval(ge=0, le=100)] = 2
     """Further attempts for a job that was killed or that failed unexpectedly."""
     rerun: Literal["nothing", "failures"] = "nothing"
-    """What of an earlier run to repeat. Jobs: none, or those that failed."""
+    """Repeat these of an earlier run. Jobs: none, or those that failed."""
     each: tuple[str, ...] = ()
     """Options of `complete` for every row that does not set them, as in --each resolution=256."""
 

@@ -39,7 +39,7 @@ class BenchOptions(RunOptions, WritingOptions):
     quick: bool = False
     """Run a quick check: the smallest case once, no growth."""
     out: Path | None = None
-    """Where results go. A folder, for bench.json and tables.md."""
+    """Write results here. A folder, for bench.json and tables.md."""
 
 
 def run_bench(options: BenchOptions) -> None:

@@ -32,7 +32,7 @@ class CleanOptions(SceneOptions, DeviceOptions):
     """Folder of the photographs of the splat, in any layout that `complete` reads; if not given,
     neighbours decide."""
     out: Path
-    """Where results go. A folder, for completed.ply (the cleaned splat), removed.ply, removed.png
+    """Write results here. A folder, for completed.ply (the cleaned splat), removed.ply, removed.png
     and summary.json."""
     scene: Path
     """File of Gaussians (a splat) to work on. It is cleaned."""

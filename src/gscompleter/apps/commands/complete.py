@@ -50,7 +50,7 @@ class CompleteOptions(CompletingOptions):
     painter: str | None = None
     """Name of their painter, for the report."""
     out: Path
-    """Where results go. A folder, for completed.ply, the report (report.html), images and
+    """Write results here. A folder, for completed.ply, the report (report.html), images and
     summary.json."""
     save_as: Literal[".ply", ".spz", ".sog"] | None = None
     """Keep results small: write the completed scene in this format, with its labels, and

@@ -17,7 +17,7 @@ class DemoOptions(RunOptions, WritingOptions):
     """
 
     out: Path = Path("demo")
-    """Where results go. A folder, for the scene, its completion and before_after.png."""
+    """Write results here. A folder, for the scene, its completion and before_after.png."""
 
 
 def run_demo(options: DemoOptions) -> None:

@@ -61,7 +61,7 @@ class EvaluateOptions(SynthesisOptions, EngineOptions, MaskOptions):
     folders, pixelSplat chunks, RealEstate10K camera files, or drives (Waymo, nuScenes, KITTI, DDAD,
     PandaSet; front camera)."""
     out: Path
-    """Where results go. A folder; that of an earlier run is continued."""
+    """Write results here. A folder; that of an earlier run is continued."""
     protocol: tuple[str, ...] = ()
     """Choice of context and target frames. One or several of: n-10 (frames n and n + 10 for n + 20,
     then n + 20 and n + 10 for n, for n = 0, 21, 42, …); stress (0 and 30 for 99) or stress-12-39
@@ -107,7 +107,7 @@ class EvaluateOptions(SynthesisOptions, EngineOptions, MaskOptions):
     far: float | None = None
     """Largest depth in the scene, in the unit of its cameras. By default as for near."""
     rerun: Literal["nothing", "failures", "scores"] = "nothing"
-    """What of an earlier run to repeat. Cases: none, those that failed, or all scores."""
+    """Repeat these of an earlier run. Cases: none, those that failed, or all scores."""
     engine: EngineName | None = None
     """Engine that runs jobs or cases: processes of this machine, Ray, or SLURM. This process if not
     given."""

@@ -25,7 +25,7 @@ class IndexOptions(WritingOptions):
     protocol: str
     """Choice of context and target frames. One, as in `evaluate`."""
     out: Path
-    """Where results go. A JSON file, for the evaluation index."""
+    """Write results here. A JSON file, for the evaluation index."""
 
     def check_overlap(self) -> None:
         """Refuse to write over an input."""

@@ -30,8 +30,8 @@ class LiveOptions(CompletingOptions):
     strokes: Path | None = None
     """The strokes.json that `live` saved. The session goes on from it, on SCENE if it is given."""
     out: Path | None = None  # type: ignore[assignment]
-    """Where results go. The folder that keeps the steps, and the results of the Save button. If not
-    given, that of the session which goes on, or else `live`."""
+    """Write results here. The folder that keeps the steps, and the results of the Save button. If
+    not given, that of the session which goes on, or else `live`."""
     resolution: Size | None = None
     """Size of images in pixels. The working size as in `complete`; smaller is faster. If not given,
     that of the session which goes on, or else 256 x 256."""

@@ -34,7 +34,7 @@ class PosesOptions(ComputeOptions, WritingOptions, MaskOptions):
     frames: NumFrames = 40
     """Most frames of a video to take as photographs, sharp ones at even steps of the camera."""
     out: Path
-    """Where results go. A folder, for upright copies in images, and cameras and points in
+    """Write results here. A folder, for upright copies in images, and cameras and points in
     sparse/0."""
 
 

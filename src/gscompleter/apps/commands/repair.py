@@ -43,7 +43,7 @@ class RepairOptions(CompletingOptions):
     """The strokes.json that `live` saved. It stands in place of cameras and masks: its steps are
     done again, at its resolution and with its photographs unless others are named."""
     out: Path
-    """Where results go. A folder, for completed.ply, the report (report.html), images and
+    """Write results here. A folder, for completed.ply, the report (report.html), images and
     summary.json."""
     config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = REPAIR_CONFIG
     """Settings of the method, which change those of `--config NAME`."""

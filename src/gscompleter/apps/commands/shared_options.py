@@ -143,7 +143,7 @@ class SceneOptions(ComputeOptions, WritingOptions, MaskOptions):
     """Photographs to work with: file names, or numbers from 0 in the order of the file paths. If
     not given, those that help most; photographs of targets are never used."""
     out: Path
-    """Where results go. A folder, for completed.ply, the report (report.html), images and
+    """Write results here. A folder, for completed.ply, the report (report.html), images and
     summary.json."""
     format: str | None = None
     """Format of SCENE: colmap, nerfstudio, cameras-json, llff, kitti, kitti-raw, dgp, waymo,

@@ -33,7 +33,7 @@ class StripOptions(WritingOptions):
     edit: Annotated[int, Interval(ge=1)] | None = None
     """Undo this edit alone, by its number in edits.json, from 1."""
     out: Path
-    """Where results go. A file, for the scene without these edits."""
+    """Write results here. A file, for the scene without these edits."""
 
     def check_overlap(self) -> None:
         """Refuse to write over an input."""
