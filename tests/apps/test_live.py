@@ -13,6 +13,7 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -54,6 +55,7 @@ from gscompleter.system.errors import InputError
 from gscompleter.system.progress import notify_of_stages
 from gscompleter.system.timing import STAGES
 from gscompleter.types import Camera, ContextScene, Gaussians, merge
+from live_marks import make_mark
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 
 SIZE = 48
@@ -72,15 +74,8 @@ def complete_camera(session: Session, camera: Camera) -> tuple[Session, str]:
     return apply_step(session, Step("complete", save_camera(session, camera)))
 
 
-def mark(rows: slice, columns: slice) -> bytes:
-    """Make the PNG of a mask that is white there."""
-    pixels = np.zeros((SIZE, SIZE), dtype=np.uint8)
-    pixels[rows, columns] = 255
-    file = io.BytesIO()
-    Image.fromarray(pixels).save(file, format="PNG")
-    return file.getvalue()
-
-
+mark = partial(make_mark, SIZE)
+"""Maker of a mask of the size of these cameras."""
 SPOT = mark(slice(18, 30), slice(20, 32))
 """A mark in the middle of an image."""
 
@@ -914,11 +909,8 @@ def test_a_session_of_a_splat_alone_is_replayed_to_the_same_bytes(tmp_path, monk
     ready = serving.prepare(parse_command(words), QUIET)
     begun = serving.begin_session(ready)
     camera = replace(camera_at(0.05, size=64), near=None, far=None)
-    pixels = np.zeros((64, 64), dtype=np.uint8)
-    pixels[24:36, 28:40] = 255
-    file = io.BytesIO()
-    Image.fromarray(pixels).save(file, format="PNG")
-    step = Step("repair", save_camera(begun, camera), file.getvalue())
+    marked = make_mark(64, slice(24, 36), slice(28, 40))
+    step = Step("repair", save_camera(begun, camera), marked)
     session, _ = apply_step(begun, step)
     serving.save_session(ready, session)
     other = tmp_path / "other"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import http.client
-import io
 import json
 import os
 import re
@@ -14,12 +13,11 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
-from PIL import Image
 from rich.console import Console
 
 from command import run
@@ -38,6 +36,7 @@ from gscompleter.splats.edits import read_edits
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.output_folder import list_session, read_listing, reserve_output
 from gscompleter.types import Camera, Gaussians, merge
+from live_marks import make_mark
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 
 SIZE = 48
@@ -48,15 +47,8 @@ LEFT = (-2.0, -1.0, 2.0, -1.2, 2.0, 6.0)
 SMALL = ("--resolution", SIZE, SIZE, "--near", 0.5, "--far", 20, "--context", 0, 1)
 
 
-def mark(rows: slice, columns: slice) -> bytes:
-    """Make the PNG of a mask that is white there."""
-    pixels = np.zeros((SIZE, SIZE), dtype=np.uint8)
-    pixels[rows, columns] = 255
-    file = io.BytesIO()
-    Image.fromarray(pixels).save(file, format="PNG")
-    return file.getvalue()
-
-
+mark = partial(make_mark, SIZE)
+"""Maker of a mask of the size of these cameras."""
 SPOT = mark(slice(18, 30), slice(20, 32))
 OTHER = mark(slice(2, 9), slice(34, 44))
 STEPS = (
