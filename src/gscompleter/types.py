@@ -785,6 +785,15 @@ class DepthPairs:
         return DepthPairs("anchor", torch.empty(0), torch.empty(0), torch.empty(0).bool())
 
 
+def find_equal_positions(
+    points: Float[Tensor, "n 3"], others: Float[Tensor, "_m 3"]
+) -> Bool[Tensor, "n"]:
+    """Find the points that are exactly at the position of one of the others."""
+    # Equal positions get equal numbers, which can be compared as single values.
+    _, numbers = torch.unique(torch.cat([others, points]), dim=0, return_inverse=True)
+    return torch.isin(numbers[len(others) :], numbers[: len(others)])
+
+
 @dataclass(frozen=True)
 class ContextScene:
     """The n Gaussians of the context and the m <= n that are rendered in their place (LOD)."""
@@ -831,13 +840,10 @@ class ContextScene:
 
     def find_pieces(self, gaussians: Gaussians) -> Bool[Tensor, "_n"]:
         """Find the pieces of cut Gaussians among others, by their exact positions."""
-        count = len(self.piece_means)
-        if count == 0:
+        # Most completions cut nothing, and the search sorts all positions.
+        if len(self.piece_means) == 0:
             return torch.zeros_like(gaussians.opacities, dtype=torch.bool)
-        # Equal positions get equal numbers, which can be compared as single values.
-        points = torch.cat([self.piece_means, gaussians.means])
-        _, numbers = torch.unique(points, dim=0, return_inverse=True)
-        return torch.isin(numbers[count:], numbers[:count])
+        return find_equal_positions(gaussians.means, self.piece_means)
 
     @property
     def chosen_mask(self) -> Bool[Tensor, "n"]:

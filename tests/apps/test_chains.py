@@ -12,6 +12,7 @@ import torch
 from command import run
 from gscompleter import load_ply, save_ply
 from gscompleter.apps.inputs.taken_out import describe_taken_out
+from gscompleter.apps.inputs.task import InputSplatFile
 from gscompleter.render.loading import load_renderer
 from gscompleter.splats.edits import read_edits
 from gscompleter.splats.undo import strip_edits
@@ -95,13 +96,13 @@ def test_what_was_removed_comes_back_if_that_is_asked_for(room, without_crate, t
 
 
 def test_lines_say_what_is_kept_and_what_is_not_known(without_crate, tmp_path):
-    (line,) = describe_taken_out(without_crate, forgets=False)
+    (line,) = describe_taken_out(InputSplatFile(without_crate), forgets=False)
     assert line.startswith("1 removal of this splat is kept: photographs are ignored where they")
-    (line,) = describe_taken_out(without_crate, forgets=True)
+    (line,) = describe_taken_out(InputSplatFile(without_crate), forgets=True)
     assert "forgotten" in line
     alone = tmp_path / "alone.ply"
     alone.write_bytes(without_crate.read_bytes())
-    (line,) = describe_taken_out(alone, forgets=False)
+    (line,) = describe_taken_out(InputSplatFile(alone), forgets=False)
     assert "What was removed is not known" in line
 
 

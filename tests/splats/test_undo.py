@@ -15,7 +15,7 @@ import torch
 from gscompleter import load_ply, save_ply
 from gscompleter.apps.inputs.task import InputSplatFile
 from gscompleter.apps.report.completion import save_completed_splat
-from gscompleter.splats.edits import EditDraft, read_edits, record_edit
+from gscompleter.splats.edits import EditDraft, hash_given, read_edits, record_edit
 from gscompleter.splats.provenance import RunRecord
 from gscompleter.splats.undo import strip_edits
 from gscompleter.system.errors import InputError
@@ -34,11 +34,13 @@ def edit(splat: Path, folder: Path, number: int, has_record: bool = True) -> Pat
     changed = torch.rand(len(context), generator=generator) < (0.0 if number == 3 else 0.2)
     added = random_gaussians(0 if number == 4 else 5 * number, seed=number)
     added = replace(added, generated=torch.full_like(added.generated, number))
-    run = RunRecord("gscompleter", "x", (number, number), seed=number) if has_record else None
+    run = RunRecord("gscompleter", "x", (number, number), seed=number, given=hash_given(splat))
+    run = run if has_record else None
     folder.mkdir()
-    save_completed_splat(folder, context, changed, added, InputSplatFile(splat), run)
+    splat_file = InputSplatFile(splat)
+    save_completed_splat(folder, context, changed, added, splat_file, run)
     draft = EditDraft("complete" if has_record else "clean", seed=number)
-    record_edit(folder, draft, len(context), len(added), splat, has_record)
+    record_edit(folder, draft, len(context), len(added), splat, splat_file.edits, run)
     return folder / "completed.ply"
 
 

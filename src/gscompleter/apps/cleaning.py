@@ -23,11 +23,7 @@ from gscompleter.apps.inputs.describing import describe_opening, print_lines
 from gscompleter.apps.inputs.named_photographs import check_context
 from gscompleter.apps.inputs.reading import read_photographs
 from gscompleter.apps.inputs.splat import locate_splat, move_to_splat
-from gscompleter.apps.inputs.taken_out import (
-    describe_taken_out,
-    find_taken_out,
-    hide_taken_out,
-)
+from gscompleter.apps.inputs.taken_out import take_over_edits
 from gscompleter.apps.inputs.task import InputSplatFile
 from gscompleter.apps.report.cleaning_picture import (
     PICTURE_FILE,
@@ -117,10 +113,11 @@ def clean_splat(options: CleanOptions) -> None:
                 record_edit(
                     folder,
                     EditDraft(COMMAND),
-                    len(cleaning.given),
-                    0,
-                    cleaning.splat_file.path,
-                    has_record=False,
+                    rows=len(cleaning.given),
+                    added=0,
+                    given=cleaning.splat_file.path,
+                    earlier=cleaning.splat_file.edits,
+                    run=None,
                 )
             elif cleaning.removed.any():
                 save_changed(folder, cleaning.given, cleaning.removed, cleaning.splat_file)
@@ -156,9 +153,8 @@ def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
     assert given is not None
     task = apply_splat_range(task, given, renderer)
 
-    print_lines(console, *describe_taken_out(options.scene, options.forget_edits))
-    if not options.forget_edits:
-        task = hide_taken_out(task, find_taken_out(task, renderer))
+    task, notes = take_over_edits(task, options.forget_edits, renderer)
+    print_lines(console, *notes)
 
     plan = f"compared with {len(task.views)} photographs on {device}"
     plan += f", written to {quote_value(options.out)}"
@@ -170,7 +166,8 @@ def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
     run_info = describe_run(options, opened, task, config, {"strength": options.strength})
     scores, seen = score_cleaning(given, task.views, removed, renderer, opened.files)
     run_info = {**run_info, "photographs": scores, "seconds": seconds}
-    return Cleaning(given, removed, splat_file, run_info, choose_cameras(seen), renderer)
+    assert task.splat_file is not None
+    return Cleaning(given, removed, task.splat_file, run_info, choose_cameras(seen), renderer)
 
 
 def clean_alone(options: CleanOptions, console: Console) -> Cleaning:

@@ -17,9 +17,8 @@ from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import (
     SORTED,
     decode_splat,
-    describe_mode_loss,
+    describe_losses,
     describe_oddities,
-    describe_rounding,
     detect_splat_format,
     drop_labels,
     find_origin,
@@ -137,12 +136,12 @@ def convert_sources(
     if not keep_labels:
         gaussians = drop_labels(gaussians)
     save_splat(options.out, gaussians, made_by)
-    losses = [describe_mode_loss(options.out, gaussians), describe_rounding(options.out, gaussians)]
-    notes = (*(loss for loss in losses if loss is not None), *notes)
+    notes = (*describe_losses(options.out, gaussians), *notes)
     # Of a splat with an origin, `describe_rounding` says it.
     if gaussians.origin is not None:
         return Conversion(len(gaussians), num_generated, notes, None)
-    means, scales = gaussians.means, gaussians.scales
+    means = gaussians.means
+    scales = gaussians.scales
     # Harmonics are most of the memory, and those of the file are read now.
     del gaussians
     rounding = measure_rounding(options.out, means, scales)
@@ -290,7 +289,8 @@ def measure_rounding(
     if write in SORTED:
         places = means.double().numpy()
         order = argsort_morton(places, places.min(0), places.max(0))
-        means, scales = means[order], scales[order]
+        means = means[order]
+        scales = scales[order]
     read = decode_splat(path)
     factors = read.scales.clamp_min(1e-30).log() - scales.clamp_min(1e-30).log()
     worst = factors.abs().flatten().argmax()

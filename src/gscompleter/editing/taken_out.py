@@ -13,7 +13,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gscompleter.render.protocols import Renderer
-from gscompleter.render.removed import MIN_WEIGHT, add_border
+from gscompleter.render.removed import add_border, mark_shown
 from gscompleter.types import Camera, Gaussians, View
 
 
@@ -43,8 +43,4 @@ class TakenOut:
         """Find the pixels that show it, with their border."""
         # What was invented since fills its place, and would hide it.
         others = self.scene[self.scene.generated == 0]
-        values = torch.cat(
-            [torch.zeros_like(others.opacities), torch.ones_like(self.gaussians.opacities)]
-        )
-        weights = self.renderer.freeze(others, camera).extend(self.gaussians).splat(values)
-        return add_border(weights > MIN_WEIGHT)
+        return add_border(mark_shown(self.gaussians, others, camera, self.renderer))

@@ -292,7 +292,8 @@ def choose_best(
     ahead = [choice for choice in choices if not choice.candidate.looks_up_or_down]
     most_ahead = max((choice.gain for choice in ahead), default=0.0)
     if most_ahead >= max(config.min_gain, MIN_AHEAD * largest):
-        choices, largest = ahead, most_ahead
+        choices = ahead
+        largest = most_ahead
     good = [choice for choice in choices if choice.gain >= config.enough * largest]
 
     def order(choice: Choice) -> tuple[int, float]:

@@ -113,7 +113,8 @@ def merge_nearby(scene: Gaussians, max_gaussians: int) -> Gaussians:
         return np.append(np.flatnonzero(begins), len(scene))
 
     # Bisection on the logarithm: between a millionth of the extent and all of it.
-    low, high = 1e-6 * radius, 4 * radius
+    low = 1e-6 * radius
+    high = 4 * radius
     for _ in range(BISECTIONS):
         middle = math.sqrt(low * high)
         if len(find_starts(middle)) - 1 > max_gaussians:

@@ -11,7 +11,7 @@ from torch import Tensor
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.render.cache import make_camera_key
 from gscompleter.render.protocols import Renderer
-from gscompleter.types import Camera, ContextScene
+from gscompleter.types import Camera, ContextScene, Gaussians
 
 MIN_WEIGHT = 0.1
 """Compositing weight of removed Gaussians from which on a pixel shows them."""
@@ -41,9 +41,15 @@ def find_removed(source: ContextScene, camera: Camera, renderer: Renderer) -> Bo
 def draw_removed(source: ContextScene, camera: Camera, renderer: Renderer) -> Bool[Tensor, "h w"]:
     """Draw the removed Gaussians among those that are left or were revealed, and mark them."""
     scene = source.gaussians
-    removed = source.removed
     # What is chosen for removal is among `removed`, too, and must not be drawn twice.
     others = replace(scene, opacities=scene.opacities.masked_fill(source.chosen_mask, 0.0))
-    # With a value of 1 for the removed Gaussians and 0 for the others, the image is their weight.
-    values = torch.cat([torch.zeros_like(scene.opacities), torch.ones_like(removed.opacities)])
-    return renderer.freeze(others, camera).extend(removed).splat(values) > MIN_WEIGHT
+    return mark_shown(source.removed, others, camera, renderer)
+
+
+def mark_shown(
+    gaussians: Gaussians, others: Gaussians, camera: Camera, renderer: Renderer
+) -> Bool[Tensor, "h w"]:
+    """Mark the pixels that show Gaussians among others."""
+    # With a value of 1 for these and 0 for the others, the image is their weight.
+    values = torch.cat([torch.zeros_like(others.opacities), torch.ones_like(gaussians.opacities)])
+    return renderer.freeze(others, camera).extend(gaussians).splat(values) > MIN_WEIGHT

@@ -21,6 +21,7 @@ from typing import Any
 from gscompleter import __version__
 from gscompleter.splats.formats import detect_splat_format, read_provenance
 from gscompleter.splats.ply import LABEL_COLUMN, read_labels, read_scene, save_ply
+from gscompleter.splats.provenance import RunRecord
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import hash_file
 from gscompleter.system.files.result_format import MARK
@@ -32,7 +33,6 @@ EDITS_FOLDER = "edits"
 EDITS = (EDITS_FILE, f"{EDITS_FOLDER}/*.ply")
 """Globs of the files that are written."""
 ADVICE = "take all files of its folder again, or move it away to do without the record"
-_LABEL_LINE = re.compile(rb"^property\s+(\w+)\s+generated\s*$", re.M)
 _NAME = re.compile(r"removed\.ply|edits/\d{1,5}_(originals|taken_out)\.ply")
 
 
@@ -110,7 +110,6 @@ class EditDraft:
 
     command: str
     settings: Mapping[str, Any] = field(default_factory=dict)
-    labels: tuple[int, int] | None = None
     seed: int | None = None
 
 
@@ -159,7 +158,8 @@ def record_edit(
     rows: int,
     added: int,
     given: Path | None,
-    has_record: bool,
+    earlier: Edits,
+    run: RunRecord | None,
     taken_out: Gaussians | None = None,
     can_be_undone: bool = True,
 ) -> None:
@@ -171,11 +171,11 @@ def record_edit(
         rows: Gaussians before it.
         added: Rows that it appended.
         given: File that it was given; None if it reconstructed the scene.
-        has_record: True if it said in the file who made it.
+        earlier: Edits of that file.
+        run: What it said in the file about who made it; None if it said nothing.
         taken_out: What a person took out, if the command tells.
         can_be_undone: False if rows that it changed stand where they stood.
     """
-    earlier = Edits(folder) if given is None else read_edits(given)
     if given is not None and not earlier:
         earlier = assume_edit(given)
     path = None
@@ -187,12 +187,12 @@ def record_edit(
         draft.command,
         rows,
         added,
-        records=int(has_record),
+        records=int(run is not None),
         had_labels=None if given is None else find_label_type(given),
-        given=hash_file(given) if given is not None and given.is_file() else None,
+        given=hash_given(given) if run is None else run.given,
         originals=REMOVED_FILE if (folder / REMOVED_FILE).is_file() else None,
         taken_out=path,
-        labels=draft.labels,
+        labels=None if run is None else run.labels,
         seed=draft.seed,
         settings=dict(draft.settings),
         can_be_undone=can_be_undone,
@@ -200,12 +200,19 @@ def record_edit(
     write_edits(folder, folder / COMPLETED_FILE, earlier, edit)
 
 
+def hash_given(path: Path | None) -> str | None:
+    """Compute the SHA-256 of the given splat; None without one, and for the folder of a .sog."""
+    return hash_file(path) if path is not None and path.is_file() else None
+
+
 def find_label_type(path: Path) -> str | None:
-    """Find the type of the labels in a binary .ply; None without labels, or of another format."""
+    """Find the type of the labels in a .ply; None without labels, or for another format."""
     if detect_splat_format(path) != "ply":
         return None
-    found = _LABEL_LINE.search(read_scene(path).header)
-    return None if found is None else found[1].decode()
+    dtype = read_scene(path).rows.dtype
+    if LABEL_COLUMN not in (dtype.names or ()):
+        return None
+    return "float" if dtype[LABEL_COLUMN].kind == "f" else "uchar"
 
 
 def write_edits(folder: Path, splat: Path, earlier: Edits, edit: Edit) -> None:

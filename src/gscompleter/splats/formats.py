@@ -293,14 +293,19 @@ def convert_splat(
     if not keep_labels:
         gaussians = drop_labels(gaussians)
     save_splat(out, gaussians, made_by)
-    notes = [describe_mode_loss(out, gaussians), describe_rounding(out, gaussians)]
-    note = " ".join(note for note in notes if note is not None)
+    note = " ".join(describe_losses(out, gaussians))
     return len(gaussians), num_generated, note or None
 
 
 def drop_labels(gaussians: Gaussians) -> Gaussians:
     """Take all Gaussians for observed: a writer then leaves the labels out altogether."""
     return replace(gaussians, generated=torch.zeros_like(gaussians.generated))
+
+
+def describe_losses(path: Path, gaussians: Gaussians) -> list[str]:
+    """Describe in sentences what a file that was written does not hold of its Gaussians."""
+    losses = [describe_mode_loss(path, gaussians), describe_rounding(path, gaussians)]
+    return [loss for loss in losses if loss is not None]
 
 
 def describe_mode_loss(path: Path, gaussians: Gaussians) -> str | None:

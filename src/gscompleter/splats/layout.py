@@ -60,10 +60,10 @@ from gscompleter.system.files.writing import REMOVED_FILE
 from gscompleter.types import NUM_SH, Gaussians, merge
 
 _STORED = ("means", "quats", "scales", "opacities", "sh", "generated")
-_LABEL_LINES = re.compile(
-    rb"^property\s+\w+\s+generated\s*?\n(?:comment gscompleter-provenance/[^\n]*\n)*", re.M
+LABEL_LINES = re.compile(
+    rb"^property\s+\w+\s+generated\s*?\n((?:comment gscompleter-provenance/[^\n]*\n)*)", re.M
 )
-"""The line of the labels, with the comments of runs that follow it."""
+"""The line of the labels, with the comments of runs that follow it as its group."""
 _LABEL_TYPE = re.compile(rb"^(property\s+)\w+(\s+generated\s*?\n)", re.M)
 """The line of the labels, with its type in the middle."""
 _ELEMENT_LINE = re.compile(rb"^(?:element|end_header)", re.M)
@@ -89,7 +89,7 @@ def drop_generated(layout: SceneFile) -> SceneFile:
         return layout
     dtype = [column for column in layout.rows.dtype.descr if column[0] != LABEL_COLUMN]
     rows = require_fields(layout.rows[read_labels(layout.rows) == 0], dtype)
-    return replace(layout, header=_LABEL_LINES.sub(b"", layout.header, 1), rows=rows)
+    return replace(layout, header=LABEL_LINES.sub(b"", layout.header, 1), rows=rows)
 
 
 def save_like(
@@ -192,7 +192,7 @@ def _add_labels(layout: SceneFile) -> tuple[bytes, np.dtype]:
 
 def _add_run(header: bytes, run: RunRecord) -> bytes:
     """Add the comment of a run after the line of the labels and the comments of earlier runs."""
-    lines = _LABEL_LINES.search(header)
+    lines = LABEL_LINES.search(header)
     assert lines is not None
     ending = b"\r\n" if lines[0].endswith(b"\r\n") else b"\n"
     return header[: lines.end()] + make_comment_lines([run], ending) + header[lines.end() :]
@@ -274,7 +274,7 @@ def strip_rows(path: Path, layout: SceneFile, out: Path) -> tuple[int, int] | No
         return None
 
     numbers = np.flatnonzero(labels == 0)
-    header = _LABEL_LINES.sub(b"", layout.header, 1)
+    header = LABEL_LINES.sub(b"", layout.header, 1)
     dtype = np.dtype([c for c in layout.rows.dtype.descr if c[0] != LABEL_COLUMN])
     originals = np.empty(0, dtype)
     taken = np.zeros(len(numbers), np.bool_)

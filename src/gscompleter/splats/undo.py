@@ -7,7 +7,6 @@ state ascend. Without some of the edits, the splat has the rows that none of the
 
 from __future__ import annotations
 
-import re
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,7 +18,7 @@ from numpy import ndarray
 from gscompleter.splats.edits import Edit, Edits, read_edits
 from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import get_writer
-from gscompleter.splats.layout import iterate_rows, strip
+from gscompleter.splats.layout import LABEL_LINES, find_places, iterate_rows, strip
 from gscompleter.splats.ply import (
     LABEL_COLUMN,
     SceneFile,
@@ -36,10 +35,6 @@ from gscompleter.system.files.writing import EDITS_FILE
 Keys = Int64[ndarray, "_n"]
 """Number of the edit that appended each row, and its place among these in the lower 40 bits."""
 PLACE_BITS = 40
-_LABELS = re.compile(
-    rb"^property\s+\w+\s+generated\s*?\n((?:comment gscompleter-provenance/[^\n]*\n)*)", re.M
-)
-"""The line of the labels, with the comments of runs that follow it."""
 
 
 @dataclass(frozen=True)
@@ -188,12 +183,8 @@ def read_originals(edits: Edits, edit: Edit, before: Keys) -> Originals:
         return Originals(keys_of_none(), (), none)
     path = edits.find(edit.originals)
     scene = read_scene(path)
-    places = scene.trailer.view("<u4").astype(np.int64)
-    is_ordered = bool((np.diff(places, append=len(before)) > 0).all())
-    if len(places) != len(scene.rows) or not is_ordered:
-        raise InputError(
-            f"{quote_value(path)} does not say where its Gaussians belong; fetch it again."
-        )
+    num_kept = len(before) - len(scene.rows)
+    places = find_places(scene, path, num_kept, has_mode_comment(scene.header))
     rows = np.stack([np.zeros_like(places), np.arange(len(places))], axis=1)
     return Originals(before[places], (scene,), rows)
 
@@ -217,7 +208,7 @@ def make_header(
 
     Without any edit, the labels are what they were at first.
     """
-    found = _LABELS.search(layout.header)
+    found = LABEL_LINES.search(layout.header)
     names = layout.rows.dtype.descr
     if found is None:
         return layout.header, layout.rows.dtype

@@ -28,11 +28,7 @@ from gscompleter.apps.inputs.removal import Selection
 from gscompleter.apps.inputs.renders import open_renders
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.inputs.splat import add_check_views, locate_splat, move_to_splat
-from gscompleter.apps.inputs.taken_out import (
-    describe_taken_out,
-    find_taken_out,
-    hide_taken_out,
-)
+from gscompleter.apps.inputs.taken_out import take_over_edits
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened, Target
 from gscompleter.apps.warmup import SPLAT_PART, compile_kernels, list_missing
 from gscompleter.completer import GSCompleter
@@ -207,11 +203,9 @@ def load_models(
             task, notes = apply_scene_range(task, reconstructor)
         else:
             task = apply_splat_range(task, task.scene, completer.renderer)
-            assert task.splat_file is not None
+            # Renders of the splat itself show nothing that it lacks.
             if opened.renders_from is None:
-                notes = describe_taken_out(task.splat_file.path, options.forget_edits)
-                if not options.forget_edits:
-                    task = hide_taken_out(task, find_taken_out(task, completer.renderer))
+                task, notes = take_over_edits(task, options.forget_edits, completer.renderer)
     print_lines(console, *notes)
 
     cameras = collect_cameras(opened, task)

@@ -164,7 +164,7 @@ def choose_evidence(ready: Prepared, new: Sequence[int]) -> Prepared:
     )
     assert task.scene is not None
     task = apply_splat_range(task, task.scene, ready.completer.renderer)
-    task = hide_taken_out(task, task.taken_out)
+    task = hide_taken_out(task)
     completer, task = use_predicted_depth(ready.options, ready.completer, task)
     return replace(
         ready,

@@ -25,7 +25,7 @@ from gscompleter.splats.formats import load_splat, load_splat_at
 from gscompleter.splats.origin import format_corners
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.progress import track
-from gscompleter.types import Camera, Gaussians
+from gscompleter.types import Camera, Gaussians, find_equal_positions
 
 MAX_MARGIN = 0.05
 """Largest margin of a region, relative to its smallest side or its radius."""
@@ -281,10 +281,5 @@ def find_in_masks(
 
 def find_same_positions(scene: Gaussians, selected: Gaussians) -> Bool[Tensor, "n"]:
     """Find Gaussians of a scene at exactly the positions of others."""
-    # Equal positions get equal numbers, which can be compared as single values. Exactly, because a
-    # program that saves a selection leaves the positions as they were.
-    points = torch.cat([selected.means, scene.means])
-    _, numbers = torch.unique(points, dim=0, return_inverse=True)
-    numbers_of_selected = numbers[: len(selected)]
-    numbers_of_scene = numbers[len(selected) :]
-    return torch.isin(numbers_of_scene, numbers_of_selected)
+    # Exactly, because a program that saves a selection leaves the positions as they were.
+    return find_equal_positions(scene.means, selected.means)

@@ -9,7 +9,6 @@ from pathlib import Path
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Target
 from gscompleter.editing.taken_out import TakenOut
 from gscompleter.render.protocols import Renderer
-from gscompleter.splats.edits import read_edits
 from gscompleter.splats.formats import load_splat, read_provenance
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import EDITS_FILE
@@ -21,7 +20,7 @@ def load_taken_out(splat_file: InputSplatFile) -> Gaussians | None:
 
     It is relative to the origin of the splat. None if nothing was taken out.
     """
-    edits = read_edits(splat_file.path)
+    edits = splat_file.edits
     names = [edit.taken_out for edit in edits.edits if edit.taken_out is not None]
     if not names:
         return None
@@ -32,17 +31,27 @@ def load_taken_out(splat_file: InputSplatFile) -> Gaussians | None:
     return replace(gaussians.move_origin((x, y, z)), origin=None)
 
 
-def find_taken_out(task: CompletionTask, renderer: Renderer) -> TakenOut | None:
-    """Find what earlier edits took out of the splat of a task; None if nothing was."""
+def take_over_edits(
+    task: CompletionTask, forgets: bool, renderer: Renderer
+) -> tuple[CompletionTask, tuple[str, ...]]:
+    """Hide what earlier edits took out in all photographs of a task, unless it `forgets` them.
+
+    Also returns the lines about it.
+    """
     assert task.scene is not None
     assert task.splat_file is not None
-    gaussians = load_taken_out(task.splat_file)
-    return None if gaussians is None else TakenOut(gaussians.to(task.device), task.scene, renderer)
+    notes = describe_taken_out(task.splat_file, forgets)
+    gaussians = None if forgets else load_taken_out(task.splat_file)
+    if gaussians is None:
+        return task, notes
+    taken_out = TakenOut(gaussians.to(task.device), task.scene, renderer)
+    return hide_taken_out(replace(task, taken_out=taken_out)), notes
 
 
-def describe_taken_out(path: Path, forgets: bool) -> tuple[str, ...]:
+def describe_taken_out(splat_file: InputSplatFile, forgets: bool) -> tuple[str, ...]:
     """Write the lines on what earlier edits of a splat took out of it."""
-    edits = read_edits(path)
+    path = splat_file.path
+    edits = splat_file.edits
     count = sum(edit.taken_out is not None for edit in edits.edits)
     if not edits and (runs := count_runs(path)):
         return (
@@ -68,8 +77,9 @@ def count_runs(path: Path) -> int:
     return 0
 
 
-def hide_taken_out(task: CompletionTask, taken_out: TakenOut | None) -> CompletionTask:
-    """Hide what was taken out in all photographs of a task."""
+def hide_taken_out(task: CompletionTask) -> CompletionTask:
+    """Hide what was taken out in all photographs of a task; nothing if nothing was."""
+    taken_out = task.taken_out
     if taken_out is None:
         return task
     return replace(
@@ -77,7 +87,6 @@ def hide_taken_out(task: CompletionTask, taken_out: TakenOut | None) -> Completi
         views=[taken_out.hide(view) for view in task.views],
         check_views=[taken_out.hide(view) for view in task.check_views or ()],
         targets=[hide_in_target(target, taken_out) for target in task.targets],
-        taken_out=taken_out,
     )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from gscompleter.data.photograph_names import name_target
 from gscompleter.data.photographs import Photographs
 from gscompleter.editing.taken_out import TakenOut
 from gscompleter.generators.painted import Painting
+from gscompleter.splats.edits import Edits, read_edits
 from gscompleter.types import Camera, Gaussians, View
 from gscompleter.virtual_capture.witnesses import Witnesses
 
@@ -66,6 +68,11 @@ class InputSplatFile:
     """Index among these of each Gaussian of the context; None for the order of the file."""
     origin: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     """Origin of the context in the coordinates of the file."""
+
+    @cached_property
+    def edits(self) -> Edits:
+        """What earlier commands did to it; the whole file is read to know that it is the same."""
+        return read_edits(self.path)
 
 
 @dataclass(frozen=True)

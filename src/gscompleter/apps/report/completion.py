@@ -51,7 +51,7 @@ from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.reconstructors.features.consistency import measure_pose_errors
 from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
-from gscompleter.splats.edits import EditDraft, record_edit
+from gscompleter.splats.edits import EditDraft, Edits, record_edit
 from gscompleter.splats.layout import save_like, save_removed
 from gscompleter.splats.ply import save_parts, save_ply
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, RunRecord
@@ -404,14 +404,15 @@ def write_scenes(
     map_in_parallel(lambda write: write(), writing)
     record_edit(
         folder,
-        replace(edit, labels=None if run is None else run.labels, seed=completion.seed),
+        replace(edit, seed=completion.seed),
         len(completion.context),
         len(generated) if input_splat is not None else len(added),
         None if input_splat is None else input_splat.path,
-        has_record=run is not None,
+        Edits(folder) if input_splat is None else input_splat.edits,
+        run,
+        replace(completion.source.removed, origin=completion.context.origin),
         # Without the file of the given scene, recoloured rows stand where their originals were.
         can_be_undone=input_splat is not None or not completion.recolored_mask.any().item(),
-        taken_out=replace(completion.source.removed, origin=completion.context.origin),
     )
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from gscompleter import __version__
+from gscompleter.splats.edits import hash_given
 from gscompleter.splats.provenance import ModelRecord, RunRecord, shorten
 from gscompleter.state import NEW_PHOTO_ID, Completion
-from gscompleter.system.files.reading import hash_file
 
 TOOL = "gscompleter"
 LICENCE = "Apache-2.0"
@@ -38,7 +38,7 @@ def make_run_record(
         generator if invented else None,
         shorten(painters[0]) if painters and invented else None,
         completion.seed,
-        None if given is None else hash_given(given),
+        hash_given(given),
     )
 
 
@@ -59,8 +59,3 @@ def name_model(name: str | None) -> ModelRecord | None:
     if not name:
         return None
     return ModelRecord(shorten(name), None, LICENCE if name in OWN_MODELS else None)
-
-
-def hash_given(path: Path) -> str | None:
-    """Compute the SHA-256 of the given splat; None for the folder of a .sog."""
-    return hash_file(path) if path.is_file() else None
