@@ -228,6 +228,7 @@ def write_edits(folder: Path, splat: Path, earlier: Edits, edit: Edit) -> None:
         taken_out = copy_file(earlier, known.taken_out, folder, f"{number}_taken_out")
         edits.append(replace(known, originals=originals, taken_out=taken_out))
     edits.append(edit)
+    # Whoever knows nothing of edits looks for the originals of the last one there.
     for index, known in reversed(list(enumerate(edits))):
         if known.originals is not None:
             (folder / known.originals).rename(folder / REMOVED_FILE)

@@ -90,6 +90,8 @@ def undo_edits(path: Path, edits: Edits, numbers: Collection[int], out: Path) ->
     remaining = [index for index in range(len(all_edits)) if index + 1 not in numbers]
     appended = [make_keys(0, all_edits[0].rows)]
     appended += [make_keys(index + 1, all_edits[index].added) for index in remaining]
+    # What an edit left out comes back with it, unless another edit left it out; no row is left out
+    # twice.
     gone = [left_out[index].keys for index in remaining]
     keys = np.setdiff1d(np.concatenate(appended), np.concatenate(gone) if gone else keys_of_none())
     originals = join_originals(left_out)
@@ -196,6 +198,7 @@ def join_originals(parts: Sequence[Originals]) -> Originals:
     for part in parts:
         places.append(part.places + np.array([len(scenes), 0]))
         scenes += part.scenes
+    # In the order of their keys, in which rows are looked up.
     keys = np.concatenate([part.keys for part in parts])
     order = keys.argsort()
     return Originals(keys[order], scenes, np.concatenate(places)[order])
@@ -238,6 +241,8 @@ def copy_rows(
 ) -> ndarray:
     """Copy rows by their keys, from the splat or from what was left out of it."""
     rows = np.zeros(len(keys), dtype)
+    # Keys ascend, so that each is found by bisection. A key beyond the last one meets the last row,
+    # which has another key.
     places = np.searchsorted(final, keys).clip(max=len(final) - 1)
     is_there = final[places] == keys
     for block, copied in iterate_rows(layout, places[is_there]):
