@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
@@ -50,8 +51,9 @@ from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import write_image
 from gscompleter.system.files.output_folder import reserve_output
+from gscompleter.system.files.reading import check_file
 from gscompleter.system.files.writing import COMPLETED_FILE, REMOVED_FILE, SUMMARY_FILE
-from gscompleter.system.progress import show_preparation, show_progress, stage, track
+from gscompleter.system.progress import show_progress, stage, track
 from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.types import Camera, Gaussians, View
 
@@ -208,7 +210,11 @@ def clean_alone(options: CleanOptions, console: Console) -> Cleaning:
 
 def load_given_splat(options: CleanOptions) -> Gaussians:
     """Read the splat to clean."""
-    with show_preparation("reading the scene"):
+    # A file that is not there is refused before a line says that it is read. A folder may be an
+    # unpacked .sog.
+    if not os.path.isdir(options.scene):
+        check_file(options.scene)
+    with stage("reading the scene"):
         return load_splat(options.scene, options.drop_nonfinite, options.ignore_properties)
 
 
