@@ -57,6 +57,7 @@ PHOTOGRAPH_OPTIONS = {
     "frames": 40,
     "no_masks": False,
     "ignore": None,
+    "forget_edits": False,
 }
 """Options that only photographs can follow, with their defaults."""
 
@@ -288,6 +289,8 @@ def check_photographs(options: CompleteOptions) -> CompleteOptions:
             "is given; leave it out.",
             "invert-masks",
         )
+    if options.large_masks and not options.has_marks:
+        raise InputError("There are no masks that could be too large; leave it out.", "large-masks")
     return replace(options, folder=None, scene=options.scene or options.folder)
 
 
