@@ -93,6 +93,14 @@ def read_compressed_ply(path: Path) -> Gaussians:
     return replace(gaussians, is_antialiased=has_mode_comment(header))
 
 
+def list_compressed_names(path: Path) -> list[str]:
+    """List the properties of the Gaussians that are not read."""
+    with path.open("rb") as file:
+        _, elements = read_header(file, path)
+    vertex = next(element for element in elements if element.name == "vertex")
+    return [name for name in vertex.dtype.names or () if name not in PACKED_PROPERTIES]
+
+
 def _map_to_chunk(
     chunk: ndarray, bounds: Sequence[str], fractions: Float[ndarray, "n 3"]
 ) -> Float[ndarray, "n 3"]:

@@ -12,7 +12,7 @@ import lzma
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import groupby
@@ -26,14 +26,18 @@ from PIL import Image
 from torch import Tensor
 
 from gscompleter.numerics.value_checks import check_gaussians
-from gscompleter.splats.compressed_ply import read_compressed_ply, write_compressed_ply
+from gscompleter.splats.compressed_ply import (
+    list_compressed_names,
+    read_compressed_ply,
+    write_compressed_ply,
+)
 from gscompleter.splats.foreign import (
     refuse_folder,
     refuse_foreign,
     refuse_packed_folder,
     resolve_splat,
 )
-from gscompleter.splats.glb import read_glb, read_glb_remarks, write_glb
+from gscompleter.splats.glb import list_glb_names, read_glb, read_glb_remarks, write_glb
 from gscompleter.splats.ksplat import read_ksplat
 from gscompleter.splats.morton import sort_along_morton
 from gscompleter.splats.origin import measure_distance
@@ -49,7 +53,7 @@ from gscompleter.splats.ply import (
     require_finite,
     save_ply,
 )
-from gscompleter.splats.properties import describe_further
+from gscompleter.splats.properties import describe_further, refuse_other_kinds
 from gscompleter.splats.provenance import (
     KEY,
     NOTHING_KNOWN,
@@ -57,9 +61,9 @@ from gscompleter.splats.provenance import (
     parse_comments,
     parse_provenance,
 )
-from gscompleter.splats.sog import META, read_sog, read_sog_remarks, write_sog
+from gscompleter.splats.sog import META, list_sog_names, read_sog, read_sog_remarks, write_sog
 from gscompleter.splats.splat import read_splat_rows, write_splat
-from gscompleter.splats.spz import read_spz, write_spz
+from gscompleter.splats.spz import list_spz_names, read_spz, write_spz
 from gscompleter.splats.usd import read_usd, read_usd_remarks, write_usd
 from gscompleter.system.damage import describe_damage
 from gscompleter.system.errors import InputError, quote_value, refuse_pointer, require_path
@@ -100,6 +104,8 @@ class SplatFormat:
     """Text near the start of a file that tells it from others with the same first bytes."""
     read_remarks: Callable[[Path], object] | None = None
     """Reads the record of who made the file, as values of JSON; None if it lies beside it."""
+    list_names: Callable[[Path], list[str]] | None = None
+    """Lists properties that are not read, named as in a .ply; None if it can hold no others."""
 
 
 SPLAT_FORMATS = {
@@ -109,9 +115,12 @@ SPLAT_FORMATS = {
         read_compressed_ply,
         write_compressed_ply,
         contains=b"packed_position",
+        list_names=list_compressed_names,
     ),
     "ply": SplatFormat((".ply",), (b"ply",), load_ply, save_ply),
-    "spz": SplatFormat((".spz",), (b"NGSP", b"\x1f\x8b"), read_spz, write_spz),
+    "spz": SplatFormat(
+        (".spz",), (b"NGSP", b"\x1f\x8b"), read_spz, write_spz, list_names=list_spz_names
+    ),
     "usdz": SplatFormat(
         (".usdz",), (ZIP_MAGIC,), read_usd, write_usd, b".usd", read_remarks=read_usd_remarks
     ),
@@ -122,9 +131,25 @@ SPLAT_FORMATS = {
         write_usd,
         read_remarks=read_usd_remarks,
     ),
-    "sog": SplatFormat((".sog",), (ZIP_MAGIC,), read_sog, write_sog, read_remarks=read_sog_remarks),
-    "sog-folder": SplatFormat((META,), (b"{",), read_sog, read_remarks=read_sog_remarks),
-    "glb": SplatFormat((".glb",), (b"glTF",), read_glb, write_glb, read_remarks=read_glb_remarks),
+    "sog": SplatFormat(
+        (".sog",),
+        (ZIP_MAGIC,),
+        read_sog,
+        write_sog,
+        read_remarks=read_sog_remarks,
+        list_names=list_sog_names,
+    ),
+    "sog-folder": SplatFormat(
+        (META,), (b"{",), read_sog, read_remarks=read_sog_remarks, list_names=list_sog_names
+    ),
+    "glb": SplatFormat(
+        (".glb",),
+        (b"glTF",),
+        read_glb,
+        write_glb,
+        read_remarks=read_glb_remarks,
+        list_names=list_glb_names,
+    ),
     "splat": SplatFormat((".splat",), (), read_splat_rows, write_splat),
     "ksplat": SplatFormat((".ksplat",), (), read_ksplat),
 }
@@ -159,7 +184,20 @@ def load_splat(
     path = resolve_splat(require_path(path))
     if detect_splat_format(path) == "ply" and not leaves_out_band_4:
         return load_ply(path, drop_nonfinite, ignore_properties)
-    return require_finite(decode_splat(path, leaves_out_band_4), path, drop_nonfinite)
+    gaussians = decode_splat(path, leaves_out_band_4)
+    if not ignore_properties:
+        refuse_other_kinds(list_names(path), path)
+    return require_finite(gaussians, path, drop_nonfinite)
+
+
+def list_names(path: Path) -> Sequence[str]:
+    """List the properties of a file that `decode_splat` reads, at least those it does not use."""
+    name = detect_splat_format(path)
+    if name == "ply":
+        # Harmonics of a higher degree are refused, or left out, by those who read them.
+        return read_scene(path, leaves_out_band_4=True).rows.dtype.names or ()
+    listed = SPLAT_FORMATS[name].list_names
+    return () if listed is None else listed(path)
 
 
 def decode_splat(path: Path, leaves_out_band_4: bool = False) -> Gaussians:
@@ -220,12 +258,12 @@ def load_splat_at(path: Path, origin: Origin | None, drop_nonfinite: bool = Fals
 def describe_oddities(path: Path) -> list[str]:
     """Describe in sentences what a file has that plain 3DGS does not, and how it is read."""
     path = resolve_splat(path)
-    if detect_splat_format(path) != "ply":
-        return []
-    # Harmonics of a higher degree are refused, or left out, by those who read them.
-    scene = read_scene(path, leaves_out_band_4=True)
-    further = describe_further(scene.rows.dtype.names or ())
-    return [*describe_values(scene), *([] if further is None else [further])]
+    further = describe_further(list_names(path))
+    lines = [] if further is None else [further]
+    if detect_splat_format(path) == "ply":
+        # As in `list_names`.
+        lines = [*describe_values(read_scene(path, leaves_out_band_4=True)), *lines]
+    return lines
 
 
 def validate_ranges(gaussians: Gaussians, path: Path) -> Gaussians:

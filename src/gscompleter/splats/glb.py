@@ -55,6 +55,11 @@ COMPRESSIONS = tuple(f"{EXTENSION}_compression_spz{version}" for version in ("",
 SH_NAMES = [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}" for d in range(4) for i in range(2 * d + 1)]
 LABELS = "_GENERATED"
 """Attribute of the labels, if anything was generated; names of applications begin with `_`."""
+KNOWN = {
+    *("POSITION", "NORMAL", "COLOR_0", LABELS, *SH_NAMES),
+    *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY")),
+}
+"""Attributes that are read, and what viewers of points show."""
 COLOR_SPACE = "srgb_rec709_display"
 """The colour space in which all splat trainers work."""
 COMPONENT_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
@@ -102,6 +107,15 @@ def read_glb_remarks(path: Path) -> object:
     """Read the record in the `extras` of the asset, or None if there is none."""
     table = _parse_document(read_bytes(path)).table
     return table.get("asset", {}).get("extras", {}).get(KEY)
+
+
+def list_glb_names(path: Path) -> list[str]:
+    """List the attributes of the Gaussians of a .glb that are not read, named as in a .ply."""
+    primitives = _find_primitives(_parse_document(read_bytes(path)))
+    attributes = dict.fromkeys(name for one, _ in primitives for name in one["attributes"])
+    # Attributes of applications begin with `_`, as `_TRBF_CENTER`.
+    further = [name.removeprefix(f"{EXTENSION}:") for name in attributes if name not in KNOWN]
+    return [name.lstrip("_").lower() for name in further]
 
 
 def _describe_other_content(table: dict[str, Any]) -> str:

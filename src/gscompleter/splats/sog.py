@@ -69,6 +69,8 @@ FileReader = Callable[[str, int], bytes]
 """Function that reads a file of the scene by name and most bytes, from a folder or a bundle."""
 Coded = tuple[dict[str, Any], dict[str, bytes]]
 """A property as numbers for `meta.json`, and images by file name."""
+READ = ("means", "scales", "quats", "sh0", "shN", LABELS)
+"""Properties that are read."""
 
 
 def read_sog(path: Path) -> Gaussians:
@@ -89,13 +91,28 @@ def _read_folder(folder: Path, meta: str) -> Gaussians:
 
 def read_sog_remarks(path: Path) -> object:
     """Read the record in `meta.json`, or None if there is none."""
+    return _read_meta(path).get(KEY)
+
+
+def list_sog_names(path: Path) -> list[str]:
+    """List the properties of Gaussians, each of them images, that are not read."""
+    return [
+        name
+        for name, stored in _read_meta(path).items()
+        if name not in READ and isinstance(stored, dict) and "files" in stored
+    ]
+
+
+def _read_meta(path: Path) -> dict[str, Any]:
     if path.is_dir():
-        return json.loads(read_bytes(path / META)).get(KEY)
-    data = read_bytes(path)
-    if not data.startswith(ZIP_MAGIC):
-        return json.loads(data).get(KEY)
-    with zipfile.ZipFile(io.BytesIO(data)) as bundle:
-        return json.loads(_read_entry(bundle, META, MAX_META)).get(KEY)
+        data = read_bytes(path / META)
+    else:
+        data = read_bytes(path)
+        if data.startswith(ZIP_MAGIC):
+            with zipfile.ZipFile(io.BytesIO(data)) as bundle:
+                data = _read_entry(bundle, META, MAX_META)
+    table: dict[str, Any] = json.loads(data)
+    return table
 
 
 def _read_entry(bundle: zipfile.ZipFile, name: str, most: int) -> bytes:

@@ -47,6 +47,8 @@ GZIP = b"\x1f\x8b"
 HEADER = struct.Struct("<4sIIBBBB")
 """Magic, version, count, SH degree, fractional bits, flags, and the number of streams."""
 ANTIALIASED_FLAG = 0x1
+EXTENSIONS_FLAG = 0x2
+"""Flag of a file with records of other programs, such as the orbit of a viewer's camera."""
 MAX_WINDOW = 1 << 27
 """Largest window of zstd, in bytes, which it keeps in memory."""
 COLOR_SCALE = 0.15
@@ -107,6 +109,14 @@ def decode_spz(data: bytes, max_degree: int = 3) -> Gaussians:
         streams = _read_zstd(header, data)
     turned = rotate_half_turn(_decode_streams(header, streams), HALF_TURN_X)
     return replace(turned, is_antialiased=bool(header.flags & ANTIALIASED_FLAG))
+
+
+def list_spz_names(path: Path) -> list[str]:
+    """List what is stored besides the attributes, and is not read."""
+    data = read_bytes(path)
+    if data.startswith(GZIP):
+        data = zlib.decompressobj(wbits=GZIP_BITS).decompress(data, HEADER.size)
+    return ["extensions"] if _parse_header(data, 4).flags & EXTENSIONS_FLAG else []
 
 
 def _parse_header(data: bytes, max_degree: int) -> SpzHeader:
