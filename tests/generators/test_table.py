@@ -62,7 +62,9 @@ def test_a_generator_fills_holes_and_shows_what_the_photographs_show(name):
     assert image.shape == TRUTH.image.shape
     assert 0 <= image.min() <= image.max() <= 1
     assert torch.equal(image, images[1])
-    assert psnr(image[~HOLES][None], TRUTH.image[~HOLES][None]) > 20
+    # Elsewhere it is far closer to the photographs than one colour for all would be.
+    seen = TRUTH.image[~HOLES][None]
+    assert psnr(image[~HOLES][None], seen) > psnr(seen.mean(1, keepdim=True).expand_as(seen), seen) + 5
     assert FILLINGS[name](image)
 
 

@@ -105,7 +105,8 @@ def add_options(kind: type[C]) -> type[C]:
     """
     annotated: Any = Annotated  # a type checker cannot read a type that is looked up
     for entry in GENERATORS.values():
-        types = get_type_hints(entry.settings, include_extras=True)
+        # Without their ranges, which the settings check: a sentence then names the option.
+        types = get_type_hints(entry.settings)
         for name, sentence in entry.help.items():
             kind.__annotations__[PREFIX + name] = annotated[types[name] | None, Doc(sentence)]
             setattr(kind, PREFIX + name, None)
