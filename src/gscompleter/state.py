@@ -44,20 +44,6 @@ AFFINE_NOTES = {
 }
 """Sentence about each estimator of the depth correction; empty for the usual one."""
 NOTHING_ADDED = "Nothing of it was added."
-LOSSES = {
-    "lift": "no depth was found for it",
-    "register": "what was made for it did not fit there",
-    "filter": "what was made for it lies beside the hole",
-    "free-space": "a filling would hide what other cameras see through it",
-    "removal": "nothing was removed there",
-    "hull": "a filling would lie outside of the object",
-    "refine": "the photographs beside it contradict a filling",
-    "image-agreement": "the generated image contradicts the photographs",
-    "depth-agreement": "its depths contradict the scene",
-    "psnr": "a filling would make given photographs worse",
-    "contribution": "a filling would hardly be seen",
-}
-"""Reason why each step leaves a part of a hole empty, as a clause for people."""
 
 
 @dataclass(frozen=True)
@@ -86,6 +72,9 @@ class Step:
     name: str
     """`lift`, `register`, `filter`, `refine`, or the name of a guard."""
     gaussians: Gaussians
+    loss: str = ""
+    """Why it leaves a part of a hole empty, as a clause for people; empty for those of the paper,
+    which `find_unfilled` explains."""
 
 
 @dataclass(frozen=True)
@@ -104,6 +93,8 @@ class Unfilled:
     regions: tuple[tuple[int, int, int, int], ...] = ()
     """Bounding boxes (left, top, right, bottom) of the largest regions, in pixels of the target
     image; its padding has coordinates below 0 and beyond its size."""
+    reason: str = ""
+    """Why the step that emptied most left it out, as a clause for people; empty if none did."""
 
     def describe(self) -> str:
         """Write the sentence for people; empty if the hole is filled.
@@ -113,10 +104,8 @@ class Unfilled:
         if self.share <= self.MAX_SHARE:
             return ""
         # One reason is enough: the others seldom leave as much.
-        steps = sorted(self.lost_by, key=lambda step: -self.lost_by[step])
-        reason = LOSSES.get(steps[0], f"the step {steps[0]} left it out") if steps else ""
-        mostly = "mostly " if len(steps) > 1 else ""
-        because = f", {mostly}because {reason}" if reason else ""
+        mostly = "mostly " if len(self.lost_by) > 1 else ""
+        because = f", {mostly}because {self.reason}" if self.reason else ""
         return f"{max(1, round(100 * self.share))} % of the hole stays empty{because}."
 
 

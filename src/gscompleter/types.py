@@ -724,6 +724,12 @@ class GeneratorInput:
         alpha = self.target_render.alpha if self.trusted_alpha is None else self.trusted_alpha
         return alpha < self.max_alpha
 
+    @property
+    def known_colors(self) -> Float[Tensor, "h w 3"]:
+        """Colours of the scene at the target without the black behind it; dark in holes."""
+        alpha = self.target_render.alpha.clamp_min(self.max_alpha)
+        return (self.target_render.image / alpha[..., None]).clamp(0, 1)
+
 
 @dataclass(frozen=True)
 class Lift:

@@ -14,7 +14,8 @@ import torch
 import gscompleter as gsc
 from command import run
 from gscompleter import InputError, load_ply, load_splat, save_ply, save_splat
-from gscompleter.splats.formats import convert_splat, describe_oddities
+from gscompleter.splats.conversion import convert_splat
+from gscompleter.splats.formats import describe_oddities
 from gscompleter.splats.layout import find_layout, save_like, strip
 from gscompleter.splats.ply import read_scene
 from gscompleter.splats.properties import find_further
@@ -70,7 +71,7 @@ def test_what_surely_looks_wrong_is_refused_and_can_be_gone_on_with(tmp_path, ki
         with pytest.raises(InputError, match=sentence):
             convert_splat(path, tmp_path / name)
         assert not (tmp_path / name).exists()
-        assert convert_splat(path, tmp_path / name, ignore_properties=True)[0] == COUNT
+        assert convert_splat(path, tmp_path / name, ignore_properties=True).gaussians == COUNT
     assert len(describe_oddities(path)) == 1
 
 

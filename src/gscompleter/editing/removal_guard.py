@@ -12,6 +12,7 @@ class Removal(Guard):
     """Add nothing where the scene looked the same before the removal."""
 
     name = "removal"
+    loss = "nothing was removed there"
 
     def place(self, candidates: Gaussians, view: TargetView) -> Gaussians:
         """Keep candidates in pixels that showed something removed."""

@@ -1,6 +1,7 @@
 """Safeguards beyond the paper, a file each; a preset names those that are asked, in order.
 
-A new guard is a class that overrides one of three hooks, and an entry in `config.GUARDS`.
+A new guard is a class that overrides one of three hooks and explains its losses, and an entry in
+`config.GUARDS`.
 """
 
 from __future__ import annotations
@@ -36,6 +37,8 @@ class Guard:
     """A safeguard beyond the paper. Every hook returns its first argument unless overridden."""
 
     name: ClassVar[str]
+    loss: ClassVar[str] = ""
+    """Why it leaves a part of a hole empty: a clause after "of the hole stays empty, because"."""
 
     def begin(self, state: Completion, scenes: SceneRenderer) -> Completion:
         """Inspect the scene before its first target."""
@@ -73,7 +76,7 @@ def place(candidates: Gaussians, view: TargetView) -> tuple[Step, ...]:
         placed = guard.place(kept, view)
         # A guard that changes nothing returns its argument itself, and is no step.
         if placed is not kept:
-            steps.append(Step(guard.name, placed))
+            steps.append(Step(guard.name, placed, guard.loss))
         kept = placed
     return tuple(steps)
 
@@ -89,7 +92,7 @@ def verify(attempt: Attempt) -> tuple[tuple[Step, ...], Rejection]:
     for guard in load_guards(attempt.view.state.config):
         checked = guard.verify(added, attempt)
         if checked is not added:
-            steps.append(Step(guard.name, checked))
+            steps.append(Step(guard.name, checked, guard.loss))
         if len(added) > 0 and len(checked) == 0:
             return tuple(steps), Rejection(guard.name, guard.explain_rejection(attempt))
         added = checked

@@ -26,6 +26,7 @@ class PsnrGuard(Guard):
     """Let no photograph get worse than its error budgets."""
 
     name = "psnr"
+    loss = "a filling would make given photographs worse"
 
     def begin(self, state: Completion, scenes: SceneRenderer) -> Completion:
         """Set the error budgets of all photographs for all targets, before any of them.

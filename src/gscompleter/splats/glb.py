@@ -29,6 +29,7 @@ from gscompleter.splats.packing import (
     with_labels,
 )
 from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
+from gscompleter.splats.splat_format import SplatFormat
 from gscompleter.splats.spz import decode_spz
 from gscompleter.splats.transform import (
     HALF_TURN_Z,
@@ -43,6 +44,7 @@ from gscompleter.system.files.reading import read_bytes
 from gscompleter.system.files.writing import replace_file
 from gscompleter.types import SH_C0, Gaussians, Origin
 
+MAGIC = b"glTF"
 FILE_HEADER = struct.Struct("<4sII")
 CHUNK_HEADER = struct.Struct("<II")
 JSON = 0x4E4F534A
@@ -103,7 +105,7 @@ def read_glb(path: Path) -> Gaussians:
     return rotate_half_turn(merge_placed(parts), HALF_TURN_Z)
 
 
-def read_glb_remarks(path: Path) -> object:
+def read_glb_record(path: Path) -> object:
     """Read the record in the `extras` of the asset, or None if there is none."""
     table = _parse_document(read_bytes(path)).table
     return table.get("asset", {}).get("extras", {}).get(KEY)
@@ -276,7 +278,7 @@ def write_glb(path: Path, gaussians: Gaussians, made_by: Provenance = NOTHING_KN
     if total > MAX_FILE_BYTES:
         raise InputError(f"{quote_value(path)} would exceed the 4 GiB of a .glb; write a .ply.")
     with replace_file(path) as file:
-        file.write(FILE_HEADER.pack(b"glTF", 2, total))
+        file.write(FILE_HEADER.pack(MAGIC, 2, total))
         file.write(CHUNK_HEADER.pack(len(text), JSON) + text + CHUNK_HEADER.pack(size, BINARY))
         for column in columns.values():
             file.write(column.data)
@@ -334,3 +336,18 @@ def _describe_scene(
         "bufferViews": views,
         "accessors": accessors,
     }
+
+
+GLB = SplatFormat(
+    name="glb",
+    endings=(".glb",),
+    read=read_glb,
+    starts=(MAGIC,),
+    write=write_glb,
+    read_record=read_glb_record,
+    list_names=list_glb_names,
+    holds_labels=True,
+    holds_origin=True,
+    is_y_up=True,
+    has_json=True,
+)

@@ -313,6 +313,7 @@ def make_target_row(
     """Make the row of a target."""
     fit = result.affine
     added = result.added
+    empty = result.unfilled
     return TargetRow(
         target.frame,
         **scores,
@@ -324,7 +325,7 @@ def make_target_row(
         derived_from=target.derived_from,
         recolored=result.num_recolored,
         target_id=result.target_id if len(added) or result.num_recolored else None,
-        unfilled=UnfilledRow(**vars(result.unfilled)),
+        unfilled=UnfilledRow(empty.share, empty.lost_by, empty.regions),
         notes=result.notes,
         warnings=result.warnings,
         refused=result.refusal,

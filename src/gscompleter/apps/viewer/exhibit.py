@@ -228,8 +228,8 @@ def add_file_cameras(content: ViewerContent, path: Path, resolution: Resolution)
 
 def make_frame_thumbnail(frame: Frame) -> bytes | None:
     """Make a small JPEG of the upright photograph of a frame; None if it is no file."""
-    stored = frame.find_stored()
-    return make_thumbnail(stored, frame.find_turn()) if isinstance(stored, Path) else None
+    path = None if frame.file is None else frame.file.path
+    return None if path is None else make_thumbnail(path, frame.find_turn())
 
 
 def make_thumbnail(stored: Path, orientation: int = 1) -> bytes | None:
