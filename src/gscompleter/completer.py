@@ -21,6 +21,7 @@ from gscompleter.guards import Attempt, place, prepare_guards, verify
 from gscompleter.numerics.geometry import is_inside, pad_camera, pad_like, project
 from gscompleter.numerics.image_ops import is_enclosed
 from gscompleter.numerics.value_checks import check_camera, check_gaussians, check_inputs
+from gscompleter.parts import MAX_TARGET_ID, Part, PartOrigin, find_last_target_id, make_part
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.reconstructors.depth_predictors import predict_nothing
 from gscompleter.render.cache import SceneRenderer
@@ -42,12 +43,10 @@ from gscompleter.stages.register_paper import register_as_paper
 from gscompleter.stages.synthesize import GeneratedView, synthesize
 from gscompleter.stages.target_view import TargetView, render_target
 from gscompleter.state import (
-    NEW_PHOTO_ID,
     Completion,
     Photo,
     Step,
     check_state,
-    find_last_target_id,
 )
 from gscompleter.system.errors import InputError
 from gscompleter.system.progress import show_in_notebook, track
@@ -58,8 +57,6 @@ from gscompleter.trust import Trust
 from gscompleter.trust.photometric import load_trust
 from gscompleter.types import Camera, DepthAffine, Gaussians, PaddedCamera, View, merge
 
-MAX_TARGET_ID = NEW_PHOTO_ID - 1
-"""Largest target id: `generated` is one byte per Gaussian, and 0 means observed."""
 MAX_SEED = 2**62
 """Levels and rounds add to the seed, which has 64 bits."""
 REGISTRATIONS = {"paper": register_as_paper, "ours": register_along_rays}
@@ -182,12 +179,10 @@ class GSCompleter:
                 self.reconstructor, views, scene, check_views or (), targets, self.renderer
             )
             photos = tuple(Photo(view) for view in context.views)
-            parts = (context.source.rendered,)
-
             state = Completion(
                 config,
                 context.source,
-                parts,
+                context.source.rendered,
                 photos,
                 len(views),
                 Trust(),
@@ -260,13 +255,16 @@ class GSCompleter:
             steps.append(Step("refine", refined.gaussians))
             verified, rejection = verify(Attempt(view, image, affine, refined))
             steps += verified
-            filled = fade_border(steps[-1].gaussians, view)
+            target_id = state.next_target_id
+            filled = make_part(
+                PartOrigin("target", target_id), fade_border(steps[-1].gaussians, view)
+            )
 
             # Not in the paper: what covers the target without being trusted takes new colours, and
             # gaps that a camera beside the target would see are closed.
-            recolored = recolor(image, view, state.next_target_id)
+            recolored = recolor(image, view, filled.origin)
             closing = self.close_gaps(recolored.state, view, filled)
-            added = merge([filled, closing])
+            added = merge([filled.gaussians, closing.gaussians])
             after = recolored.frozen.composite(added)
             result = replace(
                 view.make_unchanged_result(),
@@ -286,12 +284,13 @@ class GSCompleter:
             )
         return recolored.state.extended(result, seconds, (filled, closing))
 
-    def close_gaps(self, state: Completion, target: TargetView, added: Gaussians) -> Gaussians:
+    def close_gaps(self, state: Completion, target: TargetView, added: Part) -> Part:
         """Return what closes the thin gaps beside a target, for which `added` is added.
 
         None are closed where nothing was added, or in the paper.
         """
-        nothing = added[:0]
+        origin = PartOrigin("gap", state.next_target_id)
+        nothing = make_part(origin, added.gaussians[:0])
         if state.config.gaps.displacement == 0 or len(added) == 0:
             return nothing
         # The target is not counted as completed yet: what is added here gets its id, and has to be
@@ -300,7 +299,7 @@ class GSCompleter:
             replace(photo, budgets=budgets)
             for photo, budgets in zip(state.photos, target.budgets, strict=True)
         )
-        with_added = replace(state, parts=(*state.parts, added), photos=photos)
+        with_added = replace(state, added_parts=(*state.added_parts, added), photos=photos)
         view = view_gaps(with_added, target.camera.target, self.scenes, state.config.gaps)
         gaps = find_gaps(view)
         if not gaps.any():
@@ -310,7 +309,7 @@ class GSCompleter:
         placed = steps[-1].gaussians
         plans = tuple(frozen.vary_opacities(placed) for frozen in view.frozen_photos)
         verified, _ = verify(Attempt(view, image, DepthAffine(), Refined(placed, plans, ())))
-        return [*steps, *verified][-1].gaussians
+        return make_part(origin, [*steps, *verified][-1].gaussians)
 
     @run_in_plain_torch
     def advance_batch(self, state: Completion, targets: Sequence[Camera]) -> Completion:

@@ -8,10 +8,12 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, ClassVar
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import CompleterConfig
+from gscompleter.parts import Part, PartKind, find_last_target_id
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.display import Displayed
 from gscompleter.system.plugins import load_function
@@ -29,8 +31,6 @@ from gscompleter.types import (
     merge,
 )
 
-NEW_PHOTO_ID = 255
-"""Value of `generated` for Gaussians that were recoloured to a new photograph, or cut."""
 MANY_TIMES = 4
 """Gaussians outside of the image of a target, against those in it, from which on they are many."""
 MAX_SHOWN_TARGETS = 4
@@ -229,14 +229,15 @@ class Completion(Displayed):
 
     config: CompleterConfig
     source: ContextScene
-    parts: tuple[Gaussians, ...]
-    """Gaussians to render: the context, recoloured in part, then what each target added: for the
-    hole, and for thin gaps. Frozen scenes are extended part by part."""
+    rendered_context: Gaussians
+    """The context as stages see it: recoloured in part, and of a large scene a proxy."""
     photos: tuple[Photo, ...]
     """Context photographs, then check photographs."""
     num_context: int
     trust: Trust
     """Trust in `rendered_context`; added Gaussians have full trust."""
+    added_parts: tuple[Part, ...] = ()
+    """What was added, part by part, in the order of addition."""
     targets: tuple[TargetResult, ...] = ()
     free_space_cameras: tuple[Camera, ...] = ()
     """Further cameras whose free space stays empty, such as the witnesses of a splat; their images
@@ -247,8 +248,6 @@ class Completion(Displayed):
     """Exposure gain of each original photograph relative to `views`, or None if not estimated."""
     num_new_photos: int = 0
     """Number of photographs that a given scene did not reproduce."""
-    num_observed: int = 0
-    """Number of Gaussians that were added from photographs, before any target."""
     is_given: bool = False
     """True if the context is a scene that was given, and Ψ did not reconstruct it."""
     seed: int = 0
@@ -327,9 +326,9 @@ class Completion(Displayed):
         return tuple(photo.view for photo in self.photos[: self.num_context])
 
     @property
-    def rendered_context(self) -> Gaussians:
-        """The context as stages see it: recoloured in part, and of a large scene a proxy."""
-        return self.parts[0]
+    def parts(self) -> tuple[Gaussians, ...]:
+        """Gaussians to render: the context, then the additions, by which frozen scenes grow."""
+        return (self.rendered_context, *(part.gaussians for part in self.added_parts))
 
     @property
     def context(self) -> Gaussians:
@@ -338,13 +337,32 @@ class Completion(Displayed):
 
     @cached_property
     def added(self) -> Gaussians:
-        """Generated Gaussians of all targets."""
+        """All Gaussians that were added."""
         return merge([self.rendered_context[:0], *self.parts[1:]])
 
+    def count_added(self, *kinds: PartKind) -> int:
+        """Count the additions of these kinds that are in the scene."""
+        return sum(len(part) for part in self.added_parts if part.origin.kind in kinds)
+
     @property
+    def num_observed(self) -> int:
+        """Number of added Gaussians that photographs show and the given scene lacked."""
+        return self.count_added("photographs")
+
+    @property
+    def num_invented(self) -> int:
+        """Number of added Gaussians that were invented for a target."""
+        return self.count_added("target", "gap")
+
+    @cached_property
     def recolored_mask(self) -> Bool[Tensor, "n"]:
         """True for Gaussians of `context` that got new colours."""
-        return self.source.expand(self.rendered_context.generated != self.source.rendered.generated)
+        before = self.source.rendered
+        after = self.rendered_context
+        if after is before:
+            return torch.zeros_like(self.source.chosen_mask)
+        # Their labels do not tell: a Gaussian may have had this label before.
+        return self.source.expand((after.sh != before.sh).flatten(1).any(dim=1))
 
     @cached_property
     def scene(self) -> Gaussians:
@@ -420,22 +438,16 @@ class Completion(Displayed):
         self,
         result: TargetResult,
         seconds: Mapping[str, float],
-        added: Sequence[Gaussians] = (),
+        added: Sequence[Part] = (),
     ) -> Completion:
         """Append the result of one more target, and what it `added`, in the order of addition."""
-        parts = (*self.parts, *(part for part in added if len(part)))
+        parts = (*self.added_parts, *(part for part in added if len(part)))
         targets = (*self.targets, result)
-        return replace(self, parts=parts, targets=targets).plus_seconds(seconds)
+        return replace(self, added_parts=parts, targets=targets).plus_seconds(seconds)
 
     def plus_seconds(self, seconds: Mapping[str, float]) -> Completion:
         """Add wall times stage by stage."""
         return replace(self, seconds=add_seconds(self.seconds, seconds))
-
-
-def find_last_target_id(scene: Gaussians) -> int:
-    """Find the largest target id in a scene; 0 if nothing was generated for a target."""
-    ids = scene.generated.where(scene.generated != NEW_PHOTO_ID, 0)
-    return int(ids.max()) if len(ids) else 0
 
 
 def check_state(state: object) -> None:

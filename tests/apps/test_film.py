@@ -211,7 +211,7 @@ def test_whoever_stops_it_leaves_no_ffmpeg_behind(tmp_path, monkeypatch):
 
 
 def test_no_film_without_a_target(completion, tmp_path):
-    nothing = replace(completion, parts=completion.parts[:1], targets=())
+    nothing = replace(completion, added_parts=(), targets=())
     write_comparison_video(
         tmp_path, nothing, [completion.views[0].camera], load_renderer("reference")
     )

@@ -24,6 +24,7 @@ from gscompleter.numerics.geometry import (
     select_spread_cameras,
 )
 from gscompleter.numerics.image_ops import dilate, label_regions
+from gscompleter.parts import PartOrigin, make_part
 from gscompleter.reconstructors import Reconstructor, run_reconstructor
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.fit_colors import RELAXATION, fit_colors
@@ -36,7 +37,7 @@ from gscompleter.stages.refine import refine_opacities
 from gscompleter.stages.register import apply_affine
 from gscompleter.stages.select_anchor import find_nearest_view
 from gscompleter.stages.target_view import compute_hole_mask
-from gscompleter.state import NEW_PHOTO_ID, Completion
+from gscompleter.state import Completion
 from gscompleter.system.progress import track
 from gscompleter.trust.photometric import compute_color_differences
 from gscompleter.types import DepthMap, Gaussians, Reconstruction, Render, View, merge
@@ -98,7 +99,7 @@ class Evidence:
 def add_observed(
     reconstructor: Reconstructor, state: Completion, scenes: SceneRenderer, rng: torch.Generator
 ) -> Completion:
-    """Add what photographs show and the scene lacks, and count it in `num_observed`.
+    """Add what photographs show and the scene lacks, as parts of that origin.
 
     Nothing changes for a context that Ψ reconstructed: it has what its photographs show.
     """
@@ -115,15 +116,14 @@ def add_observed(
             break
         reconstructed.update(chosen)
         photos = [Evidence(views[i], frozen[i], lacks[i]) for i in chosen]
-        part, notes = reconstruct_lacking(reconstructor, photos, state, rng)
+        candidates, notes = reconstruct_lacking(reconstructor, photos, state, rng)
         state = replace(state, context_notes=(*state.context_notes, *notes))
-        part = fit_to_photographs(part, frozen, state)
+        added = fit_to_photographs(candidates, frozen, state)
         # What was found and could not be added would be found again.
-        if len(part) == 0:
+        if len(added) == 0:
             break
-        state = replace(
-            state, parts=(*state.parts, part), num_observed=state.num_observed + len(part)
-        )
+        part = make_part(PartOrigin("photographs"), added)
+        state = replace(state, added_parts=(*state.added_parts, part))
     return state
 
 
@@ -232,13 +232,8 @@ def reconstruct_lacking(
     part = merge(parts)
     # No more harmonics than the scene has, whose file has no place for them. The fit of colours
     # that follows makes up for them.
-    added = replace(
-        part,
-        sh=part.sh[:, : state.context.sh.shape[1]],
-        generated=torch.full_like(part.generated, NEW_PHOTO_ID),
-        encoded=None,
-    )
-    return added, reconstruction.notes
+    sh = part.sh[:, : state.context.sh.shape[1]]
+    return replace(part, sh=sh, encoded=None), reconstruction.notes
 
 
 def select_pixels(

@@ -20,7 +20,7 @@ from gscompleter.render.removed import add_border, find_removed
 from gscompleter.stages.enclosed_holes import keep_enclosed
 from gscompleter.stages.error_budgets import share_budgets
 from gscompleter.stages.select_anchor import AnchorChoice, compute_overlap, select_anchor
-from gscompleter.state import NEW_PHOTO_ID, Completion, TargetResult
+from gscompleter.state import Completion, TargetResult
 from gscompleter.types import Camera, ErrorBudget, GeneratorInput, PaddedCamera, Render, View, merge
 
 FULL_TRUST = 1.0
@@ -86,7 +86,8 @@ class TargetView:
             return None
         forced = self.removed
         # What an earlier target filled is no hole any more.
-        filled = [part[part.generated != NEW_PHOTO_ID] for part in self.state.parts[1:]]
+        parts = self.state.added_parts
+        filled = [part.gaussians for part in parts if part.origin.is_invented]
         if sum(map(len, filled)) == 0:
             return forced
         alpha = self.scenes.renderer.render(merge(filled), self.camera.padded).alpha
