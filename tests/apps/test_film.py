@@ -26,10 +26,11 @@ from gscompleter.apps.report.film import (
 )
 from gscompleter.numerics.geometry import measure_baseline, measure_rotation, resize_camera
 from gscompleter.render.loading import load_renderer
-from gscompleter.state import Completion, Photo, TargetResult
+from gscompleter.state import Completion, Photo
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.video import find_ffmpeg, write_video
 from gscompleter.system.progress import show_progress
+from gscompleter.target_result import TargetResult
 from gscompleter.types import Camera
 from scenes import Room, camera_at, half_a_room_of
 from target_views import begin_with

@@ -12,7 +12,8 @@ from gscompleter.apps.report.schema import UnfilledRow
 from gscompleter.completer import check_any_completed
 from gscompleter.guards.psnr import PsnrGuard
 from gscompleter.numerics.image_ops import find_largest_regions
-from gscompleter.state import Completion, Unfilled
+from gscompleter.state import Completion
+from gscompleter.target_result import Unfilled
 from scenes import Room, camera_at, view_of
 
 SIZE = 48

@@ -34,8 +34,9 @@ from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, choose_thinned_rows, t
 from gscompleter.render.reference import adapt_to_mode
 from gscompleter.render.view_map import get_view_map
 from gscompleter.stages.enclosed_holes import keep_enclosed
+from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.stages.select_anchor import compute_overlap, select_anchor
-from gscompleter.stages.target_view import compute_distrust, compute_hole_mask
+from gscompleter.stages.target_view import compute_distrust
 from gscompleter.state import Completion
 from gscompleter.system.progress import stage, track
 from gscompleter.system.timing import record_seconds

@@ -24,9 +24,10 @@ from gscompleter.numerics.geometry import look_up
 from gscompleter.numerics.image_ops import dilate, label_regions
 from gscompleter.planning.remove import contain_nothing
 from gscompleter.render.removed import mask_removed
-from gscompleter.state import Completion, Unfilled
+from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
 from gscompleter.system.progress import stage
+from gscompleter.target_result import Unfilled
 from gscompleter.types import Camera, merge
 
 NOTHING_MARKED = "The marks show no Gaussian; paint over what the picture shows."

@@ -55,7 +55,7 @@ from gscompleter.splats.edits import AppendedRows, EditDraft, Edits, record_edit
 from gscompleter.splats.layout import save_like, save_removed
 from gscompleter.splats.ply import save_parts, save_ply
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, RunRecord
-from gscompleter.state import Completion, TargetResult
+from gscompleter.state import Completion
 from gscompleter.system.files.image import write_image, write_pixels
 from gscompleter.system.files.result_format import MARK
 from gscompleter.system.files.writing import (
@@ -64,6 +64,7 @@ from gscompleter.system.files.writing import (
     REMOVED_FILE,
     SUMMARY_FILE,
 )
+from gscompleter.target_result import TargetResult
 from gscompleter.types import Camera, Gaussians, View, merge
 
 GENERATED_FILE = "generated.ply"

@@ -19,8 +19,9 @@ from gscompleter.evaluation.verdict.numbers import (
 )
 from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow, ScoreRow
 from gscompleter.reconstructors.features.consistency import count_consistent_matches
-from gscompleter.stages.target_view import NOTHING_TO_COMPLETE
-from gscompleter.state import Completion, TargetResult
+from gscompleter.stages.refusals import NOTHING_TO_COMPLETE
+from gscompleter.state import Completion
+from gscompleter.target_result import TargetResult
 
 MIN_ABOVE_PHOTOGRAPH = 1.0
 """Median over the unused photographs, in dB, of how much nearer the scene is to them than the best
