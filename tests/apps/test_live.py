@@ -414,8 +414,7 @@ def test_more_is_removed_from_a_completed_splat(splat_begun):
     labels = first.context.generated.clone()
     labels[:9] = 1
     context = replace(first.context, generated=labels)
-    parts = (context, *first.parts[1:])
-    completed = replace(first, source=ContextScene.whole(context), parts=parts)
+    completed = replace(first, source=ContextScene.whole(context), rendered_context=context)
     session = replace(splat_begun, completions=(completed,))
     changed, _ = apply_step(session, marked(session, "remove"))
     assert changed.latest.source.gone_mask.any()

@@ -13,8 +13,10 @@ from gscompleter.completer import check_any_completed
 from gscompleter.config import CompleterConfig
 from gscompleter.guards.psnr import PsnrGuard
 from gscompleter.numerics.image_ops import find_largest_regions
+from gscompleter.stages.additions import Step
 from gscompleter.stages.find_unfilled import find_unfilled
-from gscompleter.state import Completion, Step, Unfilled
+from gscompleter.state import Completion
+from gscompleter.target_result import Unfilled
 from scenes import Room, camera_at, view_of
 
 SIZE = 48

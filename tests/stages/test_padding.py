@@ -9,8 +9,8 @@ from gscompleter import GSCompleter
 from gscompleter.config import LIFTED_MARGIN, CompleterConfig
 from gscompleter.numerics.geometry import pad_pixels
 from gscompleter.stages.context import choose_config
-from gscompleter.stages.target_view import beside_holes
-from gscompleter.state import TargetResult
+from gscompleter.stages.hole_masks import beside_holes
+from gscompleter.target_result import TargetResult
 from gscompleter.types import Gaussians, Render
 from gscompleter.virtual_capture.render_views import render_views
 from scenes import Room, camera_at, gaussians_of, view_of

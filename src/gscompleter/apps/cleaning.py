@@ -120,7 +120,7 @@ def clean_splat(options: CleanOptions) -> None:
                     folder,
                     EditDraft(COMMAND),
                     rows=len(cleaning.given),
-                    added=0,
+                    appended=(),
                     given=cleaning.splat_file.path,
                     earlier=cleaning.splat_file.edits,
                     run=None,

@@ -10,6 +10,7 @@ import torch
 
 from gscompleter.apps.commands.convert import ConvertOptions
 from gscompleter.numerics.value_checks import check_gaussians
+from gscompleter.parts import MAX_TARGET_ID, NOT_INVENTED, find_last_target_id
 from gscompleter.splats.conversion import (
     Conversion,
     convert_rows,
@@ -30,7 +31,6 @@ from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, RunRecord
 from gscompleter.splats.streamed import is_streamed, load_level
 from gscompleter.splats.transform import merge_placed
 from gscompleter.splats.upward import USUAL, read_upward
-from gscompleter.state import NEW_PHOTO_ID
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import REMOVED_FILE
 from gscompleter.types import Gaussians
@@ -174,8 +174,7 @@ def read_all(sources: Sequence[Path], options: ConvertOptions) -> tuple[Gaussian
             made_by = read_provenance(source) if not options.plain else NOTHING_KNOWN
         if not options.plain:
             part, made_by = move_labels(part, made_by, labels_used, source)
-            targets = part.generated.where(part.generated < NEW_PHOTO_ID, 0)
-            labels_used = max(labels_used, int(targets.max()))
+            labels_used = max(labels_used, find_last_target_id(part))
         parts.append(part)
         runs += made_by.runs
     return merge_placed(parts) if len(parts) > 1 else parts[0], Provenance(tuple(runs))
@@ -185,13 +184,13 @@ def move_labels(
     part: Gaussians, made_by: Provenance, labels_used: int, source: Path
 ) -> tuple[Gaussians, Provenance]:
     """Move the numbers of the targets of a splat behind those of the splats before it."""
-    is_target = (part.generated > 0) & (part.generated < NEW_PHOTO_ID)
+    is_target = (part.generated > 0) & (part.generated < NOT_INVENTED)
     if labels_used == 0 or not is_target.any():
         return part, made_by
     moved = part.generated.int() + labels_used * is_target
-    if moved[is_target].max() >= NEW_PHOTO_ID:
+    if moved[is_target].max() > MAX_TARGET_ID:
         raise InputError(
-            f"With {quote_value(source)} there are more than {NEW_PHOTO_ID - 1} targets; leave the "
+            f"With {quote_value(source)} there are more than {MAX_TARGET_ID} targets; leave the "
             "labels out (--plain)."
         )
     runs = tuple(

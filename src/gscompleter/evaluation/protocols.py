@@ -18,9 +18,9 @@ from typing import Annotated, Literal
 from annotated_types import Ge, MinLen
 from pydantic import Field, TypeAdapter, ValidationError
 
-from gscompleter.completer import MAX_TARGET_ID
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.evaluation.cases import Case
+from gscompleter.parts import MAX_TARGET_ID
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_json
 from gscompleter.system.files.writing import replace_file

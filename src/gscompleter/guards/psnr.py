@@ -14,7 +14,7 @@ from gscompleter.stages.error_budgets import (
     meet_error_budgets,
     set_total_budgets,
 )
-from gscompleter.stages.target_view import compute_hole_mask
+from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.state import Completion
 from gscompleter.types import Gaussians
 

@@ -28,13 +28,15 @@ from gscompleter.numerics.geometry import (
     unproject,
 )
 from gscompleter.numerics.image_ops import dilate, fill_smoothly
+from gscompleter.parts import Part, PartOrigin
 from gscompleter.planning.candidates import Candidate, is_close, propose_candidates
 from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, choose_thinned_rows, thin_gaussians
 from gscompleter.render.reference import adapt_to_mode
 from gscompleter.render.view_map import get_view_map
 from gscompleter.stages.enclosed_holes import keep_enclosed
+from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.stages.select_anchor import compute_overlap, select_anchor
-from gscompleter.stages.target_view import compute_distrust, compute_hole_mask
+from gscompleter.stages.target_view import compute_distrust
 from gscompleter.state import Completion
 from gscompleter.system.progress import stage, track
 from gscompleter.system.timing import record_seconds
@@ -235,7 +237,8 @@ class ViewPlanner:
         view = self.render_small_view(completion, padded)
         placeholders = make_placeholders(view.render, view.holes, view.camera)
         added = adapt_to_mode(completion.rendered_context, placeholders, view.camera)
-        return replace(completion, parts=(*completion.parts, added))
+        part = Part(PartOrigin("target", completion.next_target_id), added)
+        return replace(completion, added_parts=(*completion.added_parts, part))
 
 
 def add_free_space_cameras(completion: Completion, cameras: Sequence[Camera]) -> Completion:
@@ -334,6 +337,8 @@ def simplify_completion(completion: Completion, most: int = MAX_PREVIEW_GAUSSIAN
     """Simplify what is rendered of a completion for small images, with its trust."""
     rows, growth = choose_thinned_rows(completion.rendered_context, most)
     context = thin_gaussians(completion.rendered_context, most)
-    parts = (context, thin_gaussians(completion.added, most))
+    # Thinned together, whatever their origins: of a preview nobody asks.
+    added = thin_gaussians(completion.added, most)
+    parts = (Part(PartOrigin("target", completion.next_target_id), added),)
     trust = completion.trust.thin(rows, growth)
-    return replace(completion, parts=parts, trust=trust)
+    return replace(completion, rendered_context=context, added_parts=parts, trust=trust)

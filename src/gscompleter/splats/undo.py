@@ -146,6 +146,11 @@ def make_keys(number: int, count: int) -> Keys:
     return (np.int64(number) << PLACE_BITS) + np.arange(count, dtype=np.int64)
 
 
+def split_key(keys: Keys) -> tuple[Keys, Keys]:
+    """Split keys into the number of the edit and the place among the rows that it appended."""
+    return keys >> PLACE_BITS, keys & ((1 << PLACE_BITS) - 1)
+
+
 def check_counts(path: Path, edits: Edits, total: int) -> None:
     """Refuse a record whose numbers of rows do not lead to the `total` of the splat.
 

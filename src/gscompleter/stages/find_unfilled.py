@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from gscompleter.numerics.image_ops import dilate, find_largest_regions
+from gscompleter.stages.additions import Step
 from gscompleter.stages.fade_border import find_border
-from gscompleter.stages.target_view import TargetView, compute_hole_mask
-from gscompleter.state import Step, Unfilled
+from gscompleter.stages.hole_masks import compute_hole_mask
+from gscompleter.stages.target_view import TargetView
+from gscompleter.target_result import Unfilled
 from gscompleter.types import Render
 
 LOSSES = {

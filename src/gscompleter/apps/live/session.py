@@ -25,8 +25,9 @@ from gscompleter.data.photographs import Resolution
 from gscompleter.data.scene import describe_camera, parse_camera
 from gscompleter.splats.alignment.similarity import transform_camera_exactly
 from gscompleter.splats.origin import format_corners
-from gscompleter.state import NOTHING_ADDED, Completion, TargetResult
+from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
+from gscompleter.target_result import NOTHING_ADDED, TargetResult
 from gscompleter.types import Camera
 
 Action = Literal["complete", "fill", "remove", "repair"]

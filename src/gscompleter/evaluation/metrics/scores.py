@@ -31,7 +31,7 @@ from gscompleter.evaluation.metrics.thin_gaps import (
     render_flight,
 )
 from gscompleter.render.protocols import Renderer
-from gscompleter.stages.target_view import compute_hole_mask
+from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.types import Camera, DepthMap, Gaussians, Render, View
 
 Image = Float[Tensor, "h w 3"]
