@@ -20,7 +20,7 @@ from gscompleter.evaluation.verdict.numbers import (
 from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow, ScoreRow
 from gscompleter.reconstructors.features.consistency import count_consistent_matches
 from gscompleter.stages.target_view import NOTHING_TO_COMPLETE
-from gscompleter.state import Completion, TargetResult
+from gscompleter.state import NEW_PHOTO_ID, Completion, TargetResult
 
 MIN_ABOVE_PHOTOGRAPH = 1.0
 """Median over the unused photographs, in dB, of how much nearer the scene is to them than the best
@@ -227,8 +227,12 @@ def compute_gain(row: ScoreRow) -> float:
 
 def describe_added(completion: Completion) -> str:
     """Describe in a clause where the added Gaussians come from; empty if there are none."""
-    observed = completion.num_observed
-    made = len(completion.added) - observed
+    # Of all that is added, as later steps of a session may have removed some of it. Pieces of what
+    # a removal cut have the label of photographs, and were there before.
+    added = completion.added
+    has_photo_label = added.generated == NEW_PHOTO_ID
+    observed = int((has_photo_label & ~completion.source.find_pieces(added)).sum())
+    made = int((~has_photo_label).sum())
     verb = "painted" if any(result.painter for result in completion.targets) else "invented"
     if observed:
         others = round_count(made) if made else "none"
