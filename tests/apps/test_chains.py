@@ -5,14 +5,16 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 import torch
 from rich.console import Console
+from torch import Tensor
 
 from command import run
-from gscompleter import load_ply, save_ply
+from gscompleter import load_camera, load_ply, save_ply
 from gscompleter.apps.inputs.taken_out import describe_taken_out
 from gscompleter.apps.inputs.task import InputSplatFile
 from gscompleter.apps.live import saving
@@ -236,7 +238,7 @@ def test_a_session_between_complete_and_update_is_kept_by_both(room, tmp_path):
     assert list_commands(updated) == ["complete", "live", "update"]
     assert abs(measure_emptiness(updated) - measure_emptiness(painted)) < 0.3
     states = [splat, completed, painted, updated]
-    for before, after in zip(states, states[1:], strict=False):
+    for before, after in pairwise(states):
         assert strip_last(after, tmp_path / "before.ply") == before.read_bytes()
 
 
@@ -263,7 +265,7 @@ def test_a_splat_is_cleaned_completed_and_cleaned_again(room, tmp_path):
     assert counts["kept"] == len(load_ply(again))
 
     states = [splat, cleaned, completed, again]
-    for before, after in zip(states, states[1:], strict=False):
+    for before, after in pairwise(states):
         assert strip_last(after, tmp_path / "before.ply") == before.read_bytes()
 
 
@@ -289,3 +291,94 @@ def test_what_an_update_added_can_be_removed_and_comes_back(room, camera, tmp_pa
     with pytest.MonkeyPatch.context() as patch:
         assert run(patch, "strip", without, "--out", out, "--quiet") == 0
     assert out.read_bytes() == splat.read_bytes()
+
+
+# ------------------------------------------------------------------------------------- the fox
+
+FOX_PHOTOGRAPHS = (1, 12, 21, 30, 42)
+FOX_BOX = (0.221, -3.331, 1.068, 3.621, 2.619, 4.318, 1.44, -0.987, 3.908, 4.54, 2.613, 4.098)
+FOX_ROTATION = (-0.3356, -0.0044, 0.9419, -0.0123)
+"""Boxes around the head and its shield, in the frame of the splat."""
+SEEN = "0021.jpg"
+"""The photograph at which the fox is looked at."""
+
+
+@pytest.fixture
+def fox(shared, tmp_path) -> Path:
+    """Name a few photographs of the fox, and the splat of another trainer, in one folder."""
+    source, folder = shared / "splats" / "fox", tmp_path / "fox"
+    if not source.is_dir():
+        pytest.skip(f"needs the splat of another trainer, and there is no folder {source}")
+    (folder / "images").mkdir(parents=True)
+    names = ["sparse", *(f"images/{number:04}.jpg" for number in FOX_PHOTOGRAPHS)]
+    for name in names:
+        (folder / name).symlink_to(source / name)
+    shutil.copyfile(source / "splat.ply", folder / "splat.ply")
+    return folder
+
+
+def look_at_fox(folder: Path, splat: Path) -> Tensor:
+    """Render a splat of the fox at a photograph of it."""
+    camera = load_camera(folder, SEEN, resolution=96)
+    return load_renderer("cpu").render(load_ply(splat), camera).image
+
+
+def run_on_fox(folder: Path, name: str, splat: Path, out: Path, *others: object) -> Path:
+    """Run a command on a splat of the fox with its photographs, and return the result."""
+    words = (name, folder, "--scene", splat, "--out", out, "--resolution", 96, "--quiet", *others)
+    with pytest.MonkeyPatch.context() as patch:
+        assert run(patch, *words) == 0
+    return out / "completed.ply"
+
+
+@pytest.mark.slow
+def test_a_repair_of_the_fox_is_kept_by_an_update_and_both_come_off(fox, tmp_path):
+    """Repair -> update -> strip --last -> strip, byte for byte."""
+    splat = fox / "splat.ply"
+    given = look_at_fox(fox, splat)
+    marked = torch.zeros(given.shape[:2], dtype=torch.bool)
+    rows, columns = (slice(size // 2 - 8, size // 2 + 8) for size in marked.shape)
+    marked[rows, columns] = True
+    write_image(tmp_path / "mask.png", marked)
+
+    marks = ("--target", SEEN, "--mask", tmp_path / "mask.png")
+    repaired = run_on_fox(fox, "repair", splat, tmp_path / "repaired", *marks)
+    check_counts(splat, repaired)
+    updated = run_on_fox(fox, "update", repaired, tmp_path / "updated")
+    check_counts(repaired, updated)
+    assert list_commands(updated) == ["repair", "update"]
+
+    # What was marked as wrong does not come back with the photographs that show it.
+    was, now = look_at_fox(fox, repaired)[marked], look_at_fox(fox, updated)[marked]
+    changed = (was - given[marked]).abs().mean()
+    assert changed > 0.02 * given.max()
+    assert (now - was).abs().mean() < 0.2 * changed
+
+    assert strip_last(updated, tmp_path / "before.ply") == repaired.read_bytes()
+    assert strip_last(repaired, tmp_path / "before.ply") == splat.read_bytes()
+    out = tmp_path / "first.ply"
+    with pytest.MonkeyPatch.context() as patch:
+        assert run(patch, "strip", updated, "--out", out, "--quiet") == 0
+    assert out.read_bytes() == splat.read_bytes()
+
+
+@pytest.mark.slow
+def test_a_fox_that_was_removed_stays_out_of_a_completion(fox, tmp_path):
+    """Remove -> complete."""
+    splat = fox / "splat.ply"
+    boxes = ("--box", *FOX_BOX, "--box-rotation", *FOX_ROTATION)
+    without = run_on_fox(fox, "remove", splat, tmp_path / "without", *boxes, "--auto", 1)
+    check_counts(splat, without)
+    completed = run_on_fox(fox, "complete", without, tmp_path / "completed", "--auto", 1)
+    check_counts(without, completed)
+    assert list_commands(completed) == ["remove", "complete"]
+    summary = json.loads((completed.parent / "summary.json").read_text())
+    assert max(row["ignored"] for row in summary["context"]) > 0.1
+
+    given, was, now = (look_at_fox(fox, file) for file in (splat, without, completed))
+    taken = (was - given).abs().amax(dim=-1) > 0.2 * given.max()
+    assert taken.float().mean() > 0.1
+    removed = (was - given)[taken].abs().mean()
+    assert (now - was)[taken].abs().mean() < 0.25 * removed
+    assert strip_last(completed, tmp_path / "before.ply") == without.read_bytes()
+    assert strip_last(without, tmp_path / "before.ply") == splat.read_bytes()
