@@ -124,7 +124,10 @@ def explain_words(words: Sequence[str], kinds: Mapping[str, type], box: str) -> 
     # Of words that are no options, tyro says so as well.
     surplus = sentence.removeprefix(SURPLUS)
     if surplus != sentence and not surplus.startswith("-"):
-        return f"{surplus} is more than {words[0]} takes there; the option before takes one value"
+        return (
+            f"{surplus} belongs to no option of {words[0]}, and an option takes one value unless "
+            "its help shows several"
+        )
     return sentence
 
 
