@@ -147,7 +147,8 @@ def test_there_is_nothing_to_undo_in_the_beginning(begun):
 def test_a_camera_that_adds_nothing_is_no_step(begun):
     session, text = complete_camera(begun, begun.latest.views[0].camera)
     assert session is begun
-    assert text == "The scene is known at this camera already: nothing to complete."
+    assert text.startswith("The scene is known at this camera already: nothing to complete. ")
+    assert "“Find a hole” leads to one" in text
 
 
 def test_stages_are_heard_as_they_begin(completed, twice):

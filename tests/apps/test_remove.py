@@ -23,6 +23,7 @@ from gscompleter.apps.inputs.removal import (
 )
 from gscompleter.apps.report.removal_pictures import find_largest
 from gscompleter.data.formats import open_photographs
+from gscompleter.evaluation.verdict.outcome import round_count
 from gscompleter.numerics.geometry import axis_angle_to_matrix, rotations_to_quats
 from gscompleter.parts import NOT_INVENTED
 from gscompleter.render.loading import load_renderer
@@ -124,6 +125,10 @@ def test_the_crate_goes_its_place_is_filled_and_strip_brings_it_back(
     assert origins["piece"] == counts["pieces"]
     assert origins.get("photographs", 0) == counts["from_photographs"]
     assert sum(origins.values()) == len(completed)
+    # Nobody invented these pieces, of which they are parts.
+    made = counts["added"] - counts["from_photographs"] - counts["pieces"]
+    headline = json.loads((out / "summary.json").read_text())["outcome"]["headline"]
+    assert f"; {round_count(made)} Gaussians invented." in headline
     assert counts["removed"] == len(given) - len(left) == len(load_ply(out / "removed.ply")) > 100
     assert (out / "context.ply").read_bytes() == (scene / "splat.ply").read_bytes()
     summary = json.loads((out / "summary.json").read_text())

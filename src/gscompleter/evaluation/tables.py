@@ -25,6 +25,7 @@ from gscompleter.evaluation.columns import (
 from gscompleter.evaluation.methods import METHODS
 from gscompleter.evaluation.metrics.perceptual import compute_fid
 from gscompleter.evaluation.store import (
+    RUN,
     get_step_path,
     get_task_folder,
     get_truth_path,
@@ -181,16 +182,32 @@ def write_tables(out: Path, with_fid: bool = False) -> RunSummary:
     """Write tables.md, tables.tex, tables.json and timings.md of a run; FID takes longer."""
     summary = summarize_run(read_run_rows(out))
     fids: Fids = compute_fids(out, summary) if with_fid else "not requested."
+    # Tables of other models have the same rows, and are told apart by this line.
+    models = describe_models(out)
+    head = f"{models}\n\n" if models else ""
+    comment = f"% {models}\n" if models else ""
+    content = {**collect_score_content(summary, fids), **({"models": models} if models else {})}
     texts = {
-        "tables.md": format_score_markdown(summary, fids),
-        "tables.tex": format_score_latex(summary),
-        "tables.json": json.dumps(collect_score_content(summary, fids), indent=1) + "\n",
-        "timings.md": format_timing_markdown(summary),
+        "tables.md": head + format_score_markdown(summary, fids),
+        "tables.tex": comment + format_score_latex(summary),
+        "tables.json": json.dumps(content, indent=1) + "\n",
+        "timings.md": head + format_timing_markdown(summary),
     }
     for name, text in texts.items():
         with replace_file(out / name) as file:
             file.write(encode_text(text))
     return summary
+
+
+def describe_models(out: Path) -> str:
+    """Name Ψ, the depth that helps it, and Φ of a run; empty for one that did not record them."""
+    settings = read_run_settings(out) if (out / RUN).is_file() else {}
+    parts = [
+        f"{role} {settings[name]}"
+        for role, name in (("Ψ", "reconstructor"), ("depth", "depth"), ("Φ", "generator"))
+        if settings.get(name) not in (None, "none")
+    ]
+    return f"{', '.join(parts)}." if parts else ""
 
 
 def compute_fids(out: Path, summary: RunSummary) -> Fids:

@@ -59,6 +59,8 @@ class Choice:
     hole_fraction: float
     gain: float
     """Expected gain, as a fraction of its image."""
+    opaque_fraction: float = 0.0
+    """Part of the holes, as a fraction of its image, where a scene is opaque and not trusted."""
 
     @property
     def camera(self) -> Camera:
@@ -70,7 +72,9 @@ class Choice:
         if self.hole_fraction < MIN_TOLD:
             return "Chosen because what it sees contradicts the photographs."
         where = "up or down" if self.candidate.looks_up_or_down else "beside what is known"
-        return f"Chosen because {self.hole_fraction:.0%} of its image is empty, {where}."
+        # Of a trained splat, what is opaque and confirmed by no photograph is a hole, too.
+        kind = "empty" if self.opaque_fraction < MIN_TOLD else "empty or confirmed by no photograph"
+        return f"Chosen because {self.hole_fraction:.0%} of its image is {kind}, {where}."
 
 
 @dataclass(frozen=True)
@@ -200,6 +204,8 @@ class ViewPlanner:
         holes = small_view.holes & region
         distrust = small_view.distrust.where(region, 0.0)
         hole_fraction = holes.float().mean().item()
+        is_empty = compute_hole_mask(small_view.render.alpha, config.holes)
+        opaque_fraction = (holes & ~is_empty).float().mean().item()
         if is_close(small_view.render, candidate.nearest, config.next_best_view):
             return Choice(candidate, hole_fraction, 0.0)
 
@@ -210,7 +216,7 @@ class ViewPlanner:
         ]
         anchor = select_anchor(candidate.camera, completion.views, config.anchor, overlaps).index
         gain = compute_gain(holes, distrust, overlaps[anchor], config.next_best_view)
-        return Choice(candidate, hole_fraction, gain)
+        return Choice(candidate, hole_fraction, gain, opaque_fraction)
 
     def render_small_view(self, completion: Completion, camera: Camera) -> SmallView:
         """Render the scene at a camera in a small image."""

@@ -19,6 +19,7 @@ from gscompleter.apps.inputs.depth_range import (
     apply_scene_range,
     apply_splat_range,
 )
+from gscompleter.apps.inputs.describing import list_missing as list_missing_photographs
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.inputs.memory import check_scene
 from gscompleter.apps.inputs.named_photographs import check_context, check_target_files
@@ -194,7 +195,17 @@ def load_models(
 
     # A single photograph has no stereo, so a network predicts its depth; a splat needs neither.
     if options.scene is None:
-        task = replace(task, views=prepare_single(reconstructor, task.views))
+        try:
+            task = replace(task, views=prepare_single(reconstructor, task.views))
+        except InputError as error:
+            # Of a copy that is not whole, that is the cause.
+            missing = list_missing_photographs(opened.photographs)
+            if not missing:
+                raise
+            raise InputError(
+                f"{len(missing)} of {len(opened.photographs)} photographs are missing, such as "
+                f"{quote_value(missing[0])}, and too few are left: {error}"
+            ) from error
 
     # The depth range is counted as a part of the context stage, whose seconds it is added to.
     with show_preparation("depth range"), record_seconds() as seconds, timed_stage("context"):

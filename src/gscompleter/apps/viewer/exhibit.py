@@ -152,7 +152,11 @@ def load_known_cameras(
     try:
         photographs = load_context_cameras(source, summary, content)
     except InputError:
-        note = f"The context photographs are not shown, because {quote_value(source)} was moved."
+        # A path is as the command was given it, and leads elsewhere from another folder.
+        cause = "is not in this folder, and was named from another"
+        if source.is_absolute():
+            cause = "was moved"
+        note = f"The context photographs are not shown, because {quote_value(source)} {cause}."
         return targets, (note,)
     return (*targets, *photographs), ()
 

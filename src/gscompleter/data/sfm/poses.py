@@ -155,7 +155,7 @@ class FoundPoses:
         if self.focal is not None:
             notes.append(
                 f"{self.num_registered} of {self.photographs} cameras were found with a focal "
-                f"length of {self.focal:.0f} px, which was fixed at first."
+                f"length of {self.focal:.0f} px, assumed at first and refined with them."
             )
         if self.missing:
             names = join_names(self.missing, MAX_NAMED)
