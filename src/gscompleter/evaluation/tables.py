@@ -52,6 +52,10 @@ ABSENT_NOTES = {
         "LPIPS: not available. It needs `pip install 'gscompleter[evaluation]'` and, the first "
         "time, a connection; then score the run again to add the columns."
     ),
+    "st_lpips": (
+        "ST-LPIPS: not installed. Run `pip install stlpips-pytorch`, which holds its weights; then "
+        "score the run again to add the column."
+    ),
     "hole_flip": (
         "FLIP: not installed. Run `pip install 'gscompleter[evaluation]'`; then score the run "
         "again to add the columns."
