@@ -8,8 +8,8 @@ that are not kept apart, with the settings `default` and `paper`, a trained spla
 and eight targets in sequence. `room` is the same for a synthetic room, which needs no data: the
 tests check it everywhere. `texts` holds the help of every command, and exit code and sentence of
 wrong input. Bytes are compared on the machine that recorded them; other machines round otherwise
-and compare scores. A method that gave the recorded bytes of all scenes is listed by its digest (`methods`), so
-that figures measured with another one of the list still hold (write_results.py).
+and compare scores. A method that gave the recorded bytes of all scenes is listed by its digest
+(`methods`), so that figures measured with another one of the list still hold (write_results.py).
 """
 
 from __future__ import annotations

@@ -59,13 +59,10 @@ def describe_left_out(left_out: Sequence[Apartable], kept: int, kind: str = "cas
     if not kept:
         raise InputError(
             f"All of the {len(left_out)} {kind} are kept apart by {file}, for reports of what was "
-            f"decided without them; add --apart, which notes the use in {LEDGER}.",
+            f"decided without them; ask for them, and the use is noted in {LEDGER}.",
             "apart",
         )
-    return [
-        f"{len(left_out)} {kind} are left out, because {file} keeps them apart; --apart uses them, "
-        f"and notes that in {LEDGER}."
-    ]
+    return [f"{len(left_out)} {kind} are left out, because {file} keeps them apart."]
 
 
 def find_ledger(file: Path) -> Path:

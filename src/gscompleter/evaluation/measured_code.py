@@ -9,7 +9,6 @@ import ast
 import hashlib
 import shutil
 import subprocess
-from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -49,8 +48,9 @@ def compute_method_digest(package: Path = PACKAGE) -> str:
     digest = hashlib.sha256()
     for path in list_method_files(package):
         digest.update(path.relative_to(package).as_posix().encode() + b"\0")
-        tree = ast.parse(path.read_bytes())
-        digest.update("\0".join(iterate_words(tree)).encode("utf-8", "backslashreplace") + b"\0")
+        words: list[str] = []
+        collect_words(ast.parse(path.read_bytes()), words)
+        digest.update("\0".join(words).encode("utf-8", "backslashreplace") + b"\0")
     return digest.hexdigest()[:16]
 
 
@@ -63,20 +63,20 @@ def list_method_files(package: Path) -> list[Path]:
     return sorted(found)
 
 
-def iterate_words(node: ast.AST) -> Iterator[str]:
-    """Iterate over the words of a syntax tree, the same for every version of Python."""
-    yield type(node).__name__
+def collect_words(node: ast.AST, words: list[str]) -> None:
+    """Append the words of a syntax tree, which are the same for every version of Python."""
+    words.append(type(node).__name__)
     for name, value in ast.iter_fields(node):
         for child in value if isinstance(value, list) else [value]:
             # Versions of Python differ in the fields that they leave empty. A string that stands
             # alone is a docstring.
             if child is None or (isinstance(child, ast.Expr) and is_text(child.value)):
                 continue
-            yield name
+            words.append(name)
             if isinstance(child, ast.AST):
-                yield from iterate_words(child)
+                collect_words(child, words)
             else:
-                yield repr(child)
+                words.append(repr(child))
 
 
 def is_text(node: ast.expr) -> bool:

@@ -19,7 +19,12 @@ from gscompleter.data.limits import check_planes
 from gscompleter.data.mask_checks import read_masks_as_asked
 from gscompleter.data.photographs import MAX_TRANSLATION, Photographs, Resolution
 from gscompleter.evaluation import protocols
-from gscompleter.evaluation.apart import Apartable, describe_left_out, leave_out_apart
+from gscompleter.evaluation.apart import (
+    LEDGER,
+    Apartable,
+    describe_left_out,
+    leave_out_apart,
+)
 from gscompleter.evaluation.authors_loader import AuthorsLoader
 from gscompleter.evaluation.cases import (
     Case,
@@ -41,12 +46,12 @@ def collect_tasks(
     if options.protocol:
         # The iterator opens clips one by one, so those beyond the limit are not opened.
         tasks = list(islice(iterate_tasks(options, skipped, notes, left_out), options.limit))
-        notes += describe_left_out(left_out, len(tasks), "scenes")
+        notes += describe_apart(left_out, len(tasks), "scenes")
         return tasks
 
     listed = [case for path in options.paths for case in read_cases(find_cases_file(path))]
     cases = list(leave_out_apart(listed, options.apart, left_out))
-    notes += describe_left_out(left_out, len(cases))
+    notes += describe_apart(left_out, len(cases), "cases")
     if options.one_per_scene:
         # The first case of a scene is the last that overwrites its entry in reversed order.
         first = {case.scene: case for case in reversed(cases)}
@@ -67,6 +72,12 @@ def collect_tasks(
             own = mark_masked(read_masks_as_asked(clip, options.mask_reading), own, notes)
         tasks += own
     return tasks
+
+
+def describe_apart(left_out: Sequence[Apartable], kept: int, kind: str) -> list[str]:
+    """Describe what is kept apart and left out, and how to use it; raises as `describe_left_out`."""
+    lines = describe_left_out(left_out, kept, kind)
+    return [f"{line} Add --apart to use them, which is noted in {LEDGER}." for line in lines]
 
 
 def mark_masked(
