@@ -53,12 +53,12 @@ class RunFacts:
 def read_run_facts(out: Path, rows: Sequence[RunRow]) -> RunFacts:
     """Read the facts of the run in a folder; `rows` are those of its tables."""
     settings = read_run_settings(out)
-    depth = settings["depth"]
+    depth = settings.get("depth", "none")
     # Folders of files are left out: a table can be published.
     extras = {
         "depth": None if depth == "none" else strip_folder(depth),
         "weights": settings["weights"],
-        "depth weights": settings["depth_weights"],
+        "depth weights": settings.get("depth_weights"),
     }
     given = {k.removeprefix(SETTING): v for k, v in settings.items() if k.startswith(SETTING)}
     return RunFacts(

@@ -75,7 +75,7 @@ def collect_tasks(
 
 
 def describe_apart(left_out: Sequence[Apartable], kept: int, kind: str) -> list[str]:
-    """Describe what is kept apart and left out, and how to use it; raises as `describe_left_out`."""
+    """Describe what is left out, and how to use it; raise as `describe_left_out`."""
     lines = describe_left_out(left_out, kept, kind)
     return [f"{line} Add --apart to use them, which is noted in {LEDGER}." for line in lines]
 
