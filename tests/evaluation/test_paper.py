@@ -210,6 +210,10 @@ def test_a_table_and_a_figure_of_rooms(rooms, tmp_path, monkeypatch):
     assert len(differences) == 2
     assert after["difference"]["mean"] == pytest.approx(statistics.fmean(differences))
     assert after["value"] > before["value"]
+    facts = table["made_with"]["plane-sweep, n-2"]
+    assert (facts["reconstructor"], facts["generator"]) == ("plane-sweep", "warp-inpaint")
+    for suffix, sentence in ((".md", "Ψ: plane-sweep; Φ: "), (".tex", "Psi: plane-sweep; Phi: ")):
+        assert sentence in (tmp_path / "tables" / f"spans{suffix}").read_text()
     text = (tmp_path / "results.md").read_text()
     assert "## Seams without and with a dilated hole mask" in text
     assert text.count("not measured") < len(PAPER.claims)
