@@ -105,11 +105,11 @@ def test_a_preset_sets_what_is_not_given():
     found = apply_preset(options(preset="dl3dv"))
     assert (found.resolution, found.near, found.far) == ((256, 448), 0.5, 200)
     assert found.reconstructor == ("depthsplat-base-dl3dv-256x448",)
-    assert found.synthesis.generator == "pe-field"
+    assert found.synthesis.generator == ("pe-field",)
     found = apply_preset(options(preset="dl3dv", reconstructor=("plane-sweep",), resolution=64))
     assert (found.reconstructor, found.resolution) == (("plane-sweep",), 64)
     found = apply_preset(options())
-    assert (found.reconstructor, found.synthesis.generator) == (("plane-sweep",), "warp-inpaint")
+    assert (found.reconstructor, found.synthesis.generator) == (("plane-sweep",), ("warp-inpaint",))
 
 
 @pytest.mark.parametrize(
