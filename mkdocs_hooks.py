@@ -29,6 +29,7 @@ TEXTS = {
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
     "benchmarks/history.md": "history.md",
+    "benchmarks/apart_uses.md": "apart_uses.md",
 }
 """Files of the repository that are pages of the site."""
 FILES = ("LICENSE", "CITATION.cff")

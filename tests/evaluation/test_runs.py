@@ -102,18 +102,6 @@ def same_tables(out: Path, other: Path) -> None:
         assert (out / name).read_bytes() == (other / name).read_bytes(), name
 
 
-def test_tables_name_the_models_of_their_run(finished, tmp_path):
-    out = Path(shutil.copytree(finished, tmp_path / "out"))
-    models = {"reconstructor": "mine.py:psi", "depth": "none", "generator": "mine.py:phi"}
-    (out / "run.json").write_text(json.dumps({"version": 4, **models}))
-    write_tables(out)
-    line = "Ψ mine.py:psi, Φ mine.py:phi."
-    for name in ("tables.md", "timings.md"):
-        assert (out / name).read_text(encoding="utf-8").startswith(f"{line}\n\n")
-    assert (out / "tables.tex").read_text(encoding="utf-8").startswith(f"% {line}\n")
-    assert read_run_file(out / "tables.json")["models"] == line
-
-
 def test_each_case_and_method_has_a_row_and_full_beats_the_context(finished):
     content = read_run_file(finished / "tables.json")
     assert list(content["methods"]) == list(METHOD_NAMES)
