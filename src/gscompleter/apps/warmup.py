@@ -145,7 +145,7 @@ def format_duration(seconds: float) -> str:
 def time_compilation() -> float:
     """Measure how long it takes to compile one kernel on this machine, in seconds."""
     # The first compilation of a process also imports the parts of numba that compile.
-    numba.njit(lambda: 0)()
+    numba.njit(lambda start: start)(0)
     one = np.ones((1, 4), np.float32)
     kernel = numba.njit(nogil=True, error_model="numpy")(mark_usable.py_func)
     start = time.perf_counter()

@@ -454,7 +454,6 @@ class CompleterConfig(Settings):
         return CompleterConfig(
             trust="photometric",
             guards=("image-agreement", "free-space", "psnr", "contribution"),
-            margin=0.0,
             registration=SPLAT_REGISTRATION,
             holes=HoleConfig(padding="beside"),
         )
