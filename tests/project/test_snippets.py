@@ -38,6 +38,7 @@ SIDE = 32
 NOT_RUN = {
     "batch": "needs a manifest; test_batch.py has some",
     "live": "serves until it is closed; test_live.py presses its buttons",
+    "repair": "needs a painted mask; test_repair.py paints some",
     "poses": "needs photographs that COLMAP can match; test_poses.py has them",
     "demo": "takes half a minute; test_demo.py runs it on small images",
     "bench": "takes minutes; test_bench.py runs it on less",
@@ -54,7 +55,7 @@ NEEDS_PAINTER = ("--images",)
 FAST = ("doctor", "models", "report", "strip", "view", "convert", "inspect")
 """Commands that take a second or two."""
 NEEDS_PHOTOGRAPHS = ("--photos",)
-"""Options that name photographs that COLMAP has to place; test_new_photographs.py does."""
+"""Options that name photographs that COLMAP has to place; test_update.py has some."""
 WRITES_OUT = ("complete", "clean", "update", "remove", "repair")
 """Commands after which OUT is theirs."""
 PYTHON_NOT_RUN = {"docs/models.md": "needs published weights"}
