@@ -350,8 +350,6 @@ def make_clean(folder: Path) -> None:
 
 def make_batch(folder: Path) -> None:
     """Photograph the page of a batch of three scenes, one of which is broken."""
-    from playwright.sync_api import sync_playwright
-
     for name, first in (("hall", 0), ("library", 1)):
         cameras = [stand(-0.5 + 0.3 * n, 0, 0, -10 + 6 * first + 2 * n) for n in range(4)]
         (folder / "SCENES" / name).mkdir(parents=True, exist_ok=True)
@@ -361,19 +359,33 @@ def make_batch(folder: Path) -> None:
         write_cameras(folder / "SCENES" / name / "transforms.json", cameras, names)
     broken = folder / "SCENES" / "porch"
     shutil.copytree(folder / "SCENES" / "hall", broken, dirs_exist_ok=True)
-    (broken / "1.png").write_bytes(b"no picture")
+    for file in names:
+        (broken / file).write_bytes(b"no picture")
     shutil.rmtree(folder / "BATCH", ignore_errors=True)
     words = "batch SCENES --out BATCH --each resolution=128 auto=1"
     print(f"$ gscompleter {words}", flush=True)
     # One scene fails on purpose: the exit code is 3.
     subprocess.run([sys.executable, "-m", "gscompleter", *words.split()], cwd=folder, check=False)
+    # The page without the place of the folder on this machine.
+    text = (folder / "BATCH" / "index.html").read_text("utf-8")
+    page_file = folder / "BATCH" / "page.html"
+    page_file.write_text(text.replace(f"{folder.absolute()}/", ""), "utf-8")
+    photograph_page(page_file, folder / "batch.png")
+    page = Image.open(folder / "batch.png").convert("RGB")
+    page.thumbnail((900, 900))
+    write_page(page, "batch")
+
+
+def photograph_page(page: Path, picture: Path) -> None:
+    """Draw a page in chromium, without the seconds of its last line."""
+    from playwright.sync_api import sync_playwright
+
     with sync_playwright() as playwright:
         path = shutil.which("chromium")
         browser = playwright.chromium.launch(executable_path=path, args=["--no-sandbox"])
-        tab = browser.new_page(viewport={"width": 900, "height": 560})
-        tab.goto((folder / "BATCH" / "index.html").absolute().as_uri())
-        tab.screenshot(path=folder / "batch.png")
-    write_page(Image.open(folder / "batch.png").convert("RGB"), "batch")
+        tab = browser.new_page(viewport={"width": 1250, "height": 900})
+        tab.goto(page.absolute().as_uri())
+        tab.screenshot(path=picture, clip={"x": 0, "y": 50, "width": 1250, "height": 740})
 
 
 PICTURES: dict[str, Callable[[Path], None]] = {
