@@ -62,7 +62,7 @@ TASKS = sorted((DOCS / "guide").glob("*.md"))
 """One page for each task, of about 600 words; rules and tables of options are in `reference`."""
 MOST_WORDS = 700
 MOST_BYTES = 150_000
-"""Size of a picture; the film of the demo alone may have more."""
+"""Size of a picture that make_guide_pictures.py makes; the demo and its viewer have more."""
 WITHOUT_PICTURE = {"convert", "evaluate"}
 DECISIONS = sorted((DOCS / "decisions").glob("[0-9]*.md"))
 LINKED = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", ROOT / "llms.txt"]
@@ -123,7 +123,7 @@ def test_the_first_page_of_the_repository_is_short_and_begins_with_the_loop():
 
 
 def test_pictures_are_small_and_used():
-    pictures = [*(DOCS / "pictures").glob("*"), DOCS / "loop.webp", DOCS / "viewer.png"]
+    pictures = [*(DOCS / "pictures").glob("*"), DOCS / "loop.webp"]
     assert [name_of(path) for path in pictures if path.stat().st_size > MOST_BYTES] == []
     pages = "".join(page.read_text("utf-8") for page in LINKED)
     assert [name_of(path) for path in pictures if f"/{path.name})" not in pages] == []
