@@ -29,6 +29,7 @@ TEXTS = {
     "CONTRIBUTING.md": "contributing.md",
     "CHANGELOG.md": "changelog.md",
     "benchmarks/history.md": "history.md",
+    "benchmarks/apart_uses.md": "apart_uses.md",
 }
 """Files of the repository that are pages of the site."""
 FILES = ("LICENSE", "CITATION.cff")
@@ -59,6 +60,8 @@ DEMO = "demo-viewer.html"
 DEMO_RESOLUTION = 192
 """Longer side of the demo's photographs, in pixels: a file of some megabytes."""
 COLAB = "https://colab.research.google.com"
+FROM_CODE = ("reference/commands.md", "reference/python.md", "reference/stages.md")
+"""Pages that are made of help texts and docstrings, whose links are those of the site already."""
 LINK = re.compile(r"(?<=\]\()[^)\s]+(?=\))")
 
 
@@ -104,9 +107,7 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     made |= {
         NOTEBOOK_PAGE: of_notebook(config.repo_url),
         DEMO_PAGE: of_demo(),
-        "reference/commands.md": of_commands(),
-        "reference/python.md": of_names(),
-        "reference/stages.md": of_stages(),
+        **dict(zip(FROM_CODE, (of_commands(), of_names(), of_stages()), strict=True)),
     }
     made |= {name: (ROOT / name).read_text() for name in FILES}
     made[LLMS] = link_pages((ROOT / LLMS).read_text())
@@ -140,7 +141,7 @@ def link_pages(text: str) -> str:
 def site_link(link: str, place: str, page: str) -> str:
     """Convert a link in the repository file `place` to a link from its page."""
     target, mark, anchor = link.partition("#")
-    if ":" in target or not target or page.startswith("reference/"):
+    if ":" in target or not target or page in FROM_CODE:
         return link
     path = os.path.normpath(os.path.join(os.path.dirname(place), target))
     scripts = {f"examples/{script.name}": made for made, script in tutorials().items()}

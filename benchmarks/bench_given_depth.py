@@ -1,6 +1,6 @@
 """Error of depth at held-out pixels, and PSNR at the target, with half of the depth given.
 
-    python benchmarks/bench_given_depth.py --data ../shared/data/cases.json --block 16
+    python benchmarks/bench_given_depth.py --data benchmarks/development.json --block 16
 
 Each context photograph of the cases whose scene has depth gets a random half of the blocks of its
 depth map; the other half, and the depth of the target, score. `--drive` scores a synthetic street
@@ -18,9 +18,9 @@ from statistics import fmean
 
 import torch
 
+from apart import HELP, read_used_cases
 from gscompleter import GSCompleter, View
 from gscompleter.data.given_depth import drop_edges, drop_hidden
-from gscompleter.evaluation.cases import read_cases
 from gscompleter.evaluation.metrics.geometry import compare_depths
 from gscompleter.evaluation.metrics.image import compute_masked_psnr
 
@@ -29,9 +29,9 @@ SCAN_ROWS, SCAN_COLUMNS = 6, 2
 Scene = tuple[str, list[View], View, bool]
 
 
-def read_scenes(path: Path) -> Iterator[Scene]:
+def read_scenes(path: Path, uses_apart: bool) -> Iterator[Scene]:
     """Yield name, context and target of the cases whose photographs have depth maps."""
-    for case in read_cases(path):
+    for case in read_used_cases(path, uses_apart):
         views, (target,) = case.load(case.context), case.load((case.target,))
         if target.depth is not None:
             yield case.name, views, target, True
@@ -89,10 +89,11 @@ def main() -> None:
     parser.add_argument("--data", type=Path)
     parser.add_argument("--block", type=int, default=16, help="side of a block, in pixels")
     parser.add_argument("--drive", action="store_true")
+    parser.add_argument("--apart", action="store_true", help=HELP)
     options = parser.parse_args()
     print(f"{'':24s} AbsRel held out  AbsRel target  PSNR seen  PSNR completed")
     for name, views, target, is_dense in (
-        make_drive() if options.drive else read_scenes(options.data)
+        make_drive() if options.drive else read_scenes(options.data, options.apart)
     ):
         chosen = [choose_blocks(v, options.block, i) for i, v in enumerate(views)]
         given = [give_blocks(v, b, is_dense) for v, b in zip(views, chosen, strict=True)]

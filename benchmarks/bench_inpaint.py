@@ -1,6 +1,6 @@
 """Time and PSNR of the embedded hole filling and of other methods, in one run.
 
-    python benchmarks/bench_inpaint.py path/to/cases.json [--only NAME] [--pictures FOLDER]
+    python benchmarks/bench_inpaint.py benchmarks/development.json [--only NAME] [--pictures FOLDER]
 
 All methods fill the same holes of the same warped image; PSNR (dB) is over the hole. The biharmonic
 fill of scikit-image runs at half size, as it solves a dense system for each hole.
@@ -22,8 +22,9 @@ from jaxtyping import Float
 from skimage.restoration import inpaint_biharmonic
 from torch import Tensor
 
+from apart import read_used_cases
 from gscompleter.apps.report.completion import join_images
-from gscompleter.evaluation.cases import Case, read_cases
+from gscompleter.evaluation.cases import Case
 from gscompleter.generators.warp import WarpedImage, warp_photographs
 from gscompleter.generators.warp_inpaint import WarpInpaint
 from gscompleter.numerics.image_ops import push_pull
@@ -93,18 +94,22 @@ def load_known_scene(case: Case) -> tuple[View, View, GeneratorInput]:
 
 
 def main(
-    cases: Annotated[Path, tyro.conf.Positional], only: str = "", pictures: Path | None = None
+    cases: Annotated[Path, tyro.conf.Positional],
+    only: str = "",
+    pictures: Path | None = None,
+    apart: bool = False,
 ) -> None:
     """Fill the holes of all cases with all methods and print means.
 
     Args:
-        cases: A cases.json next to its scene folders.
+        cases: A file of cases.
         only: Run only cases whose name contains this.
         pictures: Folder for one strip of images per case, the photograph last.
+        apart: Use also what is kept apart, and note that in apart_uses.md.
     """
     scores: dict[str, list[float]] = {name: [] for name in METHODS}
     seconds: dict[str, list[float]] = {name: [] for name in METHODS}
-    for number, case in enumerate(c for c in read_cases(cases) if only in c.name):
+    for number, case in enumerate(read_used_cases(cases, apart, only)):
         nearest, target, context = load_known_scene(case)
         warped = warp_photographs(nearest, target.camera, context)
         if warped.known.all():

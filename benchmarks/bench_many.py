@@ -1,7 +1,7 @@
 """Further photographs against the pair alone, on the development cases and on held-out ones.
 
     GSCOMPLETER_DATA=DIR python benchmarks/bench_many.py pair nearest-3 spread-3
-    GSCOMPLETER_DATA=DIR python benchmarks/bench_many.py pair nearest-3 --held-out
+    GSCOMPLETER_DATA=DIR python benchmarks/bench_many.py pair nearest-3 --held-out --apart
 
 Each case is reconstructed and completed from the pair and from more photographs. What the *pair*
 leaves open of the target counts as the hole in all rows, so that they are comparable; `gscompleter
@@ -22,9 +22,10 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from apart import HELP, read_used_cases
 from choose_many import add_photographs
 from gscompleter.config.settings import COVERED
-from gscompleter.evaluation.cases import Case, read_cases
+from gscompleter.evaluation.cases import Case
 from gscompleter.evaluation.metrics.image import compute_masked_psnr
 from gscompleter.evaluation.protocols import make_case_task
 from gscompleter.evaluation.runner import RunConfig, load_task_views
@@ -33,7 +34,7 @@ from gscompleter.stages.context import normalize_exposures, reconstruct_context,
 from gscompleter.types import Gaussians, View
 
 HELD_OUT = Path(__file__).with_name("held_out.json")
-DEVELOPMENT = Path(__file__).with_name("many") / "nearest-1.json"
+DEVELOPMENT = Path(__file__).with_name("development.json")
 MIN_HOLE = 50
 """Smallest hole that is scored, in pixels."""
 
@@ -45,9 +46,10 @@ def main() -> None:
     parser.add_argument("sets", nargs="+", help="pair, or an order and a number: nearest-3")
     parser.add_argument("--held-out", action="store_true")
     parser.add_argument("--only", default="", help="part of the names of the cases")
+    parser.add_argument("--apart", action="store_true", help=HELP)
     options = parser.parse_args()
-    cases = read_pairs(HELD_OUT if options.held_out else DEVELOPMENT)
-    cases = [case for case in cases if options.only in case.name]
+    path = HELD_OUT if options.held_out else DEVELOPMENT
+    cases = read_pairs(path, options.apart, options.only)
     jobs = [(case, tuple(options.sets)) for case in cases]
     with get_context("spawn").Pool(2) as pool:
         rows = list(pool.imap(score_case, jobs))
@@ -57,11 +59,10 @@ def main() -> None:
             print(f"  {case.name:32s} {json.dumps(row[number])}")
 
 
-def read_pairs(path: Path) -> list[Case]:
+def read_pairs(path: Path, uses_apart: bool, name: str) -> list[Case]:
     """Read cases and keep the pair that each begins with; near and far are found, as for users."""
-    return [
-        replace(case, context=case.context[:2], near=None, far=None) for case in read_cases(path)
-    ]
+    cases = read_used_cases(path, uses_apart, name)
+    return [replace(case, context=case.context[:2], near=None, far=None) for case in cases]
 
 
 def average(rows: list[Scores]) -> Scores:

@@ -21,6 +21,7 @@ from jaxtyping import Float
 from torch import Tensor
 
 import gscompleter as gsc
+from apart import HELP, select_scenes
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.reconstructors.features.depth_range import get_depth_range
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
@@ -93,11 +94,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Photographs to Gaussians, of many views.")
     parser.add_argument("scenes", nargs="*", type=Path, default=[DATA / "data" / "fox"])
     parser.add_argument("--views", nargs="+", type=int, default=[4, 8, 16])
+    parser.add_argument("--apart", action="store_true", help=HELP)
     given = parser.parse_args()
+    used = select_scenes([scene.name for scene in given.scenes], given.apart)
     columns = ("scene", "", "views", "s", "s a view", "1000 Gaussians")
     print(f"| {' | '.join(columns)} | given, dB (worst) | between (worst) |")
     print("| --- | --- | ---: | ---: | ---: | ---: | ---: | ---: |")
-    for scene in given.scenes:
+    for scene in (scene for scene in given.scenes if scene.name in used):
         for count in given.views:
             print_row("jointly", reconstruct_jointly, scene, count)
             print_row("by pairs", reconstruct_by_pairs, scene, count)

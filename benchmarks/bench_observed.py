@@ -19,6 +19,7 @@ from statistics import fmean
 import numpy as np
 from PIL import Image
 
+from apart import HELP, select_scenes
 from gscompleter import (
     CompleterConfig,
     Completion,
@@ -109,9 +110,14 @@ def find_splat(folder: Path | None, name: str, views: Sequence[View]) -> Gaussia
     return load_splat(path)
 
 
-def measure_trained(data: Path, splats: Path | None, pictures: Path | None) -> None:
+def measure_trained(
+    data: Path, splats: Path | None, pictures: Path | None, uses_apart: bool
+) -> None:
     """Complete splats of a plain loop at targets between their photographs, and score."""
+    used = select_scenes(TRAINED, uses_apart)
     for name, (context, targets, held_back) in TRAINED.items():
+        if name not in used:
+            continue
         views = load_views(data / "data" / name, context, TRAINED_SIZE)
         others = load_views(data / "data" / name, held_back, TRAINED_SIZE)
         splat = find_splat(splats, name, views)
@@ -152,11 +158,12 @@ def main() -> None:
     parser.add_argument("--data", type=Path, default=Path("../shared"))
     parser.add_argument("--splats", type=Path, help="folder that keeps the trained splats")
     parser.add_argument("--pictures", type=Path)
+    parser.add_argument("--apart", action="store_true", help=HELP)
     options = parser.parse_args()
     if options.what == "cut":
         measure_cut(options.data)
     else:
-        measure_trained(options.data, options.splats, options.pictures)
+        measure_trained(options.data, options.splats, options.pictures, options.apart)
 
 
 if __name__ == "__main__":

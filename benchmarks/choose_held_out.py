@@ -7,10 +7,8 @@ development cases of DIR/data/cases.json. g is the median gap of the scene's dev
 that held-out ones are as hard. No frame of a case, and no photograph beside its target, is in a
 development case, and its target is in no measurement of the documentation (`MEASURED`). Of what is
 left, the SHA-256 of "SCENE CONTEXT TARGET" decides: the smallest come first, up to three for each
-scene, none with a frame of another.
-
-Scenes kept apart: the two with the smallest SHA-256 of their name. From now on nothing is decided
-on them, neither on their development cases nor on other frames.
+scene, none with a frame of another. The file keeps all of them apart: `evaluate` uses them with
+--apart alone, and notes the use in apart_uses.md.
 """
 
 from __future__ import annotations
@@ -23,10 +21,11 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from choose_apart import get_place, write_list
+
 DATA = Path(os.environ["GSCOMPLETER_DATA"]) / "data"
 OUT = Path(__file__).with_name("held_out.json")
 PER_SCENE = 3
-NUM_APART = 2
 MEASURED = {
     "fountain_p11": {4},
     "fox": {4, 8, 16, 29, 34, 37, 39},
@@ -47,12 +46,10 @@ def main() -> None:
     cases = [case for scene in scenes for case in choose_cases(scene, rows)]
     head = {
         "about": "Held-out cases: chosen once by benchmarks/choose_held_out.py, for reports only.",
-        "apart": sorted(sorted(scenes, key=compute_digest)[:NUM_APART]),
+        "apart": True,
         "resolution": [256, 256],
     }
-    lines = [f" {json.dumps(key)}: {json.dumps(value)}," for key, value in head.items()]
-    listed = ",\n".join(f"  {json.dumps(case)}" for case in cases)
-    OUT.write_text("\n".join(["{", *lines, ' "cases": [', listed, " ]", "}"]) + "\n")
+    write_list(OUT, head, "cases", cases)
     print(f"{len(cases)} cases of {len({case['scene'] for case in cases})} scenes")
 
 
@@ -77,8 +74,12 @@ def choose_cases(scene: str, rows: list[dict[str, Any]]) -> list[dict[str, Any]]
         if len(cases) < PER_SCENE and not is_measured and not frames & (seen | taken):
             taken |= frames
             planes = {"near": own[0]["near"], "far": own[0]["far"]}
-            place = f"$GSCOMPLETER_DATA/data/{scene}"
-            case = {"scene": place, "context": [*context], "target": target, "neighbours": beside}
+            case = {
+                "scene": get_place(scene),
+                "context": [*context],
+                "target": target,
+                "neighbours": beside,
+            }
             cases.append({**case, **planes})
     return cases
 

@@ -11,11 +11,12 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from choose_apart import draw_scenes, get_place, write_list
 
 DATA = Path(os.environ["GSCOMPLETER_DATA"]) / "data"
 OUT = Path(__file__).with_name("many")
@@ -25,25 +26,18 @@ COUNTS = (1, 3, 6, 14)
 def main() -> None:
     """Write a file of cases for each order and number of further photographs."""
     content = json.loads((DATA / "cases.json").read_text())
+    apart = draw_scenes(sorted({row["scene"] for row in content["cases"]}))
     OUT.mkdir(exist_ok=True)
     for order in ("nearest", "spread"):
         for count in COUNTS:
+            head = {
+                "about": f"The development cases with up to {count} further photographs ({order}), "
+                "from benchmarks/choose_many.py.",
+                "apart": apart,
+                "resolution": content["resolution"],
+            }
             cases = [add_photographs(row, order, count) for row in content["cases"]]
-            write_cases(OUT / f"{order}-{count}.json", order, count, cases, content["resolution"])
-
-
-def write_cases(
-    path: Path, order: str, count: int, cases: Sequence[dict[str, Any]], resolution: Sequence[int]
-) -> None:
-    """Write a file of cases, one a line."""
-    head = {
-        "about": f"The development cases with up to {count} further photographs ({order}), from "
-        "benchmarks/choose_many.py.",
-        "resolution": resolution,
-    }
-    lines = [f" {json.dumps(key)}: {json.dumps(value)}," for key, value in head.items()]
-    listed = ",\n".join(f"  {json.dumps(case)}" for case in cases)
-    path.write_text("\n".join(["{", *lines, ' "cases": [', listed, " ]", "}"]) + "\n")
+            write_list(OUT / f"{order}-{count}.json", head, "cases", cases)
 
 
 def add_photographs(row: dict[str, Any], order: str, count: int) -> dict[str, Any]:
@@ -58,8 +52,7 @@ def add_photographs(row: dict[str, Any], order: str, count: int) -> dict[str, An
         further = sorted(left, key=lambda number: distances[number])[:count]
     else:
         further = [left[(2 * step + 1) * len(left) // (2 * count)] for step in range(count)]
-    place = f"$GSCOMPLETER_DATA/data/{row['scene']}"
-    return {**row, "scene": place, "context": [*row["context"], *sorted(further)]}
+    return {**row, "scene": get_place(row["scene"]), "context": [*row["context"], *sorted(further)]}
 
 
 if __name__ == "__main__":

@@ -3,12 +3,13 @@
     python benchmarks/golden.py record [--only scenes|room|texts] [--data DIR] [--file FILE]
     python benchmarks/golden.py check  [--only scenes|room|texts] [--data DIR] [--file FILE]
 
-`scenes` holds the SHA-256 of every .ply and the PSNR and SSIM of every view: 24 development cases
-with the settings `default` and `paper`, a trained splat at seven targets, and eight targets in
-sequence. `room` is the same for a synthetic room, which needs no data: the tests check it
-everywhere. `texts` holds the help of every command, and exit code and sentence of wrong input.
-Bytes are compared on the machine that recorded them; other machines round otherwise and compare
-scores.
+`scenes` holds the SHA-256 of every .ply and the PSNR and SSIM of every view: the development cases
+that are not kept apart, with the settings `default` and `paper`, a trained splat at seven targets,
+and eight targets in sequence. `room` is the same for a synthetic room, which needs no data: the
+tests check it everywhere. `texts` holds the help of every command, and exit code and sentence of
+wrong input. Bytes are compared on the machine that recorded them; other machines round otherwise
+and compare scores. A method that gave the recorded bytes of all scenes is listed by its digest
+(`methods`), so that figures measured with another one of the list still hold (write_results.py).
 """
 
 from __future__ import annotations
@@ -28,10 +29,13 @@ from typing import Any
 
 import torch
 
+from apart import HELP, read_used_cases
 from gscompleter.cli import COMMANDS
+from gscompleter.evaluation.measured_code import compute_method_digest
 
 ROOT = Path(__file__).resolve().parents[1]
 DATA = Path(os.environ.get("GSCOMPLETER_DATA", ROOT.parent / "shared"))
+DEVELOPMENT = ROOT / "benchmarks" / "development.json"
 PROGRAM = (sys.executable, "-c", "from gscompleter.cli import run; run()")
 MEAN_TOLERANCE, CASE_TOLERANCE = 0.02, 0.1
 """dB by which the mean PSNR, and the PSNR of one view, may fall on another machine."""
@@ -45,29 +49,41 @@ def main() -> None:
     parser.add_argument("action", choices=("record", "check"))
     parser.add_argument("--only", choices=SECTIONS)
     parser.add_argument("--data", type=Path, default=DATA)
+    parser.add_argument("--apart", action="store_true", help=HELP)
     parser.add_argument("--file", type=Path, default=ROOT / "benchmarks" / "golden.json")
     options = parser.parse_args()
     sections = (options.only,) if options.only else SECTIONS
-    if "scenes" in sections and not (options.data / "data" / "cases.json").is_file():
-        parser.error(f"{options.data} has no data/cases.json; name the data by GSCOMPLETER_DATA")
+    if "scenes" in sections and not (options.data / "data").is_dir():
+        parser.error(f"{options.data} has no folder data; name the data by GSCOMPLETER_DATA")
     known = json.loads(options.file.read_text()) if options.file.is_file() else {}
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder)
         present = {
-            "scenes": lambda: run_scenes(dict(list_runs(options.data)), place / "scenes"),
+            "scenes": lambda: run_scenes(
+                dict(list_runs(options.data, options.apart)), place / "scenes"
+            ),
             "room": lambda: run_scenes(dict(list_room_runs(place)), place / "rooms"),
             "texts": run_texts,
         }
         found = {"machine": describe_machine()} | {name: present[name]() for name in sections}
     if options.action == "record":
-        content = json.dumps(known | found, indent=1, sort_keys=True, ensure_ascii=False)
-        options.file.write_text(content + "\n")
+        if "scenes" in found:
+            found["methods"] = [compute_method_digest()]
+        write(options.file, known | found)
     elif differences := compare(known, found):
         sys.exit("\n".join([*differences, f"{len(differences)} differences"]))
     else:
         counts = ", ".join(f"{len(found[name])} {name}" for name in sections)
         exact = "bytes" if known["machine"] == found["machine"] else "scores (another machine)"
+        if exact == "bytes" and "scenes" in found:
+            methods = dict.fromkeys([*known.get("methods", []), compute_method_digest()])
+            write(options.file, known | {"methods": [*methods]})
         print(f"equal: {counts}; compared: {exact}")
+
+
+def write(path: Path, content: Mapping[str, Any]) -> None:
+    """Write what was recorded."""
+    path.write_text(json.dumps(content, indent=1, sort_keys=True, ensure_ascii=False) + "\n")
 
 
 def describe_machine() -> dict[str, str]:
@@ -82,17 +98,17 @@ def describe_machine() -> dict[str, str]:
     }
 
 
-def list_runs(data: Path) -> Iterator[tuple[str, list[str]]]:
+def list_runs(data: Path, uses_apart: bool = False) -> Iterator[tuple[str, list[str]]]:
     """List the completions, by name, with their arguments."""
-    cases = json.loads((data / "data" / "cases.json").read_text())
-    size = [str(side) for side in cases["resolution"]]
-    for case in cases["cases"]:
-        context = [str(frame) for frame in case["context"]]
-        given = [str(data / "data" / case["scene"]), "--context", *context, "--resolution", *size]
-        given += ["--near", str(case["near"]), "--far", str(case["far"])]
+    os.environ["GSCOMPLETER_DATA"] = str(data)  # development.json names its scenes by it
+    for case in read_used_cases(DEVELOPMENT, uses_apart):
+        height, width = case.resolution
+        context = [str(frame) for frame in case.context]
+        given = [str(case.scene), "--context", *context, "--resolution", str(height), str(width)]
+        given += ["--near", str(case.near), "--far", str(case.far)]
         for config in ("default", "paper"):
-            name = f"{case['scene']} {'+'.join(context)} to {case['target']}, {config}"
-            yield name, [*given, "--target", str(case["target"]), "--config", config]
+            name = f"{case.scene.name} {'+'.join(context)} to {case.target}, {config}"
+            yield name, [*given, "--target", str(case.target), "--config", config]
     splat = data / "splats" / "fox"
     unseen = [str(frame) for frame in (27, 29, 31, 33, 35, 37, 39)]
     given = [str(splat), "--scene", str(splat / "splat.ply"), "--resolution", "320"]
@@ -201,7 +217,8 @@ def compare(known: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
             recorded = known.get(section, {}).get(name)
             differences += [f"{name}: {text}" for text in match(recorded, row)]
     if not same_machine and "scenes" in found:
-        fall = mean_psnr(known["scenes"]) - mean_psnr(found["scenes"])
+        same = {name: row for name, row in known["scenes"].items() if name in found["scenes"]}
+        fall = mean_psnr(same) - mean_psnr(found["scenes"])
         differences += [f"mean PSNR fell by {fall:.3f} dB"] * (fall > MEAN_TOLERANCE)
     for name, row in found.get("texts", {}).items():
         before = known["texts"].get(name, {})

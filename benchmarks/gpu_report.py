@@ -64,10 +64,19 @@ class PartResult:
     seconds: float
     rows: tuple[Row, ...]
     date: str = field(default_factory=lambda: date.today().isoformat())
+    commit: str = field(default_factory=lambda: name_commit())
+    """Commit of the code that was measured."""
 
     @property
     def failed(self) -> bool:
         return any(row.failed for row in self.rows)
+
+
+def name_commit() -> str:
+    """Name the commit of the code; a copy of a checkout has none."""
+    from gscompleter.evaluation.measured_code import find_commit  # imports torch
+
+    return find_commit() or "unknown"
 
 
 @dataclass(frozen=True)
@@ -127,7 +136,11 @@ def read_earlier(path: Path | None, machine: Mapping[str, str]) -> dict[str, Par
         raise SystemExit(f"{path} is of another machine: its {differing[0]} differs; leave it out.")
     return {
         name: PartResult(
-            part["title"], part["seconds"], tuple(Row(**row) for row in part["rows"]), part["date"]
+            part["title"],
+            part["seconds"],
+            tuple(Row(**row) for row in part["rows"]),
+            part["date"],
+            part["commit"],
         )
         for name, part in content["parts"].items()
     }
@@ -231,7 +244,7 @@ def format_page(machine: Mapping[str, str], found: Mapping[str, PartResult]) -> 
     for part in found.values():
         lines += [
             "",
-            f"## {part.title} ({part.date}, {part.seconds:.0f} s)",
+            f"## {part.title} ({part.date}, commit {part.commit}, {part.seconds:.0f} s)",
             "",
             "| | |",
             "|---|---|",

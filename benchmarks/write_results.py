@@ -1,11 +1,20 @@
 """Write the figures of docs/reproduce.md and docs/results.md from the outputs of evaluations.
 
     python benchmarks/write_results.py [--reproduced OUT] [--held-out OUT] [--check]
+    python benchmarks/write_results.py --measured NAME COMMIT
 
 `make reproduce` and `make held-out` make the two outputs. Tables and scores are copied to
-docs/results, and what stands between `<!-- ours: ... -->` and `<!-- end -->` in the pages is
-written from there, beside the numbers of the paper (paper_values.yaml). Nobody types a figure. With
---check nothing is written; the exit code is 1 if a page differs from the stored outputs.
+docs/results with the commit that computed them. What stands between `<!-- ours: ... -->` and
+`<!-- end -->` in the pages is written from there, beside the numbers of the paper
+(paper_values.yaml). Nobody types a figure. With --check nothing is written; the exit code is 1 if a
+page differs from the stored outputs.
+
+A figure is true of the code that it was measured with. docs/results/measured.json has that commit
+for each set of figures, with the digests of its method and of its golden scenes, and the sentence
+above the figures says whether the method is still the same. So --check fails once after a change of
+the method: run this script, and the page says it. It says that pictures are the same where the
+golden scenes prove it (`make check-golden` lists the method in golden.json). --measured names the
+commit of figures that a script of their own printed.
 
 The comment names what is written:
     table NAME COLUMN ...    a table of the paper, a row for each method
@@ -13,15 +22,22 @@ The comment names what is written:
     claims                   the verdicts on the claims
     scores FILE COLUMN ...   means of `evaluate` of docs/results/FILE.json
     headline FILE ...        the three lines of the README, for each of these files
+    measured NAME            the commit of a set of figures, and whether the method changed since
+    alternatives KIND        the table of alternatives (alternatives.yaml), or what they do better
 """
 
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import re
 import shutil
+import subprocess
 import sys
+import tempfile
+from collections.abc import Iterable, Mapping, Sequence
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +45,24 @@ import yaml
 
 from gscompleter.evaluation.claims import HEAD, tabulate_claims
 from gscompleter.evaluation.columns import BY_KEY
+from gscompleter.evaluation.measured_code import compute_method_digest
 from gscompleter.evaluation.paper import load_paper
 from gscompleter.evaluation.tables import format_markdown, format_score
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 STORED = DOCS / "results"
-PAGES = ("reproduce.md", "results.md", "../README.md")
+MEASURED = STORED / "measured.json"
+"""Commit and digests of each set of figures."""
+GOLDEN = Path(__file__).with_name("golden.json")
+PAGES = ("reproduce.md", "results.md", "generators.md", "alternatives.md", "../README.md")
+ALTERNATIVES = {
+    "in_place": "completes your .ply in place",
+    "kept": "observed part kept bit for bit",
+    "cuda": "needs CUDA",
+    "time": "time for a scene",
+    "licence": "licence",
+}
+"""Columns of the table of alternatives."""
 DEVELOPMENT = "plane-sweep-cases-warp-inpaint"
 """Start of the name of the run with the table of all development cases."""
 REGION = re.compile(r"(<!-- ours: (?P<words>[^>]*?) -->\n)(?P<body>.*?)(<!-- end -->)", re.DOTALL)
@@ -47,11 +75,15 @@ def main() -> None:
     parser.add_argument("--reproduced", type=Path, help="output of make reproduce")
     parser.add_argument("--held-out", type=Path, help="output of make held-out")
     parser.add_argument("--check", action="store_true", help="only compare the pages")
+    parser.add_argument("--measured", nargs=2, metavar=("NAME", "COMMIT"))
     options = parser.parse_args()
+    if options.measured is not None:
+        note_measured(*options.measured)
     if options.reproduced is not None:
         copy_reproduction(options.reproduced)
     if options.held_out is not None:
         shutil.copyfile(options.held_out / "tables.json", STORED / "held_out.json")
+        note_measured("held_out", find_one_commit([STORED / "held_out.json"]))
     stale = []
     for name in PAGES:
         page = DOCS / name
@@ -76,6 +108,55 @@ def copy_reproduction(out: Path) -> None:
     (STORED / "results.md").write_text(without_figures.rstrip() + "\n", "utf-8")
     (scores,) = (out / "runs").glob(f"{DEVELOPMENT}/tables.json")
     shutil.copyfile(scores, STORED / "development.json")
+    stored = [STORED / "development.json", *(STORED / "tables").glob("*.json")]
+    note_measured("reproduced", find_one_commit(stored))
+
+
+def find_one_commit(paths: Iterable[Path]) -> str:
+    """Find the commit that computed all rows of some tables; exit where it is none or several."""
+    facts = [json.loads(path.read_text("utf-8"))["made_with"] for path in paths]
+    # A table of the paper has the facts of each of its runs.
+    runs = [run for of in facts for run in ([of] if "commits" in of else of.values())]
+    commits = {commit for run in runs for commit in run["commits"]}
+    if len(commits) != 1 or (commit := commits.pop()).endswith("-dirty"):
+        sys.exit(
+            f"The rows are of {sorted(commits) or 'no commit'}; evaluate one committed state of "
+            "the code in an empty folder."
+        )
+    return commit
+
+
+def note_measured(name: str, commit: str) -> None:
+    """Note the commit of a set of figures, with the digests of its method and golden scenes."""
+    with tempfile.TemporaryDirectory() as folder:
+        archive = run_git("archive", commit, "src/gscompleter")
+        subprocess.run(["tar", "-x", "-C", folder], input=archive, check=True)
+        method = compute_method_digest(Path(folder, "src", "gscompleter"))
+    # The oldest commits have no golden scenes.
+    path = GOLDEN.relative_to(DOCS.parent).as_posix()
+    has_golden = bool(run_git("ls-tree", commit, path))
+    golden = json.loads(run_git("show", f"{commit}:{path}")) if has_golden else {}
+    known = json.loads(MEASURED.read_text("utf-8")) if MEASURED.is_file() else {}
+    known[name] = {
+        "commit": run_git("rev-parse", "--short=8", commit).decode().strip(),
+        "date": run_git("show", "-s", "--format=%cs", commit).decode().strip(),
+        "method": method,
+        "golden": compute_golden_digest(golden),
+    }
+    MEASURED.write_text(json.dumps(known, indent=1, sort_keys=True) + "\n", "utf-8")
+
+
+def run_git(*words: str) -> bytes:
+    """Run git in this checkout and return its output."""
+    return subprocess.run(
+        ["git", "-C", str(DOCS.parent), *words], capture_output=True, check=True
+    ).stdout
+
+
+def compute_golden_digest(golden: Mapping[str, Any]) -> str:
+    """Compute the digest of the pictures and scores of golden scenes."""
+    scenes = {name: golden.get(name) for name in ("room", "scenes")}
+    return hashlib.sha256(json.dumps(scenes, sort_keys=True).encode()).hexdigest()[:16]
 
 
 def fill_page(text: str) -> str:
@@ -210,12 +291,70 @@ def read_scores(file: str) -> dict[str, Any] | None:
     return content
 
 
+def write_measured(name: str) -> str:
+    """Write the commit of a set of figures, and whether the method is still the same."""
+    of = json.loads(MEASURED.read_text("utf-8"))[name]
+    return f"Measured at commit `{of['commit']}` ({of['date']}); {describe_change(of)}.\n"
+
+
+def describe_change(measured: Mapping[str, str]) -> str:
+    """Describe what the method did since a measurement."""
+    golden = json.loads(GOLDEN.read_text("utf-8"))
+    now = compute_current_digest()
+    if measured["method"] == now:
+        return "the method is the same since"
+    proven = golden.get("methods", [])
+    is_golden = compute_golden_digest(golden) == measured["golden"]
+    if is_golden and measured["method"] in proven and now in proven:
+        return "the method gives the same pictures since"
+    return "the method changed since" if is_golden else "the pictures changed since"
+
+
+@cache
+def compute_current_digest() -> str:
+    """Compute the digest of the method of this checkout, once for all pages."""
+    return compute_method_digest(DOCS.parent / "src" / "gscompleter")
+
+
+def write_alternatives(kind: str) -> str:
+    """Write the table of alternatives: all columns, or what each of the others does better."""
+    rows = yaml.safe_load(Path(__file__).with_name("alternatives.yaml").read_text("utf-8"))
+    if kind == "better":
+        others = [row for row in rows if "better" in row]
+        cells = [[link_name(row), row["better"]] for row in others]
+        return format_text_table(["", "what it does better"], cells)
+    seconds = {
+        row["method"]: f"{row['cells']['seconds']['value']:.0f}"
+        for row in read_table("paradigms")["rows"]
+    }
+    # Its row comes with the next reproduction; until then nothing else was timed beside it.
+    seconds.setdefault("distill", "not measured with the others")
+    head = ["", *ALTERNATIVES.values()]
+    cells = [
+        [link_name(row), *(row[key].format_map(seconds) for key in ALTERNATIVES)] for row in rows
+    ]
+    return format_text_table(head, cells)
+
+
+def link_name(row: Mapping[str, str]) -> str:
+    """Link the name of a row to the page of its authors, if one is given."""
+    return f"[{row['name']}]({row['address']})" if "address" in row else row["name"]
+
+
+def format_text_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """Format a Markdown table of words."""
+    lines = [head, ["---"] * len(head), *rows]
+    return "".join("| " + " | ".join(line) + " |\n" for line in lines)
+
+
 WRITERS = {
     "table": write_table,
     "spans": write_spans,
     "claims": write_claims,
     "scores": write_scores,
     "headline": write_headline,
+    "measured": write_measured,
+    "alternatives": write_alternatives,
 }
 """Writers of a region, by the first word of its comment."""
 

@@ -31,7 +31,7 @@ kind of value, and the first sentence of its help is the same. What follows ther
 command adds, such as a default or the files that it writes (`gscompleter COMMAND --help-all`). A
 command may take fewer of the choices, or one value where another takes several. Settings of the
 method, `--config NAME` and `--config.GROUP.NAME VALUE`, are in
-[another chapter](guide/complete.md#options).
+[another table](reference/completing.md#options).
 
 Of masks two options say which way: `--mask` marks what goes, and `--ignore` what to leave out of
 photographs, both in white. Masks that lie beside photographs are black where a photograph is

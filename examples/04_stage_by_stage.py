@@ -30,13 +30,14 @@ def main() -> None:
     target = state.with_depth_range(gsc.load_camera(scene, frame=number, resolution=256))
     scenes = SceneRenderer(gsc.load_renderer("cpu"))
     view = stages.render_target(state, pad_camera(target, 0.0), scenes)
-    (image,) = stages.synthesize(phi, [(target, view.make_generator_input())])
-    lifted = stages.lift(psi, image, view)
-    print(f"anchor: context view {view.anchor.index}; {len(lifted.gaussians):,} candidates")
+    anchor = stages.choose_anchor(view)
+    (image,) = stages.synthesize(phi, [(target, stages.make_generator_input(view))])
+    lifted = stages.lift(psi, image, anchor, view)
+    print(f"anchor: context view {anchor.index}; {len(lifted.gaussians):,} candidates")
 
     # 3. Register: one affine for all depths, then each Gaussian along its ray.
-    affine = stages.align_depth(lifted, view, torch.Generator().manual_seed(0))
-    moved = stages.register_as_paper(lifted, affine, image, view)
+    affine = stages.align_depth(lifted, anchor, view, torch.Generator().manual_seed(0))
+    moved = stages.register_as_paper(lifted, affine, image, anchor, view)
     print(f"affine: {affine}")
     print(f"loss: {moved.losses[0]:.4f} to {moved.losses[-1]:.4f}")
 

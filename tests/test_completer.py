@@ -23,9 +23,11 @@ from gscompleter.guards.free_space import respect_free_space
 from gscompleter.numerics.geometry import pad_camera, project, rotations_to_quats
 from gscompleter.render.cpu import CpuRenderer
 from gscompleter.render.reference import adapt_to_mode
+from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.stages.lift import lift_pair
 from gscompleter.stages.register import apply_affine
-from gscompleter.stages.target_view import compute_hole_mask
+from gscompleter.stages.result import make_unchanged_result
+from gscompleter.stages.select_anchor import choose_anchor
 from gscompleter.state import Completion
 from gscompleter.system.timing import STAGES
 from gscompleter.types import Camera, Gaussians, View, make_observed, merge
@@ -190,7 +192,7 @@ def test_a_hole_is_what_the_target_shows_whatever_its_padding():
 
     view = completer.observe(completer.begin(photographs(), scene), target)
     assert view.camera.padded.width > SIZE
-    result = view.make_unchanged_result()
+    result = make_unchanged_result(view, choose_anchor(view))
     assert_close(result.before.alpha, shown.alpha, "alpha", 1e-5)
     assert_close(result.before.image, shown.image, "image", 1e-5)
     assert torch.equal(result.hole_mask, compute_hole_mask(shown.alpha))

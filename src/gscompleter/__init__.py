@@ -42,8 +42,8 @@ if TYPE_CHECKING:
     from gscompleter.splats.ply import save_ply as save_ply
     from gscompleter.stages.target_view import TargetView as TargetView
     from gscompleter.state import Completion as Completion
-    from gscompleter.state import TargetResult as TargetResult
     from gscompleter.system.errors import InputError as InputError
+    from gscompleter.target_result import TargetResult as TargetResult
     from gscompleter.types import Camera as Camera
     from gscompleter.types import DepthMap as DepthMap
     from gscompleter.types import Gaussians as Gaussians
@@ -101,7 +101,7 @@ _HOMES = {
     "Guard": "guards",
     "Attempt": "guards",
     "TargetView": "stages.target_view",
-    "TargetResult": "state",
+    "TargetResult": "target_result",
     "write_demo_scene": "data.demo_scene",
     "render_views": "virtual_capture.render_views",
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import compress
 
 import torch
 
@@ -17,16 +18,18 @@ from gscompleter.generators import (
     as_generator,
     load_generator,
 )
-from gscompleter.guards import Attempt, place, prepare_guards, verify
+from gscompleter.guards import accept_at, prepare_guards
 from gscompleter.numerics.geometry import is_inside, pad_camera, pad_like, project
 from gscompleter.numerics.image_ops import is_enclosed
 from gscompleter.numerics.value_checks import check_camera, check_gaussians, check_inputs
+from gscompleter.parts import MAX_TARGET_ID, Part, PartOrigin, find_last_target_id, make_part
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.reconstructors.depth_predictors import predict_nothing
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
 from gscompleter.stages.add_observed import add_observed
+from gscompleter.stages.additions import Additions
 from gscompleter.stages.align_depth import align_depth
 from gscompleter.stages.close_gaps import continue_surfaces, find_gaps, view_gaps
 from gscompleter.stages.context import choose_config, init_context
@@ -36,18 +39,18 @@ from gscompleter.stages.find_unfilled import find_unfilled
 from gscompleter.stages.lift import lift
 from gscompleter.stages.new_photos import find_new_photos, recolor_to_photos
 from gscompleter.stages.recolor import recolor
-from gscompleter.stages.refine import Refined, refine
+from gscompleter.stages.refine import keep_as_it_is, refine
+from gscompleter.stages.refusals import explain_skip
 from gscompleter.stages.register import register_along_rays
 from gscompleter.stages.register_paper import register_as_paper
-from gscompleter.stages.synthesize import GeneratedView, synthesize
+from gscompleter.stages.result import make_unchanged_result
+from gscompleter.stages.select_anchor import choose_anchor
+from gscompleter.stages.synthesize import GeneratedView, make_generator_input, synthesize
 from gscompleter.stages.target_view import TargetView, render_target
 from gscompleter.state import (
-    NEW_PHOTO_ID,
     Completion,
     Photo,
-    Step,
     check_state,
-    find_last_target_id,
 )
 from gscompleter.system.errors import InputError
 from gscompleter.system.progress import show_in_notebook, track
@@ -58,8 +61,6 @@ from gscompleter.trust import Trust
 from gscompleter.trust.photometric import load_trust
 from gscompleter.types import Camera, DepthAffine, Gaussians, PaddedCamera, View, merge
 
-MAX_TARGET_ID = NEW_PHOTO_ID - 1
-"""Largest target id: `generated` is one byte per Gaussian, and 0 means observed."""
 MAX_SEED = 2**62
 """Levels and rounds add to the seed, which has 64 bits."""
 REGISTRATIONS = {"paper": register_as_paper, "ours": register_along_rays}
@@ -182,12 +183,10 @@ class GSCompleter:
                 self.reconstructor, views, scene, check_views or (), targets, self.renderer
             )
             photos = tuple(Photo(view) for view in context.views)
-            parts = (context.source.rendered,)
-
             state = Completion(
                 config,
                 context.source,
-                parts,
+                context.source.rendered,
                 photos,
                 len(views),
                 Trust(),
@@ -242,56 +241,55 @@ class GSCompleter:
         # Seeded anew for each target, so that its result does not depend on how many came before.
         rng = torch.Generator().manual_seed(self.seed)
         with record_seconds() as seconds:
+            # Stages 2 to 4 of the paper, an equation a line.
             view = self.observe(state, target, reference)
-            if view.skip_reason:
-                return state.extended(view.make_unchanged_result(), seconds)
-
-            # Stages 2 to 4 of the paper, an equation a line. `steps` keeps the new Gaussians after
-            # each one, from which the report tells which step left a hole empty.
+            anchor = choose_anchor(view)  # Sec. III-D
+            unchanged = make_unchanged_result(view, anchor)
+            if unchanged.skip_reason:
+                return state.extended(unchanged, seconds)
             image = reference or self.synthesize([view])[0]  # Eq. 6
-            lifted = lift(self.reconstructor, image, view)  # Eq. 7
-            affine = align_depth(lifted, view, rng)  # Eq. 8
+            lifted = lift(self.reconstructor, image, anchor, view)  # Eq. 7
+            affine = align_depth(lifted, anchor, view, rng)  # Eq. 8
             register = REGISTRATIONS[state.config.registration_method]
-            moved = register(lifted, affine, image, view)  # Eq. 9 to 11
-            steps = [Step("lift", lifted.gaussians), Step("register", moved.gaussians)]
-            steps.append(Step("filter", filter_holes(moved, view)))  # Eq. 12
-            steps += place(steps[-1].gaussians, view)
-            refined = refine(steps[-1].gaussians, image, view)  # Eq. 13
-            steps.append(Step("refine", refined.gaussians))
-            verified, rejection = verify(Attempt(view, image, affine, refined))
-            steps += verified
-            filled = fade_border(steps[-1].gaussians, view)
+            moved = register(lifted, affine, image, anchor, view)  # Eq. 9 to 11
+            in_holes = filter_holes(moved, view)  # Eq. 12
+            origin = PartOrigin("target", state.next_target_id)
+            candidates = Additions.begin(origin, "lift", lifted.gaussians)
+            candidates = candidates.then("register", moved.gaussians).then("filter", in_holes)
+            filled = accept_at(view, candidates, image, affine, refine)  # Eq. 13
+            part = make_part(origin, fade_border(filled.gaussians, view))
 
             # Not in the paper: what covers the target without being trusted takes new colours, and
             # gaps that a camera beside the target would see are closed.
-            recolored = recolor(image, view, state.next_target_id)
-            closing = self.close_gaps(recolored.state, view, filled)
-            added = merge([filled, closing])
+            recolored = recolor(image, view, origin)
+            closing = self.close_gaps(recolored.state, view, part)
+            added = merge([part.gaussians, closing.gaussians])
             after = recolored.frozen.composite(added)
             result = replace(
-                view.make_unchanged_result(),
+                unchanged,
                 after=after.crop(view.camera),
                 added=added,
-                unfilled=find_unfilled(after, steps, view),
+                unfilled=find_unfilled(after, filled.steps, view),
                 reference=image.crop(view.camera),
                 affine=affine,
-                losses={"register": moved.losses, "refine": refined.losses},
+                losses={"register": moved.losses, "refine": filled.losses},
                 registered=moved.gaussians if self.keep_registered else None,
                 num_outside=count_outside(added, target) if state.is_given else 0,
                 num_recolored=recolored.count,
                 synthesis_notes=image.notes,
                 lift_notes=lifted.notes,
                 painter=image.painter,
-                rejection=rejection,
+                rejection=filled.rejection,
             )
-        return recolored.state.extended(result, seconds, (filled, closing))
+        return recolored.state.extended(result, seconds, (part, closing))
 
-    def close_gaps(self, state: Completion, target: TargetView, added: Gaussians) -> Gaussians:
+    def close_gaps(self, state: Completion, target: TargetView, added: Part) -> Part:
         """Return what closes the thin gaps beside a target, for which `added` is added.
 
         None are closed where nothing was added, or in the paper.
         """
-        nothing = added[:0]
+        origin = PartOrigin("gap", state.next_target_id)
+        nothing = make_part(origin, added.gaussians[:0])
         if state.config.gaps.displacement == 0 or len(added) == 0:
             return nothing
         # The target is not counted as completed yet: what is added here gets its id, and has to be
@@ -300,17 +298,14 @@ class GSCompleter:
             replace(photo, budgets=budgets)
             for photo, budgets in zip(state.photos, target.budgets, strict=True)
         )
-        with_added = replace(state, parts=(*state.parts, added), photos=photos)
+        with_added = replace(state, added_parts=(*state.added_parts, added), photos=photos)
         view = view_gaps(with_added, target.camera.target, self.scenes, state.config.gaps)
         gaps = find_gaps(view)
         if not gaps.any():
             return nothing
-        image, candidates = continue_surfaces(view, gaps)
-        steps = [Step("continue", candidates), *place(candidates, view)]
-        placed = steps[-1].gaussians
-        plans = tuple(frozen.vary_opacities(placed) for frozen in view.frozen_photos)
-        verified, _ = verify(Attempt(view, image, DepthAffine(), Refined(placed, plans, ())))
-        return [*steps, *verified][-1].gaussians
+        image, continued = continue_surfaces(view, gaps)
+        candidates = Additions.begin(origin, "continue", continued)
+        return accept_at(view, candidates, image, DepthAffine(), keep_as_it_is).to_part()
 
     @run_in_plain_torch
     def advance_batch(self, state: Completion, targets: Sequence[Camera]) -> Completion:
@@ -324,10 +319,11 @@ class GSCompleter:
             return self.advance(state, targets[0])
         with record_seconds() as seconds:
             views = [self.observe(state, target) for target in targets]
-            images = iter(self.synthesize([view for view in views if not view.skip_reason]))
+            is_open = [not explain_skip(view) for view in views]
+            images = iter(self.synthesize(list(compress(views, is_open))))
         state = state.plus_seconds(seconds)
-        for target, view in zip(targets, views, strict=True):
-            state = self.advance(state, target, None if view.skip_reason else next(images))
+        for target, has_image in zip(targets, is_open, strict=True):
+            state = self.advance(state, target, next(images) if has_image else None)
         return state
 
     @run_in_plain_torch
@@ -364,7 +360,7 @@ class GSCompleter:
         """Synthesize the image of each padded target (paper, Eq. 6)."""
         if not views:
             return []
-        inputs = [(view.camera.padded, view.make_generator_input()) for view in views]
+        inputs = [(view.camera.padded, make_generator_input(view)) for view in views]
         return synthesize(self.generator, inputs, views[0].state.config.synthesis)
 
 

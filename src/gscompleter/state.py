@@ -1,4 +1,4 @@
-"""A scene during completion, and the result of each target; conventions are in `types`."""
+"""A scene during completion; conventions are in `types`."""
 
 from __future__ import annotations
 
@@ -6,58 +6,27 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
+import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import CompleterConfig
+from gscompleter.parts import Part, PartKind, find_last_target_id
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.display import Displayed
 from gscompleter.system.plugins import load_function
 from gscompleter.system.tensor_checks import describe
 from gscompleter.system.timing import add_seconds
+from gscompleter.target_result import TargetResult
 from gscompleter.trust import Trust
-from gscompleter.types import (
-    Camera,
-    ContextScene,
-    DepthAffine,
-    ErrorBudget,
-    Gaussians,
-    Render,
-    View,
-    merge,
-)
+from gscompleter.types import Camera, ContextScene, ErrorBudget, Gaussians, View, merge
 
-NEW_PHOTO_ID = 255
-"""Value of `generated` for Gaussians that were recoloured to a new photograph, or cut."""
-MANY_TIMES = 4
-"""Gaussians outside of the image of a target, against those in it, from which on they are many."""
 MAX_SHOWN_TARGETS = 4
 """Most targets whose pictures a notebook shows."""
 RESULTS = "gscompleter.apps.report.results"
 """Module of the files and scores of a completion, which is above this one."""
-AFFINE_NOTES = {
-    "ransac": "",
-    "median": "RANSAC finds no reliable depth correction; the median depth ratio replaces it.",
-    "identity": "There is nothing to fit a depth correction to; the predicted depths are used.",
-}
-"""Sentence about each estimator of the depth correction; empty for the usual one."""
-NOTHING_ADDED = "Nothing of it was added."
-LOSSES = {
-    "lift": "no depth was found for it",
-    "register": "what was made for it did not fit there",
-    "filter": "what was made for it lies beside the hole",
-    "free-space": "a filling would hide what other cameras see through it",
-    "removal": "nothing was removed there",
-    "hull": "a filling would lie outside of the object",
-    "refine": "the photographs beside it contradict a filling",
-    "image-agreement": "the generated image contradicts the photographs",
-    "depth-agreement": "its depths contradict the scene",
-    "psnr": "a filling would make given photographs worse",
-    "contribution": "a filling would hardly be seen",
-}
-"""Reason why each step leaves a part of a hole empty, as a clause for people."""
 
 
 @dataclass(frozen=True)
@@ -70,173 +39,21 @@ class Photo:
     """Largest errors that additions may cause; none if no guard sets them."""
 
 
-@dataclass(frozen=True)
-class Rejection:
-    """The guard that removed everything that was generated for a target, if one did."""
-
-    guard: str = ""
-    reason: str = ""
-    """Sentence for the report; empty if the notes of Φ say it."""
-
-
-@dataclass(frozen=True)
-class Step:
-    """The new Gaussians after a step of a target."""
-
-    name: str
-    """`lift`, `register`, `filter`, `refine`, or the name of a guard."""
-    gaussians: Gaussians
-
-
-@dataclass(frozen=True)
-class Unfilled:
-    """The part of the dilated hole mask, at the padded target, that is still a hole afterwards."""
-
-    MAX_SHARE: ClassVar[float] = 0.005
-    """Largest share of the mask that is not worth a word."""
-    LARGE_SHARE: ClassVar[float] = 0.1
-    """Share of the mask from which on a person should look at what stays empty."""
-
-    share: float = 0.0
-    """Share of the pixels of the mask."""
-    lost_by: Mapping[str, float] = field(default_factory=dict)
-    """The same by the step that emptied them for the first time; empty if there is little."""
-    regions: tuple[tuple[int, int, int, int], ...] = ()
-    """Bounding boxes (left, top, right, bottom) of the largest regions, in pixels of the target
-    image; its padding has coordinates below 0 and beyond its size."""
-
-    def describe(self) -> str:
-        """Write the sentence for people; empty if the hole is filled.
-
-        `lost_by` and `regions` have the details, for the report.
-        """
-        if self.share <= self.MAX_SHARE:
-            return ""
-        # One reason is enough: the others seldom leave as much.
-        steps = sorted(self.lost_by, key=lambda step: -self.lost_by[step])
-        reason = LOSSES.get(steps[0], f"the step {steps[0]} left it out") if steps else ""
-        mostly = "mostly " if len(steps) > 1 else ""
-        because = f", {mostly}because {reason}" if reason else ""
-        return f"{max(1, round(100 * self.share))} % of the hole stays empty{because}."
-
-
-@dataclass(frozen=True, repr=False)
-class TargetResult(Displayed):
-    """Result of one target camera. No stage reads it."""
-
-    target: Camera
-    before: Render
-    """The scene without what this target changed, rendered at the target."""
-    after: Render
-    hole_mask: Bool[Tensor, "h w"]
-    """True where the scene had a hole or was not trusted, before dilation."""
-    trusted_alpha: Float[Tensor, "h w"]
-    """Accumulated opacity weighted by trust, from which `hole_mask` follows."""
-    anchor: int
-    """Index of the anchor among the context views."""
-    anchor_fallback: bool
-    """True if every view exceeded the rotation limit, so that the smallest rotation won."""
-    added: Gaussians
-    reference: View | None = None
-    """The synthesized view, or None if there was nothing to complete."""
-    affine: DepthAffine = DepthAffine()
-    losses: Mapping[str, Sequence[float]] = field(default_factory=dict)
-    """Loss per iteration of `register` (Eq. 11) and `refine` (Eq. 13)."""
-    registered: Gaussians | None = None
-    """All registered Gaussians, hole or not; None without `GSCompleter.keep_registered`."""
-    target_id: int = 0
-    """Value of `generated` for what this target added or recoloured."""
-    num_outside: int = 0
-    """Number of added Gaussians outside of the image of the target, if the scene was given."""
-    num_recolored: int = 0
-    """Number of rendered context Gaussians that got new colours."""
-    synthesis_notes: tuple[str, ...] = ()
-    """Sentences of the generator about its image."""
-    lift_notes: tuple[str, ...] = ()
-    """Sentences of Ψ about the depth of that image."""
-    painter: str = ""
-    """Who painted the image elsewhere; empty if Φ synthesized it."""
-    unfilled: Unfilled = Unfilled()
-    """The part of the hole that stays empty; nothing for a target that was skipped."""
-    rejection: Rejection = Rejection()
-    refusal: str | None = None
-    """Sentence why the target cannot be completed, or None if it can."""
-    skip_reason: str = ""
-    """Sentence why there was nothing to complete; empty if there was."""
-
-    def summarize(self) -> str:
-        """Describe the hole, and what was done about it."""
-        parts = [f"hole {self.hole_fraction:.1%}", f"{len(self.added):,} Gaussians added"]
-        if self.num_recolored:
-            parts.append(f"{self.num_recolored:,} recoloured")
-        return ", ".join([*parts, f"{len(self.notes)} notes"] if self.notes else parts)
-
-    def list_pictures(self) -> dict[str, Tensor]:
-        """List the scene at the target before and after."""
-        return {"before": self.before.image, "after": self.after.image}
-
-    @property
-    def hole_fraction(self) -> float:
-        """Fraction of the image in holes."""
-        return self.hole_mask.float().mean().item()
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """Sentences about fallbacks and rejections, for a reader of the results."""
-        if self.skip_reason:
-            return (self.skip_reason,)
-        notes = [*self.synthesis_notes, *self.lift_notes]
-        if self.anchor_fallback:
-            notes.append("Every view is turned too far; the least-turned one is the anchor.")
-        if self.affine.is_refitted_at_target:
-            notes.append(
-                "The depths that fit the anchor contradict the scene at the target; they are "
-                "fitted at the target instead."
-            )
-        notes.append(AFFINE_NOTES[self.affine.method])
-        if self.rejection.guard:
-            notes += [self.rejection.reason, NOTHING_ADDED]
-        notes.append(self.unfilled.describe())
-        notes.append(self.describe_outside())
-        return tuple(filter(None, notes))
-
-    @property
-    def warnings(self) -> tuple[str, ...]:
-        """Those of the notes that ask for a look at the result."""
-        if self.skip_reason:
-            return ()
-        found = [self.rejection.reason or " ".join(self.synthesis_notes), NOTHING_ADDED]
-        found = found if self.rejection.guard else []
-        if self.unfilled.share >= self.unfilled.LARGE_SHARE:
-            found.append(self.unfilled.describe())
-        return tuple(filter(None, found))
-
-    def describe_outside(self) -> str:
-        """Write a sentence if far more was added outside of the image than in its hole."""
-        inside = len(self.added) - self.num_outside
-        if self.num_outside <= MANY_TIMES * inside:
-            return ""
-        return (
-            f"{self.num_outside:,} of the {len(self.added):,} added Gaussians lie outside of the "
-            f"image of the target, whose hole has {int(self.hole_mask.sum()):,} pixels: they fill "
-            "its padding (config.margin 0 leaves them out)."
-        )
-
-
 @dataclass(frozen=True, repr=False)
 class Completion(Displayed):
     """A scene during completion; steps return a new value, and the old one serves as undo."""
 
     config: CompleterConfig
     source: ContextScene
-    parts: tuple[Gaussians, ...]
-    """Gaussians to render: the context, recoloured in part, then what each target added: for the
-    hole, and for thin gaps. Frozen scenes are extended part by part."""
+    rendered_context: Gaussians
+    """The context as stages see it: recoloured in part, and of a large scene a proxy."""
     photos: tuple[Photo, ...]
     """Context photographs, then check photographs."""
     num_context: int
     trust: Trust
     """Trust in `rendered_context`; added Gaussians have full trust."""
+    added_parts: tuple[Part, ...] = ()
+    """What was added, part by part, in the order of addition."""
     targets: tuple[TargetResult, ...] = ()
     free_space_cameras: tuple[Camera, ...] = ()
     """Further cameras whose free space stays empty, such as the witnesses of a splat; their images
@@ -247,8 +64,6 @@ class Completion(Displayed):
     """Exposure gain of each original photograph relative to `views`, or None if not estimated."""
     num_new_photos: int = 0
     """Number of photographs that a given scene did not reproduce."""
-    num_observed: int = 0
-    """Number of Gaussians that were added from photographs, before any target."""
     is_given: bool = False
     """True if the context is a scene that was given, and Ψ did not reconstruct it."""
     seed: int = 0
@@ -327,9 +142,9 @@ class Completion(Displayed):
         return tuple(photo.view for photo in self.photos[: self.num_context])
 
     @property
-    def rendered_context(self) -> Gaussians:
-        """The context as stages see it: recoloured in part, and of a large scene a proxy."""
-        return self.parts[0]
+    def parts(self) -> tuple[Gaussians, ...]:
+        """Gaussians to render: the context, then the additions, by which frozen scenes grow."""
+        return (self.rendered_context, *(part.gaussians for part in self.added_parts))
 
     @property
     def context(self) -> Gaussians:
@@ -338,13 +153,32 @@ class Completion(Displayed):
 
     @cached_property
     def added(self) -> Gaussians:
-        """Generated Gaussians of all targets."""
+        """All Gaussians that were added."""
         return merge([self.rendered_context[:0], *self.parts[1:]])
 
+    def count_added(self, *kinds: PartKind) -> int:
+        """Count the additions of these kinds that are in the scene."""
+        return sum(len(part) for part in self.added_parts if part.origin.kind in kinds)
+
     @property
+    def num_observed(self) -> int:
+        """Number of added Gaussians that photographs show and the given scene lacked."""
+        return self.count_added("photographs")
+
+    @property
+    def num_invented(self) -> int:
+        """Number of added Gaussians that were invented for a target."""
+        return self.count_added("target", "gap")
+
+    @cached_property
     def recolored_mask(self) -> Bool[Tensor, "n"]:
         """True for Gaussians of `context` that got new colours."""
-        return self.source.expand(self.rendered_context.generated != self.source.rendered.generated)
+        before = self.source.rendered
+        after = self.rendered_context
+        if after is before:
+            return torch.zeros_like(self.source.chosen_mask)
+        # Their labels do not tell: a Gaussian may have had this label before.
+        return self.source.expand((after.sh != before.sh).flatten(1).any(dim=1))
 
     @cached_property
     def scene(self) -> Gaussians:
@@ -420,22 +254,16 @@ class Completion(Displayed):
         self,
         result: TargetResult,
         seconds: Mapping[str, float],
-        added: Sequence[Gaussians] = (),
+        added: Sequence[Part] = (),
     ) -> Completion:
         """Append the result of one more target, and what it `added`, in the order of addition."""
-        parts = (*self.parts, *(part for part in added if len(part)))
+        parts = (*self.added_parts, *(part for part in added if len(part)))
         targets = (*self.targets, result)
-        return replace(self, parts=parts, targets=targets).plus_seconds(seconds)
+        return replace(self, added_parts=parts, targets=targets).plus_seconds(seconds)
 
     def plus_seconds(self, seconds: Mapping[str, float]) -> Completion:
         """Add wall times stage by stage."""
         return replace(self, seconds=add_seconds(self.seconds, seconds))
-
-
-def find_last_target_id(scene: Gaussians) -> int:
-    """Find the largest target id in a scene; 0 if nothing was generated for a target."""
-    ids = scene.generated.where(scene.generated != NEW_PHOTO_ID, 0)
-    return int(ids.max()) if len(ids) else 0
 
 
 def check_state(state: object) -> None:

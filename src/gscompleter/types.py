@@ -51,11 +51,6 @@ MAX_CENTER = 100.0
 SH_C0 = 0.28209479177387814
 """Constant spherical harmonic: colour = 0.5 + SH_C0 * sh[:, 0]."""
 
-REMOVED = -1
-"""Number, in a `ContextScene`, of Gaussians that were removed."""
-REVEALED = -2
-"""Number, in a `ContextScene`, of unseen Gaussians behind those that were removed."""
-
 MAX_RIGID_ERROR = 1e-3
 """Largest entry of RᵀR - I that counts as rounding error of a rotation R."""
 
@@ -429,7 +424,8 @@ class Gaussians(Displayed, TensorDataclass):
     sh: Float[Tensor, "n k 3"]
     """Spherical harmonics; k is 1, 4, 9 or 16 for degree 0 to 3."""
     generated: UInt8[Tensor, "n"]
-    """0 for observed Gaussians, otherwise the id of the target that they were generated for."""
+    """0 for observed Gaussians, else the label of their origin (`parts.PartOrigin`): 1 to 254 for
+    the target that they were invented for, 255 for what is new and was not invented."""
     encoded: Float[Tensor, "n 4"] | None = None
     """Log-scales and logit opacities as read from a file, or None.
     The writer uses them while they still match, since float32 exp and log are not exact
@@ -724,6 +720,12 @@ class GeneratorInput:
         alpha = self.target_render.alpha if self.trusted_alpha is None else self.trusted_alpha
         return alpha < self.max_alpha
 
+    @property
+    def known_colors(self) -> Float[Tensor, "h w 3"]:
+        """Colours of the scene at the target without the black behind it; dark in holes."""
+        alpha = self.target_render.alpha.clamp_min(self.max_alpha)
+        return (self.target_render.image / alpha[..., None]).clamp(0, 1)
+
 
 @dataclass(frozen=True)
 class Lift:
@@ -803,14 +805,15 @@ class ContextScene:
     rendered: Gaussians
     """The m Gaussians that the stages render; `gaussians` itself for small scenes and on GPUs."""
     proxy_index: Int64[Tensor, "_n"]
-    """Rendered Gaussian that stands for each Gaussian, `REMOVED` or `REVEALED` for those that are
-    gone; empty if `rendered is gaussians`."""
+    """Rendered Gaussian that stands for each Gaussian, any one for those that are gone; empty if
+    `rendered is gaussians`."""
+    chosen_mask: Bool[Tensor, "n"]
+    """True for Gaussians that were chosen and removed."""
+    revealed_mask: Bool[Tensor, "n"]
+    """True for unseen Gaussians behind those, which are gone as well."""
     removed: Gaussians
     """The Gaussians that were removed, cut where they reached out of the place that was chosen; to
     save memory, without their colours by direction."""
-    piece_means: Float[Tensor, "_p 3"]
-    """Means of the pieces that stayed where a removed Gaussian reached out of that place. They are
-    among the additions, and were given."""
 
     @staticmethod
     def whole(gaussians: Gaussians) -> ContextScene:
@@ -823,8 +826,9 @@ class ContextScene:
     ) -> ContextScene:
         """Return a context from which nothing was removed yet."""
         none = gaussians[:0]
+        nowhere = torch.zeros_like(gaussians.generated, dtype=torch.bool)
         none = replace(none, sh=none.sh[:, :1])
-        return ContextScene(gaussians, rendered, index, none, none.means)
+        return ContextScene(gaussians, rendered, index, nowhere, nowhere, none)
 
     @cached_property
     def removed_pixels(self) -> dict[Hashable, Bool[Tensor, "h w"]]:
@@ -833,34 +837,23 @@ class ContextScene:
 
     @property
     def stand_ins(self) -> Int64[Tensor, "n"]:
-        """Rendered Gaussian that stands for each Gaussian, below 0 if it is gone."""
+        """Rendered Gaussian that stands for each Gaussian, any one for those that are gone."""
         if self.rendered is not self.gaussians:
             return self.proxy_index
         return torch.arange(len(self.gaussians), device=self.gaussians.means.device)
 
-    def find_pieces(self, gaussians: Gaussians) -> Bool[Tensor, "_n"]:
-        """Find the pieces of cut Gaussians among others, by their exact positions."""
-        # Most completions cut nothing, and the search sorts all positions.
-        if len(self.piece_means) == 0:
-            return torch.zeros_like(gaussians.opacities, dtype=torch.bool)
-        return find_equal_positions(gaussians.means, self.piece_means)
-
-    @property
-    def chosen_mask(self) -> Bool[Tensor, "n"]:
-        """True for Gaussians that were removed, without those that this revealed."""
-        return self.stand_ins == REMOVED
-
     @property
     def gone_mask(self) -> Bool[Tensor, "n"]:
         """True for Gaussians that were removed or revealed: they are not in the scene."""
-        return self.stand_ins < 0
+        return self.chosen_mask | self.revealed_mask
 
     def expand(self, values: Shaped[Tensor, "m *c"]) -> Shaped[Tensor, "n *c"]:
-        """Map values of rendered Gaussians to those they stand for; 0 for removed ones."""
+        """Map values of rendered Gaussians to those they stand for; 0 for those that are gone."""
         if self.rendered is self.gaussians:
             return values
-        # Numbers below 0 read the row of zeros at the end.
-        return torch.cat([values, torch.zeros_like(values[:1])])[self.proxy_index.clamp_min(-1)]
+        expanded = values[self.proxy_index]
+        expanded[self.gone_mask] = 0
+        return expanded
 
 
 @dataclass(frozen=True)

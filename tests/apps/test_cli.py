@@ -283,6 +283,7 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
         (("--sed", 1), "nearest is --seed INT (see gscompleter complete --help)."),
         (("--drop_nonfinit",), "options: --drop_nonfinit; the nearest is --drop-nonfinite (see"),
         (("--qwertz", 1), "Unrecognized options: --qwertz, 1 (see gscompleter complete --help)."),
+        (("--depth", "none", "moge-2"), "moge-2 belongs to no option of complete, and"),
         (("--config.registration.hole-deptth", 1), "nearest is --config.registration.hole-depth"),
         (("--device", "tpu"), "invalid choice 'tpu' for argument '--device'."),
         (("--near", "a" * 5000), "aaa…aaa"),

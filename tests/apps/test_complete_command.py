@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -143,6 +144,17 @@ def test_the_summary_says_what_was_opened_and_between_which_depths(chosen):
     depths = summary["depth_range"]
     assert depths["from"] == {"near": "features", "far": "given"}
     assert 0 < depths["near"] < depths["far"] == 20
+
+
+def test_photographs_that_are_missing_are_named_where_too_few_are_left(
+    scene, tmp_path, monkeypatch, capsys
+):
+    copy = Path(shutil.copytree(scene, tmp_path / "copy"))
+    for number in range(4):
+        (copy / f"{number}.png").unlink()
+    assert run(monkeypatch, "complete", copy, "--out", tmp_path / "out", "--resolution", 48) == 2
+    said = capsys.readouterr().err
+    assert "4 of 5 photographs are missing, such as 0.png, and too few are left: 1 context" in said
 
 
 def test_too_few_photographs_beside_the_targets_are_refused(scene, tmp_path, monkeypatch, capsys):

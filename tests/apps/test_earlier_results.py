@@ -57,6 +57,9 @@ def test_view_reads_the_result_of_an_earlier_version(earlier):
     assert (len(content.before), len(content.after)) == (3, 5)
     assert content.after.generated.tolist() == [0, 0, 0, 1, 1]
     assert [camera.name for camera in content.cameras] == ["target-1"]
+    # The photographs were named relative to where the command ran.
+    (note,) = content.notes
+    assert note.endswith("because room is not in this folder, and was named from another.")
 
 
 def test_report_makes_the_page_of_an_earlier_version_again(earlier, monkeypatch, capsys):

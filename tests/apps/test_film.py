@@ -26,10 +26,11 @@ from gscompleter.apps.report.film import (
 )
 from gscompleter.numerics.geometry import measure_baseline, measure_rotation, resize_camera
 from gscompleter.render.loading import load_renderer
-from gscompleter.state import Completion, Photo, TargetResult
+from gscompleter.state import Completion, Photo
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.video import find_ffmpeg, write_video
 from gscompleter.system.progress import show_progress
+from gscompleter.target_result import TargetResult
 from gscompleter.types import Camera
 from scenes import Room, camera_at, half_a_room_of
 from target_views import begin_with
@@ -211,7 +212,7 @@ def test_whoever_stops_it_leaves_no_ffmpeg_behind(tmp_path, monkeypatch):
 
 
 def test_no_film_without_a_target(completion, tmp_path):
-    nothing = replace(completion, parts=completion.parts[:1], targets=())
+    nothing = replace(completion, added_parts=(), targets=())
     write_comparison_video(
         tmp_path, nothing, [completion.views[0].camera], load_renderer("reference")
     )

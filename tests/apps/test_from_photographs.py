@@ -11,7 +11,7 @@ import pytest
 from command import run
 from gscompleter import load_ply, save_ply
 from gscompleter.evaluation.verdict.outcome import round_count
-from gscompleter.state import NEW_PHOTO_ID
+from gscompleter.parts import NOT_INVENTED
 from scenes import camera_at, photographed, room_without_a_box
 
 SIZE = 96
@@ -55,11 +55,11 @@ def test_the_generator_invents_only_what_no_photograph_shows(
     said = capsys.readouterr().out
     assert re.search(r" photographs? gains? [\d.]+ dB; ", said.splitlines()[0])
     assert f"{round_count(counts['from_photographs'])} Gaussians from photographs, " in said
-    assert "The splat reproduces all photographs" not in said
+    assert "none is new to it" not in said
     told = f"{counts['from_photographs']:,} of the added Gaussians come from photographs"
     assert (out / "report.html").read_text().count(told) == 1
     generated = load_ply(out / "completed.ply").generated
-    assert int((generated == NEW_PHOTO_ID).sum()) >= counts["from_photographs"]
+    assert int((generated == NOT_INVENTED).sum()) >= counts["from_photographs"]
 
     back = tmp_path / "back.ply"
     assert run(monkeypatch, "strip", out / "completed.ply", "--out", back, "--quiet") == 0
@@ -77,4 +77,4 @@ def test_without_the_generator_there_are_no_targets(room, cut, tmp_path, monkeyp
     assert printed.out.startswith("What photographs show and the splat lacked is added")
     assert "show and the splat lacks by plane-sweep on cpu" in printed.err
     rows = plyfile.PlyData.read(str(out / "completed.ply"))["vertex"].data
-    assert set(np.unique(rows["generated"])) == {0, NEW_PHOTO_ID}
+    assert set(np.unique(rows["generated"])) == {0, NOT_INVENTED}

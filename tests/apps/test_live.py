@@ -147,7 +147,8 @@ def test_there_is_nothing_to_undo_in_the_beginning(begun):
 def test_a_camera_that_adds_nothing_is_no_step(begun):
     session, text = complete_camera(begun, begun.latest.views[0].camera)
     assert session is begun
-    assert text == "The scene is known at this camera already: nothing to complete."
+    assert text.startswith("The scene is known at this camera already: nothing to complete. ")
+    assert "“Find a hole” leads to one" in text
 
 
 def test_stages_are_heard_as_they_begin(completed, twice):
@@ -414,8 +415,7 @@ def test_more_is_removed_from_a_completed_splat(splat_begun):
     labels = first.context.generated.clone()
     labels[:9] = 1
     context = replace(first.context, generated=labels)
-    parts = (context, *first.parts[1:])
-    completed = replace(first, source=ContextScene.whole(context), parts=parts)
+    completed = replace(first, source=ContextScene.whole(context), rendered_context=context)
     session = replace(splat_begun, completions=(completed,))
     changed, _ = apply_step(session, marked(session, "remove"))
     assert changed.latest.source.gone_mask.any()

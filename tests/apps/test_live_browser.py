@@ -149,10 +149,17 @@ def test_a_hole_that_is_flown_to_closes_opens_again_and_is_saved(tmp_path, monke
         assert tab.ask("undo").startswith("There is nothing to undo")
         tab.drag((-60, 40), (0, 40))
         assert not tab.page.is_visible("#unsaved")
+        given = tab.stats()["counts"]
+        assert given["observed"] > 0 == given["generated"]
         assert "Gaussians are added" in tab.ask("complete")
+        # The page counts what it shows.
+        shown = tab.stats()["counts"]
+        assert shown["observed"] == given["observed"]
+        assert shown["generated"] > 50
         assert tab.page.is_visible("#unsaved")
         check_places(tab)
         assert tab.ask("undo") == "Undone. Steps left: 0."
+        assert tab.stats()["counts"] == given
         assert "The scene has a hole here" in tab.ask("find")
         assert "Gaussians are added" in tab.ask("complete")
         assert "Saved in" in tab.ask("save")
@@ -238,6 +245,9 @@ def test_the_fox_is_painted_repaired_undone_saved_and_stripped(fox_splat, tmp_pa
         said = tab.ask("repair")
         assert "are removed" in said
         assert tab.stats()["strokes"] == 0
+        counts = tab.stats()["counts"]
+        assert counts["observed"] < counts["before"]
+        assert counts["generated"] > 100
         repaired = tab.picture()
         is_changed = np.abs(repaired - given).max(axis=-1) > 0.02
         assert 0.005 < is_changed.mean() < 0.3

@@ -9,12 +9,16 @@ import pytest
 
 import gscompleter as gsc
 from command import run
+from gscompleter.apps.commands.evaluate import PresetGeneratorOptions
+from gscompleter.evaluation.store import make_file_name
+from gscompleter.system.errors import InputError
 from paths import ROOT
 from scenes import camera_at, photographed
 
 EXAMPLES = ROOT / "examples"
 SMALL = ("--context", 0, 1, "--target", 2, "--resolution", 32, "--near", 0.5, "--far", 20)
 DEPTH = f"{EXAMPLES / '06_own_depth.py'}:predict_depth"
+PAINTER = f"{EXAMPLES / '08_own_generator.py'}:paint"
 
 
 def complete(monkeypatch, room: Path, out: Path, *words: object) -> dict:
@@ -110,6 +114,52 @@ def test_depths_are_compared_in_one_table(room, tmp_path, monkeypatch, capsys):
     assert "named twice" in refuse(monkeypatch, capsys, *words, "--depth", "none", "none")
     line = refuse(monkeypatch, capsys, *words, "--depth", "none", DEPTH, "--table", "models")
     assert "table of their own" in line
+
+
+def test_generators_are_compared_in_one_table(room, tmp_path, monkeypatch, capsys):
+    case = {"scene": str(room), "context": [0, 1], "target": 2, "near": 0.5, "far": 20}
+    cases = tmp_path / "cases.json"
+    cases.write_text(json.dumps({"resolution": [32, 32], "cases": [case]}))
+    out = tmp_path / "out"
+    words = ("evaluate", cases, "--methods", "full", "--out", out, "--device", "cpu")
+    both = ("warp-inpaint", PAINTER)
+    assert run(monkeypatch, *words, "--generator", *both) == 0
+    table = json.loads((out / "tables" / "generators.json").read_text())
+    assert [(row["model"], row["method"]) for row in table["rows"]] == [(g, "full") for g in both]
+    assert table["rows"][0]["cells"]["psnr"]["difference"] is None
+    assert table["rows"][1]["cells"]["psnr"]["difference"]["num_scenes"] == 1
+    printed = capsys.readouterr().out
+    assert "| Φ | method |" in printed
+    # Both folders say above each table which models they are of.
+    for name in both:
+        run_folder = out / "runs" / make_file_name(f"generator {name}")
+        made_with = f"Ψ: plane-sweep; Φ: {Path(name).name}; seed 0"
+        assert f"{name}: {made_with}" in printed
+        for file in ("tables.md", "timings.md"):
+            assert made_with in (run_folder / file).read_text().splitlines()[0]
+        latex = (run_folder / "tables.tex").read_text()
+        assert latex.startswith(f"% Psi: plane-sweep; Phi: {Path(name).name}; seed 0")
+        facts = json.loads((run_folder / "tables.json").read_text())["made_with"]
+        assert (facts["reconstructor"], facts["generator"]) == ("plane-sweep", Path(name).name)
+
+    line = refuse(monkeypatch, capsys, *words, "--generator", *both, "--generator-steps", 4)
+    assert "None of the generators" in line
+    assert "named twice" in refuse(monkeypatch, capsys, *words, "--generator", PAINTER, PAINTER)
+    line = refuse(monkeypatch, capsys, *words, "--generator", *both, "--depth", "none", DEPTH)
+    assert "table of their own" in line
+
+
+def test_a_setting_goes_to_the_generators_that_have_it():
+    options = PresetGeneratorOptions(("warp-inpaint", "pe-field"), generator_steps=2)
+    shared = options.share_settings()
+    assert [(of.generator, of.generator_steps) for of in shared.values()] == [
+        (("warp-inpaint",), None),
+        (("pe-field",), 2),
+    ]
+    assert shared["pe-field"].make_settings().steps == 2
+    taken = PresetGeneratorOptions(("migan", "pe-field"), generator_weights="a.safetensors")
+    with pytest.raises(InputError, match="would be taken by migan and pe-field"):
+        taken.share_settings()
 
 
 WAVES = """

@@ -1,19 +1,24 @@
 """Compilation of all kernels in advance, once, with a message."""
 
 import io
+import logging
 import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import torch
 from rich.console import Console
 
 from command import run
 from gscompleter.apps import installation, warmup
 from gscompleter.numerics import kernels
+from gscompleter.numerics.geometry import pad_camera
 from gscompleter.numerics.kernels import compiled
 from gscompleter.numerics.kernels.cache import KernelCache
+from gscompleter.system.children import start_python
+from gscompleter.system.errors import InputError
 from gscompleter.system.progress import show_progress, stage
 from paths import TESTS
 
@@ -29,12 +34,28 @@ print(len(found.buffer))
 
 
 @pytest.fixture
-def rehearsed(monkeypatch, tmp_path) -> list[bool]:
-    """Use an empty folder of marks, and note each rehearsal instead of running it."""
-    done: list[bool] = []
+def rehearsed(monkeypatch, tmp_path) -> list[list[str]]:
+    """Use an empty folder of marks and one process; note each rehearsal instead of running it."""
+    done: list[list[str]] = []
     monkeypatch.setattr(compiled, "get_cache_folder", lambda: tmp_path)
-    monkeypatch.setattr(warmup, "rehearse", lambda with_splat: done.append(with_splat))
+    monkeypatch.setattr(warmup, "get_thread_count", lambda: 1)
+    monkeypatch.setattr(warmup, "time_compilation", lambda: 0.5)
+    monkeypatch.setattr(warmup, "rehearse", lambda parts: done.append(list(parts)))
     return done
+
+
+@pytest.fixture
+def children(rehearsed, monkeypatch) -> list[subprocess.Popen[bytes]]:
+    """Have two cores, and keep the processes that are started."""
+    started: list[subprocess.Popen[bytes]] = []
+
+    def start(program: str, words: list[str]) -> subprocess.Popen[bytes]:
+        started.append(start_python(program, words))
+        return started[-1]
+
+    monkeypatch.setattr(warmup, "get_thread_count", lambda: 2)
+    monkeypatch.setattr(warmup, "start_python", start)
+    return started
 
 
 PLACES = """
@@ -98,7 +119,8 @@ import sys
 sys.path.insert(0, sys.argv[1])
 from gscompleter.apps import warmup
 from kernel_signatures import complete, signatures
-warmup.rehearse(with_splat=True)
+for parts in warmup.split_work(warmup.PARTS, 2):
+    warmup.rehearse(parts)
 rehearsed = signatures()
 complete()
 print(len(rehearsed), *sorted(signatures() - rehearsed), sep="\\n")
@@ -113,22 +135,87 @@ print(len(rehearsed), *sorted(signatures() - rehearsed), sep="\\n")
 def test_what_is_compiled_is_compiled_once(rehearsed):
     assert warmup.compile_kernels(["cuda", "mvsplat"]) is None
     assert warmup.compile_kernels(["cpu", "mvsplat"]) > 0
-    assert warmup.compile_kernels(["plane-sweep", "cpu"]) is None
-    assert rehearsed == [False]
+    assert warmup.compile_kernels(["cpu"]) is None
+    assert rehearsed == [["cpu"]]
+    # Only what is missing, and only what was asked for.
+    assert warmup.compile_kernels(["plane-sweep", "cpu"]) > 0
     assert warmup.compile_kernels(["cpu", warmup.SPLAT_PART]) > 0
     assert warmup.compile_kernels(["cpu", warmup.SPLAT_PART]) is None
-    assert rehearsed == [False, True]
+    assert rehearsed == [["cpu"], ["plane-sweep"], [warmup.SPLAT_PART]]
+
+
+def test_the_models_are_compiled_in_a_process_beside_the_block(
+    rehearsed, children, monkeypatch, tmp_path
+):
+    noted = tmp_path / "parts"
+    note = f"import sys; open({str(noted)!r}, 'w').write(' '.join(sys.argv[1:]))"
+    monkeypatch.setattr(warmup, "CHILD", note)
+    with warmup.compile_beside(warmup.PARTS):
+        # It ends without the end of the block, within which nothing is compiled here.
+        assert children[0].wait() == 0
+        assert noted.read_text() == "plane-sweep warp-inpaint"
+        assert rehearsed == []
+    assert rehearsed == [["cpu", warmup.SPLAT_PART]]
+    assert warmup.list_missing(warmup.PARTS) == []
+
+
+def test_a_process_that_fails_is_told_and_its_part_compiled_here(
+    rehearsed, children, monkeypatch, caplog
+):
+    # A command with `--quiet` may have run in this process before.
+    caplog.set_level(logging.WARNING, "gscompleter")
+    monkeypatch.setattr(warmup, "CHILD", "raise SystemExit(3)")
+    warmup.compile_kernels(["cpu", "plane-sweep"])
+    assert rehearsed == [["cpu"], ["plane-sweep"]]
+    assert "ended with code 3" in caplog.text
+
+
+def test_an_error_beside_the_compilation_ends_it(rehearsed, children, monkeypatch):
+    monkeypatch.setattr(warmup, "CHILD", "import time; time.sleep(60)")
+    with pytest.raises(InputError, match="damaged"), warmup.compile_beside(warmup.PARTS):
+        raise InputError("A photograph is damaged.")
+    assert children[0].poll() is not None
+    assert rehearsed == []
+    assert warmup.list_missing(warmup.PARTS) == list(warmup.PARTS)
+
+
+def test_without_the_renderer_one_process_is_enough(rehearsed, children):
+    warmup.compile_kernels(["cuda", "plane-sweep", "warp-inpaint"])
+    assert rehearsed == [["plane-sweep", "warp-inpaint"]]
+    assert children == []
+
+
+def test_a_wall_of_the_rehearsal_is_the_same_from_all_cameras():
+    """Or stereo would find nothing, and a completion would skip stages."""
+    first, second = (view.image for view in warmup.make_photographs())
+    shift = warmup.DISPARITY_PX
+    assert torch.equal(first[:, shift:], second[:, :-shift])
+    padded = pad_camera(warmup.make_wall_camera(0), 0.25)
+    assert torch.equal(padded.crop(warmup.draw_wall(padded.padded)), first)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.3, "about 5 s"), (22.6, "about 25 s"), (76.0, "about 80 s")]
+)
+def test_a_rough_time_is_rounded(seconds, text):
+    assert warmup.format_duration(seconds) == text
+
+
+def test_the_time_of_a_compilation_is_measured_each_time():
+    """What is compiled by then takes no time, and would tell nothing about this machine."""
+    assert [warmup.time_compilation() > 0.01 for _ in range(2)] == [True, True]
 
 
 def test_a_log_has_one_line_about_the_compilation(rehearsed, monkeypatch, capsys):
-    def work(with_splat: bool) -> None:
+    def work(parts: list[str]) -> None:
         with stage("context"):
             pass
 
     monkeypatch.setattr(warmup, "rehearse", work)
     with show_progress(Console(stderr=True)):
         warmup.compile_kernels(["cpu"])
-    assert capsys.readouterr().err == "compiling kernels for this machine, once\n"
+    line = "compiling kernels for this machine, once, about 30 s\n"
+    assert capsys.readouterr().err == line
 
 
 def test_kernels_are_compiled_anew_for_another_processor(rehearsed, monkeypatch):
@@ -144,7 +231,7 @@ def test_one_line_says_so_before_it_happens(rehearsed):
         warmup.compile_kernels(["cpu"])
         warmup.compile_kernels(["cpu"])
     said = console.export_text()
-    assert said == "compiling kernels for this machine, once\n"
+    assert said == "compiling kernels for this machine, once, about 30 s\n"
 
 
 def test_warmup_says_what_it_did(rehearsed, monkeypatch, capsys):
@@ -154,7 +241,7 @@ def test_warmup_says_what_it_did(rehearsed, monkeypatch, capsys):
     assert capsys.readouterr().out.startswith("All kernels are compiled already: ")
     assert run(monkeypatch, "warmup", "--quiet") == 0
     assert capsys.readouterr() == ("", "")
-    assert rehearsed == [True]
+    assert [sorted(parts) for parts in rehearsed] == [sorted(warmup.PARTS)]
 
 
 @pytest.mark.slow

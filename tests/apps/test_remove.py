@@ -23,9 +23,10 @@ from gscompleter.apps.inputs.removal import (
 )
 from gscompleter.apps.report.removal_pictures import find_largest
 from gscompleter.data.formats import open_photographs
+from gscompleter.evaluation.verdict.outcome import round_count
 from gscompleter.numerics.geometry import axis_angle_to_matrix, rotations_to_quats
+from gscompleter.parts import NOT_INVENTED
 from gscompleter.render.loading import load_renderer
-from gscompleter.state import NEW_PHOTO_ID
 from gscompleter.system.files.image import read_image, write_image
 from gscompleter.types import merge
 from scenes import Room, camera_at, cast, gaussians_of, photographed, random_gaussians, view_of
@@ -101,7 +102,9 @@ def write_masks(folder: Path) -> Path:
     return folder
 
 
-def test_the_crate_goes_its_place_is_filled_and_strip_brings_it_back(scene, tmp_path, monkeypatch):
+def test_the_crate_goes_its_place_is_filled_and_strip_brings_it_back(
+    scene, tmp_path, monkeypatch, capsys
+):
     out, camera = tmp_path / "out", tmp_path / "camera"
     photographed(camera, [TARGET])
     words = remove(scene, out, "--box", *CRATE, "--target", camera / "transforms.json")
@@ -112,9 +115,20 @@ def test_the_crate_goes_its_place_is_filled_and_strip_brings_it_back(scene, tmp_
     counts = json.loads((out / "summary.json").read_text())["gaussians"]
     # Pieces of what was cut at the border of the box have the label of photographs, and are counted
     # apart from what these showed.
-    num_labelled = int((completed.generated == NEW_PHOTO_ID).sum())
+    num_labelled = int((completed.generated == NOT_INVENTED).sum())
     assert counts["pieces"] > 0
     assert counts["from_photographs"] + counts["pieces"] == num_labelled
+    capsys.readouterr()
+    assert run(monkeypatch, "inspect", out / "completed.ply", "--json") == 0
+    origins = json.loads(capsys.readouterr().out)["origins"]
+    assert origins["given"] == len(left)
+    assert origins["piece"] == counts["pieces"]
+    assert origins.get("photographs", 0) == counts["from_photographs"]
+    assert sum(origins.values()) == len(completed)
+    # Nobody invented these pieces, of which they are parts.
+    made = counts["added"] - counts["from_photographs"] - counts["pieces"]
+    headline = json.loads((out / "summary.json").read_text())["outcome"]["headline"]
+    assert f"; {round_count(made)} Gaussians invented." in headline
     assert counts["removed"] == len(given) - len(left) == len(load_ply(out / "removed.ply")) > 100
     assert (out / "context.ply").read_bytes() == (scene / "splat.ply").read_bytes()
     summary = json.loads((out / "summary.json").read_text())

@@ -7,7 +7,7 @@ import pytest
 
 from command import run
 from gscompleter import load_ply, save_ply
-from gscompleter.state import NEW_PHOTO_ID
+from gscompleter.parts import NOT_INVENTED
 from gscompleter.system.files.image import write_image
 from gscompleter.types import merge
 from scenes import Room, camera_at, gaussians_of, photographed, room_without_a_box, view_of
@@ -93,7 +93,7 @@ def test_photographs_without_cameras_are_placed_and_used(
     assert "context 6 (3.png)" in printed.out
     for row in summary["context"]:
         assert row["psnr_after"] > row["psnr_before"] + 2
-    assert bool((load_ply(out / "completed.ply").generated == NEW_PHOTO_ID).any())
+    assert bool((load_ply(out / "completed.ply").generated == NOT_INVENTED).any())
     assert (out / "colmap" / "images" / "3.png").is_file()
 
 

@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from gscompleter.data.formats import open_photographs
+from gscompleter.data.masks import find_given
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.sfm import placing, poses
 from gscompleter.data.sfm.placing import identify_input, name_new, place_photographs
@@ -125,7 +126,7 @@ def test_a_new_photograph_with_the_name_of_an_old_one_is_told_apart(known, tmp_p
 
 
 def test_photographs_of_the_scene_are_not_placed_again(known, new, tmp_path):
-    inside = known.frames[0].find_stored()
+    inside = known.frames[0].file.path
     assert isinstance(inside, Path)
     with pytest.raises(InputError, match="All 6 photographs in .* have cameras in SCENE already"):
         place_photographs(inside.parent, known, tmp_path / "colmap")
@@ -171,9 +172,9 @@ def test_masks_of_new_photographs_are_kept(known, new, tmp_path):
 
     # A mask that comes later makes another result.
     names = [f"new {number}.png" for number in NEW]
-    with_mask = identify_input(new, names, known)
+    with_mask = identify_input(find_given(new, names), known)
     (new / "masks" / "new 2.png").unlink()
-    assert identify_input(new, names, known) != with_mask
+    assert identify_input(find_given(new, names), known) != with_mask
 
 
 @pytest.mark.slow
@@ -182,7 +183,7 @@ def test_real_photographs_are_placed_within_a_pixel(shared, tmp_path):
     opened = open_photographs(shared / "data" / "fountain_p11")
     new = tmp_path / "new"
     new.mkdir()
-    shutil.copyfile(opened.frames[3].find_stored(), new / "a.jpg")
+    shutil.copyfile(opened.frames[3].file.path, new / "a.jpg")
     rest = replace(opened, frames=(*opened.frames[:3], *opened.frames[4:]))
     joined, _ = place_photographs(new, rest, tmp_path / "colmap")
     true = opened.frames[3].c2w

@@ -13,10 +13,11 @@ from gscompleter.editing.removal import find_outside, remove_gaussians, restore_
 from gscompleter.guards import load_guards
 from gscompleter.guards.free_space import Observed, ignore_removed, is_before_surface
 from gscompleter.numerics.image_ops import dilate
+from gscompleter.parts import NOT_INVENTED
 from gscompleter.render.removed import find_removed
-from gscompleter.state import NEW_PHOTO_ID, Completion
+from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
-from gscompleter.types import REMOVED, REVEALED, Gaussians, make_observed, merge, sh_from_rgb
+from gscompleter.types import Gaussians, make_observed, merge, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, view_of
 
 ROOM = Room()
@@ -61,12 +62,14 @@ def removed(begun) -> Completion:
 def test_the_chosen_are_gone_and_so_is_what_only_they_hid(begun, removed):
     source, chosen = removed.source, choose_surface(begun)
     assert torch.equal(source.chosen_mask, chosen)
-    assert source.stand_ins[-3:].tolist() == [REVEALED] * 3
+    assert source.revealed_mask[-3:].all()
+    assert not (source.chosen_mask & source.revealed_mask).any()
+    assert source.proxy_index.min() >= 0
     assert source.gone_mask.sum() < chosen.sum() + 0.05 * len(chosen)
     assert removed.context is begun.context
     left = begun.context[~source.gone_mask]
     assert torch.equal(removed.scene.means[: len(left)], left.means)
-    assert (removed.scene.generated[len(left) :] == NEW_PHOTO_ID).all()
+    assert (removed.scene.generated[len(left) :] == NOT_INVENTED).all()
     assert torch.equal(source.rendered.means, left.means)
     assert torch.equal(source.expand(source.rendered.opacities)[chosen], torch.zeros(chosen.sum()))
     assert not removed.recolored_mask.any()
@@ -122,17 +125,18 @@ def test_what_photographs_need_elsewhere_returns(begun):
     state = COMPLETER.begin(views, scene, [])
     chosen = is_crate(scene.means)
     state = remove_gaussians(state, chosen, is_crate, COMPLETER.scenes)
-    number = torch.full_like(state.source.stand_ins, REVEALED)
     hidden = replace(
         state.source,
         rendered=state.rendered_context[:-1],
-        proxy_index=state.source.stand_ins.where(torch.arange(len(scene)) < len(scene) - 1, number),
+        proxy_index=state.source.proxy_index.clamp_max(len(state.rendered_context) - 2),
+        revealed_mask=state.source.revealed_mask | (torch.arange(len(scene)) == len(scene) - 1),
     )
-    state = replace(state, source=hidden, parts=(hidden.rendered,))
+    state = replace(state, source=hidden, rendered_context=hidden.rendered, added_parts=())
     restored = restore_surroundings(state, COMPLETER.renderer)
     assert restored.source.stand_ins[-1] == len(restored.rendered_context) - 1
     assert torch.equal(restored.scene.means[-1], glow.means[0])
-    assert (restored.source.stand_ins == REMOVED).sum() == chosen.sum()
+    assert not restored.source.gone_mask[-1]
+    assert torch.equal(restored.source.chosen_mask, chosen)
     assert restore_surroundings(begun, COMPLETER.renderer) is begun
 
 
@@ -187,9 +191,10 @@ def test_what_reaches_out_of_the_place_stays_and_additions_match_photographs(beg
     )
     pairs = zip(*(measure_errors(state, each.scene) for each in (cut, uncut)), strict=True)
     assert all(less < 0.5 * more for less, more in pairs)
-    assert set(cut.added.generated.tolist()) == {NEW_PHOTO_ID}
+    assert set(cut.added.generated.tolist()) == {NOT_INVENTED}
+    assert [part.origin.kind for part in cut.added_parts] == ["piece"]
     dyed = replace(cut.added, sh=cut.added.sh - 0.5)
-    dyed = replace(cut, parts=(cut.rendered_context, dyed))
+    dyed = replace(cut, added_parts=(replace(cut.added_parts[0], gaussians=dyed),))
     restored = restore_surroundings(dyed, COMPLETER.renderer)
     before, after = measure_errors(state, dyed.scene), measure_errors(state, restored.scene)
     assert max(after) < 0.7 * max(before)

@@ -71,7 +71,7 @@ def test_a_mistake_is_one_sentence(tmp_path, changes, sentence):
 
 
 def test_the_page_names_all_keys():
-    text = (ROOT / "docs" / "guide" / "evaluate.md").read_text()
+    text = (ROOT / "docs" / "reference" / "evaluating.md").read_text()
     section = text.partition("## cases.json")[2].partition("\n## ")[0]
     rows = re.findall(r"^\| (`[^|]+) \|", section, re.M)
     assert set(re.findall(r"`(\w+)`", " ".join(rows))) == {*FILE_KEYS, *CASE_KEYS}

@@ -12,6 +12,7 @@ from gscompleter.generators.warp import warp_photographs
 from gscompleter.numerics.geometry import project
 from gscompleter.stages.align_depth import align_depth
 from gscompleter.stages.register import register_along_rays
+from gscompleter.stages.select_anchor import choose_anchor
 from gscompleter.types import DepthMap, Gaussians, Lift, Reconstruction, Render, merge
 from scenes import Room, camera_at, gaussians_of, view_of
 from target_views import observe
@@ -94,8 +95,9 @@ def test_the_depth_of_a_thin_pixel_is_followed_by_default_and_carried_into_where
     def error(max_alpha: float) -> float:
         config = CompleterConfig(holes=HoleConfig(max_alpha))
         view = observe(scene, [anchor], TARGET, config)
-        affine = align_depth(candidates, view, torch.Generator().manual_seed(0))
-        found = register_along_rays(candidates, affine, REFERENCE, view)
+        at_anchor = choose_anchor(view)
+        affine = align_depth(candidates, at_anchor, view, torch.Generator().manual_seed(0))
+        found = register_along_rays(candidates, affine, REFERENCE, at_anchor, view)
         _, z = project(found.gaussians.means, TARGET)
         return ((z.reshape(SIZE, SIZE) / truth - 1).abs()[INNER]).median().item()
 

@@ -9,6 +9,7 @@ from gscompleter import GSCompleter
 from gscompleter.apps.report.plain_words import describe_kept
 from gscompleter.config import CompleterConfig
 from gscompleter.evaluation.verdict.kept import measure_kept
+from gscompleter.parts import PartOrigin, make_part
 from gscompleter.render.loading import load_renderer
 from gscompleter.state import Completion
 from gscompleter.virtual_capture.render_views import render_views
@@ -34,7 +35,7 @@ def test_nothing_added_keeps_all_and_a_veil_is_named(begun):
     # White dots half-way before what the camera sees.
     veil = begun.context[::40]
     veil = replace(veil, means=0.5 * veil.means, sh=torch.full_like(veil.sh, 1.7))
-    covered = replace(begun, parts=(*begun.parts, veil))
+    covered = replace(begun, added_parts=(make_part(PartOrigin("target", 1), veil),))
     kept = measure_kept(covered, [camera, camera_at(0.1, yaw=180, size=SIZE)], RENDERER)
     # Nothing of the splat is behind the camera, so that one camera counts.
     assert kept.cameras == 1

@@ -42,7 +42,7 @@ from gscompleter.evaluation.metrics.scores import (
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.render.loading import load_renderer
 from gscompleter.stages.filter_holes import select_in_mask
-from gscompleter.stages.target_view import compute_hole_mask
+from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, Gaussians, View, merge
 from scenes import Room, camera_at, gaussians_of, scaled, view_of

@@ -105,11 +105,11 @@ def test_a_preset_sets_what_is_not_given():
     found = apply_preset(options(preset="dl3dv"))
     assert (found.resolution, found.near, found.far) == ((256, 448), 0.5, 200)
     assert found.reconstructor == ("depthsplat-base-dl3dv-256x448",)
-    assert found.synthesis.generator == "pe-field"
+    assert found.synthesis.generator == ("pe-field",)
     found = apply_preset(options(preset="dl3dv", reconstructor=("plane-sweep",), resolution=64))
     assert (found.reconstructor, found.resolution) == (("plane-sweep",), 64)
     found = apply_preset(options())
-    assert (found.reconstructor, found.synthesis.generator) == (("plane-sweep",), "warp-inpaint")
+    assert (found.reconstructor, found.synthesis.generator) == (("plane-sweep",), ("warp-inpaint",))
 
 
 @pytest.mark.parametrize(
@@ -210,6 +210,10 @@ def test_a_table_and_a_figure_of_rooms(rooms, tmp_path, monkeypatch):
     assert len(differences) == 2
     assert after["difference"]["mean"] == pytest.approx(statistics.fmean(differences))
     assert after["value"] > before["value"]
+    facts = table["made_with"]["plane-sweep, n-2"]
+    assert (facts["reconstructor"], facts["generator"]) == ("plane-sweep", "warp-inpaint")
+    for suffix, sentence in ((".md", "Ψ: plane-sweep; Φ: "), (".tex", "Psi: plane-sweep; Phi: ")):
+        assert sentence in (tmp_path / "tables" / f"spans{suffix}").read_text()
     text = (tmp_path / "results.md").read_text()
     assert "## Seams without and with a dilated hole mask" in text
     assert text.count("not measured") < len(PAPER.claims)

@@ -11,7 +11,6 @@ from gscompleter.generators.painted import (
     Painting,
     fit_mask,
     fit_painting,
-    normalize_render,
 )
 from gscompleter.generators.warp import BORDER_WIDTH
 from gscompleter.numerics.image_ops import dilate
@@ -22,7 +21,7 @@ from scenes import Room, camera_at, view_of
 CONTEXT = known_room()
 TRUTH = view_of(Room(), TARGET).image
 RIM = dilate(CONTEXT.holes, BORDER_WIDTH)
-SCENE = normalize_render(CONTEXT.target_render, CONTEXT.max_alpha)
+SCENE = CONTEXT.known_colors
 
 
 def pasted() -> torch.Tensor:

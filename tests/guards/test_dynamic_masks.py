@@ -10,7 +10,8 @@ from gscompleter import GSCompleter
 from gscompleter.config import CompleterConfig
 from gscompleter.guards.dynamic_masks import find_dynamic_masks
 from gscompleter.numerics.geometry import project, sample, unproject
-from gscompleter.state import Completion, TargetResult
+from gscompleter.state import Completion
+from gscompleter.target_result import TargetResult
 from gscompleter.types import Camera, Render, View
 from moving_object import (
     CAMERAS,

@@ -14,6 +14,7 @@ from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import FrozenScene
 from gscompleter.stages import error_budgets as guard
+from gscompleter.stages.additions import Refined
 from gscompleter.stages.error_budgets import (
     add_psnr_loss,
     compute_pixel_errors,
@@ -24,7 +25,6 @@ from gscompleter.stages.error_budgets import (
     set_total_budgets,
     share_budgets,
 )
-from gscompleter.stages.refine import Refined
 from gscompleter.stages.synthesize import GeneratedView
 from gscompleter.stages.target_view import render_target
 from gscompleter.types import DepthAffine, ErrorBudget, Gaussians, View, merge

@@ -112,6 +112,8 @@ def test_steps_ahead_come_before_turns_up_and_down():
     assert choose_best([replace(turned, gain=0.005)], [here], 1.0) is None
     assert aside.describe() == "Chosen because 20% of its image is empty, beside what is known."
     assert "up or down" in turned.describe()
+    unconfirmed = replace(aside, opaque_fraction=0.1).describe()
+    assert "20% of its image is empty or confirmed by no photograph, beside" in unconfirmed
 
 
 def test_cameras_are_found_until_little_is_left_and_the_scene_covers_more(begun):

@@ -10,7 +10,7 @@ import gscompleter
 from gscompleter.types import DepthAffine
 
 # As names of `gscompleter.stages` they are the functions.
-align_depth = import_module("gscompleter.stages.align_depth")
+align_paper = import_module("gscompleter.stages.align_paper")
 context = import_module("gscompleter.stages.context")
 lift = import_module("gscompleter.stages.lift")
 refine = import_module("gscompleter.stages.refine")
@@ -18,13 +18,16 @@ select_anchor = import_module("gscompleter.stages.select_anchor")
 register = import_module("gscompleter.stages.register")
 register_paper = import_module("gscompleter.stages.register_paper")
 synthesize = import_module("gscompleter.stages.synthesize")
-target_view = import_module("gscompleter.stages.target_view")
+hole_masks = import_module("gscompleter.stages.hole_masks")
 
 EQUATIONS = {
     5: (r"\Psi(\mathcal{V}_{\text{in}}; \Theta)", [context.init_context]),
     6: (r"\Phi(\mathbf{I}_n, \mathbf{P}_t)", [synthesize.synthesize]),
     7: (r"\Psi(\mathcal{V}_{\text{pair}}; \Theta)", [lift.lift_pair]),
-    8: (r"(s \cdot D_{\text{pred}}^{\text{anc}}", [align_depth.fit_affine, DepthAffine]),
+    8: (
+        r"(s \cdot D_{\text{pred}}^{\text{anc}}",
+        [align_paper.align_as_paper, align_paper.fit_affine, DepthAffine],
+    ),
     9: (r"d_i^{\text{init}} = \frac", [register_paper.initialize_distances, register.apply_affine]),
     10: (
         r"\mathbf{c}_{\text{tgt}} + d_i \cdot \mathbf{r}_i",
@@ -39,7 +42,7 @@ EQUATIONS = {
             register.optimize_distances,
         ],
     ),
-    12: (r"\mathbf{A}_{\text{ctx}}(\mathbf{p}) < \tau", [target_view.compute_hole_mask]),
+    12: (r"\mathbf{A}_{\text{ctx}}(\mathbf{p}) < \tau", [hole_masks.compute_hole_mask]),
     13: (r"\mathcal{L}_{\text{mv}} =", [refine.refine_opacities]),
 }
 """For each equation of the paper by number, a piece of it and the code that implements it."""
@@ -47,7 +50,7 @@ EQUATIONS = {
 SECTIONS = {
     "III-C": ("Feed-Forward Metric Context Initialization", [context]),
     "III-D": ("Anchor-Guided Gaussian Initialization", [select_anchor]),
-    "III-E": ("Ray-Constrained Gaussian Registration", [align_depth, register_paper, register]),
+    "III-E": ("Ray-Constrained Gaussian Registration", [align_paper, register_paper, register]),
     "III-F": (r"Multi-View Gaussian Integration \& Refinement", [refine]),
 }
 

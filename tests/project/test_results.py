@@ -2,13 +2,16 @@
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+import write_results
 from gscompleter.evaluation.cases import read_cases
+from gscompleter.evaluation.measured_code import compute_method_digest
 from paths import ROOT
 
 BENCHMARKS = ROOT / "benchmarks"
@@ -60,12 +63,112 @@ def test_no_frame_of_a_held_out_case_is_in_a_development_case(shared, cases):
             assert (case.scene.name, frame) not in seen
 
 
-def test_held_out_cases_are_those_of_the_rule(shared, tmp_path):
-    """The script writes beside itself; a copy of it gives the same file."""
-    script = tmp_path / "choose_held_out.py"
-    script.write_bytes((BENCHMARKS / "choose_held_out.py").read_bytes())
+def test_all_held_out_cases_are_kept_apart(cases):
+    assert all(case.apart_by for case in cases)
+
+
+@pytest.mark.parametrize("name", ["choose_apart.py", "choose_held_out.py", "choose_many.py"])
+def test_the_rules_give_the_cases_that_stand_there(name, shared, tmp_path):
+    """The scripts write beside themselves; copies of them give the same files."""
+    for script in BENCHMARKS.glob("choose_*.py"):
+        (tmp_path / script.name).write_bytes(script.read_bytes())
     environment = {**os.environ, "GSCOMPLETER_DATA": str(shared)}
-    subprocess.run([sys.executable, str(script)], env=environment, check=True, capture_output=True)
-    written = (tmp_path / "held_out.json").read_bytes()
-    assert written == (BENCHMARKS / "held_out.json").read_bytes()
-    assert json.loads(written)["apart"] == ["fountain_p11", "kitti_city"]
+    command = [sys.executable, str(tmp_path / name)]
+    subprocess.run(command, env=environment, check=True, capture_output=True)
+    written = sorted(tmp_path.rglob("*.json"))
+    assert written
+    for path in written:
+        assert path.read_bytes() == (BENCHMARKS / path.relative_to(tmp_path)).read_bytes()
+
+
+def write_package(folder: Path, source: str) -> Path:
+    """Write a package with one file of the method and one of the applications."""
+    for name in ("stages", "apps"):
+        (folder / name).mkdir(parents=True)
+        (folder / name / "step.py").write_text(source if name == "stages" else "x = 1\n")
+    return folder
+
+
+def test_comments_and_docstrings_age_no_figure_but_a_constant_does(tmp_path):
+    first = write_package(tmp_path / "first", 'STEPS = 3\n"""Steps."""\n')
+    same = write_package(tmp_path / "same", '# Fewer fail.\nSTEPS = 3  # of Adam\n"""More."""\n')
+    (same / "apps" / "step.py").write_text("x = 2\n")
+    other = write_package(tmp_path / "other", "STEPS = 4\n")
+    digest = compute_method_digest(first)
+    assert compute_method_digest(same) == digest
+    assert compute_method_digest(other) != digest
+    (same / "stages" / "step.py").rename(same / "stages" / "renamed.py")
+    assert compute_method_digest(same) != digest
+
+
+def test_a_figure_says_what_happened_to_its_method(monkeypatch, tmp_path):
+    golden = {"room": {"a": 1}, "scenes": {"b": 2}, "methods": ["then", "now"]}
+    monkeypatch.setattr(write_results, "GOLDEN", tmp_path / "golden.json")
+    monkeypatch.setattr(write_results, "compute_current_digest", lambda: "now")
+    pictures = write_results.compute_golden_digest(golden)
+
+    def describe(method: str, of: str = pictures) -> str:
+        (tmp_path / "golden.json").write_text(json.dumps(golden))
+        return write_results.describe_change({"method": method, "golden": of})
+
+    assert describe("now") == "the method is the same since"
+    assert describe("then") == "the method gives the same pictures since"
+    assert describe("another") == "the method changed since"
+    assert describe("then", "other pictures") == "the pictures changed since"
+    golden["methods"] = ["then"]  # nobody checked the method of now
+    assert describe("then") == "the method changed since"
+
+
+def test_a_page_is_stale_once_the_method_changed(monkeypatch):
+    """The check fails until the page says so: once for each measurement."""
+    filled = write_results.fill_page("<!-- ours: measured held_out -->\n<!-- end -->")
+    assert "Measured at commit `a18a163d`" in filled
+    assert write_results.fill_page(filled) == filled
+    method = json.loads(write_results.MEASURED.read_text())["held_out"]["method"]
+    monkeypatch.setattr(write_results, "compute_current_digest", lambda: method)
+    assert write_results.fill_page(filled) != filled
+
+
+@pytest.mark.parametrize(
+    ("commits", "said"),
+    [([["a"], ["b"]], "['a', 'b']"), ([["a-dirty"]], "one committed state"), ([[]], "no commit")],
+)
+def test_figures_of_no_or_several_commits_are_refused(commits, said, tmp_path):
+    paths = []
+    for number, of in enumerate(commits):
+        paths.append(tmp_path / f"{number}.json")
+        paths[-1].write_text(json.dumps({"made_with": {"commits": of}}))
+    with pytest.raises(SystemExit, match=re.escape(said)):
+        write_results.find_one_commit(paths)
+
+
+def test_the_commit_of_a_reproduction_is_that_of_all_runs_of_its_tables(tmp_path):
+    run = {"commits": ["12345678"]}
+    (tmp_path / "cases.json").write_text(json.dumps({"made_with": run}))
+    (tmp_path / "table.json").write_text(json.dumps({"made_with": {"n-2": run, "n-4": run}}))
+    assert write_results.find_one_commit(sorted(tmp_path.iterdir())) == "12345678"
+
+
+NUMBERS = re.compile(r"^\|.*\|[^|]*\d[^|]*\|[^|]*\d[^|]*\|", re.M)
+"""A row of a table with two cells that have digits."""
+COMMIT = re.compile(r"`[0-9a-f]{8}`|commit [0-9a-f]{8}\b")
+
+
+@pytest.mark.parametrize(
+    "page",
+    ["README.md", "docs/results.md", "docs/gpu.md", "docs/gpu_h100.md", "docs/alternatives.md"],
+)
+def test_each_section_with_measured_figures_names_their_commit(page):
+    text = (ROOT / page).read_text("utf-8")
+    head, *sections = re.split(r"^## ", text, flags=re.M)
+    without = []
+    for section in sections:
+        # What is measured stands in its own section, or is that of the head of the page.
+        if NUMBERS.search(section) and not COMMIT.search(section + head):
+            without.append(section.splitlines()[0])
+    assert without == []
+
+
+@pytest.mark.parametrize("page", ["docs/reproduce.md", "docs/generators.md"])
+def test_pages_with_figures_of_one_measurement_name_its_commit(page):
+    assert COMMIT.search((ROOT / page).read_text("utf-8"))

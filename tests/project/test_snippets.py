@@ -38,6 +38,7 @@ SIDE = 32
 NOT_RUN = {
     "batch": "needs a manifest; test_batch.py has some",
     "live": "serves until it is closed; test_live.py presses its buttons",
+    "repair": "needs a painted mask; test_repair.py paints some",
     "poses": "needs photographs that COLMAP can match; test_poses.py has them",
     "demo": "takes half a minute; test_demo.py runs it on small images",
     "bench": "takes minutes; test_bench.py runs it on less",
@@ -53,7 +54,9 @@ NEEDS_PAINTER = ("--images",)
 """Options that name what somebody painted; test_painters.py does."""
 FAST = ("doctor", "models", "report", "strip", "view", "convert", "inspect")
 """Commands that take a second or two."""
-WRITES_OUT = ("complete", "clean")
+NEEDS_PHOTOGRAPHS = ("--photos",)
+"""Options that name photographs that COLMAP has to place; test_update.py has some."""
+WRITES_OUT = ("complete", "clean", "update", "remove", "repair")
 """Commands after which OUT is theirs."""
 PYTHON_NOT_RUN = {"docs/models.md": "needs published weights"}
 """Pages whose Python is only compiled, and why."""
@@ -183,7 +186,7 @@ def test_the_reference_has_a_term_for_each_option(command):
 
 def is_run(words: list[str]) -> bool:
     """Return True if these words after `gscompleter` can be run here."""
-    needed = {*NEEDS_WEIGHTS, *NEEDS_PAINTER}
+    needed = {*NEEDS_WEIGHTS, *NEEDS_PAINTER, *NEEDS_PHOTOGRAPHS}
     return words[0] in COMMANDS and words[0] not in NOT_RUN and not set(words) & needed
 
 

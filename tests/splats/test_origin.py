@@ -13,7 +13,8 @@ from command import run
 from gscompleter import InputError, load_ply, load_splat, merge, save_ply, save_splat
 from gscompleter.apps.inspection import describe_range
 from gscompleter.splats import ply
-from gscompleter.splats.formats import convert_splat, describe_oddities
+from gscompleter.splats.conversion import convert_splat
+from gscompleter.splats.formats import describe_oddities
 from gscompleter.splats.layout import is_same_scene, save_like, save_removed, strip
 from gscompleter.splats.origin import format_corners
 from gscompleter.splats.transform import HALF_TURN_X, rotate_half_turn, transform_gaussians
@@ -111,7 +112,7 @@ def test_formats_of_nodes_keep_the_origin(tmp_path, name):
     if name != "a.glb":
         pytest.importorskip("pxr")
     means = write_map_ply(tmp_path / "map.ply", small_gaussians())
-    assert convert_splat(tmp_path / "map.ply", tmp_path / name)[2] is None
+    assert convert_splat(tmp_path / "map.ply", tmp_path / name).notes == ()
     loaded = load_splat(tmp_path / name)
     assert np.abs(places_of(loaded) - means).max() < EXACT
     convert_splat(tmp_path / name, tmp_path / "back.ply")
@@ -123,8 +124,7 @@ def test_formats_of_nodes_keep_the_origin(tmp_path, name):
 @pytest.mark.parametrize("name", ["a.spz", "a.splat", "a.sog", "a.compressed.ply"])
 def test_formats_that_round_say_by_how_much(tmp_path, name):
     means = write_map_ply(tmp_path / "map.ply", small_gaussians())
-    note = convert_splat(tmp_path / "map.ply", tmp_path / name)[2]
-    assert note is not None
+    (note,) = convert_splat(tmp_path / "map.ply", tmp_path / name).notes
     rounding = float(note.partition("largest rounding of a position is ")[2].partition(";")[0])
     loaded = places_of(load_splat(tmp_path / name))
     assert 0.1 < rounding < 10
@@ -135,7 +135,7 @@ def test_formats_that_round_say_by_how_much(tmp_path, name):
 
 def test_near_scenes_have_no_line_on_rounding(tmp_path):
     save_ply(tmp_path / "a.ply", random_gaussians(20))
-    assert convert_splat(tmp_path / "a.ply", tmp_path / "a.spz")[2] is None
+    assert convert_splat(tmp_path / "a.ply", tmp_path / "a.spz").notes == ()
 
 
 # Values with an origin.

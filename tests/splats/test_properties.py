@@ -1,7 +1,9 @@
 """Files that are more or other than plain 3DGS are named, and read right where that is certain."""
 
+import gzip
 import json
 import math
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,7 +14,8 @@ import torch
 import gscompleter as gsc
 from command import run
 from gscompleter import InputError, load_ply, load_splat, save_ply, save_splat
-from gscompleter.splats.formats import convert_splat, describe_oddities
+from gscompleter.splats.conversion import convert_splat
+from gscompleter.splats.formats import describe_oddities
 from gscompleter.splats.layout import find_layout, save_like, strip
 from gscompleter.splats.ply import read_scene
 from gscompleter.splats.properties import find_further
@@ -68,7 +71,7 @@ def test_what_surely_looks_wrong_is_refused_and_can_be_gone_on_with(tmp_path, ki
         with pytest.raises(InputError, match=sentence):
             convert_splat(path, tmp_path / name)
         assert not (tmp_path / name).exists()
-        assert convert_splat(path, tmp_path / name, ignore_properties=True)[0] == COUNT
+        assert convert_splat(path, tmp_path / name, ignore_properties=True).gaussians == COUNT
     assert len(describe_oddities(path)) == 1
 
 
@@ -206,3 +209,92 @@ def test_complete_refuses_a_moving_splat(tmp_path, monkeypatch, capsys):
     path = make(tmp_path / "moving.ply", **MOVING)
     assert run(monkeypatch, "complete", str(path), "--auto", "--out", str(tmp_path / "OUT")) == 2
     assert "all of its moments would be shown at once" in capsys.readouterr().err
+
+
+# Other formats.
+
+
+def add_to_glb(path: Path, name: str) -> Path:
+    """Give the Gaussians of a .glb an attribute more, whose numbers are their opacities."""
+    data = path.read_bytes()
+    size = int.from_bytes(data[12:16], "little")
+    table = json.loads(data[20 : 20 + size])
+    attributes = table["meshes"][0]["primitives"][0]["attributes"]
+    attributes[name] = attributes["KHR_gaussian_splatting:OPACITY"]
+    text = json.dumps(table).encode()
+    text += b" " * (-len(text) % 4)
+    rest = data[20 + size :]
+    total = 20 + len(text) + len(rest)
+    header = data[:8] + total.to_bytes(4, "little") + len(text).to_bytes(4, "little")
+    path.write_bytes(header + data[16:20] + text + rest)
+    return path
+
+
+def add_to_sog(path: Path, name: str) -> Path:
+    """Give the Gaussians of a .sog an image more, which is that of their colours."""
+    with zipfile.ZipFile(path) as bundle:
+        files = {entry: bundle.read(entry) for entry in bundle.namelist()}
+    table = json.loads(files["meta.json"])
+    table[name] = {"files": table["sh0"]["files"]}
+    files["meta.json"] = json.dumps(table).encode()
+    with zipfile.ZipFile(path, "w") as bundle:
+        for entry, content in files.items():
+            bundle.writestr(entry, content)
+    return path
+
+
+def add_to_compressed(path: Path, name: str) -> Path:
+    """Give the Gaussians of a compressed .ply a property more."""
+    header, body = path.read_bytes().split(b"end_header\n")
+    after = b"property uint packed_color\n"
+    bounds = 4 * 18 * math.ceil(COUNT / 256)
+    rows = np.frombuffer(body[bounds:], "<u4", 4 * COUNT).reshape(COUNT, 4)
+    wider = np.column_stack([rows, np.ones(COUNT, "<f4").view("<u4")])
+    rest = body[bounds + rows.nbytes :]
+    header = header.replace(after, after + f"property float {name}\n".encode())
+    path.write_bytes(header + b"end_header\n" + body[:bounds] + wider.tobytes() + rest)
+    return path
+
+
+@pytest.mark.parametrize(
+    ("ending", "add", "moving", "harmless", "odd"),
+    [
+        (".glb", add_to_glb, "_TRBF_CENTER", "_CONFIDENCE", "_ODD"),
+        (".sog", add_to_sog, "trbf_center", "confidence", "odd"),
+        (".compressed.ply", add_to_compressed, "trbf_center", "confidence", "odd"),
+    ],
+)
+def test_properties_of_other_formats_are_named_by_the_same_table(
+    tmp_path, ending, add, moving, harmless, odd
+):
+    def write(name: str) -> Path:
+        path = tmp_path / f"{name}{ending}"
+        save_splat(path, random_gaussians(COUNT, seed=2))
+        return path
+
+    plain = write("plain")
+    assert describe_oddities(plain) == []
+    path = add(write("moving"), moving)
+    with pytest.raises(InputError, match=r"is a moving splat \(trbf_center\)"):
+        load_splat(path)
+    assert torch.equal(load_splat(path, ignore_properties=True).means, load_splat(plain).means)
+    assert "looks like a moving splat (trbf_center)" in describe_oddities(path)[0]
+    assert describe_oddities(add(write("harmless"), harmless)) == []
+    path = add(write("odd"), odd)
+    assert torch.equal(load_splat(path).means, load_splat(plain).means)
+    assert describe_oddities(path) == [
+        "Properties that plain 3DGS does not have are not used: odd."
+    ]
+
+
+def test_extensions_of_a_spz_are_named(tmp_path):
+    path = tmp_path / "splat.spz"
+    save_splat(path, random_gaussians(COUNT, seed=2))
+    assert describe_oddities(path) == []
+    data = bytearray(gzip.decompress(path.read_bytes()))
+    data[14] |= 2
+    path.write_bytes(gzip.compress(bytes(data)))
+    assert describe_oddities(path) == [
+        "Properties that plain 3DGS does not have are not used: extensions."
+    ]
+    assert len(load_splat(path)) == COUNT

@@ -10,7 +10,7 @@ from gscompleter import Gaussians, InputError, load_ply, merge, save_ply
 from gscompleter.numerics.kernels.splat_rows import permute_rows
 from gscompleter.numerics.value_checks import find_finite
 from gscompleter.splats import ply
-from gscompleter.splats.formats import convert_splat
+from gscompleter.splats.conversion import Conversion, convert_splat
 from gscompleter.splats.layout import is_same_scene, save_like
 from gscompleter.splats.morton import argsort_nearby, sort_nearby
 from gscompleter.splats.ply import encode, make_row_type, make_rows, save_parts
@@ -144,8 +144,8 @@ def test_a_ply_is_converted_some_gaussians_at_a_time_with_the_same_bytes(tmp_pat
         given = tmp_path / f"{number}.ply"
         save_ply(given, replace(gaussians, generated=generated))
         for keep_labels in (True, False):
-            counts = convert_splat(given, tmp_path / "copy.ply", keep_labels=keep_labels)
-            assert counts == (50, int(generated.sum()), None)
+            done = convert_splat(given, tmp_path / "copy.ply", keep_labels=keep_labels)
+            assert done == Conversion(50, int(generated.sum()))
             kept = generated if keep_labels else torch.zeros_like(generated)
             save_ply(tmp_path / "expected.ply", replace(load_ply(given), generated=kept))
             assert (tmp_path / "copy.ply").read_bytes() == (tmp_path / "expected.ply").read_bytes()
@@ -165,7 +165,7 @@ def test_the_chunks_of_a_damaged_ply_are_refused_or_left_out_together(tmp_path, 
     with pytest.raises(InputError, match="3 of 50 Gaussians"):
         convert_splat(given, out)
     assert not out.exists()
-    assert convert_splat(given, out, drop_nonfinite=True) == (47, 0, None)
+    assert convert_splat(given, out, drop_nonfinite=True) == Conversion(47, 0)
     save_ply(tmp_path / "expected.ply", load_ply(given, drop_nonfinite=True))
     assert out.read_bytes() == (tmp_path / "expected.ply").read_bytes()
 

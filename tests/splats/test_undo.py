@@ -15,8 +15,15 @@ import torch
 from gscompleter import load_ply, save_ply
 from gscompleter.apps.inputs.task import InputSplatFile
 from gscompleter.apps.report.completion import save_completed_splat
-from gscompleter.splats.edits import EditDraft, hash_given, read_edits, record_edit
+from gscompleter.splats.edits import (
+    AppendedRows,
+    EditDraft,
+    hash_given,
+    read_edits,
+    record_edit,
+)
 from gscompleter.splats.provenance import RunRecord
+from gscompleter.splats.row_kinds import count_row_kinds
 from gscompleter.splats.undo import strip_edits
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.ply import read_ply_file, write_ply_file
@@ -40,7 +47,9 @@ def edit(splat: Path, folder: Path, number: int, has_record: bool = True) -> Pat
     splat_file = InputSplatFile(splat)
     save_completed_splat(folder, context, changed, added, splat_file, run)
     draft = EditDraft("complete" if has_record else "clean", seed=number)
-    record_edit(folder, draft, len(context), len(added), splat, splat_file.edits, run)
+    half = len(added) // 2
+    appended = [AppendedRows("photographs", half), AppendedRows("target", len(added) - half)]
+    record_edit(folder, draft, len(context), appended, splat, splat_file.edits, run)
     return folder / "completed.ply"
 
 
@@ -91,6 +100,40 @@ def test_edits_from_the_middle_are_taken_off(states, numbers, tmp_path):
         if number not in numbers:
             expected -= before - after
     assert find_rows(load_ply(out)) == expected
+
+
+def count_kinds(splat: Path) -> dict[str, int] | None:
+    return count_row_kinds(splat, read_edits(splat), len(load_ply(splat)))
+
+
+def test_rows_are_counted_by_their_kind_after_all_edits(states):
+    counts = count_kinds(states[-1])
+    first = find_rows(load_ply(states[0]))
+    shown, invented = set(), set()
+    for number in range(1, NUM_EDITS + 1):
+        added = random_gaussians(0 if number == 4 else 5 * number, seed=number)
+        shown |= find_rows(added[: len(added) // 2])
+        invented |= find_rows(added[len(added) // 2 :])
+    last = find_rows(load_ply(states[-1]))
+    expected = {"given": first, "photographs": shown, "target": invented}
+    assert counts == {kind: len(rows & last) for kind, rows in expected.items()}
+    assert sum(counts.values()) == len(load_ply(states[-1]))
+
+
+def test_kinds_that_no_record_tells_are_not_known(states, tmp_path):
+    alone = tmp_path / "alone.ply"
+    shutil.copyfile(states[-1], alone)
+    assert count_kinds(alone) is None
+    # Earlier versions did not tell.
+    folder = shutil.copytree(states[1].parent, tmp_path / "earlier")
+    content = json.loads((folder / "edits.json").read_text())
+    kinds = content["edits"][0].pop("appended")
+    (folder / "edits.json").write_text(json.dumps(content))
+    assert count_kinds(folder / "completed.ply") is None
+    content["edits"][0]["appended"] = [{**kinds[0], "count": kinds[0]["count"] + 1}]
+    (folder / "edits.json").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="do not add up"):
+        count_kinds(folder / "completed.ply")
 
 
 def test_a_record_that_does_not_fit_is_refused(states, tmp_path):

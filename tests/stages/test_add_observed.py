@@ -9,13 +9,13 @@ from gscompleter import GSCompleter, load_renderer
 from gscompleter.config import CompleterConfig
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.numerics.geometry import project
+from gscompleter.parts import NOT_INVENTED
 from gscompleter.stages.add_observed import (
     Lack,
     choose_photographs,
     keep_large_regions,
     select_pixels,
 )
-from gscompleter.state import NEW_PHOTO_ID
 from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, merge
 from scenes import Room, camera_at, gaussians_of, reconstruction_of, view_of
 
@@ -63,7 +63,7 @@ def score(scene: Gaussians) -> list[float]:
 def test_a_hole_that_photographs_show_is_filled_from_them():
     state = begin(CUT)
     assert state.num_observed == len(state.added) > 100
-    assert (state.added.generated == NEW_PHOTO_ID).all()
+    assert (state.added.generated == NOT_INVENTED).all()
     for before, after in zip(score(CUT), score(state.scene), strict=True):
         assert after > before + 8
     # What was given stays, bit for bit.

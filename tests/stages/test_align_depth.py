@@ -8,8 +8,10 @@ import torch
 from gscompleter.config import AlignmentConfig, CompleterConfig
 from gscompleter.guards import Attempt
 from gscompleter.guards.agreement import DepthAgreement
-from gscompleter.stages.align_depth import align_depth, fit_affine, refit_at_target
-from gscompleter.stages.refine import Refined
+from gscompleter.stages.additions import Refined
+from gscompleter.stages.align_depth import align_depth, refit_at_target
+from gscompleter.stages.align_paper import fit_affine
+from gscompleter.stages.select_anchor import choose_anchor
 from gscompleter.stages.synthesize import GeneratedView
 from gscompleter.types import DepthAffine, DepthMap, Lift, View, merge
 from scenes import Room, camera_at, gaussians_of, random_gaussians, view_of
@@ -177,5 +179,5 @@ def test_eq_8_compares_depths_at_the_anchor_and_its_ablation_at_the_target(align
     view = observe(context, seen_at[:1], target, config)
     at_anchor, at_target = (known.depth for known in seen_at)
     lift = Lift(context, everywhere(at_target / 0.8), everywhere(at_anchor / 1.25), None)
-    found = align_depth(lift, view, torch.Generator().manual_seed(0))
+    found = align_depth(lift, choose_anchor(view), view, torch.Generator().manual_seed(0))
     assert found.scale == pytest.approx(scale, rel=0.05)

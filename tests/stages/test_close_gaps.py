@@ -8,6 +8,7 @@ import torch
 from gscompleter import CompleterConfig, load_renderer
 from gscompleter.config import GapConfig
 from gscompleter.numerics.geometry import compute_z_depths, pad_camera
+from gscompleter.parts import PartOrigin, make_part
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.stages.close_gaps import continue_surfaces, find_gaps, move_on, view_gaps
 from gscompleter.stages.target_view import TargetView, render_target
@@ -70,7 +71,8 @@ def test_a_gap_takes_depth_and_colour_of_the_farther_surface():
 
 
 def replace_frozen(view: TargetView, added: Gaussians) -> TargetView:
-    state = replace(view.state, parts=(*view.state.parts, added))
+    part = make_part(PartOrigin("gap", 1), added)
+    state = replace(view.state, added_parts=(*view.state.added_parts, part))
     return render_target(state, view.camera, view.scenes)
 
 

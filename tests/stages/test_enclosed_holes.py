@@ -13,7 +13,8 @@ from gscompleter.numerics.geometry import add_near_plane, look_along, resize_cam
 from gscompleter.numerics.image_ops import dilate, label_regions
 from gscompleter.render.loading import load_renderer
 from gscompleter.stages.enclosed_holes import keep_enclosed
-from gscompleter.stages.target_view import compute_hole_mask
+from gscompleter.stages.hole_masks import compute_hole_mask
+from gscompleter.stages.synthesize import make_generator_input
 from gscompleter.types import Camera, Gaussians, make_observed, merge
 from paths import DATA
 from scenes import camera_at
@@ -100,7 +101,7 @@ def test_a_target_completes_only_what_an_object_encloses():
     enclosed = replace(bare, holes=replace(bare.holes, kind="enclosed"))
     view = observe(scene, views, CAMERA, enclosed)
     assert torch.equal(view.holes, view.empty)
-    assert torch.equal(view.make_generator_input().holes, view.holes)
+    assert torch.equal(make_generator_input(view).holes, view.holes)
     done = gsc.GSCompleter(config=enclosed)(views, CAMERA, scene=scene)
     (result,) = done.targets
     assert len(result.added) > 20

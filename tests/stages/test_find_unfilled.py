@@ -10,9 +10,13 @@ from gscompleter import GSCompleter
 from gscompleter.apps.report.plain_words import describe_losses
 from gscompleter.apps.report.schema import UnfilledRow
 from gscompleter.completer import check_any_completed
+from gscompleter.config import CompleterConfig
 from gscompleter.guards.psnr import PsnrGuard
 from gscompleter.numerics.image_ops import find_largest_regions
-from gscompleter.state import Completion, Unfilled
+from gscompleter.stages.additions import Step
+from gscompleter.stages.find_unfilled import find_unfilled
+from gscompleter.state import Completion
+from gscompleter.target_result import Unfilled
 from scenes import Room, camera_at, view_of
 
 SIZE = 48
@@ -56,13 +60,54 @@ def test_the_guard_that_empties_a_part_is_named_with_its_place(monkeypatch):
     reason = "a filling would make given photographs worse"
     assert note == f"{share} % of the hole stays empty, because {reason}."
     assert note in result.warnings
-    (details,) = describe_losses(UnfilledRow(**vars(left)))
+    (details,) = describe_losses(UnfilledRow(left.share, left.lost_by, left.regions))
     assert f"x {left.regions[0][0]} to {left.regions[0][2]}" in details
     assert "psnr " in details
 
 
+GUARD = """
+import gscompleter as gsc
+
+
+class Curfew(gsc.Guard):
+    name = "curfew"
+{loss}
+
+    def place(self, candidates, view):
+        return candidates[:0]
+"""
+
+
+@pytest.mark.parametrize(
+    ("loss", "reason"),
+    [("    loss = 'it is night'", "it is night"), ("", "the step curfew left it out")],
+)
+def test_a_guard_of_a_user_explains_its_losses(tmp_path, loss, reason):
+    (tmp_path / "curfew.py").write_text(GUARD.format(loss=loss))
+    config = replace(CompleterConfig(), guards=(f"{tmp_path / 'curfew.py'}:Curfew",))
+    views = [photo.view for photo in begun().photos]
+    (result,) = GSCompleter(config=config)(views, camera_at(0.6, size=SIZE)).targets
+    assert set(result.unfilled.lost_by) == {"curfew"}
+    assert result.unfilled.describe().endswith(f"of the hole stays empty, because {reason}.")
+
+
+def test_steps_of_the_paper_are_explained_and_the_worst_is_said():
+    """What the filter of Eq. 12 drops lies beside the hole; a later guard loses less."""
+    (result,) = complete().targets
+    nothing = result.added[:0]
+    state = begun()
+    view = GSCompleter().observe(state, camera_at(0.6, size=SIZE))
+    before = view.frozen.composite(nothing)
+    steps = [Step("lift", result.added), Step("filter", nothing), Step("curfew", nothing, "x")]
+    left = find_unfilled(before, steps, view)
+    assert set(left.lost_by) <= {"lift", "filter"}
+    assert left.lost_by["filter"] > 0.5
+    assert left.reason == "what was made for it lies beside the hole"
+
+
 def test_what_stays_empty_is_a_sentence_for_people_and_a_warning_only_if_it_is_much():
-    few = Unfilled(0.021, {"psnr": 0.019, "removal": 0.001}, ((67, 39, 71, 45),))
+    lost = {"psnr": 0.019, "removal": 0.001}
+    few = Unfilled(0.021, lost, ((67, 39, 71, 45),), PsnrGuard.loss)
     assert few.describe() == (
         "2 % of the hole stays empty, mostly because a filling would make given photographs worse."
     )

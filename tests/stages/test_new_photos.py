@@ -9,9 +9,9 @@ from gscompleter import GSCompleter, load_renderer
 from gscompleter.config import CompleterConfig
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.numerics.geometry import is_inside, project
+from gscompleter.parts import NOT_INVENTED
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.stages.new_photos import find_new_photos
-from gscompleter.state import NEW_PHOTO_ID
 from gscompleter.types import Gaussians, View, merge, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, view_of
 
@@ -63,6 +63,6 @@ def test_the_scene_is_recoloured_to_a_new_photograph_and_no_other_gets_worse(exp
     assert psnr(after, ASIDE.image) > psnr(before, ASIDE.image) + 3
     for view in PHOTOS:
         assert psnr(RENDERER.render(done.scene, view.camera).image, view.image) > 45
-    assert set(done.scene.generated.unique().tolist()) == {0, NEW_PHOTO_ID}
+    assert set(done.scene.generated.unique().tolist()) == {0, NOT_INVENTED}
     assert done.next_target_id == 1
     assert torch.equal(done.context.sh, SCENE.sh)

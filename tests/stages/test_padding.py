@@ -9,8 +9,8 @@ from gscompleter import GSCompleter
 from gscompleter.config import LIFTED_MARGIN, CompleterConfig
 from gscompleter.numerics.geometry import pad_pixels
 from gscompleter.stages.context import choose_config
-from gscompleter.stages.target_view import beside_holes
-from gscompleter.state import TargetResult
+from gscompleter.stages.hole_masks import beside_holes
+from gscompleter.target_result import TargetResult
 from gscompleter.types import Gaussians, Render
 from gscompleter.virtual_capture.render_views import render_views
 from scenes import Room, camera_at, gaussians_of, view_of
@@ -35,7 +35,10 @@ def test_a_trained_splat_has_no_padding_unless_it_is_asked_for(lifted, trained):
     assert choose_config(bare, lifted, None).margin == LIFTED_MARGIN
     assert choose_config(None, None, None).margin == LIFTED_MARGIN
     assert choose_config(replace(bare, margin=0.1), trained, None).margin == 0.1
-    assert choose_config(CompleterConfig.splat(), lifted, ()).margin == 0
+    # With photographs as without: what the Gaussians are decides.
+    splat = CompleterConfig.splat()
+    assert choose_config(splat, lifted, ()).margin == LIFTED_MARGIN
+    assert choose_config(splat, trained, ()).margin == 0
 
 
 def test_padding_follows_the_hole_that_touches_the_border():

@@ -206,7 +206,7 @@ def test_gaussians_follow_their_proxy():
     state = replace(
         begin_with(scene[index], PHOTOS),
         source=source,
-        parts=(replace(recolored_scene, generated=ids),),
+        rendered_context=replace(recolored_scene, generated=ids),
     )
     after = state.recolored_context
     assert torch.allclose(after.sh, recolored_scene.sh[index], atol=1e-6)

@@ -9,8 +9,8 @@ from gscompleter.config import CompleterConfig, HoleConfig, RefineConfig
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.render.loading import load_renderer
 from gscompleter.stages.filter_holes import select_in_mask
+from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.stages.refine import refine, refine_opacities
-from gscompleter.stages.target_view import compute_hole_mask
 from gscompleter.types import View, merge
 from scenes import Room, camera_at, gaussians_of, half_a_room_of, view_of
 from target_views import observe

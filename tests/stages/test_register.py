@@ -24,6 +24,7 @@ from gscompleter.stages.register_paper import (
     initialize_distances,
     move_on_rays,
 )
+from gscompleter.stages.select_anchor import choose_anchor
 from gscompleter.stages.target_view import TargetView
 from gscompleter.types import Camera, DepthAffine, DepthMap, Gaussians, Lift, View, merge
 from parity import assert_close
@@ -64,9 +65,10 @@ class Registered:
 
 def register(lift: Lift, reference: View, view: TargetView) -> Registered:
     """Register lifted Gaussians to the scene of a target."""
-    affine = align_depth(lift, view, torch.Generator().manual_seed(0))
+    anchor = choose_anchor(view)
+    affine = align_depth(lift, anchor, view, torch.Generator().manual_seed(0))
     move = REGISTRATIONS[view.state.config.registration_method]
-    moved = move(lift, affine, reference, view)
+    moved = move(lift, affine, reference, anchor, view)
     return Registered(moved.gaussians, moved.losses, affine)
 
 
@@ -306,7 +308,7 @@ def test_where_nothing_overlaps_the_scene_the_affine_is_kept():
     view = observe(scene, [anchor], TARGET, CompleterConfig())
     whole = lifted(reference, anchor, 1.1)
     alone = replace(whole, gaussians=whole.gaussians[rows], pixel_index=rows)
-    moved = register_along_rays(alone, DepthAffine(1.0, 0.0), reference, view)
+    moved = register_along_rays(alone, DepthAffine(1.0, 0.0), reference, choose_anchor(view), view)
     assert moved.losses == ()
     assert_close(moved.gaussians.means, alone.gaussians.means, "means")
 

@@ -40,7 +40,7 @@ def kitti_city_segment(
         Moment(
             100_000 * number,
             frame.c2w @ OPENCV_FROM_CAMERA @ np.linalg.inv(MOUNTED),
-            {1: frame.find_stored().read_bytes()},
+            {1: frame.file.path.read_bytes()},
             {1: road_ahead()},
             boxes=boxes,
         )

@@ -17,26 +17,12 @@ import zstandard
 from PIL import Image
 
 from gscompleter import Render, load_renderer, save_ply, save_splat
+from gscompleter.splats.table import SPLAT_FORMATS
 from gscompleter.splats.transform import HALF_TURN_Z, rotate_half_turn
 from gscompleter.types import SH_C0, Gaussians
 from scenes import camera_at, random_gaussians
 
 CPU = load_renderer("cpu")
-WRITTEN = (
-    *("scene.ply", "scene.compressed.ply", "scene.spz", "scene.splat"),
-    *("written.sog", "written.glb"),
-)
-FORMATS_BUT_PLY = (
-    "scene.compressed.ply",
-    "scene.spz",
-    "four.spz",
-    "scene.splat",
-    "scene.ksplat",
-    "scene.sog",
-    "scene.glb",
-    "written.sog",
-    "written.glb",
-)
 SH_NAME = "KHR_gaussian_splatting:SH_DEGREE_{}_COEF_{}"
 
 
@@ -296,21 +282,44 @@ def plausible(n: int = 200, degree: int = 3) -> Gaussians:
     return replace(gaussians, sh=sh.clamp(-0.98, 0.98))
 
 
+def pack_spz_4(path: Path, gaussians: Gaussians) -> None:
+    write_spz_4(path, made(path.parent, "scene.spz", gaussians))
+
+
+def unpack_spz(path: Path, gaussians: Gaussians) -> None:
+    path.write_bytes(gzip.decompress(made(path.parent, "scene.spz", gaussians).read_bytes()))
+
+
+BY_HAND = {
+    "four.spz": pack_spz_4,
+    "plain.spz": unpack_spz,
+    "scene.ksplat": lambda path, gaussians: write_ksplat(path, gaussians, level=1),
+    "scene.sog": lambda path, gaussians: write_sog(path, sog_files(gaussians)),
+    "folder": lambda path, gaussians: write_sog(path, sog_files(gaussians)),
+    "scene.glb": lambda path, gaussians: write_glb(
+        path, *glb_table(rotate_half_turn(gaussians, HALF_TURN_Z))
+    ),
+}
+"""Writers of this file by file name, for what the package only reads or writes in another way."""
+WRITTEN = tuple(
+    f"{'written' if f'scene{row.endings[0]}' in BY_HAND else 'scene'}{row.endings[0]}"
+    for row in SPLAT_FORMATS.values()
+    if row.write is not None and not row.extra
+)
+"""A file of each format that the package writes without an extra."""
+FORMATS_BUT_PLY = (
+    *(name for name in WRITTEN if name != "scene.ply"),
+    *("four.spz", "scene.ksplat", "scene.sog", "scene.glb"),
+)
+
+
 def made(folder: Path, name: str, gaussians: Gaussians) -> Path:
     """Write a file of the Gaussians in the format of `name`."""
     path = folder / name
-    if name in WRITTEN:
-        save_splat(path, gaussians)
-    elif path.suffix == ".ksplat":
-        write_ksplat(path, gaussians, level=1)
-    elif path.suffix == ".glb":
-        write_glb(path, *glb_table(rotate_half_turn(gaussians, HALF_TURN_Z)))
-    elif name == "plain.spz":
-        path.write_bytes(gzip.decompress(made(folder, "scene.spz", gaussians).read_bytes()))
-    elif path.suffix == ".spz":
-        write_spz_4(path, made(folder, "scene.spz", gaussians))
+    if name in BY_HAND:
+        BY_HAND[name](path, gaussians)
     else:
-        write_sog(path, sog_files(gaussians))
+        save_splat(path, gaussians)
     return path
 
 

@@ -23,7 +23,7 @@ def begin_with(
 ) -> Completion:
     """Begin a completion of `context` without guards."""
     photos = tuple(map(Photo, views))
-    return Completion(config, ContextScene.whole(context), (context,), photos, len(photos), trust)
+    return Completion(config, ContextScene.whole(context), context, photos, len(photos), trust)
 
 
 def observe(

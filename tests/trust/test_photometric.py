@@ -220,7 +220,9 @@ def test_a_sorted_scene_is_the_same_in_the_order_of_its_file():
     state = begin_with(SCENE[order], VIEWS)
     is_changed = torch.arange(len(SCENE)) % 3 == 0
     ids = is_changed[order].to(torch.uint8)
-    state = replace(state, parts=(replace(state.rendered_context, generated=ids),))
+    dyed = state.rendered_context
+    dyed = replace(dyed, sh=dyed.sh + 0.1 * ids[:, None, None], generated=ids)
+    state = replace(state, rendered_context=dyed)
     in_file = find_file_order(state.context, given)
     assert torch.equal(state.context.means[in_file], SCENE.means)
     assert torch.equal(state.recolored_mask[in_file], is_changed)

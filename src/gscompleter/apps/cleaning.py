@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from typing import Any
 
@@ -57,7 +57,11 @@ from gscompleter.system.progress import show_progress, stage, track
 from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.types import Camera, Gaussians, View
 
-PHOTOGRAPH_OPTIONS = ("context", "format", "near", "far", "ignore")
+PHOTOGRAPH_OPTIONS = (
+    *("context", "format", "frames", "resolution", "near", "far", "no_given_depth"),
+    *("no_masks", "invert_masks", "large_masks", "ignore", "forget_edits"),
+)
+"""Options that only photographs can follow."""
 COMMAND = "clean"
 RESULTS = (COMPLETED_FILE, REMOVED_FILE, PICTURE_FILE, SUMMARY_FILE, *EDITS)
 """Files that it may write."""
@@ -116,7 +120,7 @@ def clean_splat(options: CleanOptions) -> None:
                     folder,
                     EditDraft(COMMAND),
                     rows=len(cleaning.given),
-                    added=0,
+                    appended=(),
                     given=cleaning.splat_file.path,
                     earlier=cleaning.splat_file.edits,
                     run=None,
@@ -174,8 +178,9 @@ def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
 
 def clean_alone(options: CleanOptions, console: Console) -> Cleaning:
     """Find floaters by statistics of the splat alone."""
+    defaults = {field.name: field.default for field in fields(options)}
     for name in PHOTOGRAPH_OPTIONS:
-        if getattr(options, name) is not None:
+        if getattr(options, name) != defaults[name]:
             raise InputError("There are no photographs to apply this to; name their SCENE.", name)
 
     device = choose_device(options.device)

@@ -3,82 +3,44 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import torch
-from jaxtyping import Float
-from torch import Tensor
 
 from gscompleter.apps.commands.convert import ConvertOptions
 from gscompleter.numerics.value_checks import check_gaussians
-from gscompleter.splats.compressed_ply import write_compressed_ply
+from gscompleter.parts import MAX_TARGET_ID, NOT_INVENTED, find_last_target_id
+from gscompleter.splats.conversion import (
+    Conversion,
+    convert_rows,
+    is_ply_to_ply,
+    measure_rounding,
+    write_converted,
+)
 from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import (
-    SORTED,
-    decode_splat,
-    describe_losses,
     describe_oddities,
-    detect_splat_format,
-    drop_labels,
     find_origin,
-    get_writer,
     load_splat,
     read_provenance,
-    save_splat,
 )
-from gscompleter.splats.morton import argsort_morton
 from gscompleter.splats.operations import Operations
 from gscompleter.splats.packing import DegreeError
-from gscompleter.splats.ply import copy_ply, save_ply
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, RunRecord
-from gscompleter.splats.sog import write_sog
-from gscompleter.splats.spz import write_spz
 from gscompleter.splats.streamed import is_streamed, load_level
 from gscompleter.splats.transform import merge_placed
 from gscompleter.splats.upward import USUAL, read_upward
-from gscompleter.state import NEW_PHOTO_ID
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import REMOVED_FILE
 from gscompleter.types import Gaussians
 
 MAX_SHIFT = 1000.0
 """Longest shift, in scene units, after which coordinates certainly fit float32."""
-ROUNDED = (write_spz, write_sog, write_compressed_ply)
-"""Writers of formats whose rounding is said."""
 CAMERAS_FILE = "cameras.json"
 """File of a trainer with the cameras of its splat, which lies beside it."""
 UP_TOLERANCE = 1e-3
 """Difference of a component of two upward directions that count as one."""
-
-
-@dataclass(frozen=True)
-class Rounding:
-    """The largest change of numbers by a format."""
-
-    position: float
-    """Largest change of a coordinate, in scene units."""
-    size: tuple[float, float]
-    """Standard deviation that changed by the largest factor, before and after, likewise."""
-
-    def describe(self) -> str:
-        """Describe it in a line."""
-        before, after = self.size
-        return (
-            f"Largest rounding: {self.position:.2g} of a coordinate, and a size of {before:.3g} "
-            f"became {after:.3g}."
-        )
-
-
-@dataclass(frozen=True)
-class Conversion:
-    """What was written."""
-
-    gaussians: int
-    generated: int
-    notes: tuple[str, ...]
-    rounding: Rounding | None
-    """None for formats that keep positions and sizes as they are."""
 
 
 def convert(options: ConvertOptions) -> Conversion:
@@ -117,35 +79,30 @@ def convert_sources(
             check_gaussians(edited, "The scene to write")
             return edited
 
-        count, num_generated = copy_ply(
+        done = convert_rows(
             sources[0],
             options.out,
             options.drop_nonfinite,
             keep_labels,
-            read_provenance(sources[0]) if keep_labels else NOTHING_KNOWN,
             options.ignore_properties,
             edit if operations.changes else None,
         )
-        return Conversion(count, num_generated, notes, None)
+        return replace(done, notes=notes)
 
     gaussians, made_by = read_all(sources, options)
     gaussians = operations.apply(gaussians)
     if len(gaussians) == 0:
         raise InputError("No Gaussian is left; change what is cut off.")
-    num_generated = int((gaussians.generated > 0).sum())
-    if not keep_labels:
-        gaussians = drop_labels(gaussians)
-    save_splat(options.out, gaussians, made_by)
-    notes = (*describe_losses(options.out, gaussians), *notes)
-    # Of a splat with an origin, `describe_rounding` says it.
+    done = write_converted(options.out, gaussians, made_by, keep_labels)
+    done = replace(done, notes=(*done.notes, *notes))
+    # Of a splat with an origin, the notes say the rounding.
     if gaussians.origin is not None:
-        return Conversion(len(gaussians), num_generated, notes, None)
+        return done
     means = gaussians.means
     scales = gaussians.scales
     # Harmonics are most of the memory, and those of the file are read now.
     del gaussians
-    rounding = measure_rounding(options.out, means, scales)
-    return Conversion(len(means), num_generated, notes, rounding)
+    return replace(done, rounding=measure_rounding(options.out, means, scales))
 
 
 def make_operations(options: ConvertOptions) -> Operations:
@@ -191,7 +148,7 @@ def can_be_streamed(
         max(map(abs, operations.translate)) > MAX_SHIFT or find_origin(sources[0]) is not None
     ):
         return False
-    return get_writer(options.out) is save_ply and detect_splat_format(sources[0]) == "ply"
+    return is_ply_to_ply(sources[0], options.out)
 
 
 def read_all(sources: Sequence[Path], options: ConvertOptions) -> tuple[Gaussians, Provenance]:
@@ -217,8 +174,7 @@ def read_all(sources: Sequence[Path], options: ConvertOptions) -> tuple[Gaussian
             made_by = read_provenance(source) if not options.plain else NOTHING_KNOWN
         if not options.plain:
             part, made_by = move_labels(part, made_by, labels_used, source)
-            targets = part.generated.where(part.generated < NEW_PHOTO_ID, 0)
-            labels_used = max(labels_used, int(targets.max()))
+            labels_used = max(labels_used, find_last_target_id(part))
         parts.append(part)
         runs += made_by.runs
     return merge_placed(parts) if len(parts) > 1 else parts[0], Provenance(tuple(runs))
@@ -228,13 +184,13 @@ def move_labels(
     part: Gaussians, made_by: Provenance, labels_used: int, source: Path
 ) -> tuple[Gaussians, Provenance]:
     """Move the numbers of the targets of a splat behind those of the splats before it."""
-    is_target = (part.generated > 0) & (part.generated < NEW_PHOTO_ID)
+    is_target = (part.generated > 0) & (part.generated < NOT_INVENTED)
     if labels_used == 0 or not is_target.any():
         return part, made_by
     moved = part.generated.int() + labels_used * is_target
-    if moved[is_target].max() >= NEW_PHOTO_ID:
+    if moved[is_target].max() > MAX_TARGET_ID:
         raise InputError(
-            f"With {quote_value(source)} there are more than {NEW_PHOTO_ID - 1} targets; leave the "
+            f"With {quote_value(source)} there are more than {MAX_TARGET_ID} targets; leave the "
             "labels out (--plain)."
         )
     runs = tuple(
@@ -277,22 +233,3 @@ def describe_left_behind(
                 f"`strip` cannot take back what was done to {quote_value(source.name)} from "
                 f"{quote_value(out.name)}, whose Gaussians are others; strip first to undo it."
             )
-
-
-def measure_rounding(
-    path: Path, means: Float[Tensor, "n 3"], scales: Float[Tensor, "n 3"]
-) -> Rounding | None:
-    """Read a file again, and compare it with the positions and sizes that were to be written."""
-    write = get_writer(path)
-    if write not in ROUNDED:
-        return None
-    if write in SORTED:
-        places = means.double().numpy()
-        order = argsort_morton(places, places.min(0), places.max(0))
-        means = means[order]
-        scales = scales[order]
-    read = decode_splat(path)
-    factors = read.scales.clamp_min(1e-30).log() - scales.clamp_min(1e-30).log()
-    worst = factors.abs().flatten().argmax()
-    sizes = scales.flatten()[worst].item(), read.scales.flatten()[worst].item()
-    return Rounding((read.means - means).abs().max().item(), sizes)

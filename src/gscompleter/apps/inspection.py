@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -25,9 +25,11 @@ from gscompleter.apps.warmup import compile_kernels
 from gscompleter.config.settings import Device
 from gscompleter.evaluation.verdict.numbers import format_percent
 from gscompleter.numerics.value_checks import find_finite
+from gscompleter.parts import NOT_INVENTED
 from gscompleter.render.device import choose_device
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
+from gscompleter.splats.edits import read_edits
 from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import (
     decode_splat,
@@ -38,7 +40,7 @@ from gscompleter.splats.formats import (
 )
 from gscompleter.splats.origin import count_digits
 from gscompleter.splats.provenance import ModelRecord, RunRecord
-from gscompleter.state import NEW_PHOTO_ID
+from gscompleter.splats.row_kinds import count_row_kinds
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import COMPLETED_FILE, SUMMARY_FILE
@@ -46,6 +48,16 @@ from gscompleter.types import Camera, Gaussians, Origin, sh_from_rgb
 
 MIDDLE = (0.01, 0.99)
 """Quantiles of the coordinates that floaters leave alone."""
+
+ORIGINS = {
+    "given": "as they were",
+    "recolored": "recoloured",
+    "photographs": "added from photographs",
+    "piece": "pieces of what was cut",
+    "target": "invented for targets",
+    "gap": "invented in thin gaps",
+}
+"""What a person is told of each kind of rows."""
 
 Bounds = tuple[tuple[float, float], ...]
 """Smallest and largest x, y and z."""
@@ -93,6 +105,8 @@ class Inspection:
     """Without the hundredth at either end."""
     invented: int
     from_photographs: int
+    origins: Mapping[str, int] | None
+    """Gaussians by their kind, as the record of edits beside the file tells; None if none does."""
     runs: tuple[RunRow, ...]
     record_defect: str | None
     """Why the record of the runs cannot be read; None if it can, or if there is none."""
@@ -118,6 +132,11 @@ def inspect_splat(options: InspectOptions) -> Inspection:
         defect = str(error)
     labels = gaussians.generated
     cameras, notes = list_cameras(options, folder, gaussians)
+    origins = None
+    try:
+        origins = count_row_kinds(path, read_edits(path), len(decoded))
+    except InputError as error:
+        notes = (str(error), *notes)
     other_name = describe_other_name(path)
     if other_name is not None:
         notes = (other_name, *notes)
@@ -133,7 +152,8 @@ def inspect_splat(options: InspectOptions) -> Inspection:
         make_bounds(low, high, gaussians.origin),
         make_bounds(*compute_middle(gaussians.means), gaussians.origin),
         int(find_invented(labels).sum()),
-        int((labels == NEW_PHOTO_ID).sum()),
+        int((labels == NOT_INVENTED).sum()),
+        origins,
         tuple(list_runs(labels, runs)),
         defect,
         measure_pictures(gaussians, cameras, options.device) if cameras else (),
@@ -171,7 +191,7 @@ def compute_middle(means: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Flo
 
 def find_invented(labels: UInt8[Tensor, "n"]) -> Tensor:
     """Mark the Gaussians that were added or recoloured for a target, by their labels."""
-    return (labels > 0) & (labels != NEW_PHOTO_ID)
+    return (labels > 0) & (labels != NOT_INVENTED)
 
 
 def list_runs(labels: UInt8[Tensor, "n"], runs: Sequence[RunRecord]) -> Iterator[RunRow]:
@@ -226,7 +246,7 @@ def measure_pictures(
 def paint_labels(gaussians: Gaussians) -> Gaussians:
     """Paint what is invented red, what photographs show green, and the rest blue."""
     labels = gaussians.generated
-    from_photographs = labels == NEW_PHOTO_ID
+    from_photographs = labels == NOT_INVENTED
     colors = torch.stack([find_invented(labels), from_photographs, labels == 0], dim=1)
     return replace(gaussians, sh=sh_from_rgb(colors.float()))
 
@@ -269,6 +289,9 @@ def describe_splat(found: Inspection) -> Iterator[tuple[str, str]]:
     yield "invented", f"{found.invented:,} ({format_percent(found.invented / count)})"
     shown = format_percent(found.from_photographs / count)
     yield "photographs", f"{found.from_photographs:,} ({shown}) added or recoloured as they show"
+    if found.origins is not None:
+        kinds = [f"{count:,} {ORIGINS[kind]}" for kind, count in found.origins.items()]
+        yield "origins", ", ".join(kinds)
     for row in found.runs:
         yield "made by", describe_run(row)
     if found.record_defect is not None:

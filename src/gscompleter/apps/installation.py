@@ -28,7 +28,7 @@ from gscompleter.types import Camera, Gaussians, make_observed, sh_from_rgb
 PURPOSES = {
     "cuda": "rendering on an NVIDIA GPU",
     "metal": "rendering on the GPU of a Mac, from Python",
-    "evaluation": "the plots of evaluate and tables, FLIP, LPIPS and FID",
+    "evaluation": "the plots of evaluate and tables, FLIP, LPIPS, ST-LPIPS and FID",
     "models": "downloading published weights from the Hugging Face hub",
     "diffusion": "--generator pe-field and diffusers-inpaint",
     "onnx": "--generator migan and lama",

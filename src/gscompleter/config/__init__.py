@@ -441,6 +441,11 @@ class CompleterConfig(Settings):
         """Size of a Gaussian that moves along its ray: that of its image, or its own (paper)."""
         return "constant" if self.registration_method == "ours" else "fixed"
 
+    @property
+    def completes_removals_only(self) -> bool:
+        """True if only what a removal opened is a hole."""
+        return "removal" in self.guards
+
     @staticmethod
     def splat() -> CompleterConfig:
         """Return the settings for a splat that comes with further photographs."""
@@ -449,7 +454,6 @@ class CompleterConfig(Settings):
         return CompleterConfig(
             trust="photometric",
             guards=("image-agreement", "free-space", "psnr", "contribution"),
-            margin=0.0,
             registration=SPLAT_REGISTRATION,
             holes=HoleConfig(padding="beside"),
         )

@@ -1,11 +1,16 @@
-"""The choice of a generator, and its settings as options. Nothing here needs torch."""
+"""The table of generators, and the choice of one with its settings as options.
+
+Nothing here needs torch, so that help pages wait for nothing that computes.
+"""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
-from typing import Annotated, Any
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Annotated, Any, TypeVar, get_type_hints
 
 from annotated_types import Len
+from typing_extensions import Doc
 
 from gscompleter.config.settings import Settings, validate
 from gscompleter.system.errors import InputError, quote_value
@@ -14,7 +19,7 @@ from gscompleter.system.plugins import is_in_file, load_plugins
 
 @dataclass(frozen=True)
 class GeneratorSettings(Settings):
-    """Settings of a generator; each is an option that the class `GeneratorOptions` explains."""
+    """Settings of a generator."""
 
 
 @dataclass(frozen=True)
@@ -25,14 +30,47 @@ class PaintedSettings(GeneratorSettings):
     """Name of the program, model or person."""
 
 
-BUILT_IN: dict[str, type[GeneratorSettings]] = {
-    "warp-inpaint": GeneratorSettings,
-    "oracle": GeneratorSettings,
-    "painted": PaintedSettings,
+@dataclass(frozen=True)
+class GeneratorEntry:
+    """All that is known of a built-in generator."""
+
+    what: str
+    """What its image is, as a clause for help pages."""
+    load: str
+    """Loader as `module:function`: settings, seed, images of the targets, device -> Φ."""
+    settings: type[GeneratorSettings] = GeneratorSettings
+    help: Mapping[str, str] = field(default_factory=dict)
+    """Sentence about each setting that is the option `--generator-NAME`, by its name."""
+
+
+GENERATORS = {
+    "warp-inpaint": GeneratorEntry(
+        "warped photographs, holes filled by patches",
+        "gscompleter.generators.warp_inpaint:load_warp_inpaint",
+    ),
+    "oracle": GeneratorEntry(
+        "the real photograph",
+        "gscompleter.generators.oracle:load_oracle",
+    ),
+    "painted": GeneratorEntry(
+        # The painter is an option of its own, beside that of the images.
+        "by `complete --images`",
+        "gscompleter.generators.painted:load_painted",
+        PaintedSettings,
+    ),
 }
-"""Settings of the built-in generators."""
+"""Built-in generators by name."""
 
 PREFIX = "generator_"
+"""Start of the names of their settings as options."""
+CHOICE = (
+    "Model that synthesizes the image at a target. It is "
+    f"{', '.join(f'{name} ({entry.what})' for name, entry in GENERATORS.items())}, pe-field (the "
+    "paper's), diffusers-inpaint, one of the other models that docs/generators.md lists, or a "
+    "function of yours as file.py:function."
+)
+"""Help of the option `--generator`."""
+C = TypeVar("C")
 
 PLUGINS = "gscompleter.generators"
 """Group of entry points that name tables of further generators, from name to loader.
@@ -48,27 +86,39 @@ def get_settings_class(name: str) -> type[GeneratorSettings]:
     """
     if is_in_file(name):
         return GeneratorSettings
-    if isinstance(name, str) and name in BUILT_IN:
-        return BUILT_IN[name]
+    if isinstance(name, str) and name in GENERATORS:
+        return GENERATORS[name].settings
     others = load_plugins(PLUGINS)
     if isinstance(name, str) and name in others:
         return getattr(others[name], "settings", GeneratorSettings)
     raise InputError(
         f"There is no generator '{quote_value(name)}'; choose one of "
-        f"{', '.join([*BUILT_IN, *others])}, or name a function as file.py:function.",
+        f"{', '.join([*GENERATORS, *others])}, or name a function as file.py:function.",
         "generator",
     )
 
 
+def add_options(kind: type[C]) -> type[C]:
+    """Add to a class of options a field for each setting that a row of the table explains.
+
+    None, their default, leaves the setting to the generator.
+    """
+    annotated: Any = Annotated  # a type checker cannot read a type that is looked up
+    for entry in GENERATORS.values():
+        # Without their ranges, which the settings check: a sentence then names the option.
+        types = get_type_hints(entry.settings)
+        for name, sentence in entry.help.items():
+            kind.__annotations__[PREFIX + name] = annotated[types[name] | None, Doc(sentence)]
+            setattr(kind, PREFIX + name, None)
+    return kind
+
+
 @dataclass(frozen=True)
+@add_options
 class GeneratorOptions(Settings):
     """Model that synthesizes images, and its settings."""
 
-    generator: str = "warp-inpaint"
-    """Model that synthesizes the image at a target. It is warp-inpaint (warped photographs,
-    holes filled by patches), oracle (the real photograph), painted (by `complete --images`),
-    pe-field (the paper's), diffusers-inpaint, one of the other models that docs/generators.md
-    lists, or a function of yours as file.py:function."""
+    generator: Annotated[str, Doc(CHOICE)] = "warp-inpaint"
     generator_weights: str | None = None
     """Weights, by default those published: a folder saved by diffusers, USER/NAME or
     USER/NAME@COMMIT on the Hugging Face hub for pe-field and diffusers-inpaint (which has no
@@ -102,7 +152,7 @@ class GeneratorOptions(Settings):
         # Refused, not ignored: the user would believe that the setting was obeyed.
         for setting in settings:
             if not hasattr(kind, setting):
-                names = [*BUILT_IN, *load_plugins(PLUGINS)]
+                names = [*GENERATORS, *load_plugins(PLUGINS)]
                 knowing = [name for name in names if hasattr(get_settings_class(name), setting)]
                 raise InputError(
                     f"The generator '{self.generator}' has no setting {setting}; leave it out, or "

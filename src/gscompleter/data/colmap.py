@@ -33,7 +33,6 @@ from gscompleter.data.limits import MAX_COEFFICIENT, MAX_NUMBER
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import read_point_cloud
 from gscompleter.system.errors import InputError, quote_value, refuse_pointer
-from gscompleter.system.files.image import read_image_size, read_orientation
 from gscompleter.system.files.reading import open_file, read_lines
 from gscompleter.types import MAX_SIDE
 
@@ -338,10 +337,9 @@ def open_colmap(path: Path) -> Iterator[Photographs]:
 
 def _describe_orientation(frame: Frame) -> tuple[str, ...]:
     """Say what becomes of an EXIF rotation, if the first photograph has one."""
-    if not isinstance(frame.image, Path) or read_orientation(frame.image) == 1:
+    if frame.file is None or frame.file.orientation == 1:
         return ()
-    stored = read_image_size(frame.image, frame.title)
-    if frame.find_orientation(frame.image, *stored) != 1:
+    if frame.find_turn() != 1:
         return ("Photographs are turned as EXIF asks, because their cameras are upright.",)
     return ("EXIF rotation is ignored: photographs are used as they are stored.",)
 

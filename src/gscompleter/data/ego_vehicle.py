@@ -18,8 +18,9 @@ from jaxtyping import Bool, Float, Int
 
 from gscompleter.data.cameras import Pinhole, find_pose_defect
 from gscompleter.data.frame import Frame
+from gscompleter.data.photograph import StoredPhotograph
 from gscompleter.system.errors import InputError
-from gscompleter.system.files.image import read_brightness, read_image_size, turn_upright
+from gscompleter.system.files.image import read_brightness, turn_upright
 
 FEWEST = 6
 """Fewest photographs of a camera that are searched; with fewer, nothing is found."""
@@ -107,9 +108,11 @@ def read_small(frames: Sequence[Frame]) -> dict[Frame, Float[np.ndarray, "h w"]]
     copies: dict[Frame, Float[np.ndarray, "h w"]] = {}
     for frame in frames:
         with suppress(InputError):
-            stored = frame.require_stored()
-            orientation = frame.find_orientation(stored, *read_image_size(stored))
-            copies[frame] = turn_upright(read_brightness(stored, SIDE), orientation)
+            photograph = frame.require_photograph()
+            # No vehicle carries the camera of a render.
+            if isinstance(photograph, StoredPhotograph):
+                small = read_brightness(photograph.stored, SIDE)
+                copies[frame] = turn_upright(small, frame.find_turn())
     shape = next((image.shape for image in copies.values()), None)
     return {frame: image for frame, image in copies.items() if image.shape == shape}
 

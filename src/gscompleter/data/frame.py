@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -20,15 +21,9 @@ from gscompleter.data.cameras import (
     undistort_pinhole,
 )
 from gscompleter.data.file_names import FolderListings, list_endings
+from gscompleter.data.photograph import Photograph, StoredPhotograph
 from gscompleter.system.errors import InputError, join_names, quote_value
-from gscompleter.system.files.image import (
-    QUARTER_TURNS,
-    leave_out_constant,
-    read_colors_and_alpha,
-    read_image_size,
-    read_orientation,
-    turn_upright,
-)
+from gscompleter.system.files.image import QUARTER_TURNS, turn_upright
 from gscompleter.types import MAX_SIDE
 
 ENDINGS = ("", ".png", ".jpg", ".jpeg")
@@ -58,8 +53,8 @@ class Frame:
     c2w: Float[np.ndarray, "4 4"]
     """Camera-to-world in OpenCV axes, float64, as stored in the file (see `find_defect`)."""
     intrinsics: Intrinsics
-    image: Path | Callable[[], bytes] | None
-    """Expected path of the photograph, or a function that returns the bytes of its file."""
+    image: Path | Photograph | None
+    """Expected path of the photograph, or the photograph itself if it has no file of its own."""
     depth: Callable[[], Float[np.ndarray, "h w"]] | None = None
     """Reads a depth map of any size: z-depth in scene units, 0 where unknown."""
     predicted_depth: Callable[[], Float[np.ndarray, "h w"]] | None = None
@@ -94,15 +89,25 @@ class Frame:
         inside = len(path.parts) > 1 and path.parts[0].casefold() in FOLDERS
         return str(PurePosixPath(*path.parts[1:]) if inside else path)
 
-    def find_stored(self) -> Path | bytes | None:
-        """Return the image file or its bytes; None if there is none."""
-        if isinstance(self.image, Path):
-            return find_image(self.image)
-        return None if self.image is None else self.image()
+    @cached_property
+    def photograph(self) -> Photograph | None:
+        """The photograph, which is looked for once; None if there is none."""
+        if not isinstance(self.image, Path):
+            return self.image
+        path = find_image(self.image)
+        return None if path is None else StoredPhotograph(path)
+
+    @property
+    def file(self) -> StoredPhotograph | None:
+        """The photograph if it is a file of its own, or None."""
+        photograph = self.photograph
+        if isinstance(photograph, StoredPhotograph) and photograph.path is not None:
+            return photograph
+        return None
 
     def has_photograph(self) -> bool:
         """Check whether the photograph exists, without opening container files."""
-        return callable(self.image) or self.find_stored() is not None
+        return self.photograph is not None
 
     def size(self) -> tuple[int, int]:
         """Return width and height of the upright photograph, or else those of the camera file.
@@ -111,11 +116,10 @@ class Frame:
         """
         stated = None if self.intrinsics.size == FRACTIONS else self.intrinsics.size
         # To measure an image inside a container, that has to be opened.
-        stored = None if stated is not None and callable(self.image) else self.find_stored()
-        if stored is not None:
-            width, height = read_image_size(stored, capitalize(self.title))
-            is_turned = self.find_orientation(stored, width, height) != 1
-            return (height, width) if is_turned else (width, height)
+        is_closed = self.photograph is None or (stated is not None and self.file is None)
+        if self.photograph is not None and not is_closed:
+            width, height = self.photograph.measure()
+            return (height, width) if self.find_turn() != 1 else (width, height)
         if stated is not None:
             return stated
         raise InputError(
@@ -123,32 +127,26 @@ class Frame:
             "add these, or its image."
         )
 
-    def require_stored(self) -> Path | bytes:
-        """Return the image file or its bytes, or raise an InputError if there is none."""
-        stored = self.find_stored()
-        if stored is None:
+    def require_photograph(self) -> Photograph:
+        """Return the photograph, or raise an InputError if there is none."""
+        if self.photograph is None:
             place = "restore it" if self.image is None else f"put it at {quote_value(self.image)}"
             raise InputError(
                 f"The image of {self.title} is missing; {place}, or choose another frame."
             )
-        return stored
+        return self.photograph
 
     def find_turn(self) -> int:
-        """Return the EXIF orientation by which the photograph is turned; 1 without a photograph."""
-        stored = self.find_stored()
-        if stored is None:
-            return 1
-        return self.find_orientation(stored, *read_image_size(stored, capitalize(self.title)))
-
-    def find_orientation(self, stored: Path | bytes, width: int, height: int) -> int:
         """Return the EXIF orientation by which stored pixels have to be turned, or 1.
 
         Cameras usually belong to the pixels as they are stored, whatever EXIF says. Only where the
         camera's width and height are those of the turned photograph is it turned.
         """
-        if not self.intrinsics.is_transposed(width, height):
+        if self.photograph is None:
             return 1
-        orientation = read_orientation(stored)
+        if not self.intrinsics.is_transposed(*self.photograph.measure()):
+            return 1
+        orientation = self.photograph.read_orientation()
         return orientation if orientation in QUARTER_TURNS else 1
 
     def load_pixels(
@@ -156,15 +154,10 @@ class Frame:
     ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None, int]:
         """Read the upright photograph: its colours, its alpha or None, and how it was turned.
 
-        The last is the EXIF orientation that was applied; 1 for the pixels as they are stored. An
-        alpha that is the same everywhere in a file tells nothing.
+        The last is the EXIF orientation that was applied; 1 for the pixels as they are stored.
         """
-        stored = self.require_stored()
-        colors, alpha = read_colors_and_alpha(stored, capitalize(self.title))
-        # Bytes may be a render of a splat, which is transparent where it is empty, even everywhere.
-        if alpha is not None and isinstance(stored, Path):
-            alpha = leave_out_constant(alpha)
-        orientation = self.find_orientation(stored, colors.shape[1], colors.shape[0])
+        colors, alpha = self.require_photograph().read_pixels()
+        orientation = self.find_turn()
         colors = turn_upright(colors, orientation)
         alpha = None if alpha is None else turn_upright(alpha, orientation)
         return colors, alpha, orientation

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path, PurePosixPath
 
@@ -22,6 +22,7 @@ from PIL import Image
 from gscompleter.data.cameras import has_same_aspect
 from gscompleter.data.file_names import FolderListings
 from gscompleter.data.frame import FOLDERS, MASKS, Frame
+from gscompleter.data.photograph import StoredPhotograph
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import HALF_OPAQUE, read_mask, turn_upright
 
@@ -40,11 +41,33 @@ def attach_masks(frames: Sequence[Frame]) -> tuple[Frame, ...]:
     listings = FolderListings()
     attached = []
     for frame in frames:
-        stored = frame.find_stored() if isinstance(frame.image, Path) else None
-        if frame.mask is None and isinstance(stored, Path):
-            frame = replace(frame, mask=find_mask(stored, frame.name, listings))
-        attached.append(frame)
+        path = None if frame.mask is not None or frame.file is None else frame.file.path
+        mask = None if path is None else find_mask(path, frame.name, listings)
+        # A frame that stays itself need not look for its photograph again.
+        attached.append(frame if mask is None else replace(frame, mask=mask))
     return tuple(attached)
+
+
+@dataclass(frozen=True)
+class GivenPhotograph:
+    """A photograph in a folder of new ones, with its mask, for which was looked once."""
+
+    name: str
+    """Path below the folder."""
+    stored: StoredPhotograph
+    path: Path
+    mask: Path | None
+
+
+def find_given(
+    folder: Path, names: Sequence[str], named: Path | None = None
+) -> list[GivenPhotograph]:
+    """Find photographs of a folder and their masks; `named` is as in `find_mask`."""
+    listings = FolderListings()
+    return [
+        GivenPhotograph(name, StoredPhotograph(path), path, find_mask(path, name, listings, named))
+        for name, path in ((name, folder / name) for name in names)
+    ]
 
 
 def find_mask_in(folder: Path, name: str, listings: FolderListings) -> Path | None:

@@ -28,7 +28,7 @@ from gscompleter.data.masks import fill_hidden, find_mask_in, find_masked, make_
 from gscompleter.data.moving_boxes import mask_moving
 from gscompleter.numerics.geometry import compute_sparse_depth
 from gscompleter.system.errors import InputError, join_names, quote_value
-from gscompleter.system.files.image import composite_over_black, convert_to_image, has_alpha
+from gscompleter.system.files.image import composite_over_black, convert_to_image
 from gscompleter.system.files.names import fold_name
 from gscompleter.types import MAX_SIDE, Camera, View
 
@@ -434,8 +434,7 @@ def _ends_alike(one: Sequence[str], other: Sequence[str]) -> bool:
 
 
 def _has_alpha(frame: Frame) -> bool:
-    stored = frame.find_stored() if isinstance(frame.image, Path) else None
-    return isinstance(stored, Path) and has_alpha(stored)
+    return frame.file is not None and frame.file.has_alpha
 
 
 def _find_skip_reason(

@@ -21,8 +21,9 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.data.cameras import FRACTIONS, Intrinsics, invert_viewmat
-from gscompleter.data.frame import Frame
+from gscompleter.data.frame import Frame, capitalize
 from gscompleter.data.limits import require
+from gscompleter.data.photograph import StoredPhotograph
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.system.errors import InputError, join_names, quote_value, refuse_pointer
 from gscompleter.system.files.reading import check_file, open_file, read_head, read_json, read_lines
@@ -184,7 +185,8 @@ def _parse_scene(example: Any, path: Path, position: int) -> Photographs:
         intrinsics, c2w = parse_camera_row(row)
         image = partial(_read_image_bytes, path, position, number)
         title = f"frame {number} of the {called}"
-        frames.append(Frame(str(number), title, c2w, intrinsics, image))
+        stored = StoredPhotograph(image, capitalize(title))
+        frames.append(Frame(str(number), title, c2w, intrinsics, stored))
     return build_photographs(name, f"the {called}", frames)
 
 

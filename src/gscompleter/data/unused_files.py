@@ -121,9 +121,9 @@ def _list_homes(frames: Sequence[Frame]) -> dict[Path, set[str]]:
     """Map the folders of photographs to the names of those that are used."""
     homes: dict[Path, set[str]] = {}
     for frame in frames:
-        stored = frame.find_stored() if isinstance(frame.image, Path) else None
-        if isinstance(stored, Path):
-            homes.setdefault(stored.parent, set()).add(stored.name)
+        path = None if frame.file is None else frame.file.path
+        if path is not None:
+            homes.setdefault(path.parent, set()).add(path.name)
     return homes
 
 

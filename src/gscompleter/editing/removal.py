@@ -19,16 +19,17 @@ from torch import Tensor
 from gscompleter.editing.cleaning import exclude_needed, limit_errors
 from gscompleter.editing.cutting import Region, cut
 from gscompleter.guards import prepare_guards
+from gscompleter.parts import Part, PartOrigin, make_part, split_into_parts
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.fit_colors import RELAXATION, fit_colors
 from gscompleter.render.protocols import FrozenScene, Renderer
 from gscompleter.render.removed import mask_removed
 from gscompleter.stages.error_budgets import meet_error_budgets, set_error_budgets
-from gscompleter.state import NEW_PHOTO_ID, Completion
+from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
 from gscompleter.trust import Trust
 from gscompleter.trust.photometric import PhotoObservations, gather_observations
-from gscompleter.types import REMOVED, REVEALED, ContextScene, Gaussians, View, merge
+from gscompleter.types import ContextScene, Gaussians, View, merge
 
 TOLERANCE = 0.003
 """Largest loss of PSNR of a photograph, in dB, by revealed Gaussians that do not return."""
@@ -65,27 +66,28 @@ def remove_gaussians(
     if gone.all():
         raise InputError("Nothing would be left of the splat; choose fewer Gaussians.")
 
-    # Outer pieces are no Gaussians of the file: they are added to it, with a label of their own.
-    rest = replace(outer, generated=torch.full_like(outer.generated, NEW_PHOTO_ID))
-    rest = rest[~is_outer_revealed]
+    is_revealed = source.revealed_mask | source.expand(gone & ~unused)
     remaining = replace(
         source,
         rendered=source.rendered[~gone],
-        proxy_index=number_left(source, chosen, unused, gone),
+        proxy_index=number_left(source, gone),
+        chosen_mask=source.chosen_mask | chosen,
+        revealed_mask=is_revealed & ~chosen,
         removed=merge([source.removed, replace(inner, sh=inner.sh[:, :1])]),
-        piece_means=torch.cat([source.piece_means, rest.means]),
     )
     # As long as nothing is recoloured, the state has that of its source itself, which tells so.
     context = remaining.rendered if first is source.rendered else first[~gone]
-    parts = (context, *state.parts[1:])
-    if len(rest):
-        parts = (*parts, rest)
-    changed = replace(state, source=remaining, parts=parts, trust=Trust())
+    # Outer pieces are no Gaussians of the file: they are added to it.
+    rest = make_part(PartOrigin("piece"), outer[~is_outer_revealed])
+    parts = (*state.added_parts, rest) if len(rest) else state.added_parts
+    changed = replace(
+        state, source=remaining, rendered_context=context, added_parts=parts, trust=Trust()
+    )
 
     # The photographs still show the object. Its pixels are ignored and painted over, so that no
     # model copies from them.
     views = [hide_removed(photo.view, remaining, scenes.renderer) for photo in state.photos]
-    shown = scenes.freeze_at(parts, [view.camera for view in views])
+    shown = scenes.freeze_at(changed.parts, [view.camera for view in views])
     photos = tuple(
         # Painted over, so that no model copies from ignored pixels. Budgets of the photographs with
         # the object would forbid what fills its place.
@@ -95,28 +97,14 @@ def remove_gaussians(
     return prepare_guards(replace(changed, photos=photos), scenes)
 
 
-def number_left(
-    source: ContextScene,
-    chosen: Bool[Tensor, "n"],
-    unused: Bool[Tensor, "m"],
-    gone: Bool[Tensor, "m"],
-) -> Int64[Tensor, "n"]:
+def number_left(source: ContextScene, gone: Bool[Tensor, "m"]) -> Int64[Tensor, "n"]:
     """Compute the `proxy_index` of what is left, in which rendered Gaussians are numbered anew.
 
-    `unused` rendered Gaussians are removed; the other `gone` ones are revealed.
+    Those that are `gone` take the number of one that is left, which nobody reads.
     """
-    # The new number of each rendered Gaussian: its place among those that stay, or the reason why
-    # it is gone.
-    number = (~gone).cumsum(0) - 1
-    number = torch.where(gone, REVEALED, number)
-    number = torch.where(unused, REMOVED, number)
-
-    # Gaussians that were gone before have the numbers REVEALED and REMOVED instead of a rendered
-    # one, and keep them. Chosen ones are removed, whatever stands for them.
-    was_gone = source.gone_mask
-    index = number[source.stand_ins.where(~was_gone, 0)]
-    index = torch.where(was_gone, source.stand_ins, index)
-    return index.where(~chosen, REMOVED)
+    # The new number of each rendered Gaussian: its place among those that stay.
+    number = ((~gone).cumsum(0) - 1).clamp_min(0)
+    return number[source.stand_ins]
 
 
 def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
@@ -131,23 +119,28 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
         return state
 
     # Outer pieces of what was cut, and what photographs showed before, are among the additions, but
-    # were not generated.
-    is_rest = state.added.generated == NEW_PHOTO_ID
-    rest = state.added[is_rest]
-    known = merge([state.rendered_context, rest])
-    is_revealed = source.stand_ins == REVEALED
+    # were not invented.
+    rest = [part for part in state.added_parts if not part.origin.is_invented]
+    invented = [part for part in state.added_parts if part.origin.is_invented]
+    known = merge([state.rendered_context, *(part.gaussians for part in rest)])
+    is_revealed = source.revealed_mask
     revealed = source.gaussians[is_revealed]
-    added = fade_harmful(state.added[~is_rest], merge([known, revealed]), state, renderer)
+    invented = fade_harmful(invented, merge([known, revealed]), state, renderer)
+    added = merge([known[:0], *(part.gaussians for part in invented)])
 
     # Revealed Gaussians that return follow those that are rendered, as rows of their own.
     is_needed = find_needed_revealed(revealed, known, added, views, renderer)
     returned = revealed[is_needed]
     is_returned = is_revealed.masked_scatter(is_revealed, is_needed)
     rows = len(source.rendered) + torch.arange(len(returned), device=is_returned.device)
-    index = source.stand_ins.masked_scatter(is_returned, rows)
-    rendered = merge([source.rendered, returned])
+    remaining = replace(
+        source,
+        rendered=merge([source.rendered, returned]),
+        proxy_index=source.stand_ins.masked_scatter(is_returned, rows),
+        revealed_mask=is_revealed & ~is_returned,
+    )
     first = (
-        rendered
+        remaining.rendered
         if state.rendered_context is source.rendered
         else merge([state.rendered_context, returned])
     )
@@ -155,15 +148,18 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
     # Additions reach beyond the hole, where photographs tell their colours. Ignored pixels show the
     # scene itself, so that colours stay as they are in the hole.
     frozen = [renderer.freeze(first, view.camera) for view in views]
-    added = merge([rest, added])
+    parts = [*rest, *invented]
+    added = merge([first[:0], *(part.gaussians for part in parts)])
     images = [
         view.paint_ignored(scene.composite(added).image.clamp(0, 1))
         for view, scene in zip(views, frozen, strict=True)
     ]
+    fitted = fit_colors(added, frozen, images, [RELAXATION] * COLOR_ROUNDS)
     return replace(
         state,
-        source=replace(source, rendered=rendered, proxy_index=index),
-        parts=(first, fit_colors(added, frozen, images, [RELAXATION] * COLOR_ROUNDS)),
+        source=remaining,
+        rendered_context=first,
+        added_parts=tuple(split_into_parts(fitted, parts)),
     )
 
 
@@ -211,9 +207,13 @@ def sum_in_mask(frozen: FrozenScene, inside: Float[Tensor, "h w"]) -> Float[Tens
 
 
 def fade_harmful(
-    added: Gaussians, context: Gaussians, state: Completion, renderer: Renderer
-) -> Gaussians:
-    """Fade what was generated until no photograph is worse than `context` alone."""
+    parts: Sequence[Part], context: Gaussians, state: Completion, renderer: Renderer
+) -> list[Part]:
+    """Fade what was invented until no photograph is worse than `context` alone.
+
+    Gaussians that faded altogether stay, unless all of them did.
+    """
+    added = merge([context[:0], *(part.gaussians for part in parts)])
     config = state.config.psnr_guard
     config = replace(config, max_drop=max(config.max_drop, TOLERANCE))
     views = [photo.view for photo in state.photos]
@@ -228,7 +228,8 @@ def fade_harmful(
         for view, scene in zip(views, frozen, strict=True)
     ]
     plans = [scene.vary_opacities(added) for scene in frozen]
-    return meet_error_budgets(added, frozen, budgets, plans, config)
+    faded = meet_error_budgets(added, frozen, budgets, plans, config)
+    return list(split_into_parts(faded, parts)) if len(faded) else []
 
 
 def find_revealed(
@@ -246,7 +247,7 @@ def find_revealed(
     # then their pieces. Of these, the inner ones go in any case.
     first = state.rendered_context
     others = replace(first, opacities=first.opacities.masked_fill(unused, 0.0), encoded=None)
-    state = replace(state, parts=(merge([others, inner, outer]), *state.parts[1:]))
+    state = replace(state, rendered_context=merge([others, inner, outer]))
     gone = torch.cat([unused, unused.new_ones(len(inner)), unused.new_zeros(len(outer))])
 
     before = observe(state, torch.ones_like(gone), scenes)

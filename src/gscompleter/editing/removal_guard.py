@@ -12,9 +12,11 @@ class Removal(Guard):
     """Add nothing where the scene looked the same before the removal."""
 
     name = "removal"
+    loss = "nothing was removed there"
 
     def place(self, candidates: Gaussians, view: TargetView) -> Gaussians:
         """Keep candidates in pixels that showed something removed."""
-        if view.opened is None:
+        opened = view.masks.edits.opened
+        if opened is None:
             return candidates
-        return candidates[project_mask(view.opened, candidates, view.camera.padded)]
+        return candidates[project_mask(opened, candidates, view.camera.padded)]

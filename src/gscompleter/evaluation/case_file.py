@@ -1,15 +1,21 @@
 """The file of cases, `cases.json`: its keys, and one sentence for each mistake in it.
 
 {"resolution": [h, w], "cases": [{"scene", "context", "target", "near", "far", "neighbours"}, ...]}.
-Scenes are folders relative to the file, and may name variables of the environment.
+Scenes are folders relative to the file, and may name variables of the environment. With "apart",
+true or a list of names of scenes, all cases or those of these scenes are kept apart (`apart.py`).
+
+A file of scenes, {"scenes": [folder, ...], "apart": [name, ...]}, names those of a data set for the
+protocols, which choose frames themselves.
 """
 
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from pathlib import Path
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePath
 from typing import Any
 
 from gscompleter.system.errors import InputError, quote_value
@@ -18,7 +24,9 @@ from gscompleter.system.tensor_checks import is_number
 from gscompleter.types import MAX_SIDE
 
 FILE_KEYS = ("resolution", "cases", "about", "apart")
-"""Keys of the file; `about` and `apart` are remarks for people and programs of their own."""
+"""Keys of the file; `about` is a remark for people."""
+SCENE_KEYS = ("scenes", "about", "apart")
+"""Keys of a file of scenes."""
 CASE_KEYS = ("scene", "context", "target", "neighbours", "near", "far", "about")
 MAX_FRAME = 10**9
 MIN_CONTEXT = 2
@@ -34,6 +42,16 @@ class CaseRow:
     neighbours: tuple[int, ...] = ()
     near: float | None = None
     far: float | None = None
+    is_apart: bool = False
+    """True if the file keeps the case apart."""
+
+
+@dataclass(frozen=True)
+class SceneRow:
+    """A scene as a file of scenes has it."""
+
+    scene: str
+    is_apart: bool = False
 
 
 @dataclass(frozen=True)
@@ -74,8 +92,61 @@ def read_case_file(path: Path) -> CaseFile:
                 f"{name}: case {number} has the scene, context and target of case {first}; leave "
                 "one of them out."
             )
+    is_apart = parse_apart(content.get("apart"), [row.scene for row in parsed], name)
     height, width = sides
-    return CaseFile((height, width), tuple(parsed))
+    return CaseFile(
+        (height, width),
+        tuple(replace(row, is_apart=apart) for row, apart in zip(parsed, is_apart, strict=True)),
+    )
+
+
+def is_scene_file(path: Path) -> bool:
+    """Check whether a path is a file of scenes; cameras of a scene can be a .json, too."""
+    if path.suffix != ".json" or not os.path.isfile(path):
+        return False
+    with suppress(InputError):
+        content = read_json(path, "name a file of scenes")
+        return isinstance(content, dict) and "scenes" in content
+    return False
+
+
+def read_scene_file(path: Path) -> tuple[SceneRow, ...]:
+    """Read a file of scenes; raise InputError with one sentence about its first mistake."""
+    content = read_json(path, "name a file of scenes")
+    name = f"{quote_value(path)} is no file of scenes"
+    if not isinstance(content, dict):
+        raise InputError(f"{name}: it has to be an object with scenes.")
+    refuse_unknown(content, SCENE_KEYS, name)
+    scenes = content.get("scenes")
+    if not isinstance(scenes, list) or not scenes:
+        raise InputError(f"{name}: scenes has to be a list of folders, and is {show(scenes)}.")
+    for number, scene in enumerate(scenes, start=1):
+        if not isinstance(scene, str) or not scene or scene in scenes[: number - 1]:
+            raise InputError(
+                f"{name}: scene {number} is {show(scene)}; name different folders, relative to "
+                "the file."
+            )
+    is_apart = parse_apart(content.get("apart"), scenes, name)
+    return tuple(SceneRow(scene, apart) for scene, apart in zip(scenes, is_apart, strict=True))
+
+
+def parse_apart(apart: Any, scenes: Sequence[str], name: str) -> list[bool]:
+    """Parse which of `scenes` are kept apart: all of them, or those that a list names."""
+    known = [PurePath(scene).name for scene in scenes]
+    if isinstance(apart, bool) or apart is None:
+        return [bool(apart)] * len(known)
+    if not isinstance(apart, list) or not all(isinstance(scene, str) for scene in apart):
+        raise InputError(
+            f"{name}: apart has to be true or a list of names of scenes, and is {show(apart)}."
+        )
+    # A misspelt name would leave its scene in every measurement.
+    unknown = [scene for scene in apart if scene not in known]
+    if unknown:
+        raise InputError(
+            f"{name}: apart names {show(unknown[0])}, which is none of its scenes "
+            f"({', '.join(dict.fromkeys(known))}); correct or remove it."
+        )
+    return [scene in apart for scene in known]
 
 
 def parse_row(row: Any, name: str) -> CaseRow:

@@ -16,7 +16,7 @@ from gscompleter.data.formats import SCENE_FORMATS, detect_format, find_format, 
 from gscompleter.data.frame import describe_moved
 from gscompleter.data.masks import attach_masks
 from gscompleter.data.photographs import MAX_TRANSLATION, Photographs, Resolution
-from gscompleter.evaluation.case_file import read_case_file
+from gscompleter.evaluation.case_file import is_scene_file, read_case_file, read_scene_file
 from gscompleter.system.files.output_folder import holds_results
 from gscompleter.types import View
 
@@ -41,6 +41,8 @@ class Case:
     """True if pixels in boxes of moving objects are ignored."""
     ego_mask: bool = True
     """True if pixels of the vehicle that carries the camera are ignored."""
+    apart_by: Path | None = None
+    """File of cases that keeps this one apart, or None."""
 
     @property
     def name(self) -> str:
@@ -70,6 +72,7 @@ def read_cases(path: Path) -> list[Case]:
             content.resolution,
             row.near,
             row.far,
+            apart_by=path if row.is_apart else None,
         )
         for row in content.rows
     ]
@@ -81,6 +84,25 @@ class SkippedScene:
 
     name: str
     reason: str
+
+
+@dataclass(frozen=True)
+class Place:
+    """A file or folder of scenes that a protocol chooses frames of."""
+
+    path: Path
+    apart_by: Path | None = None
+    """File of scenes that keeps it apart, or None."""
+
+
+def list_places(path: Path) -> list[Place]:
+    """List the scenes that a file of scenes names; else the path itself."""
+    if not is_scene_file(path):
+        return [Place(path)]
+    return [
+        Place(path.parent / os.path.expandvars(row.scene), path if row.is_apart else None)
+        for row in read_scene_file(path)
+    ]
 
 
 def list_scenes(path: Path) -> list[Path]:

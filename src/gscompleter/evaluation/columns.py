@@ -114,6 +114,7 @@ GROUPS = {
         Column("ssim", "SSIM", 3, "target_after.ssim"),
         Column("lpips_vgg", "LPIPS (VGG)", 3, "target_after.lpips_vgg"),
         Column("lpips_alex", "LPIPS (Alex)", 3, "target_after.lpips_alex"),
+        Column("st_lpips", "ST-LPIPS", 4, "target_after.st_lpips"),
         Column("hole_psnr", "PSNR (hole)", 2, "hole.psnr"),
         Column("observed_psnr", "PSNR (observed)", 2, "observed.psnr"),
         Column("neighbours", "PSNR (neighbour views)", 2, NEAR_AFTER),

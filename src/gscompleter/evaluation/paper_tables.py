@@ -15,6 +15,12 @@ from scipy.stats import t as student_t
 
 from gscompleter.evaluation.columns import BY_KEY, Column
 from gscompleter.evaluation.paper import TableSpec
+from gscompleter.evaluation.run_facts import (
+    RunFacts,
+    describe_facts,
+    read_run_facts,
+    spell_greek,
+)
 from gscompleter.evaluation.tables import (
     ABSENT_NOTES,
     RunSummary,
@@ -101,6 +107,8 @@ class PaperTable:
     """Number of cases that all methods finished, by model and protocol."""
     notes: Sequence[str]
     """Failed cases, and the reason why there is no FID."""
+    facts: Mapping[str, RunFacts]
+    """What each run was made with, by model and protocol."""
     compared: str = "Ψ"
     """Title of the column of the models."""
 
@@ -147,48 +155,56 @@ def fill_table(spec: TableSpec, runs: Mapping[tuple[str, str], Path]) -> PaperTa
     rows: list[TableRow] = []
     counts = {}
     notes = []
+    facts = {}
     for (model, protocol), folder in runs.items():
         # Every method is averaged over the same cases, those that all finished.
-        summary = summarize_run([r for r in read_run_rows(folder) if r["method"] in spec.methods])
+        own = [row for row in read_run_rows(folder) if row["method"] in spec.methods]
+        summary = summarize_run(own)
         fids = compute_fids(folder, summary) if "fid" in spec.columns else {}
         notes += [f"Failed: {' '.join(failure)}" for failure in summary.failures]
         notes += [fids] if isinstance(fids, str) else []
-        counts[f"{model}, {protocol}" if protocol else model] = len(summary.common_tasks)
+        name = f"{model}, {protocol}" if protocol else model
+        counts[name] = len(summary.common_tasks)
+        facts[name] = read_run_facts(folder, own)
         for method in spec.methods:
             cells = fill_cells(spec, summary, method)
             # FID is one number of all images, without a case to pair.
             if not isinstance(fids, str) and fids:
                 cells["fid"] = Cell(fids[method])
             rows.append(TableRow(model, protocol, method, cells))
-    return PaperTable(spec, rows, counts, list(dict.fromkeys(notes)))
+    return PaperTable(spec, rows, counts, list(dict.fromkeys(notes)), facts)
 
 
-def fill_depth_table(
-    methods: Sequence[str], columns: Sequence[str], runs: Mapping[str, Path]
+def fill_comparison(
+    title: str,
+    compared: str,
+    methods: Sequence[str],
+    columns: Sequence[str],
+    runs: Mapping[str, Path],
 ) -> PaperTable:
-    """Fill a table that compares depths, from runs of `evaluate` with one depth each.
+    """Fill a table that compares models of one kind, from runs of `evaluate` with one each.
 
-    Differences are those of a method to itself with the first depth, over the cases that both
+    Differences are those of a method to itself with the first model, over the cases that both
     finished.
     """
     first = next(iter(runs))
-    spec = TableSpec(
-        "Depths compared", columns=tuple(columns), methods=tuple(methods), baseline=first
-    )
-    summaries = {depth: summarize_run(read_run_rows(folder)) for depth, folder in runs.items()}
+    spec = TableSpec(title, columns=tuple(columns), methods=tuple(methods), baseline=first)
+    loaded = {model: read_run_rows(folder) for model, folder in runs.items()}
+    summaries = {model: summarize_run(rows) for model, rows in loaded.items()}
+    facts = {model: read_run_facts(runs[model], rows) for model, rows in loaded.items()}
     rows = []
-    for depth, summary in summaries.items():
+    for model, summary in summaries.items():
         for method in methods:
             values = collect_values(summary, method, columns)
             others: dict[str, dict[str, float]] = {key: {} for key in columns}
-            if depth != first:
+            if model != first:
                 others = collect_values(summaries[first], method, columns)
             cells = {key: fill_cell(BY_KEY[key], values[key], others[key]) for key in columns}
-            rows.append(TableRow(depth, "", method, cells))
-    counts = {depth: len(summary.common_tasks) for depth, summary in summaries.items()}
+            rows.append(TableRow(model, "", method, cells))
+    counts = {model: len(summary.common_tasks) for model, summary in summaries.items()}
     failures = [failure for summary in summaries.values() for failure in summary.failures]
     notes = [f"Failed: {' '.join(failure)}" for failure in failures]
-    return PaperTable(spec, rows, counts, list(dict.fromkeys(notes)), compared="depth")
+    return PaperTable(spec, rows, counts, list(dict.fromkeys(notes)), facts, compared)
 
 
 def fill_cells(spec: TableSpec, summary: RunSummary, method: str) -> dict[str, Cell]:
@@ -233,6 +249,7 @@ def write_paper_table(path: Path, table: PaperTable) -> None:
         "title": table.spec.title,
         "baseline": table.spec.baseline,
         "cases": table.num_cases,
+        "made_with": {name: facts.to_json() for name, facts in table.facts.items()},
         "rows": [asdict(row) for row in table.rows],
     }
     texts[".json"] = json.dumps(content, indent=1) + "\n"
@@ -284,7 +301,8 @@ def format_paper_markdown(table: PaperTable) -> str:
     head, rows = format_rows(table, partial(format_paper_number, error=" ± {}", difference=" ({})"))
     notes = [f"{note}\n" for note in table.notes]
     body = [format_markdown(head, rows), *describe_missing(table), *notes]
-    return "\n".join([f"## {table.spec.title}\n", f"{about}\n", *body])
+    made_with = "\n".join(f"* {line}" for line in describe_facts(table.facts))
+    return "\n".join([f"## {table.spec.title}\n", f"{made_with}\n", f"{about}\n", *body])
 
 
 def describe_missing(table: PaperTable) -> list[str]:
@@ -300,6 +318,8 @@ def format_paper_latex(table: PaperTable) -> str:
     cell = partial(format_paper_number, error=r"{{\tiny$\pm${}}}", difference=r"~{{\tiny({})}}")
     text = format_latex(*format_rows(table, cell))
     # pdfLaTeX knows none of these characters.
-    for sign, command in {"≈": r"$\approx$", "Ψ": r"$\Psi$", "Δ": r"$\Delta$"}.items():
+    signs = {"≈": r"$\approx$", "Ψ": r"$\Psi$", "Φ": r"$\Phi$", "Δ": r"$\Delta$"}
+    for sign, command in signs.items():
         text = text.replace(sign, command)
-    return f"% {table.spec.title}\n{text}\n"
+    about = [table.spec.title, *describe_facts(table.facts)]
+    return "\n".join([*(f"% {spell_greek(line)}" for line in about), text]) + "\n"

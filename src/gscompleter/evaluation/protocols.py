@@ -18,9 +18,9 @@ from typing import Annotated, Literal
 from annotated_types import Ge, MinLen
 from pydantic import Field, TypeAdapter, ValidationError
 
-from gscompleter.completer import MAX_TARGET_ID
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.evaluation.cases import Case
+from gscompleter.parts import MAX_TARGET_ID
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_json
 from gscompleter.system.files.writing import replace_file
@@ -214,6 +214,8 @@ class Task:
     """True to give Ψ the context in this order, as a published index has it, instead of sorted."""
     has_masks: bool = False
     """True if masks hide parts of the photographs of its scene."""
+    apart_by: Path | None = None
+    """File that keeps the task apart, or None."""
 
     @property
     def name(self) -> str:
@@ -227,7 +229,14 @@ class Task:
 
 def make_case_task(case: Case) -> Task:
     """Make a task of a case of a `cases.json`."""
-    return Task(case.scene.name, case.context, (case.target,), case.load, case.neighbours)
+    return Task(
+        case.scene.name,
+        case.context,
+        (case.target,),
+        case.load,
+        case.neighbours,
+        apart_by=case.apart_by,
+    )
 
 
 def make_tasks(

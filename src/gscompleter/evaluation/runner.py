@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 from gscompleter.config.generators import GeneratorSettings
 from gscompleter.evaluation import store
+from gscompleter.evaluation.measured_code import find_commit
 from gscompleter.evaluation.methods import Models, check_methods
 from gscompleter.evaluation.protocols import Task
 from gscompleter.evaluation.steps import PreparedTask, attempt, complete_task
@@ -271,7 +272,9 @@ def build_row(
         if prepared.context_notes:
             outcome["context_notes"] = list(prepared.context_notes)
     named = {key: getattr(task, key) for key in ("name", "context", "targets", "neighbours")}
-    return {"version": store.VERSION, "task": named, "method": method, **outcome}
+    row = {"version": store.VERSION, "task": named, "method": method, **outcome}
+    commit = find_commit()
+    return row if commit is None else {**row, "commit": commit}
 
 
 def check_tasks(tasks: Sequence[Task]) -> None:

@@ -24,6 +24,7 @@ from gscompleter.evaluation.columns import (
 )
 from gscompleter.evaluation.methods import METHODS
 from gscompleter.evaluation.metrics.perceptual import compute_fid
+from gscompleter.evaluation.run_facts import RunFacts, read_run_facts, spell_greek
 from gscompleter.evaluation.store import (
     get_step_path,
     get_task_folder,
@@ -51,6 +52,10 @@ ABSENT_NOTES = {
     "lpips_vgg": (
         "LPIPS: not available. It needs `pip install 'gscompleter[evaluation]'` and, the first "
         "time, a connection; then score the run again to add the columns."
+    ),
+    "st_lpips": (
+        "ST-LPIPS: not installed. Run `pip install stlpips-pytorch`, which holds its weights; then "
+        "score the run again to add the column."
     ),
     "hole_flip": (
         "FLIP: not installed. Run `pip install 'gscompleter[evaluation]'`; then score the run "
@@ -179,13 +184,15 @@ def summarize_run(rows: Sequence[RunRow]) -> RunSummary:
 
 def write_tables(out: Path, with_fid: bool = False) -> RunSummary:
     """Write tables.md, tables.tex, tables.json and timings.md of a run; FID takes longer."""
-    summary = summarize_run(read_run_rows(out))
+    rows = read_run_rows(out)
+    facts = read_run_facts(out, rows)
+    summary = summarize_run(rows)
     fids: Fids = compute_fids(out, summary) if with_fid else "not requested."
     texts = {
-        "tables.md": format_score_markdown(summary, fids),
-        "tables.tex": format_score_latex(summary),
-        "tables.json": json.dumps(collect_score_content(summary, fids), indent=1) + "\n",
-        "timings.md": format_timing_markdown(summary),
+        "tables.md": format_score_markdown(summary, fids, facts),
+        "tables.tex": format_score_latex(summary, facts),
+        "tables.json": json.dumps(collect_score_content(summary, fids, facts), indent=1) + "\n",
+        "timings.md": format_timing_markdown(summary, facts),
     }
     for name, text in texts.items():
         with replace_file(out / name) as file:
@@ -253,15 +260,18 @@ def format_latex(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"])
 
 
-def format_score_latex(summary: RunSummary) -> str:
+def format_score_latex(summary: RunSummary, facts: RunFacts) -> str:
     """Format the tables of scores for LaTeX."""
     scope = f"{len(summary.common_tasks)} of {len(summary.tasks)}"
-    blocks = [f"% Over the {scope} cases that all methods finished."]
+    blocks = [
+        f"% {spell_greek(facts.sentence)}",
+        f"% Over the {scope} cases that all methods finished.",
+    ]
     blocks += [f"% {note}" for note in summary.notes]
     return "\n".join([*blocks, *format_score_tables(summary, format_latex).values()]) + "\n"
 
 
-def format_score_markdown(summary: RunSummary, fids: Fids) -> str:
+def format_score_markdown(summary: RunSummary, fids: Fids, facts: RunFacts) -> str:
     """Format scores, notes, failures and the steps of sequences."""
     tables = format_score_tables(summary, format_markdown)
     present = {column.key for column in summary.columns}
@@ -270,7 +280,11 @@ def format_score_markdown(summary: RunSummary, fids: Fids) -> str:
         "methods finished; of a sequence, means over its steps come first. A number in brackets "
         "is the number of cases with the score, if some have none.\n"
     )
-    parts = [scope, *(f"### {title}\n\n{table}" for title, table in tables.items())]
+    parts = [
+        f"{facts.sentence}\n",
+        scope,
+        *(f"### {title}\n\n{table}" for title, table in tables.items()),
+    ]
     parts += [f"{note}\n" for note in summary.notes]
     parts += [f"{note}\n" for key, note in ABSENT_NOTES.items() if key not in present]
     parts.append(format_fid_markdown(summary, fids))
@@ -306,7 +320,7 @@ def format_step_cells(step: StepRow) -> list[str]:
     ]
 
 
-def collect_score_content(summary: RunSummary, fids: Fids) -> dict[str, Any]:
+def collect_score_content(summary: RunSummary, fids: Fids, facts: RunFacts) -> dict[str, Any]:
     """Return all scores with full precision, for JSON."""
     values: dict[str, float] = {} if isinstance(fids, str) else fids
     reason = fids if isinstance(fids, str) else None
@@ -317,6 +331,7 @@ def collect_score_content(summary: RunSummary, fids: Fids) -> dict[str, Any]:
         scores = {key: {"value": value, "cases": count} for key, (value, count) in cells.items()}
         methods[method] = {"finished": summary.finished[method], **scores}
     return {
+        "made_with": facts.to_json(),
         "cases": len(summary.tasks),
         "common": list(summary.common_tasks),
         "methods": methods,
@@ -329,7 +344,7 @@ def collect_score_content(summary: RunSummary, fids: Fids) -> dict[str, Any]:
     }
 
 
-def format_timing_markdown(summary: RunSummary) -> str:
+def format_timing_markdown(summary: RunSummary, facts: RunFacts) -> str:
     """Format median seconds by stage and peak memory."""
     seconds = {method: summary.compute_seconds(method) for method in summary.methods}
     stages = sorted({stage for by_stage in seconds.values() for stage in by_stage}, key=rank_stage)
@@ -340,6 +355,7 @@ def format_timing_markdown(summary: RunSummary) -> str:
         cells = [*(by_stage.get(stage) for stage in stages), memory]
         rows.append([method, *(format_score(number, 2) for number in cells)])
     return (
+        f"{facts.sentence}\n\n"
         f"Median seconds of a step over the {len(summary.common_tasks)} cases that all methods "
         "finished, and peak memory (GiB). The total excludes the reconstruction of the context, "
         "which all methods share.\n\n" + format_markdown(["method", *stages, "memory"], rows)

@@ -11,15 +11,14 @@ from torch import Tensor
 
 from gscompleter.config import SynthesisConfig
 from gscompleter.config.generators import (
+    GENERATORS,
     PLUGINS,
     GeneratorSettings,
-    PaintedSettings,
     get_settings_class,
 )
 from gscompleter.config.settings import validate
-from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.system.errors import InputError
-from gscompleter.system.plugins import is_in_file, load_from_file, load_plugins
+from gscompleter.system.plugins import is_in_file, load_from_file, load_function, load_plugins
 from gscompleter.system.tensor_checks import describe, is_whole
 from gscompleter.types import Camera, GeneratorInput, View
 
@@ -139,45 +138,8 @@ def load_generator(
         )
     if is_in_file(name):
         return as_generator(load_from_file(name, "generator"))
-    load = GENERATORS.get(name) or load_plugins(PLUGINS)[name]
-    return load(settings, seed, photographs, device)
-
-
-def _load_warp_inpaint(settings: GeneratorSettings, seed: int, *_: Any) -> Generator:
-    from gscompleter.generators.warp_inpaint import WarpInpaint
-
-    return FunctionGenerator(WarpInpaint(seed))
-
-
-def _load_oracle(
-    settings: GeneratorSettings, seed: int, photographs: Sequence[View], *_: Any
-) -> Generator:
-    """Load the Φ that returns the photograph of the target camera, which cannot be padded."""
-
-    def find_photograph(nearest: View, target: Camera, context: GeneratorInput) -> GeneratorOutput:
-        for photograph in photographs:
-            if is_same_camera(photograph.camera, target):
-                return GeneratorOutput(photograph.image.to(target.K.device), is_photograph=True)
-        raise InputError(
-            f"The generator 'oracle' has {len(photographs)} photographs, none of them taken by the "
-            "target camera; give it that photograph, or choose 'warp-inpaint'."
-        )
-
-    return FunctionGenerator(find_photograph, supports_padding=False)
-
-
-def _load_painted(
-    settings: GeneratorSettings, seed: int, photographs: Sequence[View], *_: Any
-) -> Generator:
-    from gscompleter.generators.painted import Painted
-
-    assert isinstance(settings, PaintedSettings)
-    return Painted(tuple(photographs), settings.painter)
-
-
-GENERATORS: dict[str, Callable[..., Generator]] = {
-    "warp-inpaint": _load_warp_inpaint,
-    "oracle": _load_oracle,
-    "painted": _load_painted,
-}
-"""Loader of each built-in generator: (settings, seed, images of the targets, device) -> Φ."""
+    if name in GENERATORS:
+        load = load_function(*GENERATORS[name].load.split(":"))
+    else:
+        load = load_plugins(PLUGINS)[name]
+    return as_generator(load(settings, seed, photographs, device))

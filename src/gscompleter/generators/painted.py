@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import interpolate
 
+from gscompleter.config.generators import PaintedSettings
 from gscompleter.generators import GeneratorOutput, GeneratorRequest
 from gscompleter.generators.agreement import Agreement, compare_with_observed
 from gscompleter.generators.warp import BORDER_WIDTH, complete_warp
@@ -23,7 +24,7 @@ from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.numerics.image_ops import dilate, find_largest_regions, smooth_masked
 from gscompleter.system.errors import InputError
 from gscompleter.system.tensor_checks import BOOLS, Form
-from gscompleter.types import Camera, Render, View
+from gscompleter.types import Camera, View
 
 MAX_STRETCH = 0.01
 """Largest relative difference between the aspect ratios of a painted image and of its target."""
@@ -85,7 +86,7 @@ class Painted:
         asked = rim if painting.asked is None else painting.asked
         counts = rim & asked & painting.valid_mask
 
-        scene = normalize_render(context.target_render, context.max_alpha)
+        scene = context.known_colors
         comparable = ~rim & ~asked & painting.valid_mask
         agreement = compare_with_observed(painting.image, scene, comparable)
         if not agreement.is_consistent:
@@ -116,6 +117,13 @@ class Painted:
             "the target camera; export the holes of this target and paint them, or choose "
             "'warp-inpaint'."
         )
+
+
+def load_painted(
+    settings: PaintedSettings, seed: int, photographs: Sequence[View], device: str
+) -> Painted:
+    """Load the generator of images that were painted for the targets."""
+    return Painted(tuple(photographs), settings.painter)
 
 
 def fit_painting(
@@ -167,11 +175,6 @@ def scale_layers(
     channels_first = layers.movedim(-1, 0)[None]
     scaled = interpolate(channels_first, size, mode="bilinear", antialias=True)
     return scaled[0].movedim(0, -1).contiguous()
-
-
-def normalize_render(render: Render, max_alpha: float) -> Float[Tensor, "h w 3"]:
-    """Return the colours of a render without the black behind it, where that is no hole."""
-    return (render.image / render.alpha.clamp_min(max_alpha)[..., None]).clamp(0, 1)
 
 
 def describe_other_image(name: str, agreement: Agreement) -> str:

@@ -8,6 +8,7 @@ from patches of the photographs, coarse to fine, after Wexler et al. (2007), Bar
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -19,6 +20,7 @@ from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
+from gscompleter.config.generators import GeneratorSettings
 from gscompleter.generators.smooth import average_trusted, compute_distance_to_known
 from gscompleter.generators.warp import (
     BORDER_WIDTH,
@@ -132,6 +134,13 @@ class WarpInpaint:
         detail = detail - smooth_masked(detail, undecided, TONE_RADIUS)
         fading = (2 * (1 - distance / reach)).clamp(0, 1)
         return torch.where(undecided[..., None], tone + fading[..., None] * detail, tone)
+
+
+def load_warp_inpaint(
+    settings: GeneratorSettings, seed: int, photographs: Sequence[View], device: str
+) -> WarpInpaint:
+    """Load the generator."""
+    return WarpInpaint(seed)
 
 
 def remove_cracks(hole: Bool[Tensor, "h w"], width: int) -> Bool[Tensor, "h w"]:

@@ -1,24 +1,27 @@
 """Safeguards beyond the paper, a file each; a preset names those that are asked, in order.
 
-A new guard is a class that overrides one of three hooks, and an entry in `config.GUARDS`.
+A new guard is a class that overrides one of three hooks and explains its losses, and an entry in
+`config.GUARDS`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import ClassVar
 
 from gscompleter.config import GUARDS, CompleterConfig
 from gscompleter.render.cache import SceneRenderer
-from gscompleter.stages.refine import Refined
+from gscompleter.stages.additions import Additions, Refined, accept
+from gscompleter.stages.refine import RefineAtTarget
 from gscompleter.stages.synthesize import GeneratedView
 from gscompleter.stages.target_view import TargetView
-from gscompleter.state import Completion, Rejection, Step
+from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.plugins import is_in_file, load_from_file
 from gscompleter.system.tensor_checks import describe
 from gscompleter.system.timing import timed_stage
+from gscompleter.target_result import Rejection
 from gscompleter.types import DepthAffine, Gaussians
 
 
@@ -36,6 +39,8 @@ class Guard:
     """A safeguard beyond the paper. Every hook returns its first argument unless overridden."""
 
     name: ClassVar[str]
+    loss: ClassVar[str] = ""
+    """Why it leaves a part of a hole empty: a clause after "of the hole stays empty, because"."""
 
     def begin(self, state: Completion, scenes: SceneRenderer) -> Completion:
         """Inspect the scene before its first target."""
@@ -62,38 +67,40 @@ def prepare_guards(state: Completion, scenes: SceneRenderer) -> Completion:
 
 
 @timed_stage("integrate")
-def place(candidates: Gaussians, view: TargetView) -> tuple[Step, ...]:
-    """Let guards move or drop registered Gaussians, before they are refined.
-
-    Return the Gaussians that are left after each guard that changed them.
-    """
-    steps = []
-    kept = candidates
+def place(candidates: Additions, view: TargetView) -> Additions:
+    """Let guards move or drop candidates, before they are refined."""
     for guard in load_guards(view.state.config):
-        placed = guard.place(kept, view)
-        # A guard that changes nothing returns its argument itself, and is no step.
-        if placed is not kept:
-            steps.append(Step(guard.name, placed))
-        kept = placed
-    return tuple(steps)
+        candidates = candidates.then(
+            guard.name, guard.place(candidates.gaussians, view), guard.loss
+        )
+    return candidates
 
 
 @timed_stage("integrate")
-def verify(attempt: Attempt) -> tuple[tuple[Step, ...], Rejection]:
-    """Return what may be added after each guard, and which one rejected all of it, if one did.
-
-    After a rejection no further guard is asked.
-    """
-    steps = []
-    added = attempt.refined.gaussians
+def verify(added: Additions, attempt: Attempt) -> Additions:
+    """Let guards fade or drop what was refined; after a rejection no further guard is asked."""
     for guard in load_guards(attempt.view.state.config):
-        checked = guard.verify(added, attempt)
-        if checked is not added:
-            steps.append(Step(guard.name, checked))
-        if len(added) > 0 and len(checked) == 0:
-            return tuple(steps), Rejection(guard.name, guard.explain_rejection(attempt))
-        added = checked
-    return tuple(steps), Rejection()
+        before = added.gaussians
+        added = added.then(guard.name, guard.verify(before, attempt), guard.loss)
+        if len(before) > 0 and len(added.gaussians) == 0:
+            return replace(added, rejection=Rejection(guard.name, guard.explain_rejection(attempt)))
+    return added
+
+
+def accept_at(
+    view: TargetView,
+    candidates: Additions,
+    image: GeneratedView,
+    affine: DepthAffine,
+    refine: RefineAtTarget,
+) -> Additions:
+    """Accept candidates at a target, where guards place and verify them."""
+    return accept(
+        candidates,
+        place=lambda candidates: place(candidates, view),
+        refine=lambda placed: refine(placed, image, view),
+        verify=lambda added, refined: verify(added, Attempt(view, image, affine, refined)),
+    )
 
 
 def load_guards(config: CompleterConfig) -> list[Guard]:

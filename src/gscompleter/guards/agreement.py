@@ -13,6 +13,7 @@ class ImageAgreement(Guard):
     """Reject a synthesized image that contradicts the photographs."""
 
     name = "image-agreement"
+    loss = "the generated image contradicts the photographs"
 
     def verify(self, added: Gaussians, attempt: Attempt) -> Gaussians:
         """Drop everything if Φ found its image inconsistent with the photographs."""
@@ -23,6 +24,7 @@ class DepthAgreement(Guard):
     """Reject lifted depths with which hardly any of the visible scene agrees."""
 
     name = "depth-agreement"
+    loss = "its depths contradict the scene"
 
     def verify(self, added: Gaussians, attempt: Attempt) -> Gaussians:
         """Drop everything if too few depths at the target agree with the affine correction."""

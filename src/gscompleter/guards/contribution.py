@@ -18,6 +18,7 @@ class Contribution(Guard):
     """Drop added Gaussians that are hidden, transparent or outside of every image."""
 
     name = "contribution"
+    loss = "a filling would hardly be seen"
 
     def verify(self, added: Gaussians, attempt: Attempt) -> Gaussians:
         """Keep what the target or a photograph shows."""

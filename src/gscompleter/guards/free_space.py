@@ -72,6 +72,7 @@ class FreeSpace(Guard):
     """Keep added Gaussians out of space that cameras of the scene see through."""
 
     name = "free-space"
+    loss = "a filling would hide what other cameras see through it"
 
     def place(self, candidates: Gaussians, view: TargetView) -> Gaussians:
         """Slide candidates back until no camera sees through them; drop those without a place."""

@@ -15,6 +15,7 @@ class Hull(Guard):
     """Add nothing outside of the visual hull of the scene as it was given (decision 080)."""
 
     name = "hull"
+    loss = "a filling would lie outside of the object"
 
     def place(self, candidates: Gaussians, view: TargetView) -> Gaussians:
         """Keep candidates that lie in the silhouettes of the scene from all sides."""

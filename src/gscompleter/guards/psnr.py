@@ -14,7 +14,7 @@ from gscompleter.stages.error_budgets import (
     meet_error_budgets,
     set_total_budgets,
 )
-from gscompleter.stages.target_view import compute_hole_mask
+from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.state import Completion
 from gscompleter.types import Gaussians
 
@@ -26,6 +26,7 @@ class PsnrGuard(Guard):
     """Let no photograph get worse than its error budgets."""
 
     name = "psnr"
+    loss = "a filling would make given photographs worse"
 
     def begin(self, state: Completion, scenes: SceneRenderer) -> Completion:
         """Set the error budgets of all photographs for all targets, before any of them.

@@ -28,13 +28,15 @@ from gscompleter.numerics.geometry import (
     unproject,
 )
 from gscompleter.numerics.image_ops import dilate, fill_smoothly
+from gscompleter.parts import Part, PartOrigin
 from gscompleter.planning.candidates import Candidate, is_close, propose_candidates
 from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, choose_thinned_rows, thin_gaussians
 from gscompleter.render.reference import adapt_to_mode
 from gscompleter.render.view_map import get_view_map
 from gscompleter.stages.enclosed_holes import keep_enclosed
+from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.stages.select_anchor import compute_overlap, select_anchor
-from gscompleter.stages.target_view import compute_distrust, compute_hole_mask
+from gscompleter.stages.target_view import compute_distrust
 from gscompleter.state import Completion
 from gscompleter.system.progress import stage, track
 from gscompleter.system.timing import record_seconds
@@ -57,6 +59,8 @@ class Choice:
     hole_fraction: float
     gain: float
     """Expected gain, as a fraction of its image."""
+    opaque_fraction: float = 0.0
+    """Part of the holes, as a fraction of its image, where a scene is opaque and not trusted."""
 
     @property
     def camera(self) -> Camera:
@@ -68,7 +72,9 @@ class Choice:
         if self.hole_fraction < MIN_TOLD:
             return "Chosen because what it sees contradicts the photographs."
         where = "up or down" if self.candidate.looks_up_or_down else "beside what is known"
-        return f"Chosen because {self.hole_fraction:.0%} of its image is empty, {where}."
+        # Of a trained splat, what is opaque and confirmed by no photograph is a hole, too.
+        kind = "empty" if self.opaque_fraction < MIN_TOLD else "empty or confirmed by no photograph"
+        return f"Chosen because {self.hole_fraction:.0%} of its image is {kind}, {where}."
 
 
 @dataclass(frozen=True)
@@ -198,6 +204,8 @@ class ViewPlanner:
         holes = small_view.holes & region
         distrust = small_view.distrust.where(region, 0.0)
         hole_fraction = holes.float().mean().item()
+        is_empty = compute_hole_mask(small_view.render.alpha, config.holes)
+        opaque_fraction = (holes & ~is_empty).float().mean().item()
         if is_close(small_view.render, candidate.nearest, config.next_best_view):
             return Choice(candidate, hole_fraction, 0.0)
 
@@ -208,7 +216,7 @@ class ViewPlanner:
         ]
         anchor = select_anchor(candidate.camera, completion.views, config.anchor, overlaps).index
         gain = compute_gain(holes, distrust, overlaps[anchor], config.next_best_view)
-        return Choice(candidate, hole_fraction, gain)
+        return Choice(candidate, hole_fraction, gain, opaque_fraction)
 
     def render_small_view(self, completion: Completion, camera: Camera) -> SmallView:
         """Render the scene at a camera in a small image."""
@@ -235,7 +243,8 @@ class ViewPlanner:
         view = self.render_small_view(completion, padded)
         placeholders = make_placeholders(view.render, view.holes, view.camera)
         added = adapt_to_mode(completion.rendered_context, placeholders, view.camera)
-        return replace(completion, parts=(*completion.parts, added))
+        part = Part(PartOrigin("target", completion.next_target_id), added)
+        return replace(completion, added_parts=(*completion.added_parts, part))
 
 
 def add_free_space_cameras(completion: Completion, cameras: Sequence[Camera]) -> Completion:
@@ -334,6 +343,8 @@ def simplify_completion(completion: Completion, most: int = MAX_PREVIEW_GAUSSIAN
     """Simplify what is rendered of a completion for small images, with its trust."""
     rows, growth = choose_thinned_rows(completion.rendered_context, most)
     context = thin_gaussians(completion.rendered_context, most)
-    parts = (context, thin_gaussians(completion.added, most))
+    # Thinned together, whatever their origins: of a preview nobody asks.
+    added = thin_gaussians(completion.added, most)
+    parts = (Part(PartOrigin("target", completion.next_target_id), added),)
     trust = completion.trust.thin(rows, growth)
-    return replace(completion, parts=parts, trust=trust)
+    return replace(completion, rendered_context=context, added_parts=parts, trust=trust)

@@ -26,8 +26,16 @@ from gscompleter.splats.packing import (
     restore_largest,
     unpack_fractions,
 )
-from gscompleter.splats.ply import MODE_COMMENT, encode, has_mode_comment, iterate_blocks
+from gscompleter.splats.ply import (
+    MODE_COMMENT,
+    encode,
+    has_mode_comment,
+    is_packed,
+    iterate_blocks,
+    read_ply_record,
+)
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, add_comments
+from gscompleter.splats.splat_format import PLY_MAGIC, SplatFormat
 from gscompleter.system.damage import DamagedError, check_rows
 from gscompleter.system.files.ply import make_header, read_header
 from gscompleter.system.files.writing import replace_file
@@ -91,6 +99,14 @@ def read_compressed_ply(path: Path) -> Gaussians:
     sh = assemble_sh(rgb, _unpack_sh_rest(tables["sh"]) if "sh" in tables else None)
     gaussians = build_gaussians(means, quats, np.exp(log_scales), rgba[:, 3], sh)
     return replace(gaussians, is_antialiased=has_mode_comment(header))
+
+
+def list_compressed_names(path: Path) -> list[str]:
+    """List the properties of the Gaussians that are not read."""
+    with path.open("rb") as file:
+        _, elements = read_header(file, path)
+    vertex = next(element for element in elements if element.name == "vertex")
+    return [name for name in vertex.dtype.names or () if name not in PACKED_PROPERTIES]
 
 
 def _map_to_chunk(
@@ -188,3 +204,18 @@ def _make_header(gaussians: Gaussians, chunks: int, num_rest: int) -> bytes:
     if rest:
         elements["sh"] = (count, np.dtype(rest))
     return make_header(elements, MODE_COMMENT if gaussians.is_antialiased else None)
+
+
+COMPRESSED_PLY = SplatFormat(
+    name="compressed-ply",
+    endings=(".compressed.ply",),
+    read=read_compressed_ply,
+    starts=(PLY_MAGIC,),
+    recognize=lambda path, head: is_packed(head),
+    write=write_compressed_ply,
+    read_record=read_ply_record,
+    list_names=list_compressed_names,
+    marks_antialiased=True,
+    is_sorted=True,
+    rounds_geometry=True,
+)

@@ -13,12 +13,13 @@ from __future__ import annotations
 import json
 import re
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from gscompleter import __version__
+from gscompleter.parts import PartKind
 from gscompleter.splats.formats import detect_splat_format, read_provenance
 from gscompleter.splats.ply import LABEL_COLUMN, read_labels, read_scene, save_ply
 from gscompleter.splats.provenance import RunRecord
@@ -36,6 +37,18 @@ ADVICE = "take all files of its folder again, or move it away to do without the 
 _NAME = re.compile(r"removed\.ply|edits/\d{1,5}_(originals|taken_out)\.ply")
 
 
+RowKind = Literal["recolored", PartKind]
+"""Origin of rows: given and recoloured since, or that of an addition."""
+
+
+@dataclass(frozen=True)
+class AppendedRows:
+    """Rows of one kind, one after the other."""
+
+    kind: RowKind
+    count: int
+
+
 @dataclass(frozen=True)
 class Edit:
     """What one command did to a splat."""
@@ -47,6 +60,8 @@ class Edit:
     added: int
     """Rows that it appended: Gaussians that are new, and recoloured ones in place of theirs."""
     version: str = __version__
+    appended: tuple[AppendedRows, ...] = ()
+    """These rows by their kind, in their order; none if an earlier version did not tell."""
     records: int = 0
     """Comments on who made the file that it added (`provenance`)."""
     had_labels: str | None = None
@@ -156,7 +171,7 @@ def record_edit(
     folder: Path,
     draft: EditDraft,
     rows: int,
-    added: int,
+    appended: Sequence[AppendedRows],
     given: Path | None,
     earlier: Edits,
     run: RunRecord | None,
@@ -169,7 +184,7 @@ def record_edit(
         folder: Folder of its results.
         draft: The command.
         rows: Gaussians before it.
-        added: Rows that it appended.
+        appended: Rows that it appended, in their order.
         given: File that it was given; None if it reconstructed the scene.
         earlier: Edits of that file.
         run: What it said in the file about who made it; None if it said nothing.
@@ -186,7 +201,8 @@ def record_edit(
     edit = Edit(
         draft.command,
         rows,
-        added,
+        sum(part.count for part in appended),
+        appended=tuple(appended),
         records=int(run is not None),
         had_labels=None if given is None else find_label_type(given),
         given=hash_given(given) if run is None else run.given,

@@ -9,8 +9,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import zipfile
-import zlib
 from contextlib import suppress
 from pathlib import Path
 
@@ -18,17 +16,16 @@ from gscompleter.data.formats import find_format
 from gscompleter.data.frame import FOLDERS
 from gscompleter.data.sfm.poses import ENDINGS, holds_packed_splat
 from gscompleter.splats.packing import ZIP_MAGIC
+from gscompleter.splats.sog import LOD_KEY, LOD_META, META
+from gscompleter.splats.splat_format import list_zip
+from gscompleter.splats.spz import GZIP
+from gscompleter.splats.table import FILE_ENDINGS
 from gscompleter.system.errors import InputError, quote_value
 
-GZIP = b"\x1f\x8b"
-SPZ_MAGIC = b"NGSP"
-LOD_META = "lod-meta.json"
-"""Index of a streamed scene: one .sog for each level and place."""
 OF_STREAMED = (
     "in several levels of detail; write one of them to a .ply with `gscompleter convert`, and name "
     "that"
 )
-SOG_META = "meta.json"
 MAX_JSON = 1 << 26
 """Largest JSON that is looked into, in bytes."""
 CHECKPOINTS = (".pt", ".pth", ".ckpt")
@@ -62,8 +59,6 @@ KINDS_BY_ENDING = {
     ".ssproj": "is a project of SuperSplat; open it there, export a .ply, and name that",
 }
 """Kinds of files by their endings, where the first bytes do not tell."""
-SPLATS = (".ply", ".spz", ".splat", ".ksplat", ".sog", ".glb", ".usdz", ".usdc", ".usda")
-"""Endings of files that are worth naming in an archive or folder."""
 
 SPLAT_NEIGHBOURS = (None, "cameras-json", "photograph")
 """Formats that a folder may have beside the splat that it stands for: a trainer keeps the cameras
@@ -116,7 +111,7 @@ def holds_splat_alone(folder: Path) -> bool:
 
 def resolve_splat(path: Path) -> Path:
     """Return the newest splat of a trainer's model folder; other paths stay as they are."""
-    if not os.path.isdir(path) or os.path.isfile(path / SOG_META):
+    if not os.path.isdir(path) or os.path.isfile(path / META):
         return path
     return find_newest_splat(path) or path
 
@@ -133,7 +128,7 @@ def refuse_folder(path: Path) -> None:
             raise InputError(
                 f"{name} holds {quote_value(indices[0])}, which {KINDS_BY_ENDING['.lcc']}."
             )
-        inside = [n for n in names if n.lower().endswith(SPLATS)]
+        inside = [n for n in names if n.lower().endswith(FILE_ENDINGS)]
         if inside:
             raise InputError(
                 f"{name} is a folder; name one of the splats in it, such as "
@@ -142,30 +137,14 @@ def refuse_folder(path: Path) -> None:
     raise InputError(f"{name} is a folder without a splat; name the file of a splat.")
 
 
-def refuse_packed_folder(path: Path) -> None:
-    """Raise InputError for a folder with a `meta.json` that is none of a .sog.
-
-    gsplat compresses checkpoints to PNGs beside a `meta.json` of the same name.
-    """
-    table: object = None
-    with suppress(OSError, ValueError, RecursionError):
-        table = json.loads((path / SOG_META).read_bytes()[:MAX_JSON])
-    properties = list(table.values()) if isinstance(table, dict) else []
-    are_described = [isinstance(entry, dict) and "dtype" in entry for entry in properties]
-    if are_described and all(are_described) and not any("files" in entry for entry in properties):
-        raise InputError(
-            f"{quote_value(path)} is a splat that gsplat compressed to PNGs (PngCompression); "
-            "decompress it with gsplat, export a .ply, and name that."
-        )
-
-
 def refuse_foreign(path: Path, head: bytes) -> None:
-    """Raise InputError for a file of another kind; `head` are its first bytes."""
-    name = quote_value(path)
-    ending = path.suffix.lower()
-    kind = _describe_by_content(path, head) or _describe_by_name(ending, head)
+    """Raise InputError for a file of a known kind that is no splat; `head` are its first bytes.
+
+    No format has recognised the file by its content.
+    """
+    kind = _describe_by_content(path, head) or _describe_by_name(path.suffix.lower())
     if kind is not None:
-        raise InputError(f"{name} {kind}.")
+        raise InputError(f"{quote_value(path)} {kind}.")
 
 
 def _describe_by_content(path: Path, head: bytes) -> str | None:
@@ -175,7 +154,7 @@ def _describe_by_content(path: Path, head: bytes) -> str | None:
     if head.startswith(ZIP_MAGIC):
         return _describe_zip(path)
     if head.startswith(GZIP):
-        return _describe_gzip(path, head)
+        return "is packed with gzip; unpack it (gunzip), and name the file inside"
     if start.startswith((b"{", b"[")):
         return _describe_json(path)
     if head.startswith(POINT_CLOUD_STARTS):
@@ -186,10 +165,7 @@ def _describe_by_content(path: Path, head: bytes) -> str | None:
     return None
 
 
-def _describe_by_name(ending: str, head: bytes) -> str | None:
-    is_known = head.lstrip().startswith((b"ply", SPZ_MAGIC, b"glTF", b"PXR-USDC", b"#usda"))
-    if is_known or head.startswith((ZIP_MAGIC, GZIP)):
-        return None
+def _describe_by_name(ending: str) -> str | None:
     if ending in KINDS_BY_ENDING:
         return KINDS_BY_ENDING[ending]
     if ending in CHECKPOINTS:
@@ -212,41 +188,23 @@ def _describe_points() -> str:
     return "is a point cloud, not a splat; train a splat from photographs, and name its .ply"
 
 
-def _describe_zip(path: Path) -> str | None:
-    """Describe a .zip that is neither a bundle of one splat nor OpenUSD; None if it is."""
-    names: list[str] = []
-    errors = (OSError, ValueError, RuntimeError, zipfile.BadZipFile, NotImplementedError)
-    with suppress(*errors), zipfile.ZipFile(path) as archive:
-        names = archive.namelist()
+def _describe_zip(path: Path) -> str:
+    """Describe a .zip that is none of a splat."""
+    names = list_zip(path)
     if any(name.endswith("data.pkl") for name in names) or path.suffix.lower() in CHECKPOINTS:
         return _describe_checkpoint()
     if any(Path(name).name == LOD_META for name in names):
         return f"is a streamed scene {OF_STREAMED}, once it is unpacked"
-    is_usd = any(name.lower().endswith((".usd", ".usda", ".usdc")) for name in names)
-    if SOG_META in names or is_usd:
-        return None
-    if not names and path.suffix.lower() in (".sog", ".usdz"):
-        return None  # damaged, which the reader says
     if names and all(name.endswith(".npy") for name in names):
         return "holds arrays of NumPy, no splat; name the file of a splat"
-    splats = [name for name in names if name.lower().endswith(SPLATS)]
+    splats = [name for name in names if name.lower().endswith(FILE_ENDINGS)]
     if splats:
         return f"is a .zip archive; unpack it, and name {quote_value(splats[0])} in it"
     return "is a .zip archive without a splat; name the file of a splat"
 
 
-def _describe_gzip(path: Path, head: bytes) -> str | None:
-    """Describe a .gz whose content does not begin as a .spz does; None if it may be one."""
-    content = b""
-    with suppress(zlib.error):
-        content = zlib.decompressobj(wbits=31).decompress(head, max_length=64)
-    if content.startswith(SPZ_MAGIC) or path.suffix.lower() == ".spz":
-        return None
-    return "is packed with gzip; unpack it (gunzip), and name the file inside"
-
-
-def _describe_json(path: Path) -> str | None:
-    """Describe a JSON file that is not that of a .sog; None if it is."""
+def _describe_json(path: Path) -> str:
+    """Describe a JSON file that is none of a splat."""
     table: object = None
     with suppress(OSError, ValueError, RecursionError):
         if os.path.getsize(path) <= MAX_JSON:
@@ -257,8 +215,6 @@ def _describe_json(path: Path) -> str | None:
         return "is glTF with its data in other files; export it as one .glb, or as .ply"
     if ending in KINDS_BY_ENDING:
         return KINDS_BY_ENDING[ending]
-    if path.name.lower() == LOD_META or "lodLevels" in keys:
+    if path.name.lower() == LOD_META or LOD_KEY in keys:
         return f"is the index of a streamed scene {OF_STREAMED}"
-    if path.name.lower() == SOG_META or "means" in keys:
-        return None
     return "is a JSON file without Gaussians; name the file of a splat, such as a .ply"

@@ -1,7 +1,7 @@
-"""The table of splat formats: read by the first bytes of a file, written by its extension.
+"""Splat files of any format of the table: read by their first bytes, written by their extension.
 
-The labels of generated Gaussians are a column of a .ply, and in .sog, .glb and OpenUSD an array of
-their own; other formats have a file beside them.
+The labels of generated Gaussians, and who made them, are in the file, or beside it if its format
+has no place for them.
 """
 
 from __future__ import annotations
@@ -12,8 +12,8 @@ import lzma
 import struct
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -26,20 +26,12 @@ from PIL import Image
 from torch import Tensor
 
 from gscompleter.numerics.value_checks import check_gaussians
-from gscompleter.splats.compressed_ply import read_compressed_ply, write_compressed_ply
-from gscompleter.splats.foreign import (
-    refuse_folder,
-    refuse_foreign,
-    refuse_packed_folder,
-    resolve_splat,
-)
-from gscompleter.splats.glb import read_glb, read_glb_remarks, write_glb
-from gscompleter.splats.ksplat import read_ksplat
+from gscompleter.splats.foreign import refuse_folder, refuse_foreign, resolve_splat
 from gscompleter.splats.morton import sort_along_morton
 from gscompleter.splats.origin import measure_distance
-from gscompleter.splats.packing import ZIP_MAGIC, BandError, UnsupportedError
+from gscompleter.splats.packing import BandError, UnsupportedError
 from gscompleter.splats.ply import (
-    copy_ply,
+    PLY,
     decode_gaussians,
     describe_values,
     load_ply,
@@ -49,22 +41,20 @@ from gscompleter.splats.ply import (
     require_finite,
     save_ply,
 )
-from gscompleter.splats.properties import describe_further
+from gscompleter.splats.properties import describe_further, refuse_other_kinds
 from gscompleter.splats.provenance import (
     KEY,
     NOTHING_KNOWN,
     Provenance,
-    parse_comments,
     parse_provenance,
 )
-from gscompleter.splats.sog import META, read_sog, read_sog_remarks, write_sog
-from gscompleter.splats.splat import read_splat_rows, write_splat
-from gscompleter.splats.spz import read_spz, write_spz
-from gscompleter.splats.usd import read_usd, read_usd_remarks, write_usd
+from gscompleter.splats.sog import META, SOG_FOLDER
+from gscompleter.splats.splat_format import SplatFormat
+from gscompleter.splats.table import SPLAT_FORMATS as SPLAT_FORMATS
+from gscompleter.splats.table import get_written_format, match_ending
 from gscompleter.system.damage import describe_damage
 from gscompleter.system.errors import InputError, quote_value, refuse_pointer, require_path
 from gscompleter.system.files.output_file import check_free, reserve_file
-from gscompleter.system.files.ply import read_header
 from gscompleter.system.files.reading import hash_file, open_file, read_json
 from gscompleter.system.files.writing import replace_file
 from gscompleter.system.torch_modes import run_in_plain_torch
@@ -86,61 +76,6 @@ HEAD_BYTES = 8192
 """Bytes read to detect a format; the header of a compressed .ply fits."""
 
 
-@dataclass(frozen=True)
-class SplatFormat:
-    """Functions that detect, read and write one file format."""
-
-    extensions: tuple[str, ...]
-    starts: tuple[bytes, ...]
-    """First bytes of a file, white space aside; none if only the extension tells the format."""
-    read: Callable[[Path], Gaussians]
-    write: Callable[..., None] | None = None
-    """Takes path and Gaussians; those of `RECORDING` also who made the file."""
-    contains: bytes = b""
-    """Text near the start of a file that tells it from others with the same first bytes."""
-    read_remarks: Callable[[Path], object] | None = None
-    """Reads the record of who made the file, as values of JSON; None if it lies beside it."""
-
-
-SPLAT_FORMATS = {
-    "compressed-ply": SplatFormat(
-        (".compressed.ply",),
-        (b"ply",),
-        read_compressed_ply,
-        write_compressed_ply,
-        contains=b"packed_position",
-    ),
-    "ply": SplatFormat((".ply",), (b"ply",), load_ply, save_ply),
-    "spz": SplatFormat((".spz",), (b"NGSP", b"\x1f\x8b"), read_spz, write_spz),
-    "usdz": SplatFormat(
-        (".usdz",), (ZIP_MAGIC,), read_usd, write_usd, b".usd", read_remarks=read_usd_remarks
-    ),
-    "usd": SplatFormat(
-        (".usdc", ".usda", ".usd"),
-        (b"PXR-USDC", b"#usda"),
-        read_usd,
-        write_usd,
-        read_remarks=read_usd_remarks,
-    ),
-    "sog": SplatFormat((".sog",), (ZIP_MAGIC,), read_sog, write_sog, read_remarks=read_sog_remarks),
-    "sog-folder": SplatFormat((META,), (b"{",), read_sog, read_remarks=read_sog_remarks),
-    "glb": SplatFormat((".glb",), (b"glTF",), read_glb, write_glb, read_remarks=read_glb_remarks),
-    "splat": SplatFormat((".splat",), (), read_splat_rows, write_splat),
-    "ksplat": SplatFormat((".ksplat",), (), read_ksplat),
-}
-"""Formats by name; the first that fits the start of a file is taken."""
-SORTED = (write_compressed_ply, write_sog)
-"""Writers of formats whose Gaussians lie along a Morton curve."""
-UNMARKED = (write_splat, write_glb, write_usd)
-"""Writers of formats that cannot mark Gaussians as antialiased."""
-LABELLING = (write_sog, write_glb, write_usd)
-"""Writers of formats that hold the labels of generated Gaussians, besides .ply."""
-PLACING = (write_glb, write_usd)
-"""Writers of formats that hold the origin of Gaussians in float64, besides .ply."""
-RECORDING = (write_compressed_ply, *LABELLING)
-"""Writers of formats that hold the record of who made the file, besides .ply."""
-
-
 @run_in_plain_torch
 def load_splat(
     path: Path | str,
@@ -148,7 +83,7 @@ def load_splat(
     ignore_properties: bool = False,
     leaves_out_band_4: bool = False,
 ) -> Gaussians:
-    """Load the Gaussians of a file in any format of `FORMATS`, in the axes of a 3DGS .ply.
+    """Load the Gaussians of a file in any format of `SPLAT_FORMATS`, in the axes of a 3DGS .ply.
 
     Of a trainer's model folder, the newest iteration is loaded. Labels of generated Gaussians are
     in the file, or in `NAME.generated.json` beside it. `drop_nonfinite` drops
@@ -159,19 +94,31 @@ def load_splat(
     path = resolve_splat(require_path(path))
     if detect_splat_format(path) == "ply" and not leaves_out_band_4:
         return load_ply(path, drop_nonfinite, ignore_properties)
-    return require_finite(decode_splat(path, leaves_out_band_4), path, drop_nonfinite)
+    gaussians = decode_splat(path, leaves_out_band_4)
+    if not ignore_properties:
+        refuse_other_kinds(list_names(path), path)
+    return require_finite(gaussians, path, drop_nonfinite)
+
+
+def list_names(path: Path) -> Sequence[str]:
+    """List the properties of a file that `decode_splat` reads, at least those it does not use."""
+    name = detect_splat_format(path)
+    if name == "ply":
+        # Harmonics of a higher degree are refused, or left out, by those who read them.
+        return read_scene(path, leaves_out_band_4=True).rows.dtype.names or ()
+    listed = SPLAT_FORMATS[name].list_names
+    return () if listed is None else listed(path)
 
 
 def decode_splat(path: Path, leaves_out_band_4: bool = False) -> Gaussians:
     """Decode all Gaussians of a file with their labels, those included that are not finite."""
-    name = detect_splat_format(path)
-    if name == "ply":
+    row = SPLAT_FORMATS[detect_splat_format(path)]
+    if row is PLY:
         return decode_gaussians(read_scene(path, leaves_out_band_4))
-    read = SPLAT_FORMATS[name].read
-    if name == "spz":
-        read = partial(read_spz, leaves_out_band_4=leaves_out_band_4)
-    has_json = name in ("sog", "sog-folder", "glb", "usd", "usdz")
-    errors = DECODING_ERRORS + JSON_ERRORS if has_json else DECODING_ERRORS
+    read = row.read
+    if row.can_leave_out_band_4:
+        read = partial(read, leaves_out_band_4=leaves_out_band_4)
+    errors = DECODING_ERRORS + JSON_ERRORS if row.has_json else DECODING_ERRORS
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # infinite values are refused below
             gaussians = read(path)
@@ -197,10 +144,10 @@ def decode_splat(path: Path, leaves_out_band_4: bool = False) -> Gaussians:
 def find_origin(path: Path) -> Origin | None:
     """Find the origin of the Gaussians of a file; None if its coordinates lie near zero."""
     path = resolve_splat(path)
-    name = detect_splat_format(path)
-    if name == "ply":
+    row = SPLAT_FORMATS[detect_splat_format(path)]
+    if row is PLY:
         return read_scene(path).origin
-    return decode_splat(path).origin if name in ("glb", "usd", "usdz") else None
+    return decode_splat(path).origin if row.holds_origin else None
 
 
 def load_splat_at(path: Path, origin: Origin | None, drop_nonfinite: bool = False) -> Gaussians:
@@ -220,12 +167,12 @@ def load_splat_at(path: Path, origin: Origin | None, drop_nonfinite: bool = Fals
 def describe_oddities(path: Path) -> list[str]:
     """Describe in sentences what a file has that plain 3DGS does not, and how it is read."""
     path = resolve_splat(path)
-    if detect_splat_format(path) != "ply":
-        return []
-    # Harmonics of a higher degree are refused, or left out, by those who read them.
-    scene = read_scene(path, leaves_out_band_4=True)
-    further = describe_further(scene.rows.dtype.names or ())
-    return [*describe_values(scene), *([] if further is None else [further])]
+    further = describe_further(list_names(path))
+    lines = [] if further is None else [further]
+    if detect_splat_format(path) == "ply":
+        # As in `list_names`.
+        lines = [*describe_values(read_scene(path, leaves_out_band_4=True)), *lines]
+    return lines
 
 
 def validate_ranges(gaussians: Gaussians, path: Path) -> Gaussians:
@@ -249,52 +196,31 @@ def save_splat(path: Path | str, gaussians: Gaussians, made_by: Provenance = NOT
     of generated Gaussians or for `made_by`, they go to `NAME.generated.json` beside the file.
     """
     path = require_path(path)
-    write = get_writer(path)
+    row = get_written_format(path)
     check_gaussians(gaussians, "The scene to write")
     if len(gaussians) == 0:
         raise InputError(f"There is no Gaussian to write to {quote_value(path)}.")
-    if write is save_ply:
+    if row is PLY:
         save_ply(path, gaussians, made_by=made_by)
         return
-    gaussians = gaussians.detach().to("cpu")
-    if write in SORTED:
-        gaussians = sort_along_morton(gaussians)
-    if write not in PLACING:
+    gaussians = arrange(gaussians, row)
+    if not row.holds_origin:
         gaussians = gaussians.move_origin(None)
-    if write in RECORDING:
-        write(path, gaussians, made_by)
-        made_by = NOTHING_KNOWN
+    assert row.write is not None
+    if row.read_record is None:
+        row.write(path, gaussians)
     else:
-        write(path, gaussians)
+        row.write(path, gaussians, made_by)
+        made_by = NOTHING_KNOWN
     # Labels beside a file that holds its own would be those of an earlier one.
     labels = gaussians.generated
-    save_labels(path, torch.zeros_like(labels) if write in LABELLING else labels, made_by)
+    save_labels(path, torch.zeros_like(labels) if row.holds_labels else labels, made_by)
 
 
-def convert_splat(
-    source: Path,
-    out: Path,
-    drop_nonfinite: bool = False,
-    keep_labels: bool = True,
-    ignore_properties: bool = False,
-) -> tuple[int, int, str | None]:
-    """Convert a file of Gaussians to the format given by the extension of `out`.
-
-    Returns the numbers of Gaussians and of generated ones, and a sentence on what the format cannot
-    say or None. From .ply to .ply, some Gaussians are in memory at a time.
-    """
-    source = resolve_splat(source)
-    made_by = read_provenance(source) if keep_labels else NOTHING_KNOWN
-    if get_writer(out) is save_ply and detect_splat_format(source) == "ply":
-        counts = copy_ply(source, out, drop_nonfinite, keep_labels, made_by, ignore_properties)
-        return (*counts, None)
-    gaussians = load_splat(source, drop_nonfinite, ignore_properties)
-    num_generated = int((gaussians.generated > 0).sum())
-    if not keep_labels:
-        gaussians = drop_labels(gaussians)
-    save_splat(out, gaussians, made_by)
-    note = " ".join(describe_losses(out, gaussians))
-    return len(gaussians), num_generated, note or None
+def arrange(gaussians: Gaussians, row: SplatFormat) -> Gaussians:
+    """Arrange Gaussians in the order in which a format writes them, on the CPU."""
+    gaussians = gaussians.detach().to("cpu")
+    return sort_along_morton(gaussians) if row.is_sorted else gaussians
 
 
 def drop_labels(gaussians: Gaussians) -> Gaussians:
@@ -310,7 +236,7 @@ def describe_losses(path: Path, gaussians: Gaussians) -> list[str]:
 
 def describe_mode_loss(path: Path, gaussians: Gaussians) -> str | None:
     """Describe that the format of `path` cannot mark antialiased Gaussians, or return None."""
-    if get_writer(path) not in UNMARKED or not gaussians.is_antialiased:
+    if get_written_format(path).marks_antialiased or not gaussians.is_antialiased:
         return None
     return (
         f"A {path.suffix} file cannot mark Gaussians as antialiased: viewers will render them as "
@@ -323,16 +249,12 @@ def describe_rounding(path: Path, gaussians: Gaussians) -> str | None:
 
     None if they have no origin, which tells that their coordinates are large, or if it holds that.
     """
-    write = get_writer(path)
-    if gaussians.origin is None or write is save_ply or write in PLACING:
+    row = get_written_format(path)
+    if gaussians.origin is None or row.holds_origin:
         return None
-    written = gaussians.detach().to("cpu")
-    written = sort_along_morton(written) if write in SORTED else written
-    distance = measure_distance(written, decode_splat(path))
-    name = _match_extension(path)
-    ending = path.suffix if name is None else SPLAT_FORMATS[name].extensions[0]
+    distance = measure_distance(arrange(gaussians, row), decode_splat(path))
     return (
-        f"A {ending} file cannot hold coordinates this large: the largest rounding of a "
+        f"A {row.endings[0]} file cannot hold coordinates this large: the largest rounding of a "
         f"position is {distance:.3g}; a .ply, .glb or .usdz holds them."
     )
 
@@ -341,26 +263,25 @@ def detect_splat_format(path: Path) -> str:
     """Detect the format of a file or folder, by name."""
     if path.is_dir():
         if (path / META).is_file():
-            refuse_packed_folder(path)
-            return "sog-folder"
+            return SOG_FOLDER.name
         refuse_folder(path)
     with open_file(path) as file:
         head = file.read(HEAD_BYTES)
     refuse_pointer(path)
     if not head:
         raise InputError(f"{quote_value(path)} is empty; a file of Gaussians is needed.")
-    refuse_foreign(path, head)
     # Content decides before the name, since files are renamed.
-    for name, format_ in SPLAT_FORMATS.items():
-        if head.lstrip().startswith(format_.starts) and format_.contains in head:
-            return name
-    named = _match_extension(path)
-    if named is None or SPLAT_FORMATS[named].starts:
+    for row in SPLAT_FORMATS.values():
+        if row.begins(path, head):
+            return row.name
+    refuse_foreign(path, head)
+    named = match_ending(path)
+    if named is None or named.starts:
         raise InputError(
             f"{quote_value(path)} holds no Gaussians in a format that is known; name a .ply, "
             ".spz, .splat, .ksplat or .glb (docs/formats.md has them all)."
         )
-    return named
+    return named.name
 
 
 def read_provenance(path: Path) -> Provenance:
@@ -369,19 +290,17 @@ def read_provenance(path: Path) -> Provenance:
     Raise InputError if the record is damaged.
     """
     path = resolve_splat(path)
-    name = detect_splat_format(path)
-    if name in ("ply", "compressed-ply"):
-        with open_file(path) as file:
-            return parse_comments(read_header(file, path)[0], quote_value(path))
-    read_remarks = SPLAT_FORMATS[name].read_remarks
+    row = SPLAT_FORMATS[detect_splat_format(path)]
     beside = get_labels_path(path)
     try:
-        if read_remarks is not None:
-            table = read_remarks(path)
+        if row.read_record is not None:
+            table = row.read_record(path)
         elif beside.is_file():
             table = read_json(beside, "remove it to go on without labels").get(KEY)
         else:
             table = None
+    except InputError:
+        raise
     except (*DECODING_ERRORS, *JSON_ERRORS) as error:
         raise InputError(
             f"{quote_value(path)} cannot be read: {quote_value(describe_damage(error), MAX_DEFECT)}"
@@ -390,39 +309,20 @@ def read_provenance(path: Path) -> Provenance:
     return parse_provenance(table, quote_value(path))
 
 
-def get_writer(path: Path) -> Callable[..., None]:
-    """Get the function that writes the format for the extension of `path`."""
-    name = _match_extension(path)
-    write = None if name is None else SPLAT_FORMATS[name].write
-    if write is None:
-        raise InputError(
-            f"{quote_value(path)} cannot be written in the format of its extension; end it in "
-            f"{', '.join(f.extensions[0] for f in SPLAT_FORMATS.values() if f.write)}."
-        )
-    return write
-
-
 def describe_other_name(path: Path) -> str | None:
     """Describe that a file is named for another format than it has, or return None."""
     found = detect_splat_format(path)
-    named = _match_extension(path)
-    if path.is_dir() or named is None or named == found:
+    named = match_ending(path)
+    if path.is_dir() or named is None or named.name == found:
         return None
-    ending = next(e for e in SPLAT_FORMATS[named].extensions if path.name.lower().endswith(e))
-    plain = "a plain .ply" if found == "ply" else f"a {SPLAT_FORMATS[found].extensions[0]}"
+    ending = next(e for e in named.endings if path.name.lower().endswith(e))
+    plain = "a plain .ply" if found == PLY.name else f"a {SPLAT_FORMATS[found].endings[0]}"
     return f"It is named {ending}, and holds {plain}."
 
 
 def has_splat_extension(path: Path) -> bool:
     """Check whether a name ends as that of a splat does."""
-    return _match_extension(path) is not None
-
-
-def _match_extension(path: Path) -> str | None:
-    for name, format_ in SPLAT_FORMATS.items():
-        if path.name.lower().endswith(format_.extensions):
-            return name
-    return None
+    return match_ending(path) is not None
 
 
 def get_labels_path(path: Path) -> Path:
@@ -436,10 +336,10 @@ def reserve_splat(path: Path, overwrite: bool) -> Iterator[None]:
 
     Raise an InputError for a name without a format, too.
     """
-    write = get_writer(path)
+    row = get_written_format(path)
     with reserve_file(path, overwrite):
         # Labels beside the file are replaced with it, and removed if nothing was generated.
-        if write is not save_ply:
+        if row is not PLY:
             check_free(get_labels_path(path), overwrite)
         yield
 

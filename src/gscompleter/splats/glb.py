@@ -29,6 +29,7 @@ from gscompleter.splats.packing import (
     with_labels,
 )
 from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
+from gscompleter.splats.splat_format import SplatFormat
 from gscompleter.splats.spz import decode_spz
 from gscompleter.splats.transform import (
     HALF_TURN_Z,
@@ -43,6 +44,7 @@ from gscompleter.system.files.reading import read_bytes
 from gscompleter.system.files.writing import replace_file
 from gscompleter.types import SH_C0, Gaussians, Origin
 
+MAGIC = b"glTF"
 FILE_HEADER = struct.Struct("<4sII")
 CHUNK_HEADER = struct.Struct("<II")
 JSON = 0x4E4F534A
@@ -55,6 +57,11 @@ COMPRESSIONS = tuple(f"{EXTENSION}_compression_spz{version}" for version in ("",
 SH_NAMES = [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}" for d in range(4) for i in range(2 * d + 1)]
 LABELS = "_GENERATED"
 """Attribute of the labels, if anything was generated; names of applications begin with `_`."""
+KNOWN = {
+    *("POSITION", "NORMAL", "COLOR_0", LABELS, *SH_NAMES),
+    *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY")),
+}
+"""Attributes that are read, and what viewers of points show."""
 COLOR_SPACE = "srgb_rec709_display"
 """The colour space in which all splat trainers work."""
 COMPONENT_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
@@ -98,10 +105,19 @@ def read_glb(path: Path) -> Gaussians:
     return rotate_half_turn(merge_placed(parts), HALF_TURN_Z)
 
 
-def read_glb_remarks(path: Path) -> object:
+def read_glb_record(path: Path) -> object:
     """Read the record in the `extras` of the asset, or None if there is none."""
     table = _parse_document(read_bytes(path)).table
     return table.get("asset", {}).get("extras", {}).get(KEY)
+
+
+def list_glb_names(path: Path) -> list[str]:
+    """List the attributes of the Gaussians of a .glb that are not read, named as in a .ply."""
+    primitives = _find_primitives(_parse_document(read_bytes(path)))
+    attributes = dict.fromkeys(name for one, _ in primitives for name in one["attributes"])
+    # Attributes of applications begin with `_`, as `_TRBF_CENTER`.
+    further = [name.removeprefix(f"{EXTENSION}:") for name in attributes if name not in KNOWN]
+    return [name.lstrip("_").lower() for name in further]
 
 
 def _describe_other_content(table: dict[str, Any]) -> str:
@@ -262,7 +278,7 @@ def write_glb(path: Path, gaussians: Gaussians, made_by: Provenance = NOTHING_KN
     if total > MAX_FILE_BYTES:
         raise InputError(f"{quote_value(path)} would exceed the 4 GiB of a .glb; write a .ply.")
     with replace_file(path) as file:
-        file.write(FILE_HEADER.pack(b"glTF", 2, total))
+        file.write(FILE_HEADER.pack(MAGIC, 2, total))
         file.write(CHUNK_HEADER.pack(len(text), JSON) + text + CHUNK_HEADER.pack(size, BINARY))
         for column in columns.values():
             file.write(column.data)
@@ -320,3 +336,18 @@ def _describe_scene(
         "bufferViews": views,
         "accessors": accessors,
     }
+
+
+GLB = SplatFormat(
+    name="glb",
+    endings=(".glb",),
+    read=read_glb,
+    starts=(MAGIC,),
+    write=write_glb,
+    read_record=read_glb_record,
+    list_names=list_glb_names,
+    holds_labels=True,
+    holds_origin=True,
+    is_y_up=True,
+    has_json=True,
+)

@@ -22,6 +22,7 @@ from gscompleter.splats.packing import (
     assemble_sh,
     build_gaussians,
 )
+from gscompleter.splats.splat_format import SplatFormat
 from gscompleter.system.damage import DamagedError, check_rows
 from gscompleter.system.files.reading import read_bytes
 from gscompleter.types import Gaussians, merge
@@ -155,3 +156,6 @@ def _reorder_sh(rest: Float[ndarray, "n m"]) -> Float[ndarray, "n k 3"]:
     return np.concatenate(
         [degree.reshape(len(rest), 3, -1).transpose(0, 2, 1) for degree in degrees], axis=1
     )
+
+
+KSPLAT = SplatFormat(name="ksplat", endings=(".ksplat",), read=read_ksplat)

@@ -25,7 +25,6 @@ from gscompleter.numerics.value_checks import find_finite
 from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import (
     detect_splat_format,
-    get_writer,
     load_splat,
     read_provenance,
     save_splat,
@@ -35,6 +34,7 @@ from gscompleter.splats.ply import (
     LABEL_COLUMN,
     LABEL_TYPES,
     MEANS,
+    PLY,
     SceneFile,
     append_labels,
     check_finite,
@@ -51,9 +51,9 @@ from gscompleter.splats.ply import (
     read_scene,
     require_finite,
     save_parts,
-    save_ply,
 )
 from gscompleter.splats.provenance import RunRecord, make_comment_lines
+from gscompleter.splats.table import get_written_format
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.ply import release_pages, write_ply_file
 from gscompleter.system.files.writing import REMOVED_FILE
@@ -226,7 +226,7 @@ def strip(path: Path, out: Path) -> tuple[int, int]:
     """
     path = resolve_splat(path)
     layout = find_layout(path)
-    if layout is not None and get_writer(out) is save_ply:
+    if layout is not None and get_written_format(out) is PLY:
         counts = strip_rows(path, layout, out)
         if counts is not None:
             return counts
@@ -244,7 +244,7 @@ def strip(path: Path, out: Path) -> tuple[int, int]:
         )
     # The rows of the file cannot be copied if they have the SH of the generated Gaussians.
     is_padded = layout is None or count_rest(layout) != 3 * (scene.sh.shape[1] - 1)
-    if layout is None or is_padded or get_writer(out) is not save_ply:
+    if layout is None or is_padded or get_written_format(out) is not PLY:
         save_splat(out, scene)
     else:
         write_ply_file(out, layout.header, len(layout.rows), [layout.rows], layout.trailer)

@@ -35,16 +35,24 @@ from gscompleter.numerics.value_checks import LARGEST, check_gaussians, find_fin
 from gscompleter.splats.origin import choose_origin, find_step, is_too_far
 from gscompleter.splats.packing import DegreeError
 from gscompleter.splats.properties import refuse_other_kinds
-from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, add_comments
+from gscompleter.splats.provenance import (
+    NOTHING_KNOWN,
+    Provenance,
+    add_comments,
+    parse_comments,
+)
+from gscompleter.splats.splat_format import PLY_MAGIC, SplatFormat
 from gscompleter.system.errors import InputError, quote_value, require_path
 from gscompleter.system.files.ply import (
     Element,
     PlyFile,
     make_header,
+    read_header,
     read_ply_file,
     release_pages,
     write_ply_file,
 )
+from gscompleter.system.files.reading import open_file
 from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import Gaussians, Origin, merge
 
@@ -752,3 +760,28 @@ def describe_other_content(elements: Sequence[Element], missing: Sequence[str]) 
         "a point cloud; name the .ply that the training of the splat wrote (often "
         "point_cloud/iteration_N/point_cloud.ply or splat.ply)"
     )
+
+
+def read_ply_record(path: Path) -> object:
+    """Read the record in the comments of a .ply, or None if there is none."""
+    with open_file(path) as file:
+        return parse_comments(read_header(file, path)[0], quote_value(path))
+
+
+def is_packed(head: bytes) -> bool:
+    """Check whether the start of a .ply is that of a compressed one."""
+    return b"packed_position" in head
+
+
+PLY = SplatFormat(
+    name="ply",
+    endings=(".ply",),
+    read=load_ply,
+    starts=(PLY_MAGIC,),
+    recognize=lambda path, head: not is_packed(head),
+    write=save_ply,
+    read_record=read_ply_record,
+    holds_labels=True,
+    holds_origin=True,
+    marks_antialiased=True,
+)

@@ -114,8 +114,8 @@ def make_comment_lines(runs: Sequence[RunRecord], ending: bytes = b"\n") -> byte
     return b"".join(f"comment {SCHEMA} {text}".encode("ascii") + ending for text in texts)
 
 
-def parse_comments(header: bytes, name: str) -> Provenance:
-    """Parse the comments of the .ply file `name`; raises as `parse_provenance`."""
+def parse_comments(header: bytes, name: str) -> object:
+    """Parse the comments of the .ply file `name` to values of JSON; None if none is a record."""
     runs = []
     schema = SCHEMA
     for found, text in _LINE.findall(header):
@@ -124,7 +124,7 @@ def parse_comments(header: bytes, name: str) -> Provenance:
             runs.append(json.loads(text))
         except (ValueError, RecursionError):
             raise InputError(f"The record of {name} is no JSON; {ADVICE}.") from None
-    return parse_provenance({"schema": schema, "runs": runs} if runs else None, name)
+    return {"schema": schema, "runs": runs} if runs else None
 
 
 def add_comments(header: bytes, made_by: Provenance) -> bytes:

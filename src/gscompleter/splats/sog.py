@@ -15,6 +15,7 @@ import json
 import math
 import zipfile
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -40,13 +41,18 @@ from gscompleter.splats.packing import (
 )
 from gscompleter.splats.ply import encode
 from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
+from gscompleter.splats.splat_format import SplatFormat, list_zip
 from gscompleter.system.damage import DamagedError
-from gscompleter.system.errors import quote_value
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_bytes, read_zip_entry
 from gscompleter.system.files.writing import replace_file
 from gscompleter.types import SH_C0, Gaussians
 
 META = "meta.json"
+LOD_META = "lod-meta.json"
+"""Index of a streamed scene: one .sog for each level and place."""
+LOD_KEY = "lodLevels"
+"""Entry of that index: the number of levels."""
 LABELS = "generated"
 """Name in `meta.json` of an image of the labels, if anything was generated; ours alone."""
 PALETTE_WIDTH = 64
@@ -69,11 +75,14 @@ FileReader = Callable[[str, int], bytes]
 """Function that reads a file of the scene by name and most bytes, from a folder or a bundle."""
 Coded = tuple[dict[str, Any], dict[str, bytes]]
 """A property as numbers for `meta.json`, and images by file name."""
+READ = ("means", "scales", "quats", "sh0", "shN", LABELS)
+"""Properties that are read."""
 
 
 def read_sog(path: Path) -> Gaussians:
     """Read a bundle, a folder, or the folder of a `meta.json`."""
     if path.is_dir():
+        refuse_pngs_of_gsplat(path)
         return _read_folder(path, META)
     data = read_bytes(path)
     if not data.startswith(ZIP_MAGIC):
@@ -87,15 +96,30 @@ def _read_folder(folder: Path, meta: str) -> Gaussians:
     return _read_files(lambda name, most: read_bytes(folder / name, most), meta, stored)
 
 
-def read_sog_remarks(path: Path) -> object:
+def read_sog_record(path: Path) -> object:
     """Read the record in `meta.json`, or None if there is none."""
+    return _read_meta(path).get(KEY)
+
+
+def list_sog_names(path: Path) -> list[str]:
+    """List the properties of Gaussians, each of them images, that are not read."""
+    return [
+        name
+        for name, stored in _read_meta(path).items()
+        if name not in READ and isinstance(stored, dict) and "files" in stored
+    ]
+
+
+def _read_meta(path: Path) -> dict[str, Any]:
     if path.is_dir():
-        return json.loads(read_bytes(path / META)).get(KEY)
-    data = read_bytes(path)
-    if not data.startswith(ZIP_MAGIC):
-        return json.loads(data).get(KEY)
-    with zipfile.ZipFile(io.BytesIO(data)) as bundle:
-        return json.loads(_read_entry(bundle, META, MAX_META)).get(KEY)
+        data = read_bytes(path / META)
+    else:
+        data = read_bytes(path)
+        if data.startswith(ZIP_MAGIC):
+            with zipfile.ZipFile(io.BytesIO(data)) as bundle:
+                data = _read_entry(bundle, META, MAX_META)
+    table: dict[str, Any] = json.loads(data)
+    return table
 
 
 def _read_entry(bundle: zipfile.ZipFile, name: str, most: int) -> bytes:
@@ -318,3 +342,66 @@ def _encode_image(values: Shaped[ndarray, "n k"], width: int = 0) -> bytes:
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, "WEBP", lossless=True, exact=True)
     return file.getvalue()
+
+
+def is_bundle(path: Path, head: bytes) -> bool:
+    """Check that a .zip is a bundle of one scene, and none of its levels of detail."""
+    names = list_zip(path)
+    if not names:
+        # The reader says what is wrong with a damaged one.
+        return path.suffix.lower() == ".sog"
+    return META in names and not any(Path(name).name == LOD_META for name in names)
+
+
+def is_meta(path: Path, head: bytes) -> bool:
+    """Check that a file of JSON is the `meta.json` of a scene, under whatever name."""
+    if path.name.lower() == META:
+        return True
+    table: object = None
+    with suppress(OSError, ValueError, RecursionError):
+        if path.stat().st_size <= MAX_META:
+            table = json.loads(path.read_bytes())
+    return isinstance(table, dict) and "means" in table and LOD_KEY not in table
+
+
+def refuse_pngs_of_gsplat(folder: Path) -> None:
+    """Raise InputError for a folder of PNGs of gsplat, whose `meta.json` is none of a .sog."""
+    table: object = None
+    with suppress(OSError, ValueError, RecursionError):
+        table = json.loads((folder / META).read_bytes()[:MAX_META])
+    properties = list(table.values()) if isinstance(table, dict) else []
+    are_described = [isinstance(entry, dict) and "dtype" in entry for entry in properties]
+    if are_described and all(are_described) and not any("files" in entry for entry in properties):
+        raise InputError(
+            f"{quote_value(folder)} is a splat that gsplat compressed to PNGs (PngCompression); "
+            "decompress it with gsplat, export a .ply, and name that."
+        )
+
+
+SOG = SplatFormat(
+    name="sog",
+    endings=(".sog",),
+    read=read_sog,
+    starts=(ZIP_MAGIC,),
+    recognize=is_bundle,
+    write=write_sog,
+    read_record=read_sog_record,
+    list_names=list_sog_names,
+    holds_labels=True,
+    marks_antialiased=True,
+    is_sorted=True,
+    rounds_geometry=True,
+    has_json=True,
+)
+SOG_FOLDER = SplatFormat(
+    name="sog-folder",
+    endings=(META,),
+    read=read_sog,
+    starts=(b"{",),
+    recognize=is_meta,
+    read_record=read_sog_record,
+    list_names=list_sog_names,
+    holds_labels=True,
+    marks_antialiased=True,
+    has_json=True,
+)

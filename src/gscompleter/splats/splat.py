@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gscompleter.splats.packing import assemble_sh, build_gaussians
+from gscompleter.splats.splat_format import SplatFormat
 from gscompleter.system.damage import DamagedError
 from gscompleter.system.files.reading import read_bytes
 from gscompleter.system.files.writing import replace_file
@@ -47,3 +48,12 @@ def write_splat(path: Path, gaussians: Gaussians) -> None:
     rows["quat"] = np.clip(np.rint(unit * 128 + 128), 0, 255)
     with replace_file(path) as file:
         file.write(rows.view(np.uint8).data)
+
+
+SPLAT = SplatFormat(
+    name="splat",
+    endings=(".splat",),
+    read=read_splat_rows,
+    write=write_splat,
+    holds_harmonics=False,
+)

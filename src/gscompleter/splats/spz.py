@@ -13,6 +13,7 @@ import io
 import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator
+from contextlib import suppress
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -35,6 +36,7 @@ from gscompleter.splats.packing import (
     unpack_fractions,
 )
 from gscompleter.splats.ply import encode
+from gscompleter.splats.splat_format import SplatFormat
 from gscompleter.splats.transform import HALF_TURN_X, rotate_half_turn
 from gscompleter.system.damage import DamagedError, check_rows
 from gscompleter.system.errors import InputError, quote_value
@@ -47,6 +49,8 @@ GZIP = b"\x1f\x8b"
 HEADER = struct.Struct("<4sIIBBBB")
 """Magic, version, count, SH degree, fractional bits, flags, and the number of streams."""
 ANTIALIASED_FLAG = 0x1
+EXTENSIONS_FLAG = 0x2
+"""Flag of a file with records of other programs, such as the orbit of a viewer's camera."""
 MAX_WINDOW = 1 << 27
 """Largest window of zstd, in bytes, which it keeps in memory."""
 COLOR_SCALE = 0.15
@@ -107,6 +111,14 @@ def decode_spz(data: bytes, max_degree: int = 3) -> Gaussians:
         streams = _read_zstd(header, data)
     turned = rotate_half_turn(_decode_streams(header, streams), HALF_TURN_X)
     return replace(turned, is_antialiased=bool(header.flags & ANTIALIASED_FLAG))
+
+
+def list_spz_names(path: Path) -> list[str]:
+    """List what is stored besides the attributes, and is not read."""
+    data = read_bytes(path)
+    if data.startswith(GZIP):
+        data = zlib.decompressobj(wbits=GZIP_BITS).decompress(data, HEADER.size)
+    return ["extensions"] if _parse_header(data, 4).flags & EXTENSIONS_FLAG else []
 
 
 def _parse_header(data: bytes, max_degree: int) -> SpzHeader:
@@ -298,3 +310,29 @@ def _pack_rotations(quats: Float[ndarray, "n 4"]) -> bytes:
     fields = np.stack([smaller < 0, np.abs(smaller) / np.sqrt(0.5)], axis=2).reshape(-1, 6)
     packed = (largest.astype(np.uint32) << np.uint32(30)) | pack_fractions(fields, SIGN_SIZE_BITS)
     return packed.astype("<u4").tobytes()
+
+
+def is_spz(path: Path, head: bytes) -> bool:
+    """Check that a file is no other one that is packed with gzip, by the start of its content."""
+    if not head.startswith(GZIP):
+        return True
+    content = b""
+    with suppress(zlib.error):
+        content = zlib.decompressobj(GZIP_BITS).decompress(head, max_length=HEADER.size)
+    # The reader says what is wrong with one whose content is damaged.
+    return content.startswith(MAGIC) or path.suffix.lower() == ".spz"
+
+
+SPZ = SplatFormat(
+    name="spz",
+    endings=(".spz",),
+    read=read_spz,
+    starts=(MAGIC, GZIP),
+    recognize=is_spz,
+    write=write_spz,
+    list_names=list_spz_names,
+    marks_antialiased=True,
+    is_y_up=True,
+    rounds_geometry=True,
+    can_leave_out_band_4=True,
+)

@@ -10,9 +10,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from gscompleter.splats.foreign import LOD_META
 from gscompleter.splats.formats import load_splat
-from gscompleter.splats.sog import META
+from gscompleter.splats.sog import LOD_KEY, LOD_META, META
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_json
 from gscompleter.system.progress import track
@@ -37,7 +36,7 @@ def load_level(path: Path, level: int, drop_nonfinite: bool = False) -> Gaussian
     name = quote_value(index)
     table = read_json(index, "export the scene again")
     try:
-        levels = int(table["lodLevels"])
+        levels = int(table[LOD_KEY])
         files = [str(file) for file in table["filenames"]]
         parts = sorted(set(_list_parts(table["tree"], level)))
         fits = all(0 <= file < len(files) and first >= 0 < count for file, first, count in parts)

@@ -17,16 +17,16 @@ from numpy import ndarray
 
 from gscompleter.splats.edits import Edit, Edits, read_edits
 from gscompleter.splats.foreign import resolve_splat
-from gscompleter.splats.formats import get_writer
 from gscompleter.splats.layout import LABEL_LINES, find_places, iterate_rows, strip
 from gscompleter.splats.ply import (
     LABEL_COLUMN,
+    PLY,
     SceneFile,
     has_mode_comment,
     iterate_blocks,
     read_scene,
-    save_ply,
 )
+from gscompleter.splats.table import get_written_format
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.ply import write_ply_file
 from gscompleter.system.files.reading import hash_file
@@ -132,7 +132,7 @@ def check_undone(path: Path, edits: Edits, numbers: Collection[int], out: Path) 
             f"{quote_value(path)} was changed by another program after edit {first}, so that it "
             "cannot be taken off alone; undo all edits at once."
         )
-    if get_writer(out) is not save_ply:
+    if get_written_format(out) is not PLY:
         raise InputError("An earlier state is a .ply; name such a file.", "out")
 
 
@@ -144,6 +144,11 @@ def keys_of_none() -> Keys:
 def make_keys(number: int, count: int) -> Keys:
     """Make the keys of the rows that an edit appended."""
     return (np.int64(number) << PLACE_BITS) + np.arange(count, dtype=np.int64)
+
+
+def split_key(keys: Keys) -> tuple[Keys, Keys]:
+    """Split keys into the number of the edit and the place among the rows that it appended."""
+    return keys >> PLACE_BITS, keys & ((1 << PLACE_BITS) - 1)
 
 
 def check_counts(path: Path, edits: Edits, total: int) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from gscompleter.splats.formats import detect_splat_format
+from gscompleter.splats.formats import SPLAT_FORMATS, detect_splat_format
 from gscompleter.system.files.ply import read_header
 from gscompleter.system.files.reading import open_file
 
@@ -18,8 +18,6 @@ _AXIS_LINE = re.compile(
     re.I | re.M,
 )
 """Comment of a .ply, such as `comment Vertical Axis: z` of nerfstudio."""
-Y_UP = ("spz", "glb", "usd", "usdz")
-"""Formats that define y as up. Their readers turn it to -y, which it is in the axes of a .ply."""
 
 
 def read_upward(path: Path) -> Direction | None:
@@ -27,10 +25,10 @@ def read_upward(path: Path) -> Direction | None:
 
     A .ply may say it in a comment; .spz, .glb and OpenUSD define it.
     """
-    name = detect_splat_format(path)
-    if name in Y_UP:
+    row = SPLAT_FORMATS[detect_splat_format(path)]
+    if row.is_y_up:
         return USUAL
-    if name not in ("ply", "compressed-ply"):
+    if not row.has_ply_header:
         return None
     with open_file(path) as file:
         header, _ = read_header(file, path)

@@ -15,6 +15,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -32,6 +33,7 @@ from gscompleter.splats.packing import (
     with_labels,
 )
 from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
+from gscompleter.splats.splat_format import SplatFormat, list_zip
 from gscompleter.splats.transform import (
     HALF_TURN_X,
     merge_placed,
@@ -54,7 +56,8 @@ LABELS = "generated"
 """Attribute of the labels, if anything was generated; ours alone."""
 PROBE_BYTES = 2**20
 """Bytes that are written to find out why OpenUSD could not."""
-ENDINGS = (".usda", ".usdc", ".usd", ".usdz")
+LAYER_ENDINGS = (".usdc", ".usda", ".usd")
+ENDINGS = (*LAYER_ENDINGS, ".usdz")
 LINEAR = "lin_"
 """Start of the names of linear colour spaces."""
 Y_FROM_Z_UP = ((1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1))
@@ -181,7 +184,7 @@ def read_usd(path: Path) -> Gaussians:
     return rotate_half_turn(merge_placed(parts), HALF_TURN_X)
 
 
-def read_usd_remarks(path: Path) -> object:
+def read_usd_record(path: Path) -> object:
     """Read the record in the `customLayerData` of a stage, or None if there is none."""
     _require_usd()
     with _open_stage(path) as stage:
@@ -267,3 +270,35 @@ def _read_array(prim: Usd.Prim, name: str, width: int) -> Float[ndarray, "n w"]:
             values = np.asarray(attribute.Get(Usd.TimeCode.EarliestTime()), np.float32)
             return values.reshape(-1, width)
     raise UnsupportedError(f"has Gaussians without {name}")
+
+
+def is_usdz(path: Path, head: bytes) -> bool:
+    """Check that a .zip is a package of OpenUSD."""
+    names = list_zip(path)
+    if not names:
+        # The reader says what is wrong with a damaged one.
+        return path.suffix.lower() == ".usdz"
+    return any(name.lower().endswith(LAYER_ENDINGS) for name in names)
+
+
+USDZ = SplatFormat(
+    name="usdz",
+    endings=(".usdz",),
+    read=read_usd,
+    starts=(ZIP_MAGIC,),
+    recognize=is_usdz,
+    write=write_usd,
+    read_record=read_usd_record,
+    holds_labels=True,
+    holds_origin=True,
+    is_y_up=True,
+    has_json=True,
+    extra="usd",
+)
+USD = replace(
+    USDZ,
+    name="usd",
+    endings=LAYER_ENDINGS,
+    starts=(b"PXR-USDC", b"#usda"),
+    recognize=None,
+)

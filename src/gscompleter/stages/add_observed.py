@@ -24,19 +24,21 @@ from gscompleter.numerics.geometry import (
     select_spread_cameras,
 )
 from gscompleter.numerics.image_ops import dilate, label_regions
+from gscompleter.parts import PartOrigin
 from gscompleter.reconstructors import Reconstructor, run_reconstructor
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.fit_colors import RELAXATION, fit_colors
 from gscompleter.render.protocols import FrozenScene
 from gscompleter.render.reference import adapt_to_mode
-from gscompleter.stages.align_depth import fit_affine
+from gscompleter.stages.additions import Additions, Refined, accept
+from gscompleter.stages.align_paper import fit_affine
 from gscompleter.stages.error_budgets import meet_error_budgets, share_budgets
+from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.stages.new_photos import match_exposure
 from gscompleter.stages.refine import refine_opacities
 from gscompleter.stages.register import apply_affine
 from gscompleter.stages.select_anchor import find_nearest_view
-from gscompleter.stages.target_view import compute_hole_mask
-from gscompleter.state import NEW_PHOTO_ID, Completion
+from gscompleter.state import Completion
 from gscompleter.system.progress import track
 from gscompleter.trust.photometric import compute_color_differences
 from gscompleter.types import DepthMap, Gaussians, Reconstruction, Render, View, merge
@@ -98,7 +100,7 @@ class Evidence:
 def add_observed(
     reconstructor: Reconstructor, state: Completion, scenes: SceneRenderer, rng: torch.Generator
 ) -> Completion:
-    """Add what photographs show and the scene lacks, and count it in `num_observed`.
+    """Add what photographs show and the scene lacks, as parts of that origin.
 
     Nothing changes for a context that Ψ reconstructed: it has what its photographs show.
     """
@@ -115,15 +117,14 @@ def add_observed(
             break
         reconstructed.update(chosen)
         photos = [Evidence(views[i], frozen[i], lacks[i]) for i in chosen]
-        part, notes = reconstruct_lacking(reconstructor, photos, state, rng)
+        lacking, notes = reconstruct_lacking(reconstructor, photos, state, rng)
         state = replace(state, context_notes=(*state.context_notes, *notes))
-        part = fit_to_photographs(part, frozen, state)
+        candidates = Additions.begin(PartOrigin("photographs"), "select", lacking)
+        part = accept_photographed(candidates, frozen, state).to_part()
         # What was found and could not be added would be found again.
         if len(part) == 0:
             break
-        state = replace(
-            state, parts=(*state.parts, part), num_observed=state.num_observed + len(part)
-        )
+        state = replace(state, added_parts=(*state.added_parts, part))
     return state
 
 
@@ -232,13 +233,8 @@ def reconstruct_lacking(
     part = merge(parts)
     # No more harmonics than the scene has, whose file has no place for them. The fit of colours
     # that follows makes up for them.
-    added = replace(
-        part,
-        sh=part.sh[:, : state.context.sh.shape[1]],
-        generated=torch.full_like(part.generated, NEW_PHOTO_ID),
-        encoded=None,
-    )
-    return added, reconstruction.notes
+    sh = part.sh[:, : state.context.sh.shape[1]]
+    return replace(part, sh=sh, encoded=None), reconstruction.notes
 
 
 def select_pixels(
@@ -284,27 +280,49 @@ def find_photographed(
     return shown
 
 
-def fit_to_photographs(
-    part: Gaussians, frozen: Sequence[FrozenScene], state: Completion
-) -> Gaussians:
-    """Fit new Gaussians to all photographs that see them, and let none of these get worse.
+def accept_photographed(
+    candidates: Additions, frozen: Sequence[FrozenScene], state: Completion
+) -> Additions:
+    """Accept Gaussians that photographs show, `frozen` being the scene at all of these.
+
+    They are placed already, by Eq. 8 and 9, and selected by Eq. 12. Guards judge what an image at a
+    target adds, and have no say: here every image is a photograph.
+    """
+    if len(candidates.gaussians) == 0:
+        return candidates
+    guard = state.config.psnr_guard
+
+    def keep_places(placed: Additions) -> Additions:
+        return placed
+
+    def refine(placed: Gaussians) -> Refined:
+        return refine_to_photographs(placed, frozen, state)
+
+    def keep_budgets(added: Additions, refined: Refined) -> Additions:
+        budgets = [
+            share_budgets(photo.budgets, scene.render.image, guard)
+            for photo, scene in zip(state.photos, frozen, strict=True)
+        ]
+        kept = meet_error_budgets(refined.gaussians, frozen, budgets, refined.plans, guard)
+        return added.then("psnr", kept)
+
+    return accept(candidates, keep_places, refine, keep_budgets)
+
+
+def refine_to_photographs(
+    placed: Gaussians, frozen: Sequence[FrozenScene], state: Completion
+) -> Refined:
+    """Fit new Gaussians to all photographs that see them.
 
     Colours, then opacities (Eq. 13): photographs are true images, so each has the weight 1.
     """
-    if len(part) == 0:
-        return part
     views = [photo.view for photo in state.photos]
     # In ignored pixels colours stay as the scene shows them.
     wanted = [
         view.paint_ignored(scene.render.image) for view, scene in zip(views, frozen, strict=True)
     ]
-    colored = fit_colors(part, frozen, wanted, [RELAXATION] * COLOR_ROUNDS)
-    plans = [scene.vary_opacities(colored) for scene in frozen]
+    colored = fit_colors(placed, frozen, wanted, [RELAXATION] * COLOR_ROUNDS)
+    plans = tuple(scene.vary_opacities(colored) for scene in frozen)
     settings = replace(state.config.refine, target_weight=1.0)
-    refined, _ = refine_opacities(colored, plans[0], views[0], plans[1:], views[1:], settings)
-    guard = state.config.psnr_guard
-    budgets = [
-        share_budgets(photo.budgets, scene.render.image, guard)
-        for photo, scene in zip(state.photos, frozen, strict=True)
-    ]
-    return meet_error_budgets(refined, frozen, budgets, plans, guard)
+    refined, losses = refine_opacities(colored, plans[0], views[0], plans[1:], views[1:], settings)
+    return Refined(refined, plans, losses)

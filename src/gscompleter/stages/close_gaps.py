@@ -75,8 +75,8 @@ def continue_surfaces(
 ) -> tuple[GeneratedView, Gaussians]:
     """Continue the farther surfaces beside gaps into them.
 
-    Return the image with closed gaps, and a Gaussian for each pixel of a gap and of its rim,
-    labelled with the id of the target. There is none if nothing is known beside them.
+    Return the image with closed gaps, and a Gaussian for each pixel of a gap and of its rim. There
+    is none if nothing is known beside them.
     """
     camera = view.camera.padded
     layers, known = collect_layers(view)
@@ -97,8 +97,7 @@ def continue_surfaces(
 
     chosen = dilate(gaps, RIM).flatten() & known.any()
     added = adapt_to_mode(view.state.rendered_context, discs[chosen], camera)
-    label = torch.full_like(added.generated, view.state.next_target_id)
-    return reference, replace(added, generated=label)
+    return reference, added
 
 
 def collect_layers(view: TargetView) -> tuple[Float[Tensor, "h w 4"], Bool[Tensor, "h w"]]:

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import torch
 from jaxtyping import Bool, Int
 from torch import Tensor
 
 from gscompleter.numerics.geometry import project_mask
 from gscompleter.numerics.image_ops import dilate
+from gscompleter.parts import PartOrigin, label_gaussians
 from gscompleter.stages.target_view import TargetView
 from gscompleter.system.timing import timed_stage
 from gscompleter.types import Camera, Gaussians, Registration
@@ -21,7 +19,7 @@ def filter_holes(moved: Registration, view: TargetView) -> Gaussians:
     # Beyond Eq. 12 the mask is dilated, since a hard border leaves seams (decision 037).
     mask = dilate(view.empty, view.state.config.holes.dilation)
     kept = select_in_mask(moved.gaussians, moved.pixel_index, mask, view.camera.padded)
-    return replace(kept, generated=torch.full_like(kept.generated, view.state.next_target_id))
+    return label_gaussians(kept, PartOrigin("target", view.state.next_target_id))
 
 
 def select_in_mask(

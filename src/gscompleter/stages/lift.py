@@ -10,15 +10,16 @@ from torch import Tensor
 from gscompleter.numerics.geometry import is_inside, project
 from gscompleter.reconstructors import Reconstructor, run_reconstructor
 from gscompleter.render.reference import adapt_to_mode
+from gscompleter.stages.select_anchor import Anchor
 from gscompleter.stages.target_view import TargetView
 from gscompleter.system.timing import timed_stage
 from gscompleter.types import Lift, View
 
 
 @timed_stage("lift")
-def lift(reconstructor: Reconstructor, reference: View, view: TargetView) -> Lift:
+def lift(reconstructor: Reconstructor, reference: View, anchor: Anchor, view: TargetView) -> Lift:
     """Lift the pixels near holes to Gaussians in the antialiasing mode of the scene."""
-    lifted = lift_pair(reconstructor, reference, view.anchor_view, view.candidate_mask)
+    lifted = lift_pair(reconstructor, reference, anchor.view, view.candidate_mask)
     adapted = adapt_to_mode(view.state.rendered_context, lifted.gaussians, reference.camera)
     return replace(lifted, gaussians=adapted)
 

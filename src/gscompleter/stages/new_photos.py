@@ -15,11 +15,12 @@ from torch import Tensor
 from gscompleter.config import CompleterConfig
 from gscompleter.numerics.geometry import pad_camera, select_spread_cameras
 from gscompleter.numerics.robust import fit_robust_affine
+from gscompleter.parts import PartOrigin
 from gscompleter.render.cache import Parts, SceneRenderer
 from gscompleter.stages.recolor import recolor
 from gscompleter.stages.synthesize import GeneratedView
 from gscompleter.stages.target_view import TargetView, render_target
-from gscompleter.state import NEW_PHOTO_ID, Completion
+from gscompleter.state import Completion
 from gscompleter.system.progress import track
 from gscompleter.types import View
 
@@ -95,5 +96,5 @@ def recolor_to_photos(
         matched = replace(photo, image=match_new_photo(photo, view))
         wanted = matched.paint_ignored(view.render.image)
         reference = GeneratedView(wanted.image, photo.camera, is_photograph=True)
-        state = recolor(reference, view, NEW_PHOTO_ID).state
+        state = recolor(reference, view, PartOrigin("photographs")).state
     return replace(state, num_new_photos=len(photos))

@@ -16,6 +16,7 @@ from torch.nn.functional import normalize
 
 from gscompleter.config import RecolorConfig
 from gscompleter.numerics.kernels.parallel import map_in_parallel
+from gscompleter.parts import PartOrigin
 from gscompleter.render.protocols import ColorErrors, FrozenScene, Renderer
 from gscompleter.render.spherical_harmonics import evaluate_sh_basis
 from gscompleter.stages.synthesize import GeneratedView
@@ -44,12 +45,12 @@ class Recolored:
 
 
 @timed_stage("integrate")
-def recolor(reference: GeneratedView, view: TargetView, label: int) -> Recolored:
+def recolor(reference: GeneratedView, view: TargetView, origin: PartOrigin) -> Recolored:
     """Recolour what covers the target without being trusted, and trust it from there on.
 
     A true photograph may recolour all that it shows, since other photographs hold what they show;
-    an image that is inconsistent with them recolours nothing. `label` marks the recoloured
-    Gaussians as generated.
+    an image that is inconsistent with them recolours nothing. Recoloured Gaussians get the label
+    of the `origin` of their colours.
     """
     state = view.state
     camera = view.camera.padded
@@ -76,13 +77,12 @@ def recolor(reference: GeneratedView, view: TargetView, label: int) -> Recolored
     recolored = replace(
         context,
         sh=context.sh.index_add(0, rows, delta),
-        generated=context.generated.index_fill(0, rows, label),
+        generated=context.generated.index_fill(0, rows, origin.label),
     )
-    parts = (recolored, *state.parts[1:])
     # Trusted at later targets: otherwise targets in a row compound their errors (decision 038).
     trust = state.trust.accept(view.frozen, camera, rows)
-    frozen = view.scenes.freeze(parts, camera)
-    return Recolored(replace(state, parts=parts, trust=trust), frozen, len(rows))
+    changed = replace(state, rendered_context=recolored, trust=trust)
+    return Recolored(changed, view.scenes.freeze(changed.parts, camera), len(rows))
 
 
 def fit_image_colors(

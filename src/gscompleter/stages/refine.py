@@ -6,8 +6,8 @@ One file serves the paper and us: both minimize Eq. 13 in the same way. Ours fit
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Float
@@ -18,22 +18,12 @@ from gscompleter.numerics.adam import Adam
 from gscompleter.numerics.geometry import measure_baseline
 from gscompleter.render.fit_colors import RELAXATION, fit_colors
 from gscompleter.render.protocols import OpacityRender
+from gscompleter.stages.additions import Refined
 from gscompleter.stages.target_view import TargetView
 from gscompleter.system.progress import track
 from gscompleter.system.threads import use_one_torch_thread
 from gscompleter.system.timing import timed_stage
 from gscompleter.types import Gaussians, View
-
-
-@dataclass(frozen=True)
-class Refined:
-    """Added Gaussians with refined colours and opacities."""
-
-    gaussians: Gaussians
-    plans: tuple[OpacityRender, ...]
-    """Differentiable render at each photograph of the scene."""
-    losses: tuple[float, ...]
-    """Value of Eq. 13 at each iteration."""
 
 
 @timed_stage("integrate")
@@ -67,6 +57,16 @@ def refine(kept: Gaussians, reference: View, view: TargetView) -> Refined:
         config,
     )
     return Refined(refined, plans, losses)
+
+
+def keep_as_it_is(placed: Gaussians, reference: View, view: TargetView) -> Refined:
+    """Refine nothing: what continues a surface has its colours and opacities from there."""
+    plans = tuple(frozen.vary_opacities(placed) for frozen in view.frozen_photos)
+    return Refined(placed, plans, ())
+
+
+RefineAtTarget = Callable[[Gaussians, View, TargetView], Refined]
+"""Refines what was placed, given the image at a target and the scene as that sees it."""
 
 
 def has_settled(losses: Sequence[Float[Tensor, ""]], rel_tol: float) -> bool:

@@ -19,6 +19,7 @@ from gscompleter.numerics.image_ops import fill_smoothly
 from gscompleter.numerics.sky import mask_out_sky
 from gscompleter.render.protocols import JointScene, Renderer
 from gscompleter.stages.extrapolate_registration import extrapolate_into_holes, extrapolate_sky
+from gscompleter.stages.select_anchor import Anchor
 from gscompleter.stages.target_view import TargetView
 from gscompleter.system.progress import track
 from gscompleter.system.threads import use_one_torch_thread
@@ -53,7 +54,7 @@ RenderAlone = Callable[[Gaussians], tuple[Render, Render]]
 @timed_stage("register")
 @use_one_torch_thread()
 def register_along_rays(
-    lifted: Lift, affine: DepthAffine, reference: View, view: TargetView
+    lifted: Lift, affine: DepthAffine, reference: View, anchor: Anchor, view: TargetView
 ) -> Registration:
     """Align all Gaussians by one affine of depth, then each along its ray.
 
@@ -68,27 +69,32 @@ def register_along_rays(
     if pixel_index is None:
         # Voxel-aligned models do not say which pixel a Gaussian belongs to, so that no depth map
         # of corrections can be made.
-        registered, losses = optimize_distances(coarse, reference, view)
+        registered, losses = optimize_distances(coarse, reference, anchor, view)
         return Registration(registered, None, losses)
     if config.hole_depth == "scene":
         # A trained splat has its depth from many photographs, which two-view stereo cannot better.
         # Beside an object there is neither a hole nor a depth.
         surface = view.render.depth_map(view.state.config.holes.max_alpha)
         depth = fill_smoothly(surface.depth, ~view.holes & surface.valid)
-        if view.forced is not None:
+        forced = view.masks.edits.forced
+        if forced is not None:
             # What is left in a forced hole is wrong, and must not hide what fills it.
             in_front = torch.minimum(depth, IN_FRONT * surface.depth)
-            depth = torch.where(view.forced & surface.valid, in_front, depth)
+            depth = torch.where(forced & surface.valid, in_front, depth)
         depth = depth.flatten()[pixel_index]
         return Registration(move_to_depths(coarse, camera, depth), pixel_index, ())
     if config.extrapolate_into_holes and config.degrees_of_freedom == 1:
-        return register_beside_holes(coarse, pixel_index, reference, view)
-    registered, losses = optimize_distances(coarse, reference, view)
+        return register_beside_holes(coarse, pixel_index, reference, anchor, view)
+    registered, losses = optimize_distances(coarse, reference, anchor, view)
     return Registration(registered, pixel_index, losses)
 
 
 def register_beside_holes(
-    coarse: Gaussians, pixel_index: Int[Tensor, "n"], reference: View, view: TargetView
+    coarse: Gaussians,
+    pixel_index: Int[Tensor, "n"],
+    reference: View,
+    anchor: Anchor,
+    view: TargetView,
 ) -> Registration:
     """Register Gaussians that overlap the scene, and move those in holes like them.
 
@@ -99,7 +105,7 @@ def register_beside_holes(
     surface = view.render.depth_map(view.state.config.holes.max_alpha)
     scene = replace(surface, valid=surface.valid & ~view.empty)
     overlapping = torch.nonzero(scene.valid.flatten()[pixel_index])[:, 0]
-    registered, losses = optimize_distances(coarse[overlapping], reference, view)
+    registered, losses = optimize_distances(coarse[overlapping], reference, anchor, view)
     ratios = extrapolate_into_holes(
         coarse[overlapping], registered, pixel_index[overlapping], scene, camera
     )
@@ -119,16 +125,16 @@ def apply_affine(gaussians: Gaussians, affine: DepthAffine, camera: Camera) -> G
 
 
 def optimize_distances(
-    coarse: Gaussians, reference: View, view: TargetView
+    coarse: Gaussians, reference: View, anchor: Anchor, view: TargetView
 ) -> tuple[Gaussians, tuple[float, ...]]:
     """Minimize Eq. 11 over one distance per Gaussian; also return the loss per iteration."""
     if len(coarse) == 0:
         return coarse, ()
     config = view.state.config.registration
     renderer = view.scenes.renderer
-    anchor = view.anchor_view.camera
-    objective = Objective.from_renders(view.render, view.anchor_render, reference, anchor, config)
-    alone = make_renderer_alone(coarse, reference.camera, anchor, renderer, config)
+    at_anchor = anchor.view.camera
+    objective = Objective.from_renders(view.render, anchor.render, reference, at_anchor, config)
+    alone = make_renderer_alone(coarse, reference.camera, at_anchor, renderer, config)
     parameters = torch.zeros(
         (len(coarse), config.degrees_of_freedom), device=coarse.means.device, requires_grad=True
     )

@@ -1,6 +1,6 @@
 """Registration of the lifted Gaussians as the paper has it: Eq. 9 to 11 (Sec. III-E).
 
-The affine of Eq. 8 is given (`align_depth.py`). `register.py` is our registration, which departs
+The affine of Eq. 8 is given (`align_paper.py`). `register.py` is our registration, which departs
 from the paper where measurements favour another choice. `docs/paper.md` lists how we read what the
 paper leaves open; comments here say "our reading" at these places.
 """
@@ -17,6 +17,7 @@ from gscompleter.config import PaperRegistrationConfig
 from gscompleter.numerics.adam import Adam
 from gscompleter.numerics.geometry import compute_z_depths, slide
 from gscompleter.render.redraw import composite_beside
+from gscompleter.stages.select_anchor import Anchor
 from gscompleter.stages.target_view import TargetView
 from gscompleter.system.progress import track
 from gscompleter.system.threads import use_one_torch_thread
@@ -27,7 +28,7 @@ from gscompleter.types import Camera, DepthAffine, DepthMap, Gaussians, Lift, Re
 @timed_stage("register")
 @use_one_torch_thread()
 def register_as_paper(
-    lifted: Lift, affine: DepthAffine, reference: View, view: TargetView
+    lifted: Lift, affine: DepthAffine, reference: View, anchor: Anchor, view: TargetView
 ) -> Registration:
     """Align all Gaussians by one affine of depth, then each along its own ray.
 
@@ -39,7 +40,7 @@ def register_as_paper(
         # Nothing was lifted, or the ablation without RC (Table IV): the affine alone counts. The
         # paper's text calls that row "unconstrained optimization"; our reading is that of its name.
         return Registration(initial, lifted.pixel_index, ())
-    registered, losses = optimize_paper_distances(initial, reference, view)
+    registered, losses = optimize_paper_distances(initial, reference, anchor, view)
     return Registration(registered, lifted.pixel_index, losses)
 
 
@@ -57,7 +58,7 @@ def initialize_distances(lifted: Gaussians, affine: DepthAffine, camera: Camera)
 
 
 def optimize_paper_distances(
-    initial: Gaussians, reference: View, view: TargetView
+    initial: Gaussians, reference: View, anchor: Anchor, view: TargetView
 ) -> tuple[Gaussians, tuple[float, ...]]:
     """Minimize Eq. 11 over the distances; also return its value at each iteration.
 
@@ -66,11 +67,10 @@ def optimize_paper_distances(
     """
     config = view.state.config.paper_registration
     target = reference.camera
-    anchor = view.anchor_view.camera
     # D_ctx^tgt and D_ctx^anc are rendered from G_ctx once, since G_ctx is frozen. It contains what
     # earlier targets added.
     context_at_target = view.render.depth_map()
-    context_at_anchor = view.anchor_render.depth_map()
+    context_at_anchor = anchor.render.depth_map()
     move = MOVES[config.degrees_of_freedom]
 
     # Adam changes δ_i, beginning with 0, in d_i = d_i^init + δ_i (scene units). Its steps depend on
@@ -88,7 +88,7 @@ def optimize_paper_distances(
         # \hat{D}_tgt and \hat{I}_tgt are of the composite scene, G_ctx with G_tgt, and \hat{D}_anc
         # is of the target Gaussians G_tgt alone.
         composite, alone_at_anchor = composite_beside(
-            view.frozen, moved, view.scenes.renderer, anchor
+            view.frozen, moved, view.scenes.renderer, anchor.view.camera
         )
 
         l_depth = compute_depth_error(composite.depth_map(), context_at_target)

@@ -12,8 +12,11 @@ from gscompleter.numerics.geometry import (
     measure_rotation,
     project,
     sample,
+    shrink_camera,
     unproject,
 )
+from gscompleter.stages.target_view import TargetView
+from gscompleter.system.timing import timed_stage
 from gscompleter.types import Camera, Render, View
 
 SURFACE_TOLERANCE = 0.1
@@ -22,11 +25,31 @@ SURFACE_TOLERANCE = 0.1
 
 @dataclass(frozen=True)
 class AnchorChoice:
-    """The context view that forms the stereo pair with the target."""
+    """The number of the context view that forms the stereo pair with the target."""
 
     index: int
     fallback: bool
     """True if every view exceeded the rotation limit, so that the smallest rotation won."""
+
+
+@dataclass(frozen=True)
+class Anchor:
+    """The context view that forms the stereo pair with a target, and the scene there."""
+
+    index: int
+    is_fallback: bool
+    """True if every view exceeded the rotation limit, so that the smallest rotation won."""
+    target: TargetView
+
+    @property
+    def view(self) -> View:
+        """The photograph."""
+        return self.target.state.views[self.index]
+
+    @property
+    def render(self) -> Render:
+        """Render of the scene at its camera; targets that are skipped need none."""
+        return self.target.view_renders[self.index]
 
 
 def find_nearest_view(target: Camera, views: Sequence[View]) -> int:
@@ -92,3 +115,27 @@ def compute_overlap(camera: Camera, render: Render, anchor: Camera, at_anchor: R
     surface = sample(at_anchor.depth[..., None], pixels)[:, 0]
     shared = is_inside(pixels, z, anchor) & (z < (1 + SURFACE_TOLERANCE) * surface)
     return shared.float().mean().item()
+
+
+@timed_stage("context")
+def choose_anchor(view: TargetView) -> Anchor:
+    """Choose the anchor of a target by rotation, baseline and, beyond the paper, overlap."""
+    state = view.state
+    target = view.camera.target
+    config = state.config.anchor
+    overlaps = None if config.min_overlap == 0 else measure_overlaps(view)
+    choice = select_anchor(target, state.views, config, overlaps)
+    return Anchor(choice.index, choice.fallback, view)
+
+
+def measure_overlaps(view: TargetView) -> list[float]:
+    """Measure in small images how much of what a target sees each context view sees, too."""
+    state = view.state
+    side = state.config.next_best_view.image_size
+    small_target = shrink_camera(view.camera.target, side)
+    small_views = [shrink_camera(known.camera, side) for known in state.views]
+    at_target, *at_views = view.scenes.freeze_small(state.parts, [small_target, *small_views])
+    return [
+        compute_overlap(small_target, at_target.render, camera, frozen.render)
+        for camera, frozen in zip(small_views, at_views, strict=True)
+    ]

@@ -18,9 +18,10 @@ from gscompleter.generators import (
 )
 from gscompleter.numerics.value_checks import check_colors, check_notes
 from gscompleter.stages.select_anchor import find_nearest_view
+from gscompleter.stages.target_view import TargetView
 from gscompleter.system.errors import InputError
 from gscompleter.system.tensor_checks import describe, iterate_tensors
-from gscompleter.types import Camera, GeneratorInput, PaddedCamera, View
+from gscompleter.types import Camera, GeneratorInput, PaddedCamera, Render, View
 
 
 @dataclass(frozen=True, repr=False)
@@ -38,6 +39,25 @@ class GeneratedView(View):
     def crop(self, camera: PaddedCamera) -> View:
         """Cut the padding off the image."""
         return View(camera.crop(self.image), camera.target)
+
+
+def make_generator_input(view: TargetView) -> GeneratorInput:
+    """Collect the input of Φ, whose holes are those of a target."""
+    config = view.state.config.holes
+    opened, forced = view.masks.edits.opened, view.masks.edits.forced
+    render = view.render
+    alpha = view.alpha
+    # Φ takes as holes what has too little alpha, which is more than the holes of an object, or
+    # those of a removal.
+    if config.kind == "enclosed" or opened is not None:
+        alpha = alpha.where(view.holes, 1.0)
+    # What stands in a forced hole is wrong, so that Φ must not see it.
+    if forced is not None:
+        alpha = alpha.where(~forced, 0.0)
+        render = Render(
+            render.image * ~forced[..., None], render.depth * ~forced, render.alpha * ~forced
+        )
+    return GeneratorInput(view.state.views, view.view_renders, render, config.max_alpha, alpha)
 
 
 def synthesize(

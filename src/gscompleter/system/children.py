@@ -34,12 +34,8 @@ def run_python(
     It can import what this process can. Its arguments are `words`, and `text` is its standard
     input; without one it has that of this process.
     """
-    package_root = str(Path(__file__).parents[2])
-    # A script's own folder is on the path of this process only. Relative entries, among them that
-    # of an interactive Python, stand for the working folder.
-    folders = [folder for folder in (*sys.path, package_root) if os.path.isabs(folder)]
     return subprocess.run(
-        [sys.executable, "-c", BEGINNING.format(folders=folders) + program, *words],
+        make_command(program, words),
         input=text,
         capture_output=True,
         encoding="utf-8",
@@ -47,6 +43,26 @@ def run_python(
         env={**os.environ, **SAFE_PATH},
         check=False,
     )
+
+
+def start_python(program: str, words: Sequence[str] = ()) -> subprocess.Popen[bytes]:
+    """Start a program in a process of its own, as `run_python` does, without input and output."""
+    return subprocess.Popen(
+        make_command(program, words),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        env={**os.environ, **SAFE_PATH},
+    )
+
+
+def make_command(program: str, words: Sequence[str]) -> list[str]:
+    """Make the command line of a program that can import what this process can."""
+    package_root = str(Path(__file__).parents[2])
+    # A script's own folder is on the path of this process only. Relative entries, among them that
+    # of an interactive Python, stand for the working folder.
+    folders = [folder for folder in (*sys.path, package_root) if os.path.isabs(folder)]
+    return [sys.executable, "-c", BEGINNING.format(folders=folders) + program, *words]
 
 
 def run_module(module: str, text: str) -> subprocess.CompletedProcess[str]:

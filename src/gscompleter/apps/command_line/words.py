@@ -34,6 +34,8 @@ MAX_NAMED_COMMANDS = 3
 """Most commands that a sentence names as those with an option."""
 
 NEAREST = "the nearest is"
+SURPLUS = "Unrecognized options: "
+"""Beginning of tyro's message on words that nothing takes."""
 HINTS = {"Argument helptext:": "give", "Perhaps you meant:": NEAREST}
 """Titles in tyro's messages before the option that is meant."""
 
@@ -118,7 +120,15 @@ def explain_words(words: Sequence[str], kinds: Mapping[str, type], box: str) -> 
         return extract_sentence(box, ())
     # tyro only says that an option is unknown; that it belongs to another command says more.
     own = list_options(kind)
-    return describe_foreign_option(words, own, kinds) or extract_sentence(box, own)
+    sentence = describe_foreign_option(words, own, kinds) or extract_sentence(box, own)
+    # Of words that are no options, tyro says so as well.
+    surplus = sentence.removeprefix(SURPLUS)
+    if surplus != sentence and not surplus.startswith("-"):
+        return (
+            f"{surplus} belongs to no option of {words[0]}, and an option takes one value unless "
+            "its help shows several"
+        )
+    return sentence
 
 
 def list_options(kind: Any, prefix: str = "") -> set[str]:

@@ -91,12 +91,12 @@ def run_convert(options: ConvertOptions) -> None:
         from gscompleter.apps.converting import convert
         from gscompleter.splats.formats import reserve_splat
         from gscompleter.system.console import make_console
-        from gscompleter.system.progress import show_preparation, show_progress
+        from gscompleter.system.progress import show_progress, stage
 
     with (
         reserve_splat(options.out, options.overwrite),
         show_progress(make_console(stderr=True, quiet=options.quiet)),
-        show_preparation("converting"),
+        stage("converting"),
     ):
         done = convert(options)
     lines = list(done.notes)

@@ -17,8 +17,14 @@ from gscompleter.apps.commands.shared_options import (
     list_inputs,
     replace_by_scenes,
 )
-from gscompleter.config.generators import GeneratorOptions
+from gscompleter.config.generators import (
+    PREFIX,
+    GeneratorOptions,
+    GeneratorSettings,
+    get_settings_class,
+)
 from gscompleter.data.mask_reading import MaskReading
+from gscompleter.system.errors import InputError
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.jobs.engine_names import EngineName
 from gscompleter.system.process import import_without_collection
@@ -34,15 +40,54 @@ FigureName = Literal[
 # fmt: on
 AUTO = "auto"
 """Generator of the preset, or else the default one."""
+WEIGHTS = "generator_weights"
+"""Setting that belongs to one generator."""
 
 
 @dataclass(frozen=True)
 class PresetGeneratorOptions(GeneratorOptions):
-    """Model that synthesizes images, and its settings."""
+    """Models that synthesize images, and their settings."""
 
-    generator: str = AUTO
+    generator: tuple[str, ...] = (AUTO,)  # type: ignore[assignment]
     """Model that synthesizes the image at a target. As in `complete`; `auto` is that of the preset,
-    or else warp-inpaint."""
+    or else warp-inpaint; several are compared in one table, and a setting goes to those of them
+    that have it."""
+
+    def make_settings(self) -> GeneratorSettings:
+        """Return the settings of one generator; raises as those of `complete`."""
+        (name,) = self.generator
+        return GeneratorOptions(**{**vars(self), "generator": name}).make_settings()
+
+    def share_settings(self) -> dict[str, PresetGeneratorOptions]:
+        """Return options with one generator each, and those of the given settings that it has.
+
+        Raise InputError for a setting that none has, and for weights that several would take.
+        """
+        given = {
+            name: value
+            for name, value in vars(self).items()
+            if name.startswith(PREFIX) and value != getattr(PresetGeneratorOptions, name)
+        }
+        kinds = {name: get_settings_class(name) for name in self.generator}
+        for setting in given:
+            having = [g for g, kind in kinds.items() if hasattr(kind, setting.removeprefix(PREFIX))]
+            if not having:
+                raise InputError(
+                    f"None of the generators {', '.join(kinds)} has this setting; leave it out.",
+                    setting,
+                )
+            if setting == WEIGHTS and len(having) > 1:
+                raise InputError(
+                    f"These weights would be taken by {' and '.join(having)}; compare them without "
+                    "weights of your own, or one after the other.",
+                    setting,
+                )
+        return {
+            name: PresetGeneratorOptions(
+                (name,), **{k: v for k, v in given.items() if hasattr(kind, k.removeprefix(PREFIX))}
+            )
+            for name, kind in kinds.items()
+        }
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,15 +96,15 @@ class EvaluateOptions(SynthesisOptions, EngineOptions, MaskOptions):
 
     Run the same command again to continue. `gscompleter tables OUT` writes the tables at any time.
     With a preset, a table, a figure or several reconstructors it writes tables and figures of the
-    paper instead, with several depths one table that compares them.
+    paper instead, with several depths or generators one table that compares them.
 
     Example: gscompleter evaluate cases.json --methods context full --out scores
     """
 
     paths: Annotated[tuple[Path, ...], tyro.conf.Positional, tyro.conf.arg(metavar="PATH")]
     """A cases.json; or, with --protocol, scenes: folders with a transforms.json, folders of such
-    folders, pixelSplat chunks, RealEstate10K camera files, or drives (Waymo, nuScenes, KITTI, DDAD,
-    PandaSet; front camera)."""
+    folders, a file of scenes, pixelSplat chunks, RealEstate10K camera files, or drives (Waymo,
+    nuScenes, KITTI, DDAD, PandaSet; front camera)."""
     out: Path
     """Write results here. A folder; that of an earlier run is continued."""
     protocol: tuple[str, ...] = ()
@@ -125,6 +170,9 @@ class EvaluateOptions(SynthesisOptions, EngineOptions, MaskOptions):
     of ignoring it."""
     limit: Annotated[int, Interval(ge=1)] | None = None
     """Most cases to run, over all shards."""
+    apart: bool = False
+    """Use also the cases that their file keeps apart, for reports of what was decided without them.
+    run.json and the tables say so, and apart_uses.md beside the file counts it."""
 
     @property
     def mask_reading(self) -> MaskReading:

@@ -196,7 +196,7 @@ def open_completion(
             options.max_targets,
             describe_models(ready.options),
             options.results,
-            "complete the scene" if options.export_holes is None else "export holes of the scene",
+            describe_doing(ready),
         )
         print_lines(console, *plan)
         with output.write() as folder:
@@ -206,6 +206,15 @@ def open_completion(
 def list_results(options: CompleteOptions) -> tuple[str, ...]:
     """List globs of the files that a command may write to its folder."""
     return RESULTS if options.export_holes is None else EXPORTED
+
+
+def describe_doing(ready: Prepared) -> str:
+    """Say what is done with the scene, for the lines before the work."""
+    if ready.options.export_holes is not None:
+        return "export holes of the scene"
+    if ready.command == "remove":
+        return "remove the selection and fill its place"
+    return "complete the scene"
 
 
 def describe_models(options: CompleteOptions) -> str:

@@ -22,6 +22,7 @@ from gscompleter.apps.report.hole_pictures import HolePictures, draw_hole
 from gscompleter.data.scene import describe_camera
 from gscompleter.numerics.geometry import pad_camera
 from gscompleter.splats.alignment.similarity import get_scale, transform_camera_exactly
+from gscompleter.stages.refusals import explain_skip
 from gscompleter.stages.target_view import TargetView, render_target
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
@@ -85,8 +86,8 @@ def write_holes(folder: Path, ready: Prepared, begun: Completion) -> list[str]:
     skipped = []
     for number, target in enumerate(track(ready.task.targets, "target"), start=1):
         view = observe_hole(ready, begun, target)
-        if view.skip_reason:
-            skipped.append(f"Target {number} is left out: {view.skip_reason}")
+        if reason := explain_skip(view):
+            skipped.append(f"Target {number} is left out: {reason}")
         else:
             exported.append(make_export(number, target, view, ready.task.frame))
     if not exported:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from gscompleter.apps.report.schema import find_completed
+from gscompleter.splats.conversion import convert_splat
 from gscompleter.splats.edits import rename_edited
-from gscompleter.splats.formats import convert_splat
 from gscompleter.splats.layout import is_same_scene
 from gscompleter.system.files.output_folder import read_listing
 from gscompleter.system.files.writing import COMPLETED_FILE, CONTEXT_FILE, SUMMARY_FILE
@@ -29,9 +29,9 @@ def keep_small(
     if suffix != COMPLETED_FILE.removeprefix("completed"):
         # The input was read as it is, whatever further properties it has.
         small = folder / f"completed{suffix}"
-        note = convert_splat(folder / COMPLETED_FILE, small, ignore_properties=True)[2]
-        if note is not None:
-            notes = [*summary["scene"]["notes"], note]
+        losses = convert_splat(folder / COMPLETED_FILE, small, ignore_properties=True).notes
+        if losses:
+            notes = [*summary["scene"]["notes"], " ".join(losses)]
             summary = {**summary, "scene": {**summary["scene"], "notes": notes}}
         (folder / COMPLETED_FILE).unlink()
         rename_edited(folder, folder / f"completed{suffix}")

@@ -19,6 +19,7 @@ from gscompleter.apps.inputs.depth_range import (
     apply_scene_range,
     apply_splat_range,
 )
+from gscompleter.apps.inputs.describing import list_missing as list_missing_photographs
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.inputs.memory import check_scene
 from gscompleter.apps.inputs.named_photographs import check_context, check_target_files
@@ -30,7 +31,7 @@ from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.inputs.splat import add_check_views, locate_splat, move_to_splat
 from gscompleter.apps.inputs.taken_out import take_over_edits
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened, Target
-from gscompleter.apps.warmup import SPLAT_PART, compile_kernels, list_missing
+from gscompleter.apps.warmup import SPLAT_PART, compile_beside, compile_kernels, list_missing
 from gscompleter.completer import GSCompleter
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.photograph_names import describe_offset
@@ -57,6 +58,7 @@ PHOTOGRAPH_OPTIONS = {
     "frames": 40,
     "no_masks": False,
     "ignore": None,
+    "forget_edits": False,
 }
 """Options that only photographs can follow, with their defaults."""
 
@@ -170,16 +172,15 @@ def open_for_completion(options: CompleteOptions, console: Console) -> Opened:
 def read_inputs(options: CompleteOptions, opened: Opened) -> CompletionTask:
     """Read the context and the targets, and add the input splat; compile the kernels."""
     device = options.device
-    with show_preparation("reading photographs"):
-        has_splat = options.scene is not None
-        task = read_task(opened, options.context, options.target, device, has_splat)
-        task = add_paintings(task, options, opened)
-
-    parts = list_parts(options)
-    if options.scene is None:
-        compile_kernels(parts)
+    has_splat = options.scene is not None
+    with compile_beside(list_parts(options)):
+        with show_preparation("reading photographs"):
+            task = read_task(opened, options.context, options.target, device, has_splat)
+            task = add_paintings(task, options, opened)
+        given = read_splat(task, options, opened) if has_splat else None
+    if given is None:
         return task
-    return add_splat(task, options, opened, parts)
+    return add_splat(*given, options, opened)
 
 
 def load_models(
@@ -194,7 +195,17 @@ def load_models(
 
     # A single photograph has no stereo, so a network predicts its depth; a splat needs neither.
     if options.scene is None:
-        task = replace(task, views=prepare_single(reconstructor, task.views))
+        try:
+            task = replace(task, views=prepare_single(reconstructor, task.views))
+        except InputError as error:
+            # Of a copy that is not whole, that is the cause.
+            missing = list_missing_photographs(opened.photographs)
+            if not missing:
+                raise
+            raise InputError(
+                f"{len(missing)} of {len(opened.photographs)} photographs are missing, such as "
+                f"{quote_value(missing[0])}, and too few are left: {error}"
+            ) from error
 
     # The depth range is counted as a part of the context stage, whose seconds it is added to.
     with show_preparation("depth range"), record_seconds() as seconds, timed_stage("context"):
@@ -289,6 +300,8 @@ def check_photographs(options: CompleteOptions) -> CompleteOptions:
             "is given; leave it out.",
             "invert-masks",
         )
+    if options.large_masks and not options.has_marks:
+        raise InputError("There are no masks that could be too large; leave it out.", "large-masks")
     return replace(options, folder=None, scene=options.scene or options.folder)
 
 
@@ -319,21 +332,27 @@ def check_completion_inputs(options: CompleteOptions) -> None:
         load_splat(options.scene, options.drop_nonfinite, options.ignore_properties)
 
 
-def add_splat(
-    task: CompletionTask, options: CompleteOptions, opened: Opened, parts: Sequence[str]
-) -> CompletionTask:
-    """Compile the kernels, and add the input splat to the task."""
-    path = options.scene
-    assert path is not None
+def read_splat(
+    task: CompletionTask, options: CompleteOptions, opened: Opened
+) -> tuple[CompletionTask, Gaussians]:
+    """Read the input splat, and add check views to the task."""
+    assert options.scene is not None
     with show_preparation("reading the scene"):
         task = add_check_views(task, opened)
-        gaussians = load_splat(path, options.drop_nonfinite, options.ignore_properties)
-        if "cpu" in parts:
+        gaussians = load_splat(options.scene, options.drop_nonfinite, options.ignore_properties)
+        if options.device == "cpu":
             check_scene(task, gaussians)
-    compile_kernels(parts)
+    return task, gaussians
 
+
+def add_splat(
+    task: CompletionTask, gaussians: Gaussians, options: CompleteOptions, opened: Opened
+) -> CompletionTask:
+    """Add the input splat to the task."""
+    assert options.scene is not None
     with show_preparation("aligning the scene"):
-        gaussians, splat_file = sort_splat(gaussians, locate_splat(path, options.drop_nonfinite))
+        splat_file = locate_splat(options.scene, options.drop_nonfinite)
+        gaussians, splat_file = sort_splat(gaussians, splat_file)
         return move_to_splat(task, gaussians, splat_file, opened)
 
 

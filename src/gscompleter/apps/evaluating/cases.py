@@ -19,8 +19,21 @@ from gscompleter.data.limits import check_planes
 from gscompleter.data.mask_checks import read_masks_as_asked
 from gscompleter.data.photographs import MAX_TRANSLATION, Photographs, Resolution
 from gscompleter.evaluation import protocols
+from gscompleter.evaluation.apart import (
+    LEDGER,
+    Apartable,
+    describe_left_out,
+    leave_out_apart,
+)
 from gscompleter.evaluation.authors_loader import AuthorsLoader
-from gscompleter.evaluation.cases import Case, SkippedScene, filter_usable, open_clips, read_cases
+from gscompleter.evaluation.cases import (
+    Case,
+    SkippedScene,
+    filter_usable,
+    list_places,
+    open_clips,
+    read_cases,
+)
 from gscompleter.evaluation.paper import get_data_set
 from gscompleter.system.errors import InputError, quote_value
 
@@ -29,18 +42,23 @@ def collect_tasks(
     options: EvaluateOptions, skipped: list[SkippedScene], notes: list[str]
 ) -> list[protocols.Task]:
     """Collect the tasks of the options, and append to `skipped` and `notes`."""
+    left_out: list[Apartable] = []
     if options.protocol:
         # The iterator opens clips one by one, so those beyond the limit are not opened.
-        return list(islice(iterate_tasks(options, skipped, notes), options.limit))
+        tasks = list(islice(iterate_tasks(options, skipped, notes, left_out), options.limit))
+        notes += describe_apart(left_out, len(tasks), "scenes")
+        return tasks
 
-    cases = [case for path in options.paths for case in read_cases(find_cases_file(path))]
+    listed = [case for path in options.paths for case in read_cases(find_cases_file(path))]
+    cases = list(leave_out_apart(listed, options.apart, left_out))
+    notes += describe_apart(left_out, len(cases), "cases")
     if options.one_per_scene:
         # The first case of a scene is the last that overwrites its entry in reversed order.
         first = {case.scene: case for case in reversed(cases)}
         cases = [case for case in cases if case is first[case.scene]]
     cases = cases[: options.limit]
 
-    tasks: list[protocols.Task] = []
+    tasks = []
     # Cases of one scene stand together in a file, so that each scene is opened once for its notes.
     for scene, group in groupby(cases, lambda case: case.scene):
         own = [protocols.make_case_task(apply_options(case, options)) for case in group]
@@ -54,6 +72,12 @@ def collect_tasks(
             own = mark_masked(read_masks_as_asked(clip, options.mask_reading), own, notes)
         tasks += own
     return tasks
+
+
+def describe_apart(left_out: Sequence[Apartable], kept: int, kind: str) -> list[str]:
+    """Describe what is left out, and how to use it; raise as `describe_left_out`."""
+    lines = describe_left_out(left_out, kept, kind)
+    return [f"{line} Add --apart to use them, which is noted in {LEDGER}." for line in lines]
 
 
 def mark_masked(
@@ -85,7 +109,10 @@ def apply_options(case: Case, options: EvaluateOptions) -> Case:
 
 
 def iterate_tasks(
-    options: EvaluateOptions, skipped: list[SkippedScene], notes: list[str]
+    options: EvaluateOptions,
+    skipped: list[SkippedScene],
+    notes: list[str],
+    left_out: list[Apartable],
 ) -> Iterator[protocols.Task]:
     """Iterate over the tasks of the protocols, clip by clip."""
     rules = [protocols.parse_protocol(text) for text in options.protocol]
@@ -101,8 +128,9 @@ def iterate_tasks(
         size = parse_resolution(resolution)
     # Their code also keeps clips whose coordinates are large.
     max_translation = MAX_TRANSLATION if loader is None else None
-    for path in options.paths:
-        for clip in filter_usable(open_clips(path), skipped, max_translation):
+    listed = [place for path in options.paths for place in list_places(path)]
+    for place in leave_out_apart(listed, options.apart, left_out):
+        for clip in filter_usable(open_clips(place.path), skipped, max_translation):
             notes += clip.notes
             if options.ignore_moving and not clip.has_boxes:
                 raise InputError(
@@ -133,6 +161,7 @@ def iterate_tasks(
                 # The authors' loaders keep the order of the context; ours is ascending.
                 keeps_order = loader is not None
                 tasks = protocols.make_tasks(kept, clip, size, keeps_order)
+                tasks = [replace(task, apart_by=place.apart_by) for task in tasks]
                 tasks = mark_masked(clip, tasks, notes)
                 yield from tasks[:1] if options.one_per_scene else tasks
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
-import subprocess
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -17,6 +15,7 @@ from gscompleter.apps.commands.evaluate import AUTO, EvaluateOptions, PresetGene
 from gscompleter.apps.evaluating.scoring import Scored, run_methods, score_methods
 from gscompleter.evaluation.claims import HEAD, tabulate_claims
 from gscompleter.evaluation.figures import draw_figure
+from gscompleter.evaluation.measured_code import find_commit
 from gscompleter.evaluation.methods import expand_methods
 from gscompleter.evaluation.paper import (
     FigureSpec,
@@ -27,7 +26,7 @@ from gscompleter.evaluation.paper import (
     select_names,
 )
 from gscompleter.evaluation.paper_tables import (
-    fill_depth_table,
+    fill_comparison,
     fill_table,
     format_paper_markdown,
     write_paper_table,
@@ -49,13 +48,16 @@ FIGURES = "figures"
 """Folder of the figures in OUT."""
 RUNS = "runs"
 """Folder in OUT with the scores of each run, as `evaluate` writes them."""
-DEPTHS = "depths"
-"""Name of the table that compares depths."""
 DEPTH_COLUMNS = (
     *("psnr", "hole_psnr", "neighbours", "context_change"),
     *("depth_observed", "depth_hole", "depth_hole_median"),
 )
-"""Columns of that table."""
+"""Columns of the table that compares depths."""
+GENERATOR_COLUMNS = (
+    *("psnr", "hole_psnr", "neighbours", "context_change"),
+    *("st_lpips", "hole_flip", "hole_haarpsi", "hole_gradients"),
+)
+"""Columns of the table that compares generators."""
 RESULTS = "results.md"
 """Page in OUT with all tables, claims and figures."""
 
@@ -72,44 +74,77 @@ def run_evaluation(options: EvaluateOptions) -> int:
         raise InputError("A reconstructor is named twice; change --reconstructor.")
     if not options.depth or len(set(options.depth)) < len(options.depth):
         raise InputError("A depth is named twice, or none is; change --depth.", "depth")
+    generators = options.synthesis.generator
+    if not generators or len(set(generators)) < len(generators):
+        raise InputError("A generator is named twice, or none is; change --generator.", "generator")
     weights = assign_weights(models, options.weights)
     depth_weights = assign_weights(options.depth, options.depth_weights, "depth", "depth-weights")
-    if len(options.depth) > 1:
-        if is_reproduction or len(models) > 1:
+
+    several = [kind for kind in ("depth", "generator") if len(get_compared(options, kind)) > 1]
+    if several:
+        if is_reproduction or len(models) > 1 or len(several) > 1:
             raise InputError(
-                "Several depths are compared with one reconstructor in a table of their own; leave "
-                "--preset, --table and --figure out, and name one reconstructor.",
-                "depth",
+                f"Several {several[0]}s are compared with one reconstructor in a table of their "
+                "own; leave --preset, --table and --figure out, and name one of the others.",
+                several[0],
             )
-        return compare_depths(replace(options, weights=tuple(weights.values())), depth_weights)
+        options = replace(options, weights=tuple(weights.values()))
+        if several == ["depth"]:
+            return compare_depths(options, depth_weights)
+        return compare_generators(replace(options, depth_weights=tuple(depth_weights.values())))
     options = replace(options, depth_weights=tuple(depth_weights.values()))
     if is_reproduction or len(models) > 1:
         return reproduce(options)
     return run_methods(replace(options, weights=tuple(weights.values())))
 
 
+def get_compared(options: EvaluateOptions, kind: str) -> tuple[str, ...]:
+    """Return the names of one kind, of which several are compared."""
+    return options.depth if kind == "depth" else options.synthesis.generator
+
+
 def compare_depths(options: EvaluateOptions, weights: Mapping[str, Path]) -> int:
     """Run the methods with each depth, and write one table of all; return the exit code."""
-    console = make_console(stderr=True, quiet=options.quiet)
-    methods = expand_methods(options.methods)
-    runs = {}
-    scored = []
-    for depth in options.depth:
-        console.print(f"depth {depth}")
+
+    def choose(depth: str) -> EvaluateOptions:
         own = weights.get(depth)
-        run = replace(
-            options,
-            out=options.out / RUNS / make_file_name(f"depth {depth}"),
-            depth=(depth,),
-            depth_weights=() if own is None else (own,),
-        )
-        scored.append(score_methods(run))
-        write_tables(run.out)
-        runs[depth] = run.out
-    table = fill_depth_table(methods, DEPTH_COLUMNS, runs)
+        return replace(options, depth=(depth,), depth_weights=() if own is None else (own,))
+
+    runs = {depth: choose(depth) for depth in options.depth}
+    return compare_runs(options, "depth", "depth", runs, DEPTH_COLUMNS)
+
+
+def compare_generators(options: EvaluateOptions) -> int:
+    """Run the methods with each generator, and write one table of all; return the exit code."""
+    shared = options.synthesis.share_settings()
+    runs = {name: replace(options, synthesis=own) for name, own in shared.items()}
+    return compare_runs(options, "generator", "Φ", runs, GENERATOR_COLUMNS)
+
+
+def compare_runs(
+    options: EvaluateOptions,
+    kind: str,
+    compared: str,
+    runs: Mapping[str, EvaluateOptions],
+    columns: Sequence[str],
+) -> int:
+    """Run the methods with each model of a kind, and write one table; return the exit code."""
+    console = make_console(stderr=True, quiet=options.quiet)
+    folders = {}
+    scored = []
+    for name, run in runs.items():
+        console.print(f"{kind} {name}")
+        folder = options.out / RUNS / make_file_name(f"{kind} {name}")
+        scored.append(score_methods(replace(run, out=folder)))
+        write_tables(folder)
+        folders[name] = folder
+    methods = expand_methods(options.methods)
+    table = fill_comparison(f"{kind.title()}s compared", compared, methods, columns, folders)
     make_folder(options.out / TABLES)
-    write_paper_table(options.out / TABLES / DEPTHS, table)
-    if not options.quiet:
+    write_paper_table(options.out / TABLES / f"{kind}s", table)
+    if options.json:
+        print_json(collect_outputs(options.out))
+    elif not options.quiet:
         print(format_paper_markdown(table))
     failed = sum(len(run.failures) for run in scored)
     return choose_exit_code(failed, sum(run.num_own_rows for run in scored))
@@ -146,8 +181,8 @@ def apply_preset(options: EvaluateOptions) -> EvaluateOptions:
     """Set what is not given as the preset does, or as without one."""
     preset = get_data_set(options.preset)
     synthesis = options.synthesis
-    if synthesis.generator == AUTO:
-        synthesis = replace(synthesis, generator=preset.generator)
+    named = (preset.generator if name == AUTO else name for name in synthesis.generator)
+    synthesis = replace(synthesis, generator=tuple(named))
     return replace(
         options,
         resolution=preset.resolution if options.resolution is None else options.resolution,
@@ -165,7 +200,7 @@ def reproduce(options: EvaluateOptions) -> int:
     """
     paper = load_paper()
     console = make_console(stderr=True, quiet=options.quiet)
-    generator = options.synthesis.generator
+    (generator,) = options.synthesis.generator
 
     # A preset or several reconstructors alone stand for the table of models.
     names = options.table
@@ -291,13 +326,13 @@ def make_run(
     """Return the options of a run of one model with one protocol, in a folder of its own."""
     # Settings belong to the generator that was chosen, so that of the table has its defaults.
     synthesis = options.synthesis
-    if spec.generator and spec.generator != synthesis.generator:
-        synthesis = PresetGeneratorOptions(spec.generator)
+    if spec.generator and (spec.generator,) != synthesis.generator:
+        synthesis = PresetGeneratorOptions((spec.generator,))
     one_per_scene = options.one_per_scene or spec.one_per_scene
     model = options.reconstructor[number]
 
     # The folder is named by all that differs between the runs of one reproduction.
-    parts = [model, Path(protocol).stem or "cases", synthesis.generator]
+    parts = [model, Path(protocol).stem or "cases", *synthesis.generator]
     if one_per_scene:
         parts.append("one-per-scene")
     own = assign_weights(options.reconstructor, options.weights).get(model)
@@ -318,7 +353,8 @@ def write_results(options: EvaluateOptions) -> str:
     out = options.out
     paper = load_paper()
     device = choose_device(options.renderer_device or options.device)
-    machine = {**describe_machine(device), **find_commit()}
+    commit = find_commit()
+    machine = {**describe_machine(device), **({} if commit is None else {"commit": commit})}
     facts = ", ".join(f"{key} {value}" for key, value in machine.items())
     parts = [f"# Results\n\n{facts}.\n"]
 
@@ -335,13 +371,3 @@ def write_results(options: EvaluateOptions) -> str:
     with replace_file(out / RESULTS) as file:
         file.write(encode_text(text))
     return text
-
-
-def find_commit() -> dict[str, str]:
-    """Return the commit of this code, or nothing if it is not a git checkout."""
-    # From src/gscompleter/apps/evaluating of a checkout; an installed package has no .git there.
-    root = Path(__file__).parents[4]
-    if not (root / ".git").exists() or shutil.which("git") is None:
-        return {}
-    git = ["git", "-C", str(root), "describe", "--always", "--dirty"]
-    return {"commit": subprocess.run(git, capture_output=True, text=True).stdout.strip()}

@@ -20,10 +20,12 @@ from gscompleter.apps.evaluating.tables import write_and_print_tables
 from gscompleter.apps.inputs.scene_request import LONG_SIDE
 from gscompleter.apps.warmup import compile_kernels
 from gscompleter.data.photographs import check_resolution
+from gscompleter.evaluation.apart import record_uses
 from gscompleter.evaluation.cases import SkippedScene
 from gscompleter.evaluation.methods import expand_methods
+from gscompleter.evaluation.protocols import Task
 from gscompleter.evaluation.runner import RunConfig, collect_context_notes, evaluate
-from gscompleter.evaluation.store import list_row_paths
+from gscompleter.evaluation.store import get_score_path, list_row_paths
 from gscompleter.render.device import choose_devices
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError
@@ -90,14 +92,18 @@ def score_methods(options: EvaluateOptions) -> Scored:
         weights=str(options.weights[0]) if options.weights else None,
         depth=options.depth[0],
         depth_weights=str(options.depth_weights[0]) if options.depth_weights else None,
-        generator=options.synthesis.generator,
+        generator=options.synthesis.generator[0],
         generator_settings=options.synthesis.make_settings(),
         device=devices.renderer,
         network_device=devices.networks,
         seed=options.seed,
-        source=describe_source(options, any(task.has_masks for task in tasks)),
+        source=describe_source(options, tasks),
     )
     engine = make_engine(options, options.out.resolve())
+
+    apart = [task for task in tasks if task.apart_by is not None]
+    if apart and shard[0] == 0 and will_score(apart, methods, options):
+        record_uses(apart, f"evaluate --methods {' '.join(options.methods)}")
 
     # Kernels are compiled here once, before workers would each compile them.
     with show_progress(console):
@@ -112,6 +118,12 @@ def score_methods(options: EvaluateOptions) -> Scored:
     return Scored(len(tasks) * len(methods), own, counts.failures)
 
 
+def will_score(tasks: Sequence[Task], methods: Sequence[str], options: EvaluateOptions) -> bool:
+    """Check whether this call computes scores of some tasks, rather than reading earlier ones."""
+    rows = (get_score_path(options.out, task.name, m) for task in tasks for m in methods)
+    return options.rerun == "scores" or not all(row.exists() for row in rows)
+
+
 def print_context_notes(notes: Mapping[str, str], console: Console) -> None:
     """Print what Ψ said about the photographs of the first cases, and the number of the others."""
     for name, note in list(notes.items())[:MAX_NAMED]:
@@ -122,11 +134,13 @@ def print_context_notes(notes: Mapping[str, str], console: Console) -> None:
         )
 
 
-def describe_source(options: EvaluateOptions, has_masks: bool = False) -> dict[str, Any]:
+def describe_source(options: EvaluateOptions, tasks: Sequence[Task]) -> dict[str, Any]:
     """Describe the cases, as an output folder records them.
 
     Scores with masks are not continued with scores without, nor the other way round.
     """
+    has_masks = any(task.has_masks for task in tasks)
+    num_apart = sum(task.apart_by is not None for task in tasks)
     # A cases.json has the resolution of each case; scenes of a protocol have none.
     size = LONG_SIDE if options.resolution is None and options.protocol else options.resolution
     loader = find_loader(options)
@@ -137,6 +151,7 @@ def describe_source(options: EvaluateOptions, has_masks: bool = False) -> dict[s
         **({"masks": True} if has_masks else {}),
         **({"invert_masks": True} if has_masks and options.invert_masks else {}),
         **({"ignore_moving": True} if options.ignore_moving else {}),
+        **({"apart": num_apart} if num_apart else {}),
         **({"one_per_scene": True} if options.one_per_scene else {}),
         **({"ego_mask": False} if options.no_ego_mask else {}),
         **({} if loader is None else {"loader": asdict(loader)}),

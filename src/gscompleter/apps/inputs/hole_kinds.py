@@ -20,7 +20,8 @@ from gscompleter.data.mask_reading import MaskReading
 from gscompleter.numerics.geometry import add_near_plane
 from gscompleter.render.protocols import Renderer
 from gscompleter.stages.enclosed_holes import keep_enclosed
-from gscompleter.stages.target_view import compute_hole_mask, explain_little_covered
+from gscompleter.stages.hole_masks import compute_hole_mask
+from gscompleter.stages.refusals import explain_little_covered
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.types import Camera, Gaussians
 from gscompleter.virtual_capture.kind import is_object

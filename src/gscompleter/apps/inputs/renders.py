@@ -6,13 +6,10 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from io import BytesIO
 from pathlib import Path
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
-from PIL import Image
 from torch import Tensor
 
 from gscompleter.apps.inputs.captures import (
@@ -55,11 +52,11 @@ from gscompleter.data.photographs import (
 )
 from gscompleter.render.protocols import Renderer
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.image import convert_to_pixels
 from gscompleter.system.memory import check_memory
 from gscompleter.trust.lifted import find_pixel_center
 from gscompleter.types import Camera, Gaussians, View
 from gscompleter.virtual_capture.render_views import render_views
+from gscompleter.virtual_capture.rendered_photograph import RenderedPhotograph
 from gscompleter.virtual_capture.upward import estimate_axis_up, require_direction
 from gscompleter.virtual_capture.witnesses import choose_witnesses
 
@@ -274,19 +271,9 @@ def make_frames(
         c2w[:3, 3] += origin
         (fl_x, _, cx), (_, fl_y, cy), _ = camera.K.double().tolist()
         intrinsics = Intrinsics((camera.width, camera.height), (fl_x, fl_y), (cx, cy))
-        read = partial(encode_render, camera, scene, renderer)
-        frames.append(Frame(name, f"camera {name}", c2w, intrinsics, read))
+        render = RenderedPhotograph(camera, scene, renderer)
+        frames.append(Frame(name, f"camera {name}", c2w, intrinsics, render))
     return frames
-
-
-def encode_render(camera: Camera, scene: Gaussians, renderer: Renderer) -> bytes:
-    """Encode the render at a camera as a PNG that is transparent where nothing is known."""
-    (view,) = render_views(scene, [camera], renderer)
-    alpha = view.valid_mask.to(torch.uint8).mul(255).cpu().numpy()
-    pixels = np.dstack([convert_to_pixels(view.image), alpha])
-    file = BytesIO()
-    Image.fromarray(pixels).save(file, format="PNG")
-    return file.getvalue()
 
 
 def find_depth_sources(reading: SceneRequest) -> dict[str, str]:

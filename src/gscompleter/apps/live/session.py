@@ -25,13 +25,16 @@ from gscompleter.data.photographs import Resolution
 from gscompleter.data.scene import describe_camera, parse_camera
 from gscompleter.splats.alignment.similarity import transform_camera_exactly
 from gscompleter.splats.origin import format_corners
-from gscompleter.state import NOTHING_ADDED, Completion, TargetResult
+from gscompleter.stages.refusals import NOTHING_TO_COMPLETE
+from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
+from gscompleter.target_result import NOTHING_ADDED, TargetResult
 from gscompleter.types import Camera
 
 Action = Literal["complete", "fill", "remove", "repair"]
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 """Rotation of a box that is not rotated, as a quaternion wxyz."""
+ELSEWHERE = " “Find a hole” leads to one; what is wrong and not empty has to be painted over."
 UNMARKED = "Nothing is marked: choose Brush or Lasso, and paint over what is meant."
 
 
@@ -127,7 +130,11 @@ def check_step(step: Step) -> None:
 def complete_step(session: Session, step: Step, camera: Camera) -> tuple[Completion, str]:
     """Complete all holes that the camera sees."""
     first = session.completions[0].config
-    return keep_change(session, complete_at(session.completer, first, session.latest, camera))
+    completion = complete_at(session.completer, first, session.latest, camera)
+    changed, text = keep_change(session, completion)
+    if changed is session.latest and text.endswith(NOTHING_TO_COMPLETE):
+        text += ELSEWHERE
+    return changed, text
 
 
 def fill_step(session: Session, step: Step, camera: Camera) -> tuple[Completion, str]:

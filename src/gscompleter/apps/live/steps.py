@@ -24,10 +24,11 @@ from gscompleter.numerics.geometry import look_up
 from gscompleter.numerics.image_ops import dilate, label_regions
 from gscompleter.planning.remove import contain_nothing
 from gscompleter.render.removed import mask_removed
-from gscompleter.state import Completion, Unfilled
+from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
 from gscompleter.system.progress import stage
-from gscompleter.types import Camera
+from gscompleter.target_result import Unfilled
+from gscompleter.types import Camera, merge
 
 NOTHING_MARKED = "The marks show no Gaussian; paint over what the picture shows."
 EMPTY_BOX = "The box contains nothing; drag it, or make it larger."
@@ -70,18 +71,22 @@ def fill_marked(
     # Gaussians are added in the dilated hole mask (decision 037).
     touched = find_touched(result.hole_mask, marked)
     region = dilate(touched, config.holes.dilation)
-    added = result.added[look_up(region, result.added, result.target)]
-    parts = (*state.parts, added) if len(added) else state.parts
+    new = [
+        replace(part, gaussians=part.gaussians[look_up(region, part.gaussians, result.target)])
+        for part in completed.added_parts[len(state.added_parts) :]
+    ]
+    parts = (*state.added_parts, *(part for part in new if len(part)))
+    shown = replace(completed, config=state.config, added_parts=parts)
     filled = replace(
         result,
-        added=added,
-        after=completer.scenes.freeze(parts, state.with_depth_range(camera)).render,
+        added=merge([result.added[:0], *(part.gaussians for part in new)]),
+        after=completer.scenes.freeze(shown.parts, state.with_depth_range(camera)).render,
         hole_mask=touched,
         # Other holes stay empty on purpose.
         unfilled=Unfilled(),
     )
     targets = (*completed.targets[:-1], filled)
-    return replace(completed, config=state.config, parts=parts, targets=targets)
+    return replace(shown, targets=targets)
 
 
 def find_touched(holes: Bool[Tensor, "h w"], marked: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
@@ -154,8 +159,11 @@ def remove_chosen(
 
     # What is removed from the context is marked, so that its hole may be filled. What was added is
     # simply taken out.
-    left = [part[~mask] for part, mask in zip(state.parts[1:], added, strict=True)]
-    begun = replace(state, parts=(state.rendered_context, *left), config=config)
+    left = tuple(
+        replace(part, gaussians=part.gaussians[~mask])
+        for part, mask in zip(state.added_parts, added, strict=True)
+    )
+    begun = replace(state, added_parts=left, config=config)
     changed = remove_gaussians(begun, context, contains, completer.scenes)
     gone = changed.source.gone_mask & ~state.source.gone_mask
     count = sum(int(mask.sum()) for mask in (gone, *added))

@@ -51,11 +51,11 @@ from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.reconstructors.features.consistency import measure_pose_errors
 from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
-from gscompleter.splats.edits import EditDraft, Edits, record_edit
+from gscompleter.splats.edits import AppendedRows, EditDraft, Edits, record_edit
 from gscompleter.splats.layout import save_like, save_removed
 from gscompleter.splats.ply import save_parts, save_ply
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, RunRecord
-from gscompleter.state import NEW_PHOTO_ID, Completion, TargetResult
+from gscompleter.state import Completion
 from gscompleter.system.files.image import write_image, write_pixels
 from gscompleter.system.files.result_format import MARK
 from gscompleter.system.files.writing import (
@@ -64,6 +64,7 @@ from gscompleter.system.files.writing import (
     REMOVED_FILE,
     SUMMARY_FILE,
 )
+from gscompleter.target_result import TargetResult
 from gscompleter.types import Camera, Gaussians, View, merge
 
 GENERATED_FILE = "generated.ply"
@@ -313,6 +314,7 @@ def make_target_row(
     """Make the row of a target."""
     fit = result.affine
     added = result.added
+    empty = result.unfilled
     return TargetRow(
         target.frame,
         **scores,
@@ -324,7 +326,7 @@ def make_target_row(
         derived_from=target.derived_from,
         recolored=result.num_recolored,
         target_id=result.target_id if len(added) or result.num_recolored else None,
-        unfilled=UnfilledRow(**vars(result.unfilled)),
+        unfilled=UnfilledRow(empty.share, empty.lost_by, empty.regions),
         notes=result.notes,
         warnings=result.warnings,
         refused=result.refusal,
@@ -338,15 +340,12 @@ def make_target_row(
 
 def count_changes(completion: Completion) -> dict[str, Any]:
     """Count the Gaussians and, of a splat, the photographs that it was not trained on."""
-    # What was added by one step may have been removed by another.
-    added = completion.added
-    is_piece = completion.source.find_pieces(added)
-    counts = {"context": len(completion.context), "added": len(added)}
+    counts = {"context": len(completion.context), "added": len(completion.added)}
     if completion.is_given:
-        is_observed = (added.generated == NEW_PHOTO_ID) & ~is_piece
-        counts["from_photographs"] = int(is_observed.sum())
-    if is_piece.any():
-        counts["pieces"] = int(is_piece.sum())
+        counts["from_photographs"] = completion.num_observed
+    num_pieces = completion.count_added("piece")
+    if num_pieces:
+        counts["pieces"] = num_pieces
     num_removed = int(completion.source.gone_mask.sum())
     if num_removed:
         counts["removed"] = num_removed
@@ -406,7 +405,7 @@ def write_scenes(
         folder,
         replace(edit, seed=completion.seed),
         len(completion.context),
-        len(generated) if input_splat is not None else len(added),
+        list_appended(completion, input_splat is not None),
         None if input_splat is None else input_splat.path,
         Edits(folder) if input_splat is None else input_splat.edits,
         run,
@@ -414,6 +413,17 @@ def write_scenes(
         # Without the file of the given scene, recoloured rows stand where their originals were.
         can_be_undone=input_splat is not None or not completion.recolored_mask.any().item(),
     )
+
+
+def list_appended(completion: Completion, appends_recolored: bool) -> list[AppendedRows]:
+    """List the kinds of the rows of `completed.ply` after those of the context, in their order.
+
+    `appends_recolored` is False if recoloured Gaussians stand in the rows of their originals.
+    """
+    num_recolored = len(completion.recolored) if appends_recolored else 0
+    rows = [AppendedRows("recolored", num_recolored)]
+    rows += [AppendedRows(part.origin.kind, len(part)) for part in completion.added_parts]
+    return [row for row in rows if row.count]
 
 
 def find_file_order(context: Gaussians, input_splat: InputSplatFile) -> Int64[Tensor, "n"]:

@@ -12,6 +12,7 @@ from gscompleter.apps.report.surface_mosaic import draw_mosaic
 from gscompleter.generators.warp import BORDER_WIDTH, complete_warp
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.stages.select_anchor import find_nearest_view
+from gscompleter.stages.synthesize import make_generator_input
 from gscompleter.stages.target_view import TargetView
 from gscompleter.types import View
 
@@ -37,7 +38,7 @@ class HolePictures:
 def draw_hole(view: TargetView) -> HolePictures:
     """Collect the pictures of a target that is not padded."""
     camera = view.camera.target
-    context = view.make_generator_input()
+    context = make_generator_input(view)
     nearest = context.views[find_nearest_view(camera, context.views)]
     depth = view.render.depth_map()
     return HolePictures(

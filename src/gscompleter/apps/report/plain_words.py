@@ -59,8 +59,9 @@ BARE_NOTE = (
     "strip takes the rest away."
 )
 NOTHING_NEW_NOTE = (
-    "The splat reproduces all photographs. Where it is wrong from elsewhere, only smooth colours "
-    "are known: little is to be gained without new photographs of the place or a learned generator."
+    "The splat shows all photographs about equally well, so that none is new to it. Where it is "
+    "wrong from elsewhere, only smooth colours are known: little is to be gained without new "
+    "photographs of the place or a learned generator."
 )
 
 

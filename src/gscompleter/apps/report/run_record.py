@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from gscompleter import __version__
+from gscompleter.parts import NOT_INVENTED
 from gscompleter.splats.edits import hash_given
 from gscompleter.splats.provenance import ModelRecord, RunRecord, shorten
-from gscompleter.state import NEW_PHOTO_ID, Completion
+from gscompleter.state import Completion
 
 TOOL = "gscompleter"
 LICENCE = "Apache-2.0"
@@ -23,11 +24,10 @@ def make_run_record(
     given: Path | None,
 ) -> RunRecord:
     """Make the record of a completion with its models; `given` is the file of a given scene."""
-    added = completion.added.generated
-    recolored = completion.recolored.generated
-    labels = [*added.unique().tolist(), *recolored.unique().tolist()]
+    labels = [part.origin.label for part in completion.added_parts if len(part)]
+    labels += completion.recolored.generated.unique().tolist()
     # What photographs show was added as well, and nobody invented it.
-    invented = [label for label in labels if label != NEW_PHOTO_ID]
+    invented = [label for label in labels if label != NOT_INVENTED]
     painters = [result.painter for result in completion.targets if result.painter]
     return RunRecord(
         TOOL,

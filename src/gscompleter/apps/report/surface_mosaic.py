@@ -17,6 +17,7 @@ from gscompleter.numerics.geometry import axis_angle_to_matrix, pad_camera, unpr
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.numerics.robust import fit_plane_ransac
 from gscompleter.stages.select_anchor import find_nearest_view
+from gscompleter.stages.synthesize import make_generator_input
 from gscompleter.stages.target_view import TargetView, render_target
 from gscompleter.types import Camera
 
@@ -44,7 +45,7 @@ def draw_mosaic(view: TargetView) -> Float[Tensor, "s s 3"] | None:
         return None
     camera = face_plane(plane, view.holes, view.camera.target)
     front = render_target(view.state, pad_camera(camera, 0.0), view.scenes)
-    context = front.make_generator_input()
+    context = make_generator_input(front)
     nearest = context.views[find_nearest_view(camera, context.views)]
     warped = warp_photographs(nearest, camera, context)
 

@@ -152,7 +152,11 @@ def load_known_cameras(
     try:
         photographs = load_context_cameras(source, summary, content)
     except InputError:
-        note = f"The context photographs are not shown, because {quote_value(source)} was moved."
+        # A path is as the command was given it, and leads elsewhere from another folder.
+        cause = "is not in this folder, and was named from another"
+        if source.is_absolute():
+            cause = "was moved"
+        note = f"The context photographs are not shown, because {quote_value(source)} {cause}."
         return targets, (note,)
     return (*targets, *photographs), ()
 
@@ -228,8 +232,8 @@ def add_file_cameras(content: ViewerContent, path: Path, resolution: Resolution)
 
 def make_frame_thumbnail(frame: Frame) -> bytes | None:
     """Make a small JPEG of the upright photograph of a frame; None if it is no file."""
-    stored = frame.find_stored()
-    return make_thumbnail(stored, frame.find_turn()) if isinstance(stored, Path) else None
+    path = None if frame.file is None else frame.file.path
+    return None if path is None else make_thumbnail(path, frame.find_turn())
 
 
 def make_thumbnail(stored: Path, orientation: int = 1) -> bytes | None:

@@ -21,8 +21,9 @@ from jaxtyping import Float
 
 from gscompleter.data.cameras import Distortion, Intrinsics
 from gscompleter.data.driving.vehicle import build_poses, compute_moving_boxes, transform_points
-from gscompleter.data.frame import Frame
+from gscompleter.data.frame import Frame, capitalize
 from gscompleter.data.limits import require
+from gscompleter.data.photograph import StoredPhotograph
 from gscompleter.data.photographs import Photographs, build_drive
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import check_file
@@ -131,7 +132,9 @@ def _make_frame(
         title,
         _parse_matrix(pose, title) @ vehicle_from_camera @ CAMERA_FROM_OPENCV,
         intrinsics,
-        partial(_read_value, segment, "image", {TIME: time, CAMERA: camera}),
+        StoredPhotograph(
+            partial(_read_value, segment, "image", {TIME: time, CAMERA: camera}), capitalize(title)
+        ),
         sensor=name,
         laser_points=laser_points,
         boxes=boxes,

@@ -18,8 +18,9 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from gscompleter.data.cameras import Intrinsics
-from gscompleter.data.frame import Frame
+from gscompleter.data.frame import Frame, capitalize
 from gscompleter.data.limits import require
+from gscompleter.data.photograph import StoredPhotograph
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
 from gscompleter.system.damage import describe_damage
@@ -109,7 +110,8 @@ def build_recording(
         depth = None
         if name in depths:
             depth = partial(_read_depth, depths[name], confidences.get(name), decoders, title)
-        frame = Frame(name, title, c2w @ OPENCV_FROM_OPENGL, lens, images[name], depth)
+        stored = StoredPhotograph(images[name], capitalize(title))
+        frame = Frame(name, title, c2w @ OPENCV_FROM_OPENGL, lens, stored, depth)
         frames.append(frame.with_rigid_pose())
     require(frames, f"No photograph of {quote_value(path)} has a camera; {ADVICE}.")
     return build_photographs(path.resolve().stem, str(path), frames)

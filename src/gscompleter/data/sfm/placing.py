@@ -24,11 +24,11 @@ from PIL import Image
 
 from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.colmap import open_colmap
-from gscompleter.data.file_names import FolderListings
 from gscompleter.data.frame import FOLDERS, MASKS, Frame
 from gscompleter.data.mask_checks import check_hiding_masks
 from gscompleter.data.mask_reading import MaskReading
-from gscompleter.data.masks import find_mask
+from gscompleter.data.masks import GivenPhotograph, find_given
+from gscompleter.data.photograph import StoredPhotograph
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.sfm.poses import (
     COMMAND,
@@ -38,21 +38,13 @@ from gscompleter.data.sfm.poses import (
     SEPARATORS,
     identify_files,
     list_all_photographs,
-    list_given_masks,
     read_earlier,
-    read_focal,
-    read_lens,
     require_pycolmap,
     run_colmap,
 )
 from gscompleter.numerics.geometry import select_spread_cameras
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.image import (
-    convert_to_pixels,
-    open_image,
-    read_orientation,
-    read_upright_size,
-)
+from gscompleter.system.files.image import convert_to_pixels
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.files.writing import SUMMARY_FILE
 from gscompleter.system.progress import track
@@ -149,7 +141,8 @@ def place_photographs(
     or if these masks hide most of them.
     """
     found = list_all_photographs(folder) if os.path.isdir(folder) else []
-    known = {stored.resolve() for stored in map(find_stored_file, photographs.frames) if stored}
+    files = [frame.file.path for frame in photographs.frames if frame.file is not None]
+    known = {path.resolve() for path in files if path is not None}
     names = [name for name in found if (folder / name).resolve() not in known]
     if not found:
         raise InputError(f"There are no photographs in {quote_value(folder)}.", "photos")
@@ -160,9 +153,10 @@ def place_photographs(
             "photos",
         )
 
-    masks = list_given_masks(folder, names, reading.folder)
-    check_hiding_masks(masks, reading, len(names))
-    identity = identify_input(folder, names, photographs, reading.folder)
+    new = find_given(folder, names, reading.folder)
+    masks = [given.mask for given in new if given.mask is not None]
+    check_hiding_masks(masks, reading, len(new))
+    identity = identify_input(new, photographs)
     if reading.ignores_white:
         identity["inverted masks"] = True
     earlier = read_earlier(out, "placed", identity)
@@ -171,10 +165,10 @@ def place_photographs(
     else:
         require_pycolmap()
         with reserve_output(out, overwrite, COMMAND, RESULTS) as output, output.write() as draft:
-            placed = place_copies(folder, names, photographs, draft, reading)
+            placed = place_copies(folder, new, photographs, draft, reading)
             content = {"placed": asdict(placed), "photographs": identity}
             (draft / SUMMARY_FILE).write_bytes(json.dumps(content, indent=1).encode())
-    placed = replace(placed, skipped=len(found) - len(names))
+    placed = replace(placed, skipped=len(found) - len(new))
     (opened,) = open_colmap(out)
     added = [name_new(frame, folder) for frame in opened.frames]
     return replace(photographs, frames=(*photographs.frames, *added)), placed
@@ -190,32 +184,21 @@ def name_new(frame: Frame, folder: Path) -> Frame:
     return replace(frame, name=f"{home}/{frame.name}")
 
 
-def find_stored_file(frame: Frame) -> Path | None:
-    """Return the file of a photograph, or None if it is in a container or missing."""
-    stored = frame.find_stored() if isinstance(frame.image, Path) else None
-    return stored if isinstance(stored, Path) else None
-
-
-def identify_input(
-    folder: Path, names: Sequence[str], photographs: Photographs, masks: Path | None = None
-) -> dict[str, Any]:
-    """Identify new photographs as files, and the known cameras by a hash.
-
-    `masks` is a folder of masks that takes the place of those beside the new photographs.
-    """
+def identify_input(new: Sequence[GivenPhotograph], photographs: Photographs) -> dict[str, Any]:
+    """Identify new photographs as files, and the known cameras by a hash."""
     digest = hashlib.sha256()
     for frame in photographs.frames:
         digest.update(frame.name.encode(errors="surrogateescape"))
         digest.update(frame.c2w.tobytes())
     return {
-        "new": identify_files(folder, names, masks),
+        "new": identify_files(new),
         "known": digest.hexdigest(),
     }
 
 
 def place_copies(
     folder: Path,
-    names: Sequence[str],
+    given: Sequence[GivenPhotograph],
     photographs: Photographs,
     draft: Path,
     reading: MaskReading,
@@ -224,7 +207,7 @@ def place_copies(
     with tempfile.TemporaryDirectory(dir=draft) as work:
         home = Path(work)
         known, sources = write_known(photographs, home)
-        new = write_new(folder, names, photographs, home, reading)
+        new = write_new(given, photographs, home, reading)
         job = {
             "images": str(home / IMAGES),
             "masks": str(home / MASKS),
@@ -235,12 +218,12 @@ def place_copies(
         }
         result = run_colmap(PROCESS, job, home, "Placing photographs")
         failures = {
-            name: explain_unplaced(row, sources)
-            for name, row in zip(names, result["new"], strict=True)
+            photograph.name: explain_unplaced(row, sources)
+            for photograph, row in zip(given, result["new"], strict=True)
             if not row["is_placed"]
         }
-        placed = Placed(len(names), failures)
-        if len(failures) == len(names):
+        placed = Placed(len(given), failures)
+        if len(failures) == len(given):
             raise InputError(
                 f"No photograph in {quote_value(folder)} could be placed among those of SCENE. "
                 + placed.notes[1],
@@ -319,69 +302,54 @@ def read_pinhole(view: View) -> Pinhole:
 
 
 def write_new(
-    folder: Path,
-    names: Sequence[str],
-    photographs: Photographs,
-    home: Path,
-    reading: MaskReading,
+    given: Sequence[GivenPhotograph], photographs: Photographs, home: Path, reading: MaskReading
 ) -> list[NewCopy]:
     """Write copies of new photographs, undistorted if their lens is a known one."""
     lenses = collect_lenses(photographs)
-    listings = FolderListings()
-    copies = []
-    for name in track(names, "Reading new photographs"):
-        key = read_lens_key(folder / name)
-        copies.append(write_copy(folder, name, key, lenses.get(key), home, listings, reading))
-    return copies
+    return [
+        write_copy(photograph, lenses, home, reading)
+        for photograph in track(given, "Reading new photographs")
+    ]
 
 
 def collect_lenses(photographs: Photographs) -> dict[LensKey, Intrinsics]:
     """Collect the intrinsics of the known photographs by size and lens."""
     lenses: dict[LensKey, Intrinsics] = {}
     for frame in photographs.frames:
-        file = find_stored_file(frame)
+        file = frame.file
         # The camera of a photograph belongs to the pixels as they are stored, unless it is turned.
-        if file is not None and frame.find_turn() == 1 and read_orientation(file) == 1:
-            lenses.setdefault(read_lens_key(file), frame.intrinsics)
+        if file is not None and frame.find_turn() == 1 and file.orientation == 1:
+            lenses.setdefault(get_lens_key(file), frame.intrinsics)
     return lenses
 
 
-def read_lens_key(path: Path) -> LensKey:
-    """Read the size of an upright photograph, and the key of its camera, lens and zoom."""
-    width, height = read_upright_size(path)
-    with open_image(path) as image:
-        return width, height, read_lens(image.getexif())
+def get_lens_key(photograph: StoredPhotograph) -> LensKey:
+    """Get the size of an upright photograph, and the key of its camera, lens and zoom."""
+    return *photograph.upright_size, photograph.optics.lens
 
 
 def write_copy(
-    folder: Path,
-    name: str,
-    key: LensKey,
-    known: Intrinsics | None,
-    home: Path,
-    listings: FolderListings,
-    reading: MaskReading,
+    given: GivenPhotograph, lenses: Mapping[LensKey, Intrinsics], home: Path, reading: MaskReading
 ) -> NewCopy:
-    """Write the copy of a new photograph, which is undistorted if its lens is `known`."""
-    path = folder / name
-    title = f"the photograph {quote_value(path)}"
+    """Write the copy of a new photograph, which is undistorted if its lens is known."""
+    title = f"the photograph {quote_value(given.path)}"
+    known = lenses.get(get_lens_key(given.stored))
     # Without a known lens the intrinsics are not used, but for the size that makes it upright.
-    width, height, lens = key
+    width, height = given.stored.upright_size
     guess = Intrinsics((width, height), (float(width), float(width)))
-    mask = find_mask(path, name, listings, reading.folder)
     frame = Frame(
-        name,
+        given.name,
         title,
         np.eye(4),
         known or guess,
-        path,
-        mask=mask,
+        given.stored,
+        mask=given.mask,
         has_inverted_mask=reading.ignores_white,
     )
-    (view,) = build_photographs(name, title, [frame]).views([0], MAX_SIDE)
+    (view,) = build_photographs(given.name, title, [frame]).views([0], MAX_SIDE)
 
     # Two photographs may differ in their endings alone.
-    plain = re.sub(SEPARATORS, "_", name)
+    plain = re.sub(SEPARATORS, "_", given.name)
     copy = f"{NEW}/{Path(plain).with_suffix('.png').as_posix()}"
     if (home / IMAGES / copy).exists():
         copy = f"{NEW}/{plain}.png"
@@ -389,16 +357,11 @@ def write_copy(
         raise InputError(f"Two photographs would be called {quote_value(copy)}; rename one.")
     is_masked = write_view(view, home, copy)
     camera = view.camera
-    focal = read_focal_pixels(path, camera.width, camera.height)
+    lens, focal = given.stored.optics
+    # From image diagonals to pixels of the copy.
+    focal = None if focal is None else focal * math.hypot(camera.width, camera.height)
     pinhole = None if known is None else read_pinhole(view)
     return NewCopy(copy, camera.width, camera.height, lens, focal, pinhole, is_masked)
-
-
-def read_focal_pixels(path: Path, width: int, height: int) -> float | None:
-    """Read the focal length from EXIF, in pixels of a copy of this size; None if it has none."""
-    with open_image(path) as image:
-        diagonals = read_focal(image.getexif())
-    return None if diagonals is None else diagonals * math.hypot(width, height)
 
 
 def keep_copy(home: Path, draft: Path, copy: NewCopy) -> None:

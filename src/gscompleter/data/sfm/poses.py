@@ -27,13 +27,19 @@ from jaxtyping import Bool
 from PIL import Image, ImageOps
 
 from gscompleter.data.camera_files import refuse_other_exports
-from gscompleter.data.file_names import FolderListings
 from gscompleter.data.frame import DOWNSCALE_FACTORS, MASKS, Frame
 from gscompleter.data.limits import require
 from gscompleter.data.mask_checks import check_hiding_masks, refuse_nothing_to_invert
 from gscompleter.data.mask_reading import MaskReading
-from gscompleter.data.masks import MASK_FOLDERS, find_mask, leave_out_masks, load_mask
+from gscompleter.data.masks import (
+    MASK_FOLDERS,
+    GivenPhotograph,
+    find_given,
+    leave_out_masks,
+    load_mask,
+)
 from gscompleter.data.panorama import has_panoramas, split_panorama
+from gscompleter.data.photograph import StoredPhotograph, read_focal, read_lens
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.unused_files import (
     DEPTH_FOLDERS,
@@ -47,12 +53,7 @@ from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.image import (
     HALF_OPAQUE,
     ORIENTATION,
-    has_alpha,
-    leave_out_constant,
     open_image,
-    read_colors_and_alpha,
-    read_orientation,
-    read_upright_size,
     turn_upright,
 )
 from gscompleter.system.files.output_folder import refuse_later_results, reserve_output
@@ -89,16 +90,6 @@ MAX_SIDE = 1600
 """Longest side of a copy in pixels; SIFT finds no better features in larger ones."""
 QUALITY = 95
 """JPEG quality of rotated or shrunk copies."""
-FULL_FRAME_DIAGONAL = 43.2666
-"""Diagonal of 36 x 24 mm, the reference of EXIF's "focal length in 35 mm film"."""
-
-# Tags of EXIF.
-MAKE = 0x010F
-MODEL = 0x0110
-EXIF = 0x8769
-FOCAL_LENGTH = 0x920A
-FOCAL_LENGTH_35 = 0xA405
-
 MAX_THREADS = 4
 MAX_NAMED = 5
 """Most photographs that a note names."""
@@ -164,7 +155,7 @@ class FoundPoses:
         if self.focal is not None:
             notes.append(
                 f"{self.num_registered} of {self.photographs} cameras were found with a focal "
-                f"length of {self.focal:.0f} px, which was fixed at first."
+                f"length of {self.focal:.0f} px, assumed at first and refined with them."
             )
         if self.missing:
             names = join_names(self.missing, MAX_NAMED)
@@ -212,9 +203,7 @@ def find_poses(
 
 def list_given_masks(folder: Path, names: Sequence[str], named: Path | None = None) -> list[Path]:
     """List the masks of photographs in a folder; `named` is as in `find_mask`."""
-    listings = FolderListings()
-    masks = (find_mask(folder / name, name, listings, named) for name in names)
-    return [mask for mask in masks if mask is not None]
+    return [given.mask for given in find_given(folder, names, named) if given.mask is not None]
 
 
 def _identify_input(path: Path, num_frames: int, masks: Path | None) -> dict[str, list[int]]:
@@ -222,20 +211,13 @@ def _identify_input(path: Path, num_frames: int, masks: Path | None) -> dict[str
     if is_video(path):
         stat = path.stat()
         return {path.name: [stat.st_size, stat.st_mtime_ns, num_frames]}
-    return identify_files(path, list_photograph_files(path), masks)
+    return identify_files(find_given(path, list_photograph_files(path), masks))
 
 
-def identify_files(
-    folder: Path, names: Sequence[str], named: Path | None = None
-) -> dict[str, list[int]]:
-    """Identify photographs and their masks by size and time of change.
-
-    A folder of masks that the user `named` is as in `find_mask`.
-    """
-    files = {name: folder / name for name in names}
-    listings = FolderListings()
-    masks = {name: find_mask(file, name, listings, named) for name, file in files.items()}
-    files |= {f"mask of {name}": mask for name, mask in masks.items() if mask is not None}
+def identify_files(photographs: Sequence[GivenPhotograph]) -> dict[str, list[int]]:
+    """Identify photographs and their masks by size and time of change."""
+    files = {given.name: given.path for given in photographs}
+    files |= {f"mask of {given.name}": given.mask for given in photographs if given.mask}
     stats = {name: file.stat() for name, file in files.items()}
     return {name: [stat.st_size, stat.st_mtime_ns] for name, stat in stats.items()}
 
@@ -382,11 +364,11 @@ def _run(photographs: Path, folder: Path, given: Path, reading: MaskReading) -> 
     """Write `images` and `sparse/0` of photographs, made from what was `given`, into `folder`."""
     names = list_photograph_files(photographs)
     is_panoramic = has_panoramas([photographs / name for name in names])
-    listings = FolderListings()
+    given_photographs = find_given(photographs, names, reading.folder)
     copies = [
         copy
-        for name in track(names, "Turning photographs upright")
-        for copy in write_copies(photographs, name, folder, is_panoramic, listings, reading)
+        for shown in track(given_photographs, "Turning photographs upright")
+        for copy in write_copies(photographs, shown, folder, is_panoramic, reading)
     ]
     result = _map(copies, folder, is_panoramic)
     missing = [copy.source for copy in copies if copy.name not in result["registered"]]
@@ -425,26 +407,24 @@ def _describe_origin(given: Path, images: int, copies: int) -> str:
 
 def write_copies(
     root: Path,
-    source: str,
+    given: GivenPhotograph,
     folder: Path,
     is_panoramic: bool,
-    listings: FolderListings,
     reading: MaskReading,
 ) -> list[UprightCopy]:
     """Write the upright copy of a photograph, or the views of a panorama, into `folder`/images.
 
     The views of all panoramas with the same direction are in one folder, as COLMAP's rigs need it.
-    What masks hide is written into `folder`/masks. `listings` are of the folders of `root`.
+    What masks hide is written into `folder`/masks.
     """
-    mask = find_mask(root / source, source, listings, reading.folder)
     if not is_panoramic:
-        return [write_upright(root, source, folder, mask, reading.ignores_white)]
+        return [write_upright(root, given.name, folder, given.mask, reading.ignores_white)]
     copies = []
-    hidden = read_hidden(root / source, mask, reading.ignores_white)
-    for number, (pixels, shade) in enumerate(split_panorama(root / source, hidden)):
+    hidden = read_hidden(given.path, given.mask, reading.ignores_white)
+    for number, (pixels, shade) in enumerate(split_panorama(given.path, hidden)):
         kind = f"view_{number}"
-        name = Path(re.sub(SEPARATORS, "_", source)).with_suffix(".jpg")
-        target = _prepare_target(folder / IMAGES / kind / name, root / source)
+        name = Path(re.sub(SEPARATORS, "_", given.name)).with_suffix(".jpg")
+        target = _prepare_target(folder / IMAGES / kind / name, given.path)
         Image.fromarray(pixels).save(target, quality=QUALITY, subsampling=0)
         side = len(pixels)
         place = f"{kind}/{name.as_posix()}"
@@ -500,17 +480,17 @@ def read_hidden(
     path: Path, mask: Path | None, has_inverted_mask: bool = False
 ) -> Bool[np.ndarray, "h w"] | None:
     """Read what a mask or the alpha of a photograph hides, upright; None if it has neither."""
-    if mask is None and not has_alpha(path):
+    photograph = StoredPhotograph(path)
+    if mask is None and not photograph.has_alpha:
         return None
-    orientation = read_orientation(path)
-    size = read_upright_size(path)
+    orientation = photograph.orientation
+    size = photograph.upright_size
     # A mask is of the upright photograph, or is turned with it; alpha is stored with the pixels.
     hidden = np.zeros((size[1], size[0]), dtype=bool)
     if mask is not None:
         title = f"the photograph {quote_value(path)}"
         hidden |= load_mask(mask, size, title, orientation, has_inverted_mask)
-    _, alpha = read_colors_and_alpha(path) if has_alpha(path) else (None, None)
-    alpha = None if alpha is None else leave_out_constant(alpha)
+    alpha = photograph.read_pixels()[1] if photograph.has_alpha else None
     if alpha is not None:
         hidden |= turn_upright(alpha < HALF_OPAQUE, orientation)
     return hidden
@@ -538,27 +518,6 @@ def _prepare_target(target: Path, source: Path) -> Path:
         )
     target.parent.mkdir(parents=True, exist_ok=True)
     return target
-
-
-def read_lens(exif: Image.Exif) -> str:
-    """Read the key of camera, lens and zoom; photographs with the same one share intrinsics."""
-    detail = exif.get_ifd(EXIF)
-    values = (
-        exif.get(MAKE),
-        exif.get(MODEL),
-        detail.get(FOCAL_LENGTH),
-        detail.get(FOCAL_LENGTH_35),
-    )
-    return " ".join(str(value) for value in values)
-
-
-def read_focal(exif: Image.Exif) -> float | None:
-    """Read the focal length in image diagonals from the 35 mm equivalent; None if there is none."""
-    try:
-        millimetres = float(exif.get_ifd(EXIF)[FOCAL_LENGTH_35])
-    except (KeyError, TypeError, ValueError, ZeroDivisionError):  # broken values are common
-        return None
-    return millimetres / FULL_FRAME_DIAGONAL if 1 <= millimetres <= 5000 else None
 
 
 def _map(copies: Sequence[UprightCopy], folder: Path, is_panoramic: bool) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 HaarPSI (Reisenhofer et al., A Haar Wavelet-Based Perceptual Similarity Index, 2018) compares Haar
 wavelets, which differ where only one image has an edge. FLIP is NVIDIA's flip-evaluator, LPIPS and
-FID are torchmetrics' (`gscompleter[evaluation]`).
+FID are torchmetrics' (`gscompleter[evaluation]`). ST-LPIPS is in `st_lpips.py`.
 """
 
 from __future__ import annotations

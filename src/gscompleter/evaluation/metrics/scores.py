@@ -22,6 +22,7 @@ from gscompleter.evaluation.metrics.image import (
     ssim,
 )
 from gscompleter.evaluation.metrics.perceptual import compute_flip_map, compute_lpips, haarpsi
+from gscompleter.evaluation.metrics.st_lpips import compute_st_lpips
 from gscompleter.evaluation.metrics.thin_gaps import (
     AT_TARGET,
     WorstGap,
@@ -31,7 +32,7 @@ from gscompleter.evaluation.metrics.thin_gaps import (
     render_flight,
 )
 from gscompleter.render.protocols import Renderer
-from gscompleter.stages.target_view import compute_hole_mask
+from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.types import Camera, DepthMap, Gaussians, Render, View
 
 Image = Float[Tensor, "h w 3"]
@@ -66,6 +67,8 @@ class Quality:
     lpips_vgg: float | None
     """None if LPIPS is not available."""
     lpips_alex: float | None
+    st_lpips: float | None
+    """None if the package with its weights is missing, and for a tiny image."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +203,7 @@ def score(
 
 
 def measure_quality(image: Image, photograph: View) -> Quality:
-    """Compute PSNR, SSIM and, if the weights are available, LPIPS.
+    """Compute PSNR, SSIM and, if the weights are available, LPIPS and ST-LPIPS.
 
     Ignored pixels of the photograph do not count for PSNR and count as equal for the others.
     """
@@ -211,6 +214,7 @@ def measure_quality(image: Image, photograph: View) -> Quality:
         compute_view_ssim(image, photograph),
         compute_lpips(compared, truth, "vgg"),
         compute_lpips(compared, truth, "alex"),
+        compute_st_lpips(compared, truth),
     )
 
 

@@ -19,8 +19,9 @@ from gscompleter.evaluation.verdict.numbers import (
 )
 from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow, ScoreRow
 from gscompleter.reconstructors.features.consistency import count_consistent_matches
-from gscompleter.stages.target_view import NOTHING_TO_COMPLETE
-from gscompleter.state import Completion, TargetResult
+from gscompleter.stages.refusals import NOTHING_TO_COMPLETE
+from gscompleter.state import Completion
+from gscompleter.target_result import TargetResult
 
 MIN_ABOVE_PHOTOGRAPH = 1.0
 """Median over the unused photographs, in dB, of how much nearer the scene is to them than the best
@@ -58,6 +59,8 @@ NO_TARGET = "no large hole was found around its cameras"
 NOTHING_ENCLOSED = "the splat is an object on nothing, and no hole was found that it encloses"
 NOTHING_LACKS = "Nothing was gained, because photographs show nothing that the splat lacks."
 REJECTED = "the generated image contradicts the photographs"
+REMOVED_ALONE = "The selection is removed, and its place is not filled"
+"""What was done where nothing was invented in its place."""
 NOTHING_LEFT = "no Gaussian that was generated lies in the hole"
 
 
@@ -79,11 +82,11 @@ def judge_completion(
     failure = explain_unreconstructed(completion, held_out) if is_reconstructed else None
     if failure is not None:
         return OutcomeRow("not-reconstructed", failure)
-    # A target added or recoloured something, or photographs added to a splat or recoloured it.
+    # Counted in the scene: what a target added may have been removed or faded since.
     has_gained = (
         completion.num_observed > 0
+        or completion.num_invented > 0
         or bool(completion.recolored_mask.any())
-        or count_changed(completion.targets) > 0
     )
     if not has_gained:
         reason = explain_no_gain(completion) if has_searched else NOTHING_LACKS
@@ -171,9 +174,11 @@ def count_changed(targets: Sequence[TargetResult]) -> int:
 
 def describe_work(completion: Completion) -> str:
     """Describe in a clause what was done, and for how many of several targets."""
-    has_added = any(len(result.added) > 0 for result in completion.targets)
+    has_added = completion.num_invented > 0
     has_observed = completion.num_observed > 0
     if completion.source.gone_mask.any():
+        if not has_added:
+            return REMOVED_ALONE
         work = "The selection is removed and its place is filled"
     elif has_added:
         work = f"The {'splat' if completion.is_given else 'scene'} is completed"
@@ -228,7 +233,7 @@ def compute_gain(row: ScoreRow) -> float:
 def describe_added(completion: Completion) -> str:
     """Describe in a clause where the added Gaussians come from; empty if there are none."""
     observed = completion.num_observed
-    made = len(completion.added) - observed
+    made = completion.num_invented
     verb = "painted" if any(result.painter for result in completion.targets) else "invented"
     if observed:
         others = round_count(made) if made else "none"

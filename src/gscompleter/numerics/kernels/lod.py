@@ -6,6 +6,7 @@ import numpy as np
 
 from gscompleter.numerics.kernels.cache import njit
 from gscompleter.numerics.kernels.project import normalize_quat, rotate_by_quat
+from gscompleter.numerics.kernels.splat_rows import copy_row
 
 BLOCK = 4096
 """Consecutive Gaussians that are cut into runs independently of the others."""
@@ -139,9 +140,10 @@ def merge_runs(begin, end, start, gaussians, shares, merged):
         most, total = _compute_shares(first, last, scales, opacities, shares)
         _compute_mean(first, last, shares, means, to_means[run])
         _compute_mean(first, last, shares, sh, to_sh[run])
-        to_quats[run] = quats[most]
+        copy_row(quats, most, to_quats, run)
         if last - first == 1:
-            to_scales[run], to_opacities[run] = scales[first], opacities[first]
+            copy_row(scales, first, to_scales, run)
+            to_opacities[run] = opacities[first]
             continue
         axes = rotate_by_quat(normalize_quat(quats, most)[0])
         for k in range(3):
@@ -152,5 +154,7 @@ def merge_runs(begin, end, start, gaussians, shares, merged):
         before = np.float32(0)
         for i in range(first, last):
             before += shares[i] * _compute_thickness(opacities[i])
-        to_scales[run] *= math.sqrt(_compute_fullness(thickness) / _compute_fullness(before))
+        wider = math.sqrt(_compute_fullness(thickness) / _compute_fullness(before))
+        for k in range(3):
+            to_scales[run, k] *= wider
         to_opacities[run] = min(-math.expm1(-thickness), MAX_OPACITY)

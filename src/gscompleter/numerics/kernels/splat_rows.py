@@ -131,16 +131,27 @@ def _encode_value(i, scales, opacities, encoded, written, row):
 @njit(nogil=True)
 def permute_rows(order, values, seen):
     """Bring the row order[i] of `values` [n, c] to row i, in place; `seen` [n] begins as False."""
-    held = np.empty(values.shape[1], values.dtype)
+    held = np.empty((1, values.shape[1]), values.dtype)
     for start in range(len(order)):
         if seen[start]:
             continue
         # A permutation is a set of cycles: the first row of each is held until its end.
-        held[:] = values[start]
+        copy_row(values, start, held, 0)
         place = start
         while order[place] != start:
-            values[place] = values[order[place]]
+            copy_row(values, order[place], values, place)
             seen[place] = True
             place = order[place]
-        values[place] = held
+        copy_row(held, 0, values, place)
         seen[place] = True
+
+
+@njit(inline="always")
+def copy_row(source, source_row, target, target_row):
+    """Copy a row of `source` [n, c] to a row of `target` [m, c].
+
+    `target[i] = source[j]` also compiles the words of an error for rows of other lengths, which
+    takes longer than all that its kernel does.
+    """
+    for column in range(target.shape[1]):
+        target[target_row, column] = source[source_row, column]

@@ -112,12 +112,6 @@ def read_orientation(stored: Path | bytes) -> int:
     return 1  # reading the photograph reports the error
 
 
-def read_upright_size(path: Path) -> tuple[int, int]:
-    """Read width and height of a photograph as its EXIF orientation turns it."""
-    width, height = read_image_size(path)
-    return (height, width) if read_orientation(path) in QUARTER_TURNS else (width, height)
-
-
 def turn_upright(
     pixels: Shaped[np.ndarray, "h w *c"], orientation: int
 ) -> Shaped[np.ndarray, "h2 w2 *c"]:

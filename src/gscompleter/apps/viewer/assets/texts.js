@@ -57,11 +57,24 @@ function followLink() {
   return found;
 }
 
+/* Gaussians of each layer: those of the page, and in `live` those that are shown after the steps. */
+function countGaussians() {
+  const counts = { ...content.counts };
+  if (!content.live) return counts;
+  const meshes = Object.entries(pictures.at(-1).meshes);
+  const left = (mesh) => (mesh.isGone ? 0 : mesh.extSplats.numSplats - mesh.opacities.size);
+  for (const layer of ["observed", "generated"]) {
+    const own = meshes.filter(([name]) => (name === "observed") === (layer === "observed"));
+    counts[layer] = own.reduce((sum, [, mesh]) => sum + left(mesh), 0);
+  }
+  return counts;
+}
+
 function stats() {
   const { centre, unit } = content.frame;
   const [x, y, z] = state.eye.toArray();
   return {
-    counts: content.counts,
+    counts: countGaussians(),
     camera: state.shot,
     mode: state.mode,
     generated: state.generated,

@@ -1,0 +1,97 @@
+"""What a run was made with: Ψ, Φ, the code, and whether cases that are kept apart were used.
+
+It stands above every table, so that tables of two models cannot be confused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path, PurePath
+from typing import Any
+
+from gscompleter.evaluation.apart import LEDGER
+from gscompleter.evaluation.columns import RunRow
+from gscompleter.evaluation.store import read_run_settings
+from gscompleter.system.plugins import is_in_file
+
+WEIGHT_FILES = (".ckpt", ".onnx", ".pt", ".pth", ".safetensors")
+"""Endings of files of weights."""
+SETTING = "generator_"
+"""Beginning of the names of the generator's settings."""
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """The facts of a run."""
+
+    reconstructor: str
+    """Name of Ψ, with its depth and its weights if it was given some."""
+    generator: str
+    """Name of Φ, with those of its settings that were given."""
+    seed: int
+    num_apart: int
+    """Number of cases that are kept apart."""
+    commits: tuple[str, ...]
+    """Commits of the code that computed the rows; none outside of a checkout."""
+
+    @property
+    def sentence(self) -> str:
+        """The facts in a line."""
+        parts = [f"Ψ: {self.reconstructor}", f"Φ: {self.generator}", f"seed {self.seed}"]
+        if self.commits:
+            parts.append(f"commit {' and '.join(self.commits)}")
+        if self.num_apart:
+            parts.append(f"{self.num_apart} cases that are kept apart were used ({LEDGER})")
+        return "; ".join(parts) + "."
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the facts for a JSON file."""
+        return {**asdict(self), "commits": list(self.commits)}
+
+
+def read_run_facts(out: Path, rows: Sequence[RunRow]) -> RunFacts:
+    """Read the facts of the run in a folder; `rows` are those of its tables."""
+    settings = read_run_settings(out)
+    depth = settings.get("depth", "none")
+    # Folders of files are left out: a table can be published.
+    extras = {
+        "depth": None if depth == "none" else strip_folder(depth),
+        "weights": settings["weights"],
+        "depth weights": settings.get("depth_weights"),
+    }
+    given = {k.removeprefix(SETTING): v for k, v in settings.items() if k.startswith(SETTING)}
+    return RunFacts(
+        name_model(settings["reconstructor"], extras),
+        name_model(settings["generator"], given),
+        settings["seed"],
+        settings["source"].get("apart", 0),
+        tuple(sorted({row["commit"] for row in rows if row.get("commit")})),
+    )
+
+
+def name_model(name: str, settings: Mapping[str, Any]) -> str:
+    """Name a model with the settings that have a value."""
+    known = {key: value for key, value in settings.items() if value is not None}
+    described = [f"{key} {strip_folder(str(value))}" for key, value in known.items()]
+    return f"{strip_folder(name)} ({', '.join(described)})" if described else strip_folder(name)
+
+
+def strip_folder(name: str) -> str:
+    """Strip the folder of a file, such as file.py:function; names on a hub are kept."""
+    path = PurePath(name)
+    is_file = is_in_file(name) or path.is_absolute() or path.suffix in WEIGHT_FILES
+    return path.name if is_file else name
+
+
+def describe_facts(facts: Mapping[str, RunFacts]) -> list[str]:
+    """Describe the facts of several runs by name, in a line for each that differs."""
+    lines = dict.fromkeys(of.sentence for of in facts.values())
+    if len(lines) == 1:
+        return [*lines]
+    return [f"{name}: {of.sentence}" for name, of in facts.items()]
+
+
+def spell_greek(text: str) -> str:
+    """Spell the names of models for LaTeX, which has no such letters in plain text."""
+    return text.replace("Ψ", "Psi").replace("Φ", "Phi")

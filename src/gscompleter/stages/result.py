@@ -1,0 +1,26 @@
+"""The result of a target, before and after something was added for it."""
+
+from __future__ import annotations
+
+from gscompleter.stages.refusals import explain_refusal, explain_skip
+from gscompleter.stages.select_anchor import Anchor
+from gscompleter.stages.target_view import TargetView
+from gscompleter.target_result import TargetResult
+
+
+def make_unchanged_result(view: TargetView, anchor: Anchor) -> TargetResult:
+    """Make the result of a target at which nothing was changed."""
+    before = view.render.crop(view.camera)
+    return TargetResult(
+        target=view.camera.target,
+        before=before,
+        after=before,
+        hole_mask=view.camera.crop(view.holes),
+        trusted_alpha=view.camera.crop(view.alpha),
+        anchor=anchor.index,
+        anchor_fallback=anchor.is_fallback,
+        added=view.state.rendered_context[:0],
+        refusal=explain_refusal(view),
+        skip_reason=explain_skip(view),
+        target_id=view.state.next_target_id,
+    )

@@ -1,0 +1,130 @@
+"""Each row of the table of formats keeps its promise, and has a line in the reference page."""
+
+import re
+from dataclasses import replace
+from typing import NamedTuple
+
+import pytest
+import torch
+
+from gscompleter import load_splat, save_splat
+from gscompleter.splats.formats import HEAD_BYTES, get_labels_path, read_provenance
+from gscompleter.splats.provenance import Provenance, RunRecord
+from gscompleter.splats.splat_format import SplatFormat
+from gscompleter.splats.table import SPLAT_FORMATS, match_ending
+from paths import ROOT
+from splat_files import BY_HAND, made, plausible
+
+
+class Promise(NamedTuple):
+    """A file of a format, and the largest errors of what is read from it."""
+
+    file: str
+    position: float
+    """Relative to the largest coordinate."""
+    size: float
+    """Of the logarithm."""
+    opacity: float
+
+
+PROMISES = {
+    "ply": Promise("scene.ply", 0, 0, 1e-6),
+    "compressed-ply": Promise("scene.compressed.ply", 1e-3, 2e-3, 2e-3),
+    "spz": Promise("scene.spz", 1e-5, 0.032, 2e-3),
+    "usd": Promise("scene.usdc", 0, 0, 0),
+    "usdz": Promise("scene.usdz", 0, 0, 0),
+    "sog": Promise("written.sog", 1e-4, 0.01, 2e-3),
+    "sog-folder": Promise("folder", 1e-4, 0.04, 2e-3),
+    "glb": Promise("written.glb", 0, 0, 0),
+    "splat": Promise("scene.splat", 0, 0, 2e-3),
+    "ksplat": Promise("scene.ksplat", 1e-3, 1e-3, 2e-3),
+}
+"""What each format keeps, by the name of its row."""
+
+
+def get_promise(name: str) -> Promise:
+    if SPLAT_FORMATS[name].extra:
+        pytest.importorskip("pxr", reason="needs usd-core (the extra usd)")
+    return PROMISES[name]
+
+
+def test_every_format_has_a_promise():
+    assert set(PROMISES) == set(SPLAT_FORMATS)
+
+
+@pytest.mark.parametrize("name", PROMISES)
+def test_a_format_rounds_no_more_than_it_promises(tmp_path, name):
+    promise = get_promise(name)
+    gaussians = plausible(120, 1 if SPLAT_FORMATS[name].holds_harmonics else 0)
+    loaded = load_splat(made(tmp_path, promise.file, gaussians))
+    # Some formats have an order of their own.
+    given = gaussians[torch.cdist(loaded.means, gaussians.means).argmin(1)]
+    largest = gaussians.means.abs().max()
+    assert (loaded.means - given.means).abs().max() <= promise.position * largest
+    assert (loaded.scales.log() - given.scales.log()).abs().max() <= promise.size
+    assert (loaded.opacities - given.opacities).abs().max() <= promise.opacity
+    assert len(loaded.means.unique(dim=0)) == 120
+
+
+@pytest.mark.parametrize("name", PROMISES)
+def test_a_format_is_recognised_by_itself_alone(tmp_path, name):
+    """So the order of the rows decides nothing, and a renamed file is read as what it is."""
+    path = made(tmp_path, get_promise(name).file, plausible(20, 1))
+    file = path / "meta.json" if path.is_dir() else path
+    head = file.read_bytes()[:HEAD_BYTES]
+    recognised = [row.name for row in SPLAT_FORMATS.values() if row.begins(file, head)]
+    assert recognised == ([name] if SPLAT_FORMATS[name].starts else [])
+    renamed = file.rename(tmp_path / "renamed.dat")
+    assert [row.name for row in SPLAT_FORMATS.values() if row.begins(renamed, head)] == recognised
+
+
+WRITTEN = [name for name, row in SPLAT_FORMATS.items() if row.write is not None]
+
+
+@pytest.mark.parametrize("name", WRITTEN)
+def test_a_row_says_what_its_files_hold(tmp_path, name):
+    row = SPLAT_FORMATS[name]
+    path = tmp_path / get_promise(name).file
+    labels = (torch.arange(30) % 3).to(torch.uint8)
+    gaussians = replace(
+        plausible(30, 1 if row.holds_harmonics else 0),
+        generated=labels,
+        is_antialiased=True,
+        origin=(500_000.0, 4_000_000.0, 0.0) if row.holds_origin else None,
+    )
+    record = Provenance((RunRecord("a tool", "1", (1, 2), seed=3),))
+    save_splat(path, gaussians, record)
+    beside = get_labels_path(path)
+    assert beside.exists() != row.holds_labels
+    # Without what lies beside it, a file has what its row says.
+    beside.unlink(missing_ok=True)
+    loaded = load_splat(path)
+    assert loaded.generated.any() == row.holds_labels
+    assert loaded.is_antialiased == row.marks_antialiased
+    assert (loaded.origin is not None) == row.holds_origin
+    assert (read_provenance(path) == record) == (row.read_record is not None)
+
+
+@pytest.mark.parametrize("name", [name for name in SPLAT_FORMATS if name not in WRITTEN])
+def test_a_format_that_is_only_read_is_written_by_the_tests(name):
+    assert PROMISES[name].file in BY_HAND
+
+
+def read_endings(page: str, title: str) -> set[str]:
+    """Read the endings that a page names in the first table after a title."""
+    text = (ROOT / "docs" / page).read_text("utf-8").split(f"## {title}\n")[1]
+    table = re.findall(r"^\|.*\|$", text.split("\n## ")[0], re.M)
+    return {word for line in table for word in re.findall(r"(?<![\w.])\.?\w+(?:\.\w+)*", line)}
+
+
+@pytest.mark.parametrize("row", SPLAT_FORMATS.values(), ids=list(SPLAT_FORMATS))
+def test_a_format_has_a_line_in_the_reference_page(row: SplatFormat):
+    assert row.endings[0] in read_endings("formats.md", "Splats")
+    if row.write is not None and row.read_record is not None:
+        assert row.endings[0] in read_endings("provenance.md", "Where it is")
+
+
+def test_the_longest_ending_is_meant(tmp_path):
+    assert match_ending(tmp_path / "A.COMPRESSED.PLY").name == "compressed-ply"
+    assert match_ending(tmp_path / "a.ply").name == "ply"
+    assert match_ending(tmp_path / "a.txt") is None
