@@ -117,6 +117,8 @@ GROUPS = {
         Column("st_lpips", "ST-LPIPS", 4, "target_after.st_lpips"),
         Column("hole_psnr", "PSNR (hole)", 2, "hole.psnr"),
         Column("observed_psnr", "PSNR (observed)", 2, "observed.psnr"),
+        Column("fitted", "PSNR (camera fitted)", 2, "fitted.psnr"),
+        Column("fitted_observed", "PSNR (observed, camera fitted)", 2, "fitted.observed_psnr"),
         Column("neighbours", "PSNR (neighbour views)", 2, NEAR_AFTER),
         Column("neighbours_gain", "ΔPSNR (neighbour views)", 2, NEAR_AFTER, NEAR_BEFORE),
         Column("context", "PSNR (context)", 2, SEEN_AFTER),

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gscompleter.evaluation.metrics.fitted_camera import FittedQuality, measure_fitted
 from gscompleter.evaluation.metrics.geometry import (
     SurfaceAgreement,
     compare_depths,
@@ -94,6 +95,9 @@ class Scores:
     hole: PartQuality
     """Quality after completion in the hole; `observed` over all other pixels."""
     observed: PartQuality
+    fitted: FittedQuality | None
+    """Quality after one pose and one gain of the target camera were fitted to its photograph; None
+    if too little lies outside of holes."""
     neighbours_psnr: tuple[Change, ...]
     context_psnr: tuple[Change, ...]
     context_ssim: tuple[Change, ...]
@@ -185,6 +189,7 @@ def score(
         target_after=measure_quality(now.image, target),
         hole=measure_part(now.image, target, holes),
         observed=measure_part(now.image, target, ~holes),
+        fitted=measure_fitted(after, target, holes, renderer),
         neighbours_psnr=compare_views(beside, truth.neighbours, compute_view_psnr),
         context_psnr=compare_views(context, truth.views, compute_view_psnr),
         context_ssim=compare_views(context, truth.views, compute_view_ssim),

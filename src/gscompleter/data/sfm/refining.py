@@ -1,0 +1,163 @@
+"""Refined cameras of photographs whose given ones contradict the features that they share.
+
+Poses of phones, SLAM and drives are off by a fraction of a pixel or more, which blurs whatever is
+made from several photographs. All photographs are refined together (`refining_process`), those of
+targets too: refining one pair alone moves the scene against the frame of everything else. The
+result is brought back into the given frame by a similarity.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from jaxtyping import Float
+
+from gscompleter.data.photographs import Photographs
+from gscompleter.data.sfm.placing import write_known
+from gscompleter.data.sfm.poses import require_pycolmap, run_colmap
+from gscompleter.numerics.geometry import compute_spacing
+from gscompleter.types import Camera
+
+PROCESS = "gscompleter.data.sfm.refining_process"
+MIN_REFINED = 3
+"""Fewest photographs that are refined: two cannot hold the frame of the scene."""
+NUM_MATCHED = 8
+"""Photographs near each one, of similar direction, that it is matched with."""
+TURN_PER_TWO_STEPS = 15.0
+"""Rotation in degrees that counts as much as two steps between cameras."""
+POSITION_SIGMA = 0.1
+"""Standard deviation of a given camera centre, in steps between cameras."""
+MAX_ERROR_SHARE = 0.8
+"""Largest error of the matches that were kept back, of that of the given poses, to accept."""
+PIXELS_OF = 256
+"""Shorter side of an image in whose pixels errors are told."""
+
+Poses = Float[np.ndarray, "n 4 4"]
+"""Camera-to-world matrices."""
+
+
+@dataclass(frozen=True)
+class PoseRefinement:
+    """What a refinement of poses did.
+
+    Errors are median distances of matches that were kept back from their epipolar lines, in pixels
+    of an image of `PIXELS_OF` pixels.
+    """
+
+    photographs: int
+    """Photographs that were refined together."""
+    given_error: float
+    refined_error: float
+    moved: float
+    """Median move of a camera centre, in steps between neighbouring cameras."""
+
+    @property
+    def is_accepted(self) -> bool:
+        """True if matches that were kept back agree clearly better."""
+        return self.refined_error <= MAX_ERROR_SHARE * self.given_error
+
+    def describe(self) -> str:
+        """Describe the refinement in a sentence for the user."""
+        pixels = f"{self.given_error:.2f} px, and refined ones by {self.refined_error:.2f} px"
+        if not self.is_accepted:
+            return f"Given poses are kept: they miss matches by {pixels}."
+        return (
+            f"The poses of {self.photographs} photographs are refined: given ones miss matches "
+            f"that were kept back by {pixels} (of {PIXELS_OF}); --no-refine-poses leaves them."
+        )
+
+
+def refine_poses(photographs: Photographs) -> tuple[Photographs, PoseRefinement | None]:
+    """Refine the poses of photographs together; keep them where matches do not agree better.
+
+    Returns the photographs in the given frame and scale, and what was done; None of it with fewer
+    than `MIN_REFINED` photographs, or where cameras stand in one place.
+    """
+    require_pycolmap()
+    with tempfile.TemporaryDirectory() as work:
+        home = Path(work)
+        copies, _ = write_known(photographs, home)
+        numbers = [int(Path(copy.name).stem) for copy in copies]
+        cameras = [photographs.camera(number) for number in numbers]
+        step = compute_spacing(cameras)
+        if len(copies) < MIN_REFINED or step == 0:
+            return photographs, None
+        job = {
+            "images": str(home / "images"),
+            "masks": str(home / "masks"),
+            "model": str(home / "model"),
+            "copies": [asdict(copy) for copy in copies],
+            "pairs": pair_near(cameras),
+            "position_sigma": POSITION_SIGMA * step,
+        }
+        result = run_colmap(PROCESS, job, home, "Refining poses")
+
+    given = np.stack([invert_viewmat(copy.viewmat) for copy in copies])
+    found = [row is not None for row in result["viewmats"]]
+    if sum(found) < MIN_REFINED:
+        return photographs, None
+    refined = given.copy()
+    refined[found] = bring_back(
+        np.stack([invert_viewmat(row) for row in result["viewmats"] if row is not None]),
+        given[found],
+    )
+    scale = PIXELS_OF / min(copies[0].width, copies[0].height)
+    shift = np.linalg.norm(refined[found][:, :3, 3] - given[found][:, :3, 3], axis=1)
+    done = PoseRefinement(
+        sum(found),
+        result["given_error"] * scale,
+        result["refined_error"] * scale,
+        float(np.median(shift)) / step,
+    )
+    if not done.is_accepted:
+        return photographs, done
+    frames = list(photographs.frames)
+    for number, pose in zip(numbers, refined, strict=True):
+        pose[:3, 3] += photographs.origin
+        frames[number] = replace(frames[number], c2w=pose)
+    return replace(photographs, frames=tuple(frames)), done
+
+
+def pair_near(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
+    """Pair each camera with those that are nearest in place and direction."""
+    centers = torch.stack([camera.center for camera in cameras]).double()
+    forward = torch.stack([camera.forward for camera in cameras]).double()
+    apart = (centers[:, None] - centers).norm(dim=-1)
+    turned = torch.rad2deg((forward @ forward.T).clamp(-1, 1).arccos())
+    # Cameras in one place form no pair: there is no parallax.
+    apart[apart == 0] = torch.inf
+    unlike = apart / compute_spacing(cameras) + 2 * turned / TURN_PER_TWO_STEPS
+    nearest = unlike.argsort(dim=1, stable=True)[:, :NUM_MATCHED].tolist()
+    is_apart = apart.isfinite().tolist()
+    pairs = {(i, j) for i, row in enumerate(nearest) for j in row if is_apart[i][j]}
+    return sorted({(min(pair), max(pair)) for pair in pairs})
+
+
+def invert_viewmat(viewmat: Sequence[Sequence[float]]) -> Float[np.ndarray, "4 4"]:
+    """Return the camera-to-world matrix of the rows of a world-to-camera matrix [3, 4]."""
+    return np.linalg.inv(np.vstack([viewmat, [0.0, 0.0, 0.0, 1.0]]))
+
+
+def bring_back(refined: Poses, given: Poses) -> Poses:
+    """Bring refined cameras into the given frame, by the similarity that fits all of them.
+
+    The rotation is that of their directions, since the centres of a straight drive determine none
+    about its own line; scale and shift are those of the centres.
+    """
+    covariance = np.einsum("nij,nkj->ik", given[:, :3, :3], refined[:, :3, :3])
+    u, _, v = np.linalg.svd(covariance)
+    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
+    before = refined[:, :3, 3] - refined[:, :3, 3].mean(axis=0)
+    turned = before @ rotation.T
+    wanted = given[:, :3, 3] - given[:, :3, 3].mean(axis=0)
+    scale = (wanted * turned).sum() / (turned * turned).sum()
+
+    result = refined.copy()
+    result[:, :3, :3] = rotation @ refined[:, :3, :3]
+    result[:, :3, 3] = scale * turned + given[:, :3, 3].mean(axis=0)
+    return result

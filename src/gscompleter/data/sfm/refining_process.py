@@ -1,0 +1,233 @@
+"""Refinement of the cameras of posed photographs, in a separate process as `mapping_process`.
+
+Standard input is a `RefiningJob` as JSON. The last line of the output is the result, as JSON too.
+Points are triangulated from the given cameras, and a bundle adjustment moves cameras and points
+until the features of each point meet. Intrinsics stay; the centre of each camera is held to where
+it was given, because forward motion with few near points leaves the lengths of steps free. A fifth
+of the tracks of features is kept back: it tells whether the refined cameras agree better.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pycolmap
+from jaxtyping import Bool, Float, Int
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from gscompleter.data.sfm.matching import ColmapJob, extract_features, match, prepare_colmap
+from gscompleter.data.sfm.placing import KnownCopy, Pinhole
+from gscompleter.data.sfm.placing_process import make_known_camera, read_image_number
+
+ROUNDS = 3
+"""Rounds of triangulation and adjustment; better cameras find more points."""
+KEPT_BACK = 5
+"""One track of features in so many is kept back."""
+LOSS_SCALE = 1.0
+"""Residual in pixels from which a feature counts less (soft L1): some matches are false."""
+MIN_POINTS = 30
+"""Fewest points that determine a camera; one with fewer keeps its pose."""
+Matches = dict[tuple[int, int], Int[np.ndarray, "_ 2"]]
+"""Numbers of the matching features of two images, by the numbers of the images."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class RefiningJob(ColmapJob):
+    """Input of the process."""
+
+    copies: list[KnownCopy]
+    pairs: list[tuple[int, int]]
+    """Copies that are matched with each other."""
+    position_sigma: float
+    """Standard deviation of a given camera centre, in scene units."""
+
+
+def main() -> None:
+    """Run the job that standard input holds."""
+    task = json.load(sys.stdin)
+    copies = [KnownCopy(**one) for one in task.pop("copies")]
+    pairs = [(i, j) for i, j in task.pop("pairs")]
+    job = RefiningJob(copies=copies, pairs=pairs, **task)
+    prepare_colmap()
+    cameras = extract_all_features(job)
+    names = [copy.name for copy in job.copies]
+    match(job, names, set(job.pairs))
+
+    with pycolmap.Database.open(job.database) as database:
+        numbers = [read_image_number(database, name) for name in names]
+        kept_back = keep_back_tracks(database, numbers)
+        keypoints = {number: database.read_keypoints(number)[:, :2] for number in numbers}
+    model = adjust_bundle(job, cameras, numbers)
+    given = {n: make_pose(copy) for n, copy in zip(numbers, job.copies, strict=True)}
+    seen = {image.image_id for image in model.images.values() if image.num_points3D >= MIN_POINTS}
+    refined = {number: model.images[number].cam_from_world() for number in seen}
+    rows = [refined[n].matrix().tolist() if n in refined else None for n in numbers]
+    intrinsics = {n: copy.pinhole for n, copy in zip(numbers, job.copies, strict=True)}
+    errors = {}
+    for title, poses in (("given_error", given), ("refined_error", {**given, **refined})):
+        distances = measure_epipolar_distances(kept_back, keypoints, poses, intrinsics)
+        errors[title] = float(np.median(distances)) if len(distances) else 0.0
+    print(json.dumps({"viewmats": rows, **errors}))
+
+
+def extract_all_features(job: RefiningJob) -> list[int]:
+    """Extract the features of all copies, and return the number of the camera of each."""
+    cameras = []
+    with pycolmap.Database.open(job.database) as database:
+        for copy in job.copies:
+            cameras.append(int(database.write_camera(make_known_camera(copy.pinhole, copy))))
+    for copy, camera in zip(job.copies, cameras, strict=True):
+        extract_features(job, copy.name, camera, copy.is_masked)
+    return cameras
+
+
+def make_pose(copy: KnownCopy) -> pycolmap.Rigid3d:
+    """Make COLMAP's pose, world to camera, of a copy."""
+    viewmat = np.array(copy.viewmat)
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(viewmat[:, :3]), viewmat[:, 3])
+
+
+def keep_back_tracks(database: pycolmap.Database, numbers: list[int]) -> Matches:
+    """Take the matches of one track in `KEPT_BACK` out of the database, and return them.
+
+    A track is a connected component of matches: a feature that any photograph contributes to a
+    point is kept back with all others of that point.
+    """
+    pairs = [
+        (i, j)
+        for a, i in enumerate(numbers)
+        for j in numbers[a + 1 :]
+        if database.exists_two_view_geometry(i, j)
+    ]
+    found = {pair: database.read_two_view_geometry(*pair) for pair in pairs}
+    counts = [len(database.read_keypoints(number)) for number in numbers]
+    starts = dict(zip(numbers, np.cumsum([0, *counts[:-1]]).tolist(), strict=True))
+    ends = [
+        geometry.inlier_matches.astype(np.int64) + np.array([starts[i], starts[j]])
+        for (i, j), geometry in found.items()
+    ]
+    joined = np.concatenate([np.zeros((0, 2), np.int64), *ends])
+    graph = coo_array((np.ones(len(joined)), joined.T), shape=(sum(counts),) * 2)
+    _, track_of = connected_components(graph, directed=False)
+    is_kept_back = np.random.default_rng(0).random(track_of.max(initial=0) + 1) < 1 / KEPT_BACK
+
+    kept: Matches = {}
+    for (pair, geometry), rows in zip(found.items(), ends, strict=True):
+        chosen: Bool[np.ndarray, "n"] = is_kept_back[track_of[rows[:, 0]]]
+        matches = geometry.inlier_matches
+        if chosen.any():
+            kept[pair] = matches[chosen].astype(np.int64)
+        geometry.inlier_matches = matches[~chosen]
+        database.update_two_view_geometry(*pair, geometry)
+    return kept
+
+
+def adjust_bundle(
+    job: RefiningJob, cameras: list[int], numbers: list[int]
+) -> pycolmap.Reconstruction:
+    """Triangulate points, and adjust cameras and points, `ROUNDS` times."""
+    model = pycolmap.Reconstruction()
+    with pycolmap.Database.open(job.database) as database:
+        for copy, camera, number in zip(job.copies, cameras, numbers, strict=True):
+            model.add_camera_with_trivial_rig(database.read_camera(camera))
+            image = pycolmap.Image(name=copy.name, camera_id=camera, image_id=number)
+            model.add_image_with_trivial_frame(image, make_pose(copy))
+    priors = make_position_priors(job, numbers, model)
+    for number in range(ROUNDS):
+        folder = Path(job.work) / f"triangulated{number}"
+        folder.mkdir()
+        model = pycolmap.triangulate_points(
+            model, job.database, job.images, folder, refine_intrinsics=False
+        )
+        adjust_once(model, job, priors)
+    model.update_point_3d_errors()
+    return model
+
+
+def make_position_priors(
+    job: RefiningJob, numbers: list[int], model: pycolmap.Reconstruction
+) -> list[pycolmap.PosePrior]:
+    """Make the priors of the camera centres, which are where they were given."""
+    priors = []
+    for number in numbers:
+        image = model.images[number]
+        priors.append(
+            pycolmap.PosePrior(
+                pose_prior_id=number,
+                corr_data_id=image.data_id,
+                position=image.projection_center(),
+                position_covariance=np.eye(3) * job.position_sigma**2,
+                coordinate_system=pycolmap.PosePriorCoordinateSystem.CARTESIAN,
+            )
+        )
+    return priors
+
+
+def adjust_once(
+    model: pycolmap.Reconstruction, job: RefiningJob, priors: list[pycolmap.PosePrior]
+) -> None:
+    """Adjust cameras and points, with cameras held to their priors."""
+    config = pycolmap.BundleAdjustmentConfig()
+    for number in model.reg_image_ids():
+        config.add_image(number)
+        config.set_constant_cam_intrinsics(model.images[number].camera_id)
+    options = pycolmap.BundleAdjustmentOptions(
+        refine_focal_length=False,
+        refine_principal_point=False,
+        refine_extra_params=False,
+        print_summary=False,
+    )
+    options.ceres.loss_function_type = pycolmap.LossFunctionType.SOFT_L1
+    options.ceres.loss_function_scale = LOSS_SCALE
+    options.ceres.solver_options.num_threads = job.threads
+    prior_options = pycolmap.PosePriorBundleAdjustmentOptions()
+    adjuster = pycolmap.create_pose_prior_bundle_adjuster(
+        options, prior_options, config, priors, model
+    )
+    adjuster.solve()
+
+
+def measure_epipolar_distances(
+    matches: Matches,
+    keypoints: dict[int, Float[np.ndarray, "_ 2"]],
+    poses: dict[int, pycolmap.Rigid3d],
+    intrinsics: dict[int, Pinhole],
+) -> Float[np.ndarray, "n"]:
+    """Measure the distances of all matches from their epipolar lines, in pixels.
+
+    It is Sampson's distance: to first order, how far both features together have to move.
+    """
+    rays = {}
+    for number, pixels in keypoints.items():
+        fx, fy, cx, cy = intrinsics[number]
+        flat = (pixels - [cx, cy]) / [fx, fy]
+        rays[number] = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+
+    distances = [np.zeros(0)]
+    for (i, j), rows in matches.items():
+        relative = (poses[j] * poses[i].inverse()).matrix()
+        x, y, z = relative[:, 3]
+        # E = [t]x R, and b' E a = 0 for the rays a and b of one point.
+        essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ relative[:, :3]
+        a = rays[i][rows[:, 0]]
+        b = rays[j][rows[:, 1]]
+        line_in_b = a @ essential.T
+        line_in_a = b @ essential
+        fx_i, fy_i, *_ = intrinsics[i]
+        fx_j, fy_j, *_ = intrinsics[j]
+        # Slopes of the residual per pixel, not per unit of the image plane.
+        slopes = np.concatenate(
+            [line_in_b[:, :2] / [fx_j, fy_j], line_in_a[:, :2] / [fx_i, fy_i]], axis=1
+        )
+        residual = (b * line_in_b).sum(axis=1)
+        distances.append(np.abs(residual) / np.maximum(np.linalg.norm(slopes, axis=1), 1e-30))
+    return np.concatenate(distances)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,192 @@
+"""A second score of a held-back photograph, without the errors of its own camera.
+
+A pose that is off by a quarter of a pixel, or another exposure, costs a picture decibels that no
+method can gain. So one pose (six numbers) and one gain for each channel of the target camera are
+fitted to its photograph, outside of holes. Nothing of the scene changes. With the render R(p) at
+the pose p, the photograph I and the pixels O that are counted outside of holes,
+
+    p, g = argmin  sum over O of  rho(blur(g R(p)) - blur(I)),
+
+where rho is quadratic up to `ROBUST` and grows linearly beyond it. The score is the PSNR of g R(p).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.evaluation.metrics.image import MAX_PSNR, compute_masked_psnr
+from gscompleter.numerics.image_ops import dilate
+from gscompleter.render.protocols import Renderer
+from gscompleter.types import Camera, Gaussians, Render, View
+
+MAX_MOVE = 4.0
+"""Largest rotation and shift along each axis, in pixels: poses are not searched for, but mended."""
+STEP = 0.25
+"""Difference of each number for the derivatives, in pixels."""
+MIN_STEP = 0.05
+"""Largest change in pixels at which the fit has converged."""
+ROUNDS = 10
+"""Most steps of Gauss and Newton for each blur."""
+BLURS = (6.0, 1.5)
+"""Standard deviations of the blur in pixels, one after the other, so that edges that lie beside
+their place pull."""
+SHARES = (1.0, 0.5, 0.25)
+"""Shares of a step that are tried until one helps."""
+ROBUST = 0.03
+"""Error of a colour from which on it pulls no more than linearly."""
+MARGIN = 2
+"""Pixels around holes that do not count, since holes move with the camera."""
+MIN_PIXELS = 500
+"""Fewest pixels that determine a pose."""
+
+Pixels = Float[np.ndarray, "h w 3"]
+Move = Float[np.ndarray, "6"]
+"""Rotation about x, y, z and shift along them, in camera axes and pixels."""
+
+
+@dataclass(frozen=True)
+class FittedQuality:
+    """Scores in dB after one pose and one gain of the target camera were fitted."""
+
+    psnr: float
+    """Of the whole image."""
+    observed_psnr: float
+    """Outside of holes."""
+    moved: float
+    """Length of the rotation and shift, in pixels."""
+    gain: float
+    """Mean of the gains of the channels."""
+
+
+def measure_fitted(
+    scene: Gaussians, target: View, holes: Bool[Tensor, "h w"], renderer: Renderer
+) -> FittedQuality | None:
+    """Fit the camera and the exposure of a target to its photograph, and score the scene there.
+
+    `holes` is where the scene was empty before it was completed. None if fewer than `MIN_PIXELS`
+    lie outside.
+    """
+    observed = ~dilate(holes, MARGIN) & target.valid_mask
+    if observed.sum() < MIN_PIXELS:
+        return None
+    truth = target.image.cpu().numpy()
+    counted = observed.cpu().numpy()
+    start = renderer.render(scene, target.camera)
+    unit = measure_depth(start, observed) / float(target.camera.K[0, 0])
+
+    def draw(move: Move) -> Pixels:
+        camera = move_camera_by(target.camera, move, unit)
+        image = renderer.render(scene, camera).image
+        return np.asarray(image.clamp(0, 1).cpu().numpy(), np.float64)
+
+    move = fit_move(draw, truth, counted)
+    image = draw(move)
+    gains = fit_gains(image, truth, counted)
+    fitted = torch.from_numpy(np.clip(image * gains, 0, 1)).to(target.image)
+    whole = compute_masked_psnr(fitted, target.image, target.valid_mask)
+    outside = compute_masked_psnr(fitted, target.image, ~holes & target.valid_mask)
+    assert outside is not None
+    return FittedQuality(
+        MAX_PSNR if whole is None else whole,
+        outside,
+        float(np.linalg.norm(move)),
+        float(gains.mean()),
+    )
+
+
+def measure_depth(render: Render, where: Bool[Tensor, "h w"]) -> float:
+    """Measure the median depth of a render over the pixels of `where`, in scene units."""
+    depths = render.depth_map()
+    seen = where & depths.valid
+    return float(depths.depth[seen].median()) if seen.any() else 1.0
+
+
+def move_camera_by(camera: Camera, move: Move, unit: float) -> Camera:
+    """Rotate and shift a camera; `unit` is the shift that is a pixel at the median depth."""
+    pose = camera.c2w.double().cpu().numpy().copy()
+    pose[:3, 3] += pose[:3, :3] @ (move[3:] * unit)
+    pose[:3, :3] = pose[:3, :3] @ cv2.Rodrigues(move[:3] / float(camera.K[0, 0]))[0]
+    return replace(camera, c2w=torch.from_numpy(pose).to(camera.c2w))
+
+
+def fit_move(
+    draw: Callable[[Move], Pixels], truth: Pixels, counted: Bool[np.ndarray, "h w"]
+) -> Move:
+    """Fit the move, from wide to narrow blur; zero if the picture is no nearer to the truth."""
+    still = np.zeros(6)
+    move = still
+    for sigma in BLURS:
+        move = fit_blurred(draw, move, truth, counted, sigma)
+    before, after = (measure_loss(draw(one), truth, counted) for one in (still, move))
+    return move if after < before else still
+
+
+def fit_blurred(
+    draw: Callable[[Move], Pixels],
+    start: Move,
+    truth: Pixels,
+    counted: Bool[np.ndarray, "h w"],
+    sigma: float,
+) -> Move:
+    """Fit the move to blurred images, by steps of Gauss and Newton with robust weights."""
+    wanted = blur(truth, sigma)
+
+    def compute_residuals(image: Pixels, gains: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n"]:
+        return (blur(image, sigma) * gains - wanted)[counted].ravel()
+
+    move = start
+    image = draw(move)
+    for _ in range(ROUNDS):
+        gains = fit_gains(image, truth, counted)
+        residuals = compute_residuals(image, gains)
+        steps = STEP * np.eye(6)
+        drawn = [compute_residuals(draw(move + step), gains) for step in steps]
+        slopes = np.stack([(one - residuals) / STEP for one in drawn], axis=1)
+        weighted = slopes / np.maximum(np.abs(residuals), ROBUST)[:, None]
+        # A little damping, where two of the numbers act alike, as a turn and a shift do.
+        normal = weighted.T @ slopes
+        normal += (1e-4 * np.trace(normal) + 1e-12) * np.eye(6)
+        change = -np.linalg.solve(normal, weighted.T @ residuals)
+
+        loss = np.square(residuals).mean()
+        for share in SHARES:
+            following = np.clip(move + share * change, -MAX_MOVE, MAX_MOVE)
+            image = draw(following)
+            gains = fit_gains(image, truth, counted)
+            if np.square(compute_residuals(image, gains)).mean() < loss:
+                break
+        else:
+            return move
+        is_done = np.abs(following - move).max() < MIN_STEP
+        move = following
+        if is_done:
+            break
+    return move
+
+
+def measure_loss(image: Pixels, truth: Pixels, counted: Bool[np.ndarray, "h w"]) -> float:
+    """Measure the squared error outside of holes after the best gains."""
+    gains = fit_gains(image, truth, counted)
+    return float(np.square(image * gains - truth)[counted].mean())
+
+
+def fit_gains(
+    image: Pixels, truth: Pixels, counted: Bool[np.ndarray, "h w"]
+) -> Float[np.ndarray, "3"]:
+    """Fit the gain of each channel by least squares; 1 for a black one."""
+    seen = image[counted]
+    energy = (seen * seen).sum(axis=0)
+    products = (seen * truth[counted]).sum(axis=0)
+    return np.where(energy > 0, products / np.maximum(energy, 1e-12), 1.0)
+
+
+def blur(image: Pixels, sigma: float) -> Pixels:
+    """Blur an image."""
+    return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.float64)

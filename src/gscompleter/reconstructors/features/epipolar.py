@@ -1,0 +1,139 @@
+"""How well poses agree with matches, beside the best poses that the matches allow.
+
+The relative pose of two photographs puts each match on a line of the other photograph (its epipolar
+line). Localization of the features alone leaves some tenths of a pixel, so the distance under the
+given pose says little; it contradicts the pose if another pose has a much smaller one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from jaxtyping import Float
+from scipy.optimize import least_squares
+
+from gscompleter.numerics.geometry import measure_baseline
+from gscompleter.reconstructors.features.consistency import MAX_POSE_ERROR, MIN_POSE_MATCHES
+from gscompleter.reconstructors.features.matches import Pixels, measure_match_errors
+from gscompleter.reconstructors.features.neighbours import find_neighbours
+from gscompleter.reconstructors.features.stereo_image import StereoImage, make_stereo_images
+from gscompleter.types import View
+
+PIXELS_OF = 256
+"""Shorter side of an image in whose pixels distances are told."""
+MIN_CONTRADICTION = 0.12
+"""Smallest median distance under given poses that matters. Poses from structure from motion have
+0.03 to 0.16 px, before and after they are fitted; those of SLAM and drives 0.15 to 1.2 px."""
+MAX_FITTED_SHARE = 0.65
+"""Largest share of that distance under fitted poses. It was 0.3 to 0.55 where poses are wrong, and
+0.75 to 1 where they are right."""
+
+RelativePose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
+"""Rotation and direction of the shift of points from a reference camera to a source camera."""
+
+
+@dataclass(frozen=True)
+class PoseFit:
+    """Median distances of matches from their epipolar lines, in pixels of `PIXELS_OF`."""
+
+    given: float
+    """Under the given poses."""
+    fitted: float
+    """Under the relative pose of each pair that fits its matches best."""
+
+    @property
+    def is_contradicted(self) -> bool:
+        """True if matches contradict the given poses."""
+        return self.given > MIN_CONTRADICTION and self.fitted < MAX_FITTED_SHARE * self.given
+
+
+def measure_pose_fit(views: Sequence[View]) -> PoseFit | None:
+    """Measure how well the poses of views agree with matches; None with too few of these.
+
+    Each pair of neighbours is fitted alone: it tells that poses are wrong, but not which.
+    """
+    if len(views) < 2 or not any(measure_baseline(views[0].camera, v.camera) for v in views):
+        return None
+    images, _ = make_stereo_images(views)
+    scale = PIXELS_OF / min(min(image.size) for image in images)
+    given = []
+    fitted = []
+    for (i, j), (in_i, in_j) in find_neighbours(images).matches.items():
+        reference, source = images[i], images[j]
+        errors, is_ahead = measure_match_errors(reference, source, in_i, in_j)
+        # What lies farther off is a false match.
+        is_true = is_ahead & (errors < MAX_POSE_ERROR)
+        if is_true.sum() < MIN_POSE_MATCHES:
+            continue
+        rays = (make_rays(reference, in_i[is_true]), make_rays(source, in_j[is_true]))
+        focals = (float(reference.K[0, 0]), float(source.K[0, 0]))
+        pose = compute_relative_pose(reference, source)
+        given.append(np.abs(compute_sampson_distances(pose, rays, focals)))
+        best = fit_relative_pose(pose, rays, focals)
+        fitted.append(np.abs(compute_sampson_distances(best, rays, focals)))
+    if not given:
+        return None
+    medians = [float(np.median(np.concatenate(one))) for one in (given, fitted)]
+    return PoseFit(medians[0] * scale, medians[1] * scale)
+
+
+def make_rays(image: StereoImage, pixels: Pixels) -> Float[np.ndarray, "m 3"]:
+    """Make the rays of pixels, in camera axes at z = 1."""
+    whole = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
+    return whole @ np.linalg.inv(image.K).T
+
+
+def compute_relative_pose(reference: StereoImage, source: StereoImage) -> RelativePose:
+    """Compute the rotation, and the direction of the shift, from reference to source."""
+    shift = source.rotation.T @ (reference.center - source.center)
+    return source.rotation.T @ reference.rotation, shift / np.linalg.norm(shift)
+
+
+def compute_sampson_distances(
+    pose: RelativePose,
+    rays: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]],
+    focals: tuple[float, float],
+) -> Float[np.ndarray, "m"]:
+    """Compute Sampson's distances in pixels, with a sign.
+
+    To first order, it is how far both features of a match together have to move to meet.
+    """
+    rotation, shift = pose
+    x, y, z = shift
+    # E = [t]x R, and b' E a = 0 for the rays a and b of one point.
+    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
+    a, b = rays
+    line_in_b = a @ essential.T
+    line_in_a = b @ essential
+    slopes = np.concatenate(
+        [line_in_b[:, :2] / focals[1], line_in_a[:, :2] / focals[0]],
+        axis=1,
+    )
+    residuals: Float[np.ndarray, "m"] = (b * line_in_b).sum(axis=1)
+    return residuals / np.maximum(np.linalg.norm(slopes, axis=1), 1e-30)
+
+
+def fit_relative_pose(
+    start: RelativePose,
+    rays: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]],
+    focals: tuple[float, float],
+) -> RelativePose:
+    """Fit the relative pose with the smallest distances; those above a pixel count less."""
+    # Two directions across the shift, whose length matches do not tell.
+    across = np.linalg.svd(start[1][None])[2][1:]
+
+    def change(step: Float[np.ndarray, "5"]) -> RelativePose:
+        turn: Float[np.ndarray, "3 3"] = cv2.Rodrigues(step[:3])[0]
+        shift = start[1] + step[3:] @ across
+        return turn @ start[0], shift / np.linalg.norm(shift)
+
+    solution = least_squares(
+        lambda step: compute_sampson_distances(change(step), rays, focals),
+        np.zeros(5),
+        loss="soft_l1",
+        x_scale=[1e-3, 1e-3, 1e-3, 1e-2, 1e-2],
+    )
+    return change(solution.x)

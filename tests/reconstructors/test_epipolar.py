@@ -1,0 +1,73 @@
+"""Given poses beside the poses that matches allow."""
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+
+from gscompleter.reconstructors.features.epipolar import (
+    compute_sampson_distances,
+    fit_relative_pose,
+    measure_pose_fit,
+)
+from gscompleter.types import View
+from scenes import Room, camera_at, view_of
+
+FOCALS = (300.0, 300.0)
+
+
+def turn_view(view: View, degrees: float) -> View:
+    """Turn the camera of a view to the side and up, not its photograph."""
+    turn = cv2.Rodrigues(np.radians([degrees, degrees, 0.0]))[0]
+    c2w = view.camera.c2w.clone()
+    c2w[:3, :3] = c2w[:3, :3] @ torch.from_numpy(turn).float()
+    return replace(view, camera=replace(view.camera, c2w=c2w))
+
+
+@pytest.fixture(scope="module")
+def pair() -> list[View]:
+    """Photograph a room from two places."""
+    return [view_of(Room(), camera_at(x=x, size=160)) for x in (-0.2, 0.2)]
+
+
+def test_matches_contradict_a_camera_that_is_turned(pair):
+    right = measure_pose_fit(pair)
+    assert right is not None
+    assert not right.is_contradicted
+    turned = measure_pose_fit([pair[0], turn_view(pair[1], 0.3)])
+    assert turned is not None
+    assert turned.is_contradicted
+    assert turned.given > 3 * right.given
+    # The fit finds the pose that the photograph was taken with.
+    assert turned.fitted == pytest.approx(right.fitted, rel=0.3)
+
+
+def test_a_photograph_alone_and_cameras_in_one_place_contradict_nothing(pair):
+    assert measure_pose_fit(pair[:1]) is None
+    assert measure_pose_fit([pair[0], turn_view(pair[0], 1.0)]) is None
+
+
+def test_the_distance_is_that_of_both_features_from_their_lines():
+    # A camera moves along x, so that epipolar lines are rows of the image.
+    pose = np.eye(3), np.array([1.0, 0.0, 0.0])
+    a = np.array([[0.1, 0.2, 1.0]])
+    b = np.array([[0.4, 0.2 + 3 / FOCALS[1], 1.0]])
+    # Three pixels between rows: both features move half of it, each by 1.5, so √2 · 1.5 together.
+    distance = compute_sampson_distances(pose, (a, b), FOCALS)
+    assert np.abs(distance[0]) == pytest.approx(3 / np.sqrt(2))
+
+
+def test_the_pose_of_points_is_found_from_one_beside_it():
+    rng = np.random.default_rng(0)
+    points = rng.uniform([-1, -1, 2], [1, 1, 5], (80, 3))
+    turn = cv2.Rodrigues(np.array([0.02, -0.1, 0.03]))[0]
+    shift = np.array([0.5, 0.1, -0.2])
+    seen = points @ turn.T + shift
+    rays = points / points[:, 2:], seen / seen[:, 2:]
+    beside = cv2.Rodrigues(np.array([0.003, 0.004, -0.002]))[0]
+    start = turn @ beside, np.array([0.9, 0.2, -0.3]) / np.linalg.norm([0.9, 0.2, -0.3])
+    rotation, direction = fit_relative_pose(start, rays, FOCALS)
+    assert np.abs(rotation - turn).max() < 1e-6
+    assert np.abs(direction - shift / np.linalg.norm(shift)).max() < 1e-5
