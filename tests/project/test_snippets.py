@@ -40,7 +40,6 @@ NOT_RUN = {
     "live": "serves until it is closed; test_live.py presses its buttons",
     "poses": "needs photographs that COLMAP can match; test_poses.py has them",
     "demo": "takes half a minute; test_demo.py runs it on small images",
-    "bench": "takes minutes; test_bench.py runs it on less",
     "warmup": "test_rehearsal.py compiles in advance",
     "evaluate": "needs sequences or takes hours; test_runs.py evaluates a room",
     "tables": "needs what evaluate wrote; test_runs.py has it",

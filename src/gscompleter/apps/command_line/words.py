@@ -50,13 +50,13 @@ def parse_words(words: Sequence[str], kinds: Mapping[str, type]) -> Any:
 
     It raises InputError for wrong words, and SystemExit after printing the help.
     """
+    refuse_old_spellings(words)
     if words and words[0] not in kinds and words[0] not in (*HELP, HELP_ALL):
         raise InputError(
             f"There is no command {quote_value(words[0])}; choose one of {', '.join(kinds)} "
             "(see gscompleter --help)."
         )
     refuse_empty_words(words)
-    refuse_old_spellings(words)
 
     # The rule for help pages changes the fields, so that no option could be parsed with it.
     rules: list[Rule] = []

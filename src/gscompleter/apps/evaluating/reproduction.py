@@ -10,7 +10,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gscompleter.apps.bench.report import describe_machine
 from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.command_line.exit_codes import choose_exit_code
 from gscompleter.apps.commands.evaluate import AUTO, EvaluateOptions, PresetGeneratorOptions
@@ -40,6 +39,7 @@ from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, NoCaseError, OutputError, quote_value
 from gscompleter.system.files.writing import encode_text, replace_file
 from gscompleter.system.jobs.jobs import make_folder
+from gscompleter.system.machine import describe_machine
 
 UNUSUAL = ("stress", "sequence")
 """Kinds of the protocols that only tables of their own use."""
