@@ -8,7 +8,8 @@ from typing import Annotated
 
 import tyro
 
-from gscompleter.apps.commands.shared_options import CompletingOptions, Port, Size
+from gscompleter.apps.commands.shared_options import CompletingOptions, Port
+from gscompleter.apps.requests.scene import Size
 from gscompleter.system.process import import_without_collection
 
 
@@ -43,12 +44,13 @@ class LiveOptions(CompletingOptions):
     """Print the address without opening a browser."""
 
     def check_overlap(self) -> None:
-        """Leave it to `find_opening`, which knows the inputs of a session that goes on."""
+        """Leave it to `decide_live`, which knows the inputs of a session that goes on."""
 
 
 def run_live(options: LiveOptions) -> None:
     """Serve the page until Ctrl-C."""
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
+        from gscompleter.apps.commands.sessions import decide_live
         from gscompleter.apps.live.serving import serve_live
-    serve_live(options)
+    serve_live(decide_live(options))
