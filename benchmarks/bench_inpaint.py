@@ -22,7 +22,7 @@ from jaxtyping import Float
 from skimage.restoration import inpaint_biharmonic
 from torch import Tensor
 
-from gscompleter.apps.report.completion import join_images
+from gscompleter.apps.report.pictures import join_images
 from gscompleter.evaluation.cases import Case, read_cases
 from gscompleter.generators.warp import WarpedImage, warp_photographs
 from gscompleter.generators.warp_inpaint import WarpInpaint

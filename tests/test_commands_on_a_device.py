@@ -27,8 +27,7 @@ from fake_gsplat import WHEEL, fake_gsplat, find_gsplat
 from gscompleter import load_renderer
 from gscompleter.apps.batch import engine
 from gscompleter.apps.command_line.chosen_config import ChosenConfig
-from gscompleter.apps.commands.live import LiveOptions
-from gscompleter.apps.commands.sessions import decide_session
+from gscompleter.apps.commands.live import LiveOptions, decide_live
 from gscompleter.apps.completing import complete
 from gscompleter.apps.live import saving
 from gscompleter.apps.live.session import Step, apply_step, save_camera
@@ -229,7 +228,7 @@ def test_a_session_in_the_browser_is_saved(room, tmp_path, actions):
     # Few steps of the stages, as in the other tests.
     few = {"registration": {"iterations": 2}, "refine": {"iterations": 2, "color_rounds": 2}}
     options = replace(options, config=ChosenConfig(changes=few))
-    ready = saving.prepare_session(decide_session(options), Console(quiet=True))
+    ready = saving.prepare_session(decide_live(options).session, Console(quiet=True))
     session = saving.begin_session(ready)
     pixels = np.zeros((SIZE, SIZE), np.uint8)
     pixels[SPOT] = 255

@@ -25,8 +25,7 @@ from scipy.spatial.transform import Rotation
 
 from command import run
 from gscompleter import load_cameras, load_ply, save_ply
-from gscompleter.apps.commands.live import LiveOptions
-from gscompleter.apps.commands.sessions import decide_session
+from gscompleter.apps.commands.live import LiveOptions, decide_live
 from gscompleter.apps.live import saving, serving
 from gscompleter.apps.live.addresses import Address, resolve_host
 from gscompleter.apps.live.difference import PageScene
@@ -93,7 +92,7 @@ def options_for(room: Path, out: Path, **others) -> LiveOptions:
 
 
 def prepare(options: LiveOptions) -> PreparedSession:
-    return saving.prepare_session(decide_session(options), QUIET)
+    return saving.prepare_session(decide_live(options).session, QUIET)
 
 
 @pytest.fixture(scope="module")
@@ -822,7 +821,7 @@ def test_a_malformed_request_leaves_no_traceback(server, capfd):
 def test_the_options_of_complete_are_those_of_live(room, tmp_path):
     words = ["live", str(room), "--out", str(tmp_path / "out"), "--config", "paper"]
     options = parse_command([*words, "--config.paper-registration.iterations", "7", "--seed", "3"])
-    asked = decide_session(options).completion
+    asked = decide_live(options).session.completion
     paper = CompleterConfig.paper()
     registration = replace(paper.paper_registration, iterations=7)
     assert asked.work.config == replace(paper, paper_registration=registration)

@@ -22,7 +22,7 @@ from rich.console import Console
 
 from command import run
 from gscompleter import save_ply
-from gscompleter.apps.commands.sessions import decide_session
+from gscompleter.apps.commands.live import decide_live
 from gscompleter.apps.live import saving, serving
 from gscompleter.apps.live.journal import Journal
 from gscompleter.apps.live.opening import SessionRequest
@@ -72,7 +72,7 @@ def splat(tmp_path_factory) -> Path:
 
 
 def find_opening(*words: object) -> SessionRequest:
-    return decide_session(parse_command(["live", *map(str, words), "--no-open", "--quiet"]))
+    return decide_live(parse_command(["live", *map(str, words), "--no-open", "--quiet"])).session
 
 
 class Program:

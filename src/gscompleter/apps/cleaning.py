@@ -32,7 +32,7 @@ from gscompleter.apps.report.cleaning_picture import (
     look_at_removal,
     see_removal,
 )
-from gscompleter.apps.report.completion import save_changed, save_completed_splat
+from gscompleter.apps.report.scenes import save_changed, save_completed_splat
 from gscompleter.apps.requests.cleaning import CleaningRequest
 from gscompleter.apps.requests.scene import PhotographsRequest
 from gscompleter.apps.requests.splat import SplatRequest

@@ -82,9 +82,10 @@ def parse_words(words: Sequence[str], kinds: Mapping[str, type]) -> Any:
             # than for one, which is 2 % of a completion.
             if words and words[0] in kinds:
                 about = describe_command(kinds[words[0]])
-                return call_tyro(
-                    kinds[words[0]], f"gscompleter {words[0]}", about, words[1:], registry
-                )
+                prog = f"gscompleter {words[0]}"
+                parsed = call_tyro(kinds[words[0]], prog, about, words[1:], registry)
+                check_config(parsed)
+                return parsed
             return call_tyro(make_program(kinds), "gscompleter", DESCRIPTION, words, registry)
     except SystemExit as stop:
         # Code 0: the help was printed.
@@ -93,6 +94,13 @@ def parse_words(words: Sequence[str], kinds: Mapping[str, type]) -> Any:
         sentence = explain_words(words, kinds, printed.getvalue())
         see = " ".join(["gscompleter", *words[:1]])
         raise InputError(f"{sentence} (see {see} --help).") from None
+
+
+def check_config(options: Any) -> None:
+    """Refuse a config that there is not, and settings out of range, whatever the input is."""
+    chosen = getattr(options, NAME, None)
+    if isinstance(chosen, ChosenConfig):
+        chosen.decide(is_splat=False, has_photographs=True)
 
 
 def call_tyro(

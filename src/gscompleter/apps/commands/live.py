@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
 from gscompleter.apps.commands.shared_options import CompletingOptions, Port
 from gscompleter.apps.requests.scene import Size
 from gscompleter.system.process import import_without_collection
+
+if TYPE_CHECKING:
+    from gscompleter.apps.live.opening import LiveRequest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -47,10 +50,18 @@ class LiveOptions(CompletingOptions):
         """Leave it to `decide_live`, which knows the inputs of a session that goes on."""
 
 
+def decide_live(options: LiveOptions) -> LiveRequest:
+    """Decide what a session begins with, and where its page is."""
+    from gscompleter.apps.commands.sessions import decide_session  # no help page waits for torch
+    from gscompleter.apps.live.opening import LiveRequest
+
+    session = decide_session(replace(options, strokes=None), options.strokes)
+    return LiveRequest(session, options.host, options.port, not options.no_open)
+
+
 def run_live(options: LiveOptions) -> None:
     """Serve the page until Ctrl-C."""
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
-        from gscompleter.apps.commands.sessions import decide_live
         from gscompleter.apps.live.serving import serve_live
     serve_live(decide_live(options))

@@ -13,8 +13,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from gscompleter.apps.command_line.chosen_config import ChosenConfig
-from gscompleter.apps.commands.live import LiveOptions
-from gscompleter.apps.commands.repair import RepairOptions
 from gscompleter.apps.commands.shared_decisions import (
     check_context,
     check_generator,
@@ -27,7 +25,7 @@ from gscompleter.apps.commands.shared_options import (
     CompletingOptions,
     list_inputs,
 )
-from gscompleter.apps.live.opening import LiveRequest, SessionRequest
+from gscompleter.apps.live.opening import SessionRequest
 from gscompleter.apps.live.strokes import (
     ADVICE,
     OF_STROKES,
@@ -62,15 +60,12 @@ OF_MACHINE = (
 Known = TypeVar("Known", bound=CompletingOptions)
 
 
-def decide_live(options: LiveOptions) -> LiveRequest:
-    """Decide what a session begins with, or raise InputError if its folder is not free."""
-    session = decide_session(options)
-    return LiveRequest(session, options.host, options.port, not options.no_open)
+def decide_session(options: Known, strokes: Path | None) -> SessionRequest:
+    """Decide on the scene of a session, and on the steps of `strokes` that it goes on from.
 
-
-def decide_session(options: LiveOptions) -> SessionRequest:
-    """Decide on the scene of a session, and on the steps that it goes on from."""
-    options, path = find_session(options)
+    Raises InputError if its folder is not free.
+    """
+    options, path = find_session(options, strokes)
     if path is None:
         out = options.out or DEFAULT_OUT
         size = options.resolution or DEFAULT_RESOLUTION
@@ -93,7 +88,7 @@ def decide_session(options: LiveOptions) -> SessionRequest:
         options = add_saved_options(options, saved)
     else:
         options = restore_options(options, saved, path)
-    options = replace(options, out=out, strokes=None, overwrite=options.overwrite or continues)
+    options = replace(options, out=out, overwrite=options.overwrite or continues)
     inputs = [*list_inputs(options), *(() if continues else (path,))]
     refuse_overlap(out, inputs, may_continue=False)
     return replace(
@@ -105,7 +100,7 @@ def decide_session(options: LiveOptions) -> SessionRequest:
     )
 
 
-def decide_replay(options: RepairOptions, strokes: Path) -> SessionRequest:
+def decide_replay(options: CompletingOptions, strokes: Path) -> SessionRequest:
     """Decide on the scene on which the steps of a `strokes.json` are done again."""
     path = find_strokes_file(strokes)
     saved = read_strokes(path)
@@ -166,13 +161,13 @@ def describe_value(name: str, value: Any) -> Any:
     return os.path.abspath(value) if is_path else value
 
 
-def find_session(options: LiveOptions) -> tuple[LiveOptions, Path | None]:
-    """Find the steps to go on with, if any; the options then name a scene only with `--strokes`.
+def find_session(options: Known, strokes: Path | None) -> tuple[Known, Path | None]:
+    """Find the steps to go on with, if any; the options then name a scene only with `strokes`.
 
     An output folder without steps stands for the completed scene in it.
     """
     folder = options.folder
-    path = None if options.strokes is None else find_strokes_file(options.strokes)
+    path = None if strokes is None else find_strokes_file(strokes)
     if folder is None or options.scene is not None:
         return options, path
     if os.path.isdir(folder):
@@ -206,27 +201,28 @@ def is_saved_session(path: Path) -> bool:
     return edits.is_unchanged and bool(edits) and edits.edits[-1].command == "live"
 
 
-def restore_options(options: LiveOptions, saved: StrokesFile, path: Path) -> LiveOptions:
+def restore_options(options: Known, saved: StrokesFile, path: Path) -> Known:
     """Return the options that a session began with, and those of this machine as they are given."""
     if saved.session is None:
         raise InputError(
             f"{quote_value(path)} does not tell of which scene it is; name the scene, as in "
             f"`gscompleter live splat.ply --strokes {quote_value(path)}`.",
         )
+    kind = type(options)
     given = {**describe_options(options), "config": describe_config(options)}
     known = {**saved.session, **{name: getattr(saved, name) for name in OF_STROKES}}
     asked = {**given, **{name: describe_value(name, getattr(options, name)) for name in OF_STROKES}}
     for name, value in known.items():
-        refuse_other_value(name, asked.get(name), value)
+        refuse_other_value(name, asked.get(name), value, kind)
         refuse_code(name, asked.get(name), value)
 
-    own = {field.name for field in fields(LiveOptions)}
+    own = {field.name for field in fields(kind)}
     own -= {field.name for field in fields(CompletingOptions)} - set(OF_MACHINE)
     shown = quote_value(path)
     config = validate_typed(CompleterConfig, known.get("config", {}), shown, ADVICE)
     changed = ChosenConfig(changes=asdict(config))
     values = {**known, **{name: getattr(options, name) for name in own}, "config": changed}
-    restored = validate_typed(LiveOptions, values, shown, ADVICE)
+    restored = validate_typed(kind, values, shown, ADVICE)
     for name in NAMES_SCENE:
         scene = getattr(restored, name)
         if scene is not None and not scene.exists():
@@ -237,12 +233,12 @@ def restore_options(options: LiveOptions, saved: StrokesFile, path: Path) -> Liv
     return restored
 
 
-def refuse_other_value(name: str, given: Any, known: Any) -> None:
+def refuse_other_value(name: str, given: Any, known: Any, kind: type[CompletingOptions]) -> None:
     """Refuse an option that would change what the steps did, unless it has its default."""
     if isinstance(known, Mapping) and isinstance(given, Mapping) and name != "config":
         for inner, value in known.items():
-            refuse_other_value(inner, given.get(inner), value)
-    elif normalize(given) not in [normalize(known), *list_defaults(name)]:
+            refuse_other_value(inner, given.get(inner), value, kind)
+    elif normalize(given) not in [normalize(known), *list_defaults(name, kind)]:
         raise InputError(
             "A session goes on with the settings that it began with; leave this one out, or begin "
             "anew with it.",
@@ -272,14 +268,14 @@ def list_words(value: Any) -> Iterator[str]:
             yield from list_words(inner)
 
 
-def list_defaults(name: str) -> list[Any]:
+def list_defaults(name: str, kind: type[CompletingOptions]) -> list[Any]:
     """List the values of an option, as JSON, that mean that it was not given."""
     if name == "config":
         presets = [
             load_config("default", *kind) for kind in ((False, True), (True, True), (True, False))
         ]
         return [normalize(asdict(preset)) for preset in presets]
-    options = LiveOptions()
+    options = kind()
     for place in (options, options.synthesis):
         if hasattr(place, name):
             return [normalize(describe_value(name, getattr(place, name)))]
@@ -293,14 +289,16 @@ def normalize(value: Any) -> Any:
     return [normalize(inner) for inner in value] if isinstance(value, list | tuple) else value
 
 
-def describe_config(options: LiveOptions) -> dict[str, Any]:
+def describe_config(options: CompletingOptions) -> dict[str, Any]:
     """Describe the config that the options of a session name, which goes on with its own."""
     lacks_photographs = has_splat_alone(options)
     is_splat = options.scene is not None or lacks_photographs
     return asdict(options.config.decide(is_splat, not lacks_photographs))
 
 
-def describe_changes(options: LiveOptions, saved: StrokesFile, out: Path | None) -> Iterator[str]:
+def describe_changes(
+    options: CompletingOptions, saved: StrokesFile, out: Path | None
+) -> Iterator[str]:
     """Describe what is another file than it was; `out` is the folder of a session that goes on."""
     count = len(saved.frames)
     yield f"Going on after {count} {'step' if count == 1 else 'steps'}, which are done again."

@@ -30,13 +30,10 @@ from gscompleter.apps.completing.run_info import describe_run, read_held_out, re
 from gscompleter.apps.completing.update import prepare_update
 from gscompleter.apps.inputs.describing import describe_task, print_lines
 from gscompleter.apps.inputs.task import CompletionTask
-from gscompleter.apps.report.completion import (
-    IMAGES,
-    write_images,
-    write_report,
-)
+from gscompleter.apps.report.completion import write_report
 from gscompleter.apps.report.film import write_comparison_video
 from gscompleter.apps.report.page import write_completion_page
+from gscompleter.apps.report.pictures import IMAGES, write_images
 from gscompleter.apps.report.results import COMMAND, RESULTS
 from gscompleter.apps.report.schema import read_summary
 from gscompleter.apps.requests.completion import (

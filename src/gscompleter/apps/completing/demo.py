@@ -8,7 +8,7 @@ from pathlib import Path
 from gscompleter.apps.completing.complete import complete_folder
 from gscompleter.apps.completing.printing import answer_completion
 from gscompleter.apps.inputs.describing import print_lines
-from gscompleter.apps.report.completion import join_images
+from gscompleter.apps.report.pictures import join_images
 from gscompleter.apps.requests.answer import AnswerRequest
 from gscompleter.apps.requests.completion import (
     CompletionRequest,

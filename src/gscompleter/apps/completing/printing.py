@@ -14,9 +14,9 @@ from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.completing.keeping import describe_size
 from gscompleter.apps.inputs.holes_file import HOLES_FILE, read_holes
 from gscompleter.apps.inputs.task import Opened, Target
-from gscompleter.apps.report.completion import IMAGES
 from gscompleter.apps.report.film import VIDEO_FILE
 from gscompleter.apps.report.page import REPORT_FILE
+from gscompleter.apps.report.pictures import IMAGES
 from gscompleter.apps.report.plain_words import group_target_warnings, list_warnings
 from gscompleter.apps.report.schema import CompletionSummary, find_completed, read_summary
 from gscompleter.apps.requests.answer import AnswerRequest
