@@ -37,6 +37,7 @@ from gscompleter.apps.live.strokes import (
 from gscompleter.apps.report.schema import find_completed
 from gscompleter.apps.requests.completion import CompletionRequest, TargetRequest
 from gscompleter.config import CompleterConfig, load_config
+from gscompleter.config.generators import GeneratorOptions
 from gscompleter.splats.edits import read_edits
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import holds_results, holds_session
@@ -275,11 +276,9 @@ def list_defaults(name: str, kind: type[CompletingOptions]) -> list[Any]:
             load_config("default", *kind) for kind in ((False, True), (True, True), (True, False))
         ]
         return [normalize(asdict(preset)) for preset in presets]
-    options = kind()
-    for place in (options, options.synthesis):
-        if hasattr(place, name):
-            return [normalize(describe_value(name, getattr(place, name)))]
-    return []
+    places = (GeneratorOptions, kind)
+    defaults = {field.name: field.default for place in places for field in fields(place)}
+    return [normalize(describe_value(name, defaults[name]))] if name in defaults else []
 
 
 def normalize(value: Any) -> Any:
