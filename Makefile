@@ -132,7 +132,7 @@ results-pages: $(VENV)/installed
 # What completions take comes first (docs/performance.md); without its scenes, name another PERFORMANCE.
 PERFORMANCE ?= benchmarks/performance.json
 bench: $(VENV)/installed-test
-	$(BIN)/gscompleter bench --cases $(PERFORMANCE) --out $(RESULTS)/bench --overwrite
+	$(BIN)/python benchmarks/measure_completions.py --cases $(PERFORMANCE) --out $(RESULTS)/bench --overwrite
 	for script in $(filter-out %/bench_inpaint.py,$(wildcard benchmarks/bench_*.py)); do \
 		$(BIN)/python $$script || exit 1; done
 	$(BIN)/python benchmarks/bench_inpaint.py $(CASES)

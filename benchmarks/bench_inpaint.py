@@ -23,7 +23,7 @@ from skimage.restoration import inpaint_biharmonic
 from torch import Tensor
 
 from apart import read_used_cases
-from gscompleter.apps.report.completion import join_images
+from gscompleter.apps.report.pictures import join_images
 from gscompleter.evaluation.cases import Case
 from gscompleter.generators.warp import WarpedImage, warp_photographs
 from gscompleter.generators.warp_inpaint import WarpInpaint

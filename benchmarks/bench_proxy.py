@@ -14,8 +14,8 @@ import torch
 import tyro
 
 from bench_render import make_pixel_gaussians, measure_median_seconds
+from completions.cases import multiply_gaussians
 from gscompleter import Gaussians, load_renderer, merge
-from gscompleter.apps.bench.cases import multiply_gaussians
 from gscompleter.data.demo_scene import move_right
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.render.lod import simplify_scene, thin_gaussians

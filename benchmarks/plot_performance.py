@@ -1,6 +1,6 @@
 """Figures of docs/performance.md: where the seconds of a command go, and how they grow.
 
-gscompleter bench --cases benchmarks/growth.json --out OUT
+python benchmarks/measure_completions.py --cases benchmarks/growth.json --out OUT
 python benchmarks/plot_performance.py --bench OUT/bench.json
 """
 
@@ -19,8 +19,8 @@ import tyro
 from matplotlib.figure import Figure
 from matplotlib.ticker import NullLocator
 
-from gscompleter.apps.bench.cases import BenchCase, read_manifest
-from gscompleter.apps.bench.report import fit_exponent
+from completions.cases import BenchCase, read_manifest
+from completions.report import fit_exponent
 
 ROOT = Path(__file__).resolve().parents[1]
 STAGES = ("context", "generate", "lift", "register", "integrate")
@@ -36,7 +36,7 @@ TITLES = {
 @dataclass(frozen=True)
 class Options:
     bench: Path
-    """JSON file of `gscompleter bench` with growth."""
+    """JSON file of `measure_completions.py` with growth."""
     cases: Path = ROOT / "benchmarks" / "performance.json"
     """Cases, of which the first is profiled."""
     out: Path = ROOT / "docs"

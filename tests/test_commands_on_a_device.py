@@ -26,9 +26,10 @@ from fake_cuda import Counts, FakeCudaTensor
 from fake_gsplat import WHEEL, fake_gsplat, find_gsplat
 from gscompleter import load_renderer
 from gscompleter.apps.batch import engine
-from gscompleter.apps.commands.live import LiveOptions
+from gscompleter.apps.command_line.chosen_config import ChosenConfig
+from gscompleter.apps.commands.live import LiveOptions, decide_live
 from gscompleter.apps.completing import complete
-from gscompleter.apps.live import serving
+from gscompleter.apps.live import saving
 from gscompleter.apps.live.session import Step, apply_step, save_camera
 from gscompleter.data.scene import write_cameras
 from gscompleter.evaluation.metrics.coverage import sample_held_out_cameras
@@ -225,14 +226,10 @@ def test_a_session_in_the_browser_is_saved(room, tmp_path, actions):
         quiet=True,
     )
     # Few steps of the stages, as in the other tests.
-    config = replace(
-        options.config,
-        registration=replace(options.config.registration, iterations=2),
-        refine=replace(options.config.refine, iterations=2, color_rounds=2),
-    )
-    options = replace(options, config=config)
-    ready = serving.prepare(options, Console(quiet=True))
-    session = serving.begin_session(ready)
+    few = {"registration": {"iterations": 2}, "refine": {"iterations": 2, "color_rounds": 2}}
+    options = replace(options, config=ChosenConfig(changes=few))
+    ready = saving.prepare_session(decide_live(options).session, Console(quiet=True))
+    session = saving.begin_session(ready)
     pixels = np.zeros((SIZE, SIZE), np.uint8)
     pixels[SPOT] = 255
     file = io.BytesIO()
@@ -248,7 +245,7 @@ def test_a_session_in_the_browser_is_saved(room, tmp_path, actions):
         session, _ = apply_step(session, steps[action])
         assert isinstance(session.latest.scene.means, FakeCudaTensor)
     assert session.steps
-    serving.save_session(ready, session)
+    saving.save_session(ready, session)
     check_result(tmp_path / "out", 10)
 
 

@@ -19,8 +19,8 @@ from torch import Tensor
 import gscompleter as gsc
 from gscompleter.apps.inputs.named_photographs import is_image
 from gscompleter.apps.inputs.task import InputSplatFile
-from gscompleter.apps.report.completion import write_scenes
 from gscompleter.apps.report.hole_pictures import draw_hole
+from gscompleter.apps.report.scenes import write_scenes
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.mask_checks import read_masks_as_asked, refuse_nothing_to_invert
 from gscompleter.data.mask_reading import MaskReading

@@ -32,7 +32,7 @@ from gscompleter.system.threads import limit_threads
 
 COMMANDS = (
     *("complete", "batch", "live", "update", "remove", "repair", "clean", "demo", "evaluate"),
-    *("tables", "index", "bench", "models", "convert", "poses", "report", "strip", "view"),
+    *("tables", "index", "models", "convert", "poses", "report", "strip", "view"),
     *("inspect", "doctor", "warmup"),
 )
 """Names of all commands, in the order of the help page.

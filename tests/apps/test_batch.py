@@ -24,7 +24,7 @@ from command import run
 from gscompleter import InputError
 from gscompleter.apps.batch import engine as batch_engine
 from gscompleter.apps.batch.manifest import list_results, read_manifest
-from gscompleter.apps.batch.rows import parse_row
+from gscompleter.apps.commands.batch_rows import parse_row
 from gscompleter.apps.report.page import render_batch_page
 from gscompleter.system.errors import FullDiskError, OutputError, WorkerError
 from gscompleter.system.files.writing import replace_file
@@ -314,7 +314,7 @@ def test_manifests_of_all_kinds_name_the_same_jobs(tmp_path):
     assert options[0] == options[1]
     assert options[0][0].target == ("4", "6")
     assert options[0][0].video
-    assert options[0][0].config.holes.max_alpha == 0.4
+    assert options[0][0].config.changes == {"holes": {"max_alpha": 0.4}}
     assert options[0][1] == parse_row(by_folder[1].options, tmp_path / "o")
 
 

@@ -13,7 +13,8 @@ import torch
 
 from command import run
 from gscompleter import InputError, load_cameras, load_ply
-from gscompleter.apps.commands.shared_options import parse_resolution
+from gscompleter.apps.commands.complete import decide_completion
+from gscompleter.apps.commands.evaluate import decide_evaluation
 from gscompleter.apps.completing import complete as command
 from gscompleter.apps.completing import keeping, preparation
 from gscompleter.apps.completing.keeping import describe_size
@@ -22,6 +23,7 @@ from gscompleter.apps.inputs.memory import estimate_memory
 from gscompleter.apps.inputs.reading import read_task
 from gscompleter.apps.inputs.selection import select_near_and_far
 from gscompleter.apps.inputs.task import CompletionTask, Opened
+from gscompleter.apps.requests.scene import parse_resolution
 from gscompleter.apps.viewer.exhibit import load_viewer_completion
 from gscompleter.cli import parse_command
 from gscompleter.data.formats import open_photographs
@@ -114,8 +116,10 @@ def opened_with(scene: Path, *words: object) -> CompletionTask:
     """Open `scene` with these options; nothing is completed."""
     options = parse_command([str(word) for word in ("complete", scene, *words, "--out", "OUT")])
     photographs = open_photographs(scene, near=0.5, far=20.0)
-    opened = Opened(options.make_scene_request(), photographs, "nerfstudio", 5)
-    return read_task(opened, options.context, options.target, "cpu", has_splat=False)
+    request = decide_completion(options)
+    opened = Opened(request.source.scene, photographs, "nerfstudio", 5)
+    named = request.targets.named
+    return read_task(opened, request.source.context, named, "cpu", has_splat=False)
 
 
 def test_a_context_that_is_named_is_the_one_that_is_taken(scene):
@@ -260,7 +264,7 @@ def test_evaluate_tells_the_notes_of_what_it_opens_once(tmp_path):
     for words in ([tmp_path / "cases.json"], [room, "--protocol", "sequence-1"]):
         options = parse_command([*map(str, ["evaluate", *words, "--out", tmp_path / "out"])])
         notes: list[str] = []
-        assert collect_tasks(options, [], notes)
+        assert collect_tasks(decide_evaluation(options).cases, [], notes)
         assert notes == [note]
 
 

@@ -167,7 +167,6 @@ def test_an_empty_word_is_no_working_folder(tmp_path, monkeypatch, capsys, words
         ("index", "SCENE", "--protocol", "n-10", "--out", f"{LONG}.json"),
         ("poses", LONG, "--out", "O"),
         ("poses", "SCENE", "--out", LONG),
-        ("bench", "--cases", LONG),
         ("demo", "--out", LONG),
     ],
 )

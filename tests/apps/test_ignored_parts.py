@@ -13,7 +13,7 @@ from rich.console import Console
 from command import run
 from gscompleter import save_ply
 from gscompleter.apps.inputs.opening import open_scene
-from gscompleter.apps.inputs.scene_request import PosesRequest, SceneRequest
+from gscompleter.apps.requests.scene import PosesRequest, SceneRequest
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.sfm.poses import FoundPoses
 from scenes import Room, camera_at, gaussians_of, photographed, view_of

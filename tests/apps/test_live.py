@@ -25,14 +25,14 @@ from scipy.spatial.transform import Rotation
 
 from command import run
 from gscompleter import load_cameras, load_ply, save_ply
-from gscompleter.apps.commands.live import LiveOptions
+from gscompleter.apps.commands.live import LiveOptions, decide_live
 from gscompleter.apps.live import saving, serving
 from gscompleter.apps.live.addresses import Address, resolve_host
 from gscompleter.apps.live.difference import PageScene
 from gscompleter.apps.live.journal import Journal
-from gscompleter.apps.live.opening import find_opening
 from gscompleter.apps.live.page import BUSY, LivePage
 from gscompleter.apps.live.request import parse_request
+from gscompleter.apps.live.saving import PreparedSession
 from gscompleter.apps.live.server import LiveServer
 from gscompleter.apps.live.session import (
     Session,
@@ -91,9 +91,13 @@ def options_for(room: Path, out: Path, **others) -> LiveOptions:
     return LiveOptions(folder=room, out=out, **{**given, **others})
 
 
+def prepare(options: LiveOptions) -> PreparedSession:
+    return saving.prepare_session(decide_live(options).session, QUIET)
+
+
 @pytest.fixture(scope="module")
-def ready(room, tmp_path_factory) -> serving.Prepared:
-    return serving.prepare(options_for(room, tmp_path_factory.mktemp("outs") / "out"), QUIET)
+def ready(room, tmp_path_factory) -> PreparedSession:
+    return prepare(options_for(room, tmp_path_factory.mktemp("outs") / "out"))
 
 
 @pytest.fixture(scope="module")
@@ -157,13 +161,15 @@ def test_stages_are_heard_as_they_begin(completed, twice):
     assert len(heard) == count, "the second completion was heard, too"
 
 
-def the_same_as_complete(monkeypatch, ready: serving.Prepared, tmp_path: Path, *more) -> bool:
+def the_same_as_complete(monkeypatch, ready: PreparedSession, tmp_path: Path, *more) -> bool:
     """Compare the saved files with those of `complete` at the saved cameras."""
-    out, other = ready.options.out, tmp_path / "by complete"
+    out, other = ready.request.out, tmp_path / "by complete"
     context = json.loads((out / "summary.json").read_text())["settings"]["context"]
     arguments = ("--context", *context, "--target", out / "targets.json", "--out", other)
     size = ("--resolution", SIZE, SIZE, "--near", 0.5, "--far", 20, "--quiet")
-    assert run(monkeypatch, "complete", ready.options.folder, *arguments, *size, *more) == 0
+    assert (
+        run(monkeypatch, "complete", ready.scene.source.scene.folder, *arguments, *size, *more) == 0
+    )
     names = ("completed.ply", "context.ply", "generated.ply", "images/target1_after.png")
     names_of_both = [{path.name for path in folder.iterdir()} for folder in (out, other)]
     assert names_of_both[0] - names_of_both[1] == {"strokes.json"}
@@ -175,11 +181,11 @@ def test_what_is_saved_is_what_complete_writes(ready, begun, tmp_path, monkeypat
     with pytest.raises(InputError, match="nothing to save"):
         serving.save_session(ready, begun)
     session, _ = complete_camera(begun, HOLES[0])
-    assert str(ready.options.out) in serving.save_session(ready, session)
+    assert str(ready.request.out) in serving.save_session(ready, session)
     assert the_same_as_complete(monkeypatch, ready, tmp_path)
     session, _ = complete_camera(session, HOLES[1])
     serving.save_session(ready, session)  # replaces its own files
-    assert len(json.loads((ready.options.out / "summary.json").read_text())["targets"]) == 2
+    assert len(json.loads((ready.request.out / "summary.json").read_text())["targets"]) == 2
     assert the_same_as_complete(monkeypatch, ready, tmp_path, "--overwrite")
 
 
@@ -187,7 +193,7 @@ def test_what_others_wrote_is_not_replaced(room, tmp_path):
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "mine.txt").write_text("mine")
     with pytest.raises(InputError, match="not empty"):
-        serving.prepare(options_for(room, tmp_path / "out"), QUIET)
+        prepare(options_for(room, tmp_path / "out"))
 
 
 @pytest.mark.slow
@@ -200,12 +206,11 @@ def test_what_is_saved_of_a_splat_in_a_frame_of_its_own_is_too(tmp_path, monkeyp
     save_ply(
         tmp_path / "splat.ply", transform_gaussians(scene, torch.from_numpy(ELSEWHERE).float())
     )
-    config = CompleterConfig.splat()
-    options = options_for(room, tmp_path / "out", scene=tmp_path / "splat.ply", config=config)
-    ready = serving.prepare(options, QUIET)
-    assert ready.task.method == "dataparser"
+    options = options_for(room, tmp_path / "out", scene=tmp_path / "splat.ply")
+    ready = prepare(options)
+    assert ready.scene.task.method == "dataparser"
     session = serving.begin_session(ready)
-    target = transform_camera(HOLES[0], ready.task.frame)
+    target = transform_camera(HOLES[0], ready.scene.task.frame)
     session, _ = complete_camera(session, target)
     assert len(session.latest.added) > 0
     assert torch.allclose(session.cameras[0].c2w.float(), HOLES[0].c2w, atol=1e-6)
@@ -218,7 +223,7 @@ def test_an_antialiased_splat_is_saved_as_one(room, tmp_path):
     scene = merge([gaussians_of(view_of(Room(), camera)) for camera in CAMERAS[:2]])
     save_ply(tmp_path / "splat.ply", replace(scene, is_antialiased=True))
     options = options_for(room, tmp_path / "out", scene=tmp_path / "splat.ply")
-    ready = serving.prepare(options, QUIET)
+    ready = prepare(options)
     session, _ = complete_camera(serving.begin_session(ready), HOLES[0])
     serving.save_session(ready, session)
     for name in ("context.ply", "completed.ply", "generated.ply"):
@@ -230,9 +235,9 @@ def test_a_splat_alone_is_completed_and_saved(tmp_path, monkeypatch):
     save_ply(splat, gaussians_of(view_of(Room(), camera_at(size=SIZE))))
     monkeypatch.chdir(tmp_path)
     words = ["live", "splat.ply", "--out", "out", "--resolution", "64", "64", "--no-open"]
-    ready = serving.prepare(parse_command(words), QUIET)
-    assert ready.opened.renders_from == "pixels"
-    assert ready.options.config.trust == "full"
+    ready = prepare(parse_command(words))
+    assert ready.scene.opened.renders_from == "pixels"
+    assert ready.scene.completer.config.trust == "full"
     session, _ = complete_camera(serving.begin_session(ready), HOLES[0])
     assert len(session.latest.added) > 0
     serving.save_session(ready, session)
@@ -249,8 +254,8 @@ def test_a_trained_splat_alone_begins_where_it_looks_well(tmp_path, monkeypatch)
     # As large as those of a trainer, whatever the distance.
     save_ply(tmp_path / "room.ply", replace(room, scales=torch.full_like(room.scales, 0.1)))
     options = LiveOptions(scene=tmp_path / "room.ply", out=tmp_path / "out", resolution=(48, 48))
-    ready = serving.prepare(replace(options, config=CompleterConfig.bare()), QUIET)
-    assert ready.opened.renders_from == "standpoints"
+    ready = prepare(options)
+    assert ready.scene.opened.renders_from == "standpoints"
     session = serving.begin_session(ready)
     assert len(session.latest.views) >= 2
     for view in session.latest.views:
@@ -258,13 +263,13 @@ def test_a_trained_splat_alone_begins_where_it_looks_well(tmp_path, monkeypatch)
 
 
 def test_the_frames_that_were_chosen_are_named(room, tmp_path):
-    ready = serving.prepare(options_for(room, tmp_path / "out", context=None), QUIET)
-    assert ready.options.context == tuple(view.frame for view in ready.task.views)
-    assert len(ready.options.context) >= 2
+    ready = prepare(options_for(room, tmp_path / "out", context=None))
+    assert ready.scene.source.context == tuple(view.frame for view in ready.scene.task.views)
+    assert len(ready.scene.source.context) >= 2
 
 
 def test_a_hole_is_found_where_something_is_missing(ready, begun):
-    camera = serving.find_next_target(ready, begun.latest)
+    camera = serving.find_next_target(ready.scene, begun.latest)
     assert camera is not None
     session, _ = complete_camera(begun, camera)
     assert session.latest.targets[-1].hole_fraction > 0.05
@@ -282,10 +287,10 @@ def splat(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def splat_ready(room, splat, tmp_path_factory) -> serving.Prepared:
+def splat_ready(room, splat, tmp_path_factory) -> PreparedSession:
     out = tmp_path_factory.mktemp("outs") / "out"
-    options = options_for(room, out, scene=splat, config=CompleterConfig.splat())
-    return serving.prepare(options, QUIET)
+    options = options_for(room, out, scene=splat)
+    return prepare(options)
 
 
 @pytest.fixture(scope="module")
@@ -324,7 +329,7 @@ def test_a_box_is_removed_completed_undone_and_saved(
     with pytest.raises(InputError, match="contains nothing"):
         remove_box(removed, (50.0, 50.0, 50.0, 51.0, 51.0, 51.0))
     serving.save_session(splat_ready, filled)
-    out, restored = splat_ready.options.out, tmp_path / "restored.ply"
+    out, restored = splat_ready.request.out, tmp_path / "restored.ply"
     assert json.loads((out / "summary.json").read_text())["gaussians"]["removed"] > 100
     assert run(monkeypatch, "strip", out / "completed.ply", "--out", restored, "--quiet") == 0
     assert restored.read_bytes() == splat.read_bytes()
@@ -472,7 +477,7 @@ def test_only_what_changed_is_sent(splat_begun, repaired_spot, tmp_path):
 
 @pytest.fixture
 def journal(splat_ready, tmp_path) -> Journal:
-    return Journal(tmp_path / "kept", saving.describe_began(splat_ready))
+    return Journal(tmp_path / "kept", splat_ready.began)
 
 
 @pytest.fixture
@@ -816,11 +821,12 @@ def test_a_malformed_request_leaves_no_traceback(server, capfd):
 def test_the_options_of_complete_are_those_of_live(room, tmp_path):
     words = ["live", str(room), "--out", str(tmp_path / "out"), "--config", "paper"]
     options = parse_command([*words, "--config.paper-registration.iterations", "7", "--seed", "3"])
-    asked = saving.make_complete_options(find_opening(options).options)
+    asked = decide_live(options).session.completion
     paper = CompleterConfig.paper()
     registration = replace(paper.paper_registration, iterations=7)
-    assert asked.config == replace(paper, paper_registration=registration)
-    assert (asked.seed, asked.resolution, asked.target) == (3, (256, 256), ())
+    assert asked.work.config == replace(paper, paper_registration=registration)
+    assert (asked.work.models.seed, asked.targets.named) == (3, ())
+    assert asked.source.scene.resolution == (256, 256)
 
 
 @pytest.mark.linux
@@ -876,7 +882,7 @@ def test_a_saved_session_is_replayed_to_the_same_bytes(
     session, _ = remove_box(session, CRATE)
     session = redo_step(undo_step(session))
     serving.save_session(splat_ready, session)
-    saved, other = splat_ready.options.out, tmp_path / "other"
+    saved, other = splat_ready.request.out, tmp_path / "other"
     strokes = json.loads((saved / "strokes.json").read_text())
     assert strokes["resolution"] == [SIZE, SIZE]
     assert strokes["context"] == [0, 1]
@@ -906,7 +912,7 @@ def test_a_session_of_a_splat_alone_is_replayed_to_the_same_bytes(tmp_path, monk
     splat = tmp_path / "splat.ply"
     save_ply(splat, gaussians_of(view_of(Room(), camera_at(size=SIZE))))
     words = ["live", str(splat), "--out", str(tmp_path / "out"), "--resolution", "64", "64"]
-    ready = serving.prepare(parse_command(words), QUIET)
+    ready = prepare(parse_command(words))
     begun = serving.begin_session(ready)
     camera = replace(camera_at(0.05, size=64), near=None, far=None)
     marked = make_mark(64, slice(24, 36), slice(28, 40))
@@ -967,7 +973,9 @@ def test_a_scene_of_photographs_is_repaired_and_replayed_too(
 ):
     session, _ = apply_step(begun, marked(begun, "repair"))
     out, other = tmp_path / "out", tmp_path / "other"
-    elsewhere = replace(ready, options=replace(ready.options, out=out))
+    completion = ready.request.completion
+    completion = replace(completion, results=replace(completion.results, out=out))
+    elsewhere = replace(ready, request=replace(ready.request, completion=completion))
     serving.save_session(elsewhere, session)
     words = ("repair", room, "--strokes", out / "strokes.json", "--out", other, "--quiet")
     assert run(monkeypatch, *words) == 0

@@ -22,10 +22,10 @@ from rich.console import Console
 
 from command import run
 from gscompleter import save_ply
-from gscompleter.apps.commands.live import LiveOptions
+from gscompleter.apps.commands.live import decide_live
 from gscompleter.apps.live import saving, serving
 from gscompleter.apps.live.journal import Journal
-from gscompleter.apps.live.opening import Opening, find_opening
+from gscompleter.apps.live.opening import SessionRequest
 from gscompleter.apps.live.page import LivePage
 from gscompleter.apps.live.session import Session, Step, apply_step, redo_step, undo_step
 from gscompleter.apps.live.strokes import list_steps
@@ -71,20 +71,20 @@ def splat(tmp_path_factory) -> Path:
     return path
 
 
-def parse_live(*words: object) -> LiveOptions:
-    return parse_command(["live", *map(str, words), "--no-open", "--quiet"])
+def find_opening(*words: object) -> SessionRequest:
+    return decide_live(parse_command(["live", *map(str, words), "--no-open", "--quiet"])).session
 
 
 class Program:
     """A session without its server, as `serve_live` runs it."""
 
     def __init__(self, *words: object) -> None:
-        self.opening: Opening = find_opening(parse_live(*words))
-        options = self.opening.options
-        with reserve_output(options.out, options.overwrite, "complete", saving.LIVE_RESULTS):
-            self.ready = saving.prepare(options, QUIET)
-            begun = serving.open_session(self.ready, self.opening, QUIET)
-            self.journal: Journal = serving.open_journal(self.ready, self.opening, begun)
+        self.opening: SessionRequest = find_opening(*words)
+        results = self.opening.completion.results
+        with reserve_output(results.out, results.overwrite, "complete", saving.LIVE_RESULTS):
+            self.ready = saving.prepare_session(self.opening, QUIET)
+            begun = serving.open_session(self.ready, QUIET)
+            self.journal: Journal = serving.open_journal(self.ready, begun)
         libraries = Libraries({}, {})
         self.page: LivePage = serving.build_page(self.ready, begun, libraries, QUIET, self.journal)
 
@@ -173,19 +173,19 @@ def begun(program) -> Session:
 def test_a_completed_splat_of_a_session_is_opened_as_the_session(saved, tmp_path):
     for name in (saved, saved / "completed.ply", saved / "strokes.json"):
         words = ("--strokes", name) if name.suffix == ".json" else (name,)
-        opening = find_opening(parse_live(*words))
+        opening = find_opening(*words)
         assert opening.out == saved
         assert len(opening.steps) == 2
-        assert opening.options.resolution == (SIZE, SIZE)
-        assert opening.options.context == (0, 1)
+        assert opening.completion.source.scene.resolution == (SIZE, SIZE)
+        assert opening.completion.source.context == (0, 1)
     # Elsewhere, what is saved there is not what the new folder has.
-    elsewhere = find_opening(parse_live(saved, "--out", tmp_path / "new"))
+    elsewhere = find_opening(saved, "--out", tmp_path / "new")
     assert (len(elsewhere.steps), elsewhere.saved) == (2, None)
-    assert find_opening(parse_live(saved)).saved is not None
+    assert find_opening(saved).saved is not None
 
 
 def test_what_a_session_saved_and_did_since_is_told_apart(saved, program, begun):
-    opening = find_opening(parse_live(saved))
+    opening = find_opening(saved)
     assert read_listing(saved) >= {"completed.ply", "strokes.json", "images/stroke2.png"}
     files = json.loads((saved / "summary.json").read_text())["files"]
     assert "images/stroke2.png" not in files
@@ -222,7 +222,7 @@ def test_a_session_goes_on_and_undo_reaches_back_to_the_input(program, saved, be
         assert (len(actions_in(out)), len(actions_in(out, "undone"))) == (left, 3 - left)
     assert is_same(again.scene, begun.latest.scene)
     assert "All steps are undone" in again.ask("save")["text"]
-    opening = find_opening(parse_live(out))
+    opening = find_opening(out)
     assert [step.mask for step in opening.undone] == [None, SPOT, OTHER]
 
 
@@ -231,9 +231,9 @@ def test_a_splat_that_was_changed_since_is_a_splat_of_its_own(saved, tmp_path):
     with (out / "completed.ply").open("r+b") as file:
         file.seek(-1, os.SEEK_END)
         file.write(b"\x01")
-    opening = find_opening(parse_live(out / "completed.ply", "--out", tmp_path / "new"))
-    assert (opening.steps, opening.options.folder) == ((), out / "completed.ply")
-    notes = find_opening(parse_live(out)).notes
+    opening = find_opening(out / "completed.ply", "--out", tmp_path / "new")
+    assert (opening.steps, opening.completion.work.splat.path) == ((), out / "completed.ply")
+    notes = find_opening(out).notes
     assert any("changed by another program" in note for note in notes)
 
 
@@ -241,20 +241,20 @@ def test_a_completed_splat_without_steps_is_opened_itself(saved, tmp_path):
     out = copy_of(saved, tmp_path)
     (out / "strokes.json").unlink()
     for name in (out, out / "completed.ply"):
-        opening = find_opening(parse_live(name, "--out", tmp_path / "new"))
-        assert (opening.steps, opening.options.folder) == ((), out / "completed.ply")
-    assert len(read_edits(opening.options.folder).edits) == 1
+        opening = find_opening(name, "--out", tmp_path / "new")
+        assert (opening.steps, opening.completion.work.splat.path) == ((), out / "completed.ply")
+    assert len(read_edits(opening.completion.work.splat.path).edits) == 1
 
 
 def test_steps_are_done_on_a_scene_that_is_named(saved, room, splat, tmp_path):
     words = (room, "--scene", splat, "--strokes", saved, "--out", tmp_path / "new")
-    opening = find_opening(parse_live(*words))
-    assert (len(opening.steps), opening.options.folder) == (2, room)
-    assert opening.options.context == (0, 1)
+    opening = find_opening(*words)
+    assert (len(opening.steps), opening.completion.source.scene.folder) == (2, room)
+    assert opening.completion.source.context == (0, 1)
     with pytest.raises(InputError, match="steps of its own"):
         other = tmp_path / "strokes.json"
         shutil.copyfile(saved / "strokes.json", other)
-        find_opening(parse_live(saved, "--strokes", other))
+        find_opening(saved, "--strokes", other)
 
 
 @pytest.mark.parametrize(
@@ -270,8 +270,8 @@ def test_steps_are_done_on_a_scene_that_is_named(saved, room, splat, tmp_path):
 )
 def test_a_session_goes_on_with_its_own_settings(saved, words, said):
     with pytest.raises(InputError, match=said):
-        find_opening(parse_live(saved, *words))
-    find_opening(parse_live(saved, "--near", 0.5, "--device", "cpu", "--threads", 1))
+        find_opening(saved, *words)
+    find_opening(saved, "--near", 0.5, "--device", "cpu", "--threads", 1)
 
 
 def change(out: Path, **session: object) -> None:
@@ -280,42 +280,45 @@ def change(out: Path, **session: object) -> None:
     (out / "strokes.json").write_text(json.dumps(content))
 
 
-def test_a_session_from_elsewhere_runs_no_program(saved, tmp_path):
+def test_a_session_from_elsewhere_runs_no_program(saved, tmp_path, monkeypatch):
     out = copy_of(saved, tmp_path)
+    # Named once more it is run, as a program of the user's own.
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "evil.py").write_text("def run(views):\n    return None\n")
     change(out, reconstructor="evil.py:run")
     with pytest.raises(InputError, match="a program"):
-        find_opening(parse_live(out))
-    opening = find_opening(parse_live(out, "--reconstructor", "evil.py:run"))
-    assert opening.options.reconstructor == "evil.py:run"
+        find_opening(out)
+    opening = find_opening(out, "--reconstructor", "evil.py:run")
+    assert opening.completion.work.models.reconstructor == "evil.py:run"
 
 
 def test_what_is_missing_or_damaged_is_said(saved, tmp_path):
     out = copy_of(saved, tmp_path)
     change(out, scene=str(tmp_path / "moved.ply"))
     with pytest.raises(InputError, match=r"moved\.ply is missing"):
-        find_opening(parse_live(out))
+        find_opening(out)
     change(out, seed="x")
     with pytest.raises(InputError, match="damaged"):
-        find_opening(parse_live(out))
+        find_opening(out)
     content = json.loads((out / "strokes.json").read_text())
     del content["session"]
     (out / "strokes.json").write_text(json.dumps(content))
     with pytest.raises(InputError, match="does not tell of which scene"):
-        find_opening(parse_live(out))
+        find_opening(out)
 
 
 def test_a_session_is_not_begun_over(saved, splat, tmp_path, monkeypatch, capsys):
     words = ("live", splat, "--out", saved, "--no-open")
     assert run(monkeypatch, *words) == 2
     assert f"go on with it by `gscompleter live {saved}`" in capsys.readouterr().err
-    assert find_opening(parse_live(splat, "--out", saved, "--overwrite")).steps == ()
+    assert find_opening(splat, "--out", saved, "--overwrite").steps == ()
     with pytest.raises(InputError, match="holds the input"):
-        find_opening(parse_live(splat, "--out", splat.parent))
+        find_opening(splat, "--out", splat.parent)
 
 
 def test_a_program_that_is_killed_while_it_writes_leaves_whole_steps(begun, tmp_path, monkeypatch):
     """Another mask takes the place of one that was undone."""
-    began = saving.Began(parse_live("splat.ply"), None, None)
+    began = saving.Began({}, None, None, None, None, None)
     journal = Journal(tmp_path / "out", began)
     two = begun.extended(begun.latest, STEPS[1]).extended(begun.latest, STEPS[2])
     journal.write(two)

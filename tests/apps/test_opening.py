@@ -7,7 +7,7 @@ import pytest
 
 from command import run
 from exact_room import make_cameras, write_photographs, write_transforms
-from gscompleter.apps.commands.shared_options import is_splat
+from gscompleter.apps.commands.shared_decisions import is_splat
 from gscompleter.apps.inputs.opening import describe_cameras_above
 from gscompleter.data.sfm.poses import has_photographs, list_all_photographs
 from gscompleter.splats.formats import save_splat

@@ -75,6 +75,10 @@ def test_another_meaning_under_the_same_name_is_found(table, monkeypatch):
             "any more; `gscompleter update` adds what photographs show and a splat lacks, and",
         ),
         (("repair", "splat.ply", "--camera=camera.json"), "are named by --target"),
+        (
+            ("bench", "--quick"),
+            "There is no command bench any more; `python benchmarks/measure_completions.py` in a",
+        ),
     ],
 )
 def test_an_old_spelling_is_refused_with_the_new_one(

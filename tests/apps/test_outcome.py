@@ -14,11 +14,12 @@ import pytest
 import gscompleter as gsc
 from command import run
 from gscompleter.apps.batch.running import complete_job
+from gscompleter.apps.commands.batch_rows import decide_row
 from gscompleter.apps.completing.printing import print_completion
 from gscompleter.apps.report.page import render_completion_page
 from gscompleter.apps.report.plain_words import list_facts, list_notes, list_shared_warnings
 from gscompleter.apps.report.schema import read_summary
-from gscompleter.cli import parse_command
+from gscompleter.apps.requests.completion import ResultsRequest
 from gscompleter.evaluation.verdict.outcome import describe_gain, is_like, make_clause, round_count
 from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow, ScoreRow
 from gscompleter.system.errors import InputError
@@ -117,7 +118,7 @@ def test_a_job_of_a_batch_that_did_not_reconstruct_has_failed(scene, tmp_path):
     options = {"folder": str(broken), "context": list(CONTEXT), "target": [TARGET]}
     job = Job("broken", {**options, "resolution": 64, "near": 0.5, "far": 20})
     with pytest.raises(InputError, match="The scene did not reconstruct: seen from the 3"):
-        complete_job(job, tmp_path / "jobs")
+        complete_job(job, tmp_path / "jobs", decide_row)
     assert (tmp_path / "jobs" / "broken" / "report.html").is_file()
 
 
@@ -272,7 +273,7 @@ def test_the_terminal_has_no_facts_and_the_page_folds_them(
     summary["context"][0]["given_depth"] = 0.1
     (out / "summary.json").write_text(json.dumps(summary))
     monkeypatch.setenv("COLUMNS", "300")
-    print_completion(parse_command(["complete", "room", "--out", str(out)]))
+    print_completion(ResultsRequest(out=out))
     said = capsys.readouterr().out.splitlines()
     assert said[0] == summary["outcome"]["headline"]
     # The headline, the head of the table and its three rows, and the results.

@@ -11,7 +11,7 @@ from PIL import Image
 
 from command import run
 from gscompleter import load_cameras, load_splat, load_views
-from gscompleter.apps.batch.rows import parse_row
+from gscompleter.apps.commands.batch_rows import parse_row
 from gscompleter.apps.completing.path_video import plan_path
 from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.system.errors import InputError

@@ -13,7 +13,6 @@ import torch
 from command import run
 from gscompleter import load_ply, save_ply
 from gscompleter.apps.inputs.removal import (
-    Selection,
     find_in_boxes,
     find_in_masks,
     find_in_region,
@@ -22,6 +21,7 @@ from gscompleter.apps.inputs.removal import (
     widen_regions,
 )
 from gscompleter.apps.report.removal_pictures import find_largest
+from gscompleter.apps.requests.splat import Selection
 from gscompleter.data.formats import open_photographs
 from gscompleter.evaluation.verdict.outcome import round_count
 from gscompleter.numerics.geometry import axis_angle_to_matrix, rotations_to_quats

@@ -15,9 +15,9 @@ import torch
 from PIL import Image
 
 from command import run
-from gscompleter.apps.report.completion import fit_frame
 from gscompleter.apps.report.page import open_gallery, render_completion_page
 from gscompleter.apps.report.plain_words import describe_wanted_photographs, list_photograph_notes
+from gscompleter.apps.report.record import fit_frame
 from gscompleter.apps.report.schema import AlignmentRow, ContextRow, TargetRow, read_summary
 from gscompleter.evaluation.verdict.numbers import format_change, format_number, format_percent
 from gscompleter.system.errors import InputError

@@ -14,9 +14,8 @@ import pytest
 import torch
 
 from command import run
-from gscompleter.apps.commands.evaluate import EvaluateOptions
+from gscompleter.apps.commands.evaluate import EvaluateOptions, decide_evaluation
 from gscompleter.apps.evaluating.cases import collect_tasks
-from gscompleter.apps.evaluating.reproduction import apply_preset
 from gscompleter.evaluation.cases import SkippedScene
 from gscompleter.evaluation.paper import load_paper
 from gscompleter.types import View
@@ -162,7 +161,8 @@ def test_photographs_of_dl3dv_are_fed_as_by_the_authors(shared, split, tmp_path,
 @pytest.mark.parametrize(("preset", "is_looked_for"), [("re10k", False), ("waymo", True)])
 def test_ego_vehicles_are_looked_for_where_no_authors_code_is_followed(preset, is_looked_for):
     given = EvaluateOptions(paths=(DRAWN / "re10k",), out=Path("out"), preset=preset)
-    tasks = collect_tasks(apply_preset(replace(given, protocol=("n-1",))), [], [])
+    request = decide_evaluation(replace(given, protocol=("n-1",)))
+    tasks = collect_tasks(request.run.cases, [], [])
     clips = [task.load.args[0] for task in tasks]
     assert {frame.vehicle is not None for clip in clips for frame in clip.frames} == {is_looked_for}
 
@@ -172,8 +172,8 @@ def test_another_resolution_than_that_of_a_preset_takes_photographs_of_any_size(
     given = replace(given, protocol=(str(DRAWN / "index.json"),))
     for resolution, scenes in ((None, 4), ((128, 128), 5)):
         skipped: list[SkippedScene] = []
-        options = apply_preset(replace(given, resolution=resolution))
-        assert len(collect_tasks(options, skipped, [])) == scenes
+        request = decide_evaluation(replace(given, resolution=resolution))
+        assert len(collect_tasks(request.run.cases, skipped, [])) == scenes
         square = [skip.reason for skip in skipped if skip.name == "square"]
         assert square == (
             []

@@ -15,13 +15,18 @@ import torch
 import tiny_diffusion
 from chunk_files import example, save_chunk
 from command import run
-from gscompleter.apps.commands.evaluate import EvaluateOptions, FigureName, TableName
-from gscompleter.apps.evaluating.reproduction import (
-    apply_preset,
+from gscompleter.apps.commands.evaluate import (
+    EvaluateOptions,
+    FigureName,
+    TableName,
     assign_weights,
+    decide_evaluation,
+)
+from gscompleter.apps.evaluating.reproduction import (
     choose_protocols,
     make_run,
 )
+from gscompleter.apps.requests.evaluation import EvaluationRequest, ReproductionRequest
 from gscompleter.data.formats import open_photographs
 from gscompleter.evaluation.baselines.reggs import RegGSConfig
 from gscompleter.evaluation.columns import BY_KEY
@@ -97,19 +102,20 @@ def test_differences_are_paired():
     assert compare_cases({"a 0>1": 1.0}, {"b 0>1": 1.0}) is None
 
 
-def options(**given: object) -> EvaluateOptions:
-    return EvaluateOptions(paths=(), out=Path("out"), **given)
+def decide(**given: object) -> EvaluationRequest | ReproductionRequest:
+    return decide_evaluation(EvaluateOptions(paths=(Path("data"),), out=Path("out"), **given))
 
 
 def test_a_preset_sets_what_is_not_given():
-    found = apply_preset(options(preset="dl3dv"))
-    assert (found.resolution, found.near, found.far) == ((256, 448), 0.5, 200)
-    assert found.reconstructor == ("depthsplat-base-dl3dv-256x448",)
-    assert found.synthesis.generator == ("pe-field",)
-    found = apply_preset(options(preset="dl3dv", reconstructor=("plane-sweep",), resolution=64))
-    assert (found.reconstructor, found.resolution) == (("plane-sweep",), 64)
-    found = apply_preset(options())
-    assert (found.reconstructor, found.synthesis.generator) == (("plane-sweep",), ("warp-inpaint",))
+    found = decide(preset="dl3dv")
+    cases = found.run.cases
+    assert (cases.resolution, cases.near, cases.far) == ((256, 448), 0.5, 200)
+    assert list(found.weights) == ["depthsplat-base-dl3dv-256x448"]
+    assert found.run.models.generator == "pe-field"
+    found = decide(preset="dl3dv", reconstructor=("plane-sweep",), resolution=64)
+    assert (list(found.weights), found.run.cases.resolution) == (["plane-sweep"], 64)
+    models = decide().models
+    assert (models.reconstructor, models.generator) == ("plane-sweep", "warp-inpaint")
 
 
 @pytest.mark.parametrize(
@@ -124,7 +130,9 @@ def test_a_preset_sets_what_is_not_given():
 def test_weights_are_one_for_each_model_or_named(weights, assigned):
     models = ("mvsplat-re10k", "volsplat-re10k")
     found = assign_weights(models, [Path(path) for path in weights])
-    assert {name: str(path) for name, path in found.items()} == assigned
+    assert list(found) == list(models)
+    named = {name: str(path) for name, path in found.items() if path is not None}
+    assert named == assigned
 
 
 @pytest.mark.parametrize(
@@ -136,23 +144,23 @@ def test_weights_that_belong_to_no_model_are_refused(weights):
 
 
 def test_each_run_of_table_i_gets_its_own_weights():
-    given = apply_preset(options(preset="re10k", weights=(Path("mvsplat-re10k=re10k.ckpt"),)))
-    runs = [make_run(given, PAPER.tables["models"], number, "n-30") for number in range(3)]
-    assert {run.reconstructor[0]: run.weights for run in runs} == {
-        "volsplat-re10k": (),
-        "mvsplat-re10k": (Path("re10k.ckpt"),),
-        "depthsplat-large-re10k": (),
+    given = decide(preset="re10k", weights=(Path("mvsplat-re10k=re10k.ckpt"),))
+    runs = [make_run(given, PAPER.tables["models"], model, "n-30") for model in given.weights]
+    assert {run.models.reconstructor: run.models.weights for run in runs} == {
+        "volsplat-re10k": None,
+        "mvsplat-re10k": Path("re10k.ckpt"),
+        "depthsplat-large-re10k": None,
     }
 
 
 def test_a_table_takes_the_given_protocols_of_its_kind():
-    given = options(preset="re10k", protocol=("n-2", "n-3", "stress-2-7"))
+    given = decide(preset="re10k", protocol=("n-2", "n-3", "stress-2-7")).run.cases
     assert choose_protocols(given, PAPER.tables["spans"]) == ("n-2", "n-3")
     assert choose_protocols(given, PAPER.tables["stress"]) == ("stress-2-7",)
     assert choose_protocols(given, PAPER.tables["models"]) == ("n-2",)
     assert choose_protocols(given, PAPER.tables["sequence"]) == ("sequence-10",)
-    assert choose_protocols(options(preset="re10k"), PAPER.tables["models"]) == ("n-30",)
-    assert choose_protocols(options(), PAPER.tables["models"]) == ("",)
+    assert choose_protocols(decide(preset="re10k").run.cases, PAPER.tables["models"]) == ("n-30",)
+    assert choose_protocols(decide().cases, PAPER.tables["models"]) == ("",)
 
 
 def test_all_leaves_out_what_another_generator_is_needed_for():

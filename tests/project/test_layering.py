@@ -2,6 +2,8 @@
 
 import ast
 import re
+import subprocess
+import sys
 from collections.abc import Iterator
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -73,11 +75,11 @@ def test_no_circle_of_packages():
 def orders_inside() -> dict[str, list[set[str]]]:
     """Read the order of the rooms inside some packages, from the bottom up."""
     text = (ROOT / "docs" / "architecture.md").read_text()
-    rows = re.findall(r"^\| `(\w+)` \| (.+) \|$", text, re.M)
+    table = text.split("| inside | from the bottom up |")[1].split("\n\n")[0]
+    rows = re.findall(r"^\| `(\w+)` \| (.+) \|$", table, re.M)
     return {
         package: [set(re.findall(r"`(\w+)`", group)) for group in groups.split(", then ")]
         for package, groups in rows
-        if "all others" in groups
     }
 
 
@@ -102,6 +104,8 @@ def test_imports_inside_a_package_point_down_and_make_no_circle(package):
     imports = list_imports_inside(package)
     named = set().union(*order)
     assert named <= set(imports)
+    # Each room has its floor, by its name or in a group that is called all others.
+    assert set() in order or named == set(imports)
     rank = {room: number for number, rooms in enumerate(order) for room in rooms or imports}
     rank |= {room: number for number, rooms in enumerate(order) for room in rooms}
     upward = [
@@ -114,19 +118,29 @@ def test_imports_inside_a_package_point_down_and_make_no_circle(package):
     TopologicalSorter(imports).prepare()  # raises CycleError, which names the circle
 
 
-@pytest.mark.parametrize(
-    ("folder", "others"),
-    [("inputs", ("commands", "completing", "report")), ("report", ("commands", "completing"))],
-)
-def test_inputs_and_reports_know_no_command(folder, others):
-    names = tuple(f"gscompleter.apps.{other}" for other in others)
-    imported = [
-        node.module
-        for path in sorted((PACKAGE / "apps" / folder).rglob("*.py"))
-        for node in ast.walk(ast.parse(path.read_text()))
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(names)
+def test_no_application_knows_the_options_of_a_command():
+    """A command makes a request of them; only the command line itself has options."""
+    paths = [path for path in (PACKAGE / "apps").rglob("*.py") if path.parent.name != "commands"]
+    known = [
+        (path.name, name.id)
+        for path in paths
+        for name in ast.walk(ast.parse(path.read_text()))
+        if isinstance(name, ast.Name)
+        and re.fullmatch(r"\w+Options", name.id)
+        # Options of a generator are settings; those of a help page are a group of fields.
+        and name.id not in ("GeneratorOptions", "PresetGeneratorOptions", "GroupedOptions")
     ]
-    assert imported == []
+    assert known == []
+
+
+def test_a_request_needs_no_torch():
+    """Commands import requests, and no help page waits for torch."""
+    program = "import sys, pkgutil, importlib, gscompleter.apps.requests as requests\n"
+    program += "for found in pkgutil.iter_modules(requests.__path__):\n"
+    program += "    importlib.import_module(f'{requests.__name__}.{found.name}')\n"
+    program += "print('torch' in sys.modules)\n"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout == "False\n", done.stderr
 
 
 def test_the_package_itself_imports_no_application():
@@ -134,6 +148,7 @@ def test_the_package_itself_imports_no_application():
 
 
 def test_no_circle_of_modules():
+    """In applications imports inside functions count, too: they hide a circle, and open none."""
     modules = {
         ".".join(path.relative_to(ROOT / "src").with_suffix("").parts).removesuffix(".__init__")
         for path in files()
@@ -141,7 +156,8 @@ def test_no_circle_of_modules():
     graph = TopologicalSorter()
     for path in files():
         own = ".".join(path.relative_to(ROOT / "src").with_suffix("").parts)
-        for node in ast.parse(path.read_text()).body:
+        tree = ast.parse(path.read_text())
+        for node in ast.walk(tree) if room_of(path) in ("apps", "cli") else tree.body:
             if isinstance(node, ast.ImportFrom) and node.module:
                 names = {f"{node.module}.{alias.name}" for alias in node.names} & modules
                 graph.add(own.removesuffix(".__init__"), *(names or {node.module} & modules))

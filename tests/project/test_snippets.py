@@ -41,7 +41,6 @@ NOT_RUN = {
     "repair": "needs a painted mask; test_repair.py paints some",
     "poses": "needs photographs that COLMAP can match; test_poses.py has them",
     "demo": "takes half a minute; test_demo.py runs it on small images",
-    "bench": "takes minutes; test_bench.py runs it on less",
     "warmup": "test_rehearsal.py compiles in advance",
     "evaluate": "needs sequences or takes hours; test_runs.py evaluates a room",
     "tables": "needs what evaluate wrote; test_runs.py has it",

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gscompleter.apps.bench.cases import multiply_gaussians
+from completions.cases import multiply_gaussians
 from gscompleter.completer import GSCompleter
 from gscompleter.config import CompleterConfig, TrustConfig
 from gscompleter.evaluation.metrics.image import psnr

@@ -14,7 +14,7 @@ import torch
 
 from gscompleter import load_ply, save_ply
 from gscompleter.apps.inputs.task import InputSplatFile
-from gscompleter.apps.report.completion import save_completed_splat
+from gscompleter.apps.report.scenes import save_completed_splat
 from gscompleter.splats.edits import (
     AppendedRows,
     EditDraft,

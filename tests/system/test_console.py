@@ -13,7 +13,7 @@ from rich.table import Table
 
 from command import run
 from gscompleter.apps.completing.printing import print_completion
-from gscompleter.cli import parse_command
+from gscompleter.apps.requests.completion import ResultsRequest
 from gscompleter.system.console import make_console
 from paths import TESTS
 from scenes import camera_at, photographed
@@ -74,8 +74,7 @@ def test_a_completion_names_its_folder_and_photographs_as_they_are(tmp_path, cap
     for row in (*summary["context"], *summary["targets"]):
         row["file"] = "c [red] b].png"
     (out / "summary.json").write_text(json.dumps(summary))
-    options = parse_command(["complete", str(tmp_path), "--target", "0", "--out", str(out)])
-    print_completion(options)
+    print_completion(ResultsRequest(out=out))
     said = capsys.readouterr().out
     assert "context 0 (c [red] b].png)" in said
     assert "(c [red] b].png)" in said.split("target: ")[1]

@@ -10,7 +10,7 @@ import torch
 
 from command import run
 from gscompleter.apps.inputs.task import InputSplatFile
-from gscompleter.apps.report.completion import find_file_order
+from gscompleter.apps.report.scenes import find_file_order
 from gscompleter.completer import GSCompleter
 from gscompleter.config import (
     AlignmentConfig,

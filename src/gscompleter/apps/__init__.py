@@ -1,1 +1,1 @@
-"""Applications on the method: commands, reports, viewer, live, batch and bench."""
+"""Applications on the method: commands, reports, viewer, live and batch."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
@@ -16,12 +16,10 @@ from torch import Tensor
 
 from gscompleter import __version__
 from gscompleter.apps.command_line.answers import print_answer
-from gscompleter.apps.commands.clean import CleanOptions
-from gscompleter.apps.completing.preparation import open_input
+from gscompleter.apps.completing.preparation import open_input, read_splat
 from gscompleter.apps.completing.run_info import describe_run, refuse_results
 from gscompleter.apps.inputs.depth_range import apply_splat_range
 from gscompleter.apps.inputs.describing import describe_opening, print_lines
-from gscompleter.apps.inputs.named_photographs import check_context
 from gscompleter.apps.inputs.reading import read_photographs
 from gscompleter.apps.inputs.splat import locate_splat, move_to_splat
 from gscompleter.apps.inputs.taken_out import take_over_edits
@@ -34,19 +32,19 @@ from gscompleter.apps.report.cleaning_picture import (
     look_at_removal,
     see_removal,
 )
-from gscompleter.apps.report.completion import save_changed, save_completed_splat
+from gscompleter.apps.report.scenes import save_changed, save_completed_splat
+from gscompleter.apps.requests.cleaning import CleaningRequest
+from gscompleter.apps.requests.scene import PhotographsRequest
+from gscompleter.apps.requests.splat import SplatRequest
 from gscompleter.apps.warmup import compile_kernels
 from gscompleter.editing.cleaning import find_superfluous
 from gscompleter.editing.floaters import find_floaters
 from gscompleter.evaluation.metrics.image import compute_masked_psnr
 from gscompleter.evaluation.verdict.numbers import describe_measured
 from gscompleter.numerics.image_ops import compute_mask_fraction
-from gscompleter.render.device import choose_device
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
 from gscompleter.splats.edits import EDITS, EditDraft, record_edit
-from gscompleter.splats.foreign import resolve_splat
-from gscompleter.splats.formats import load_splat
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import write_image
@@ -57,11 +55,6 @@ from gscompleter.system.progress import show_progress, stage, track
 from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.types import Camera, Gaussians, View
 
-PHOTOGRAPH_OPTIONS = (
-    *("context", "format", "frames", "resolution", "near", "far", "no_given_depth"),
-    *("no_masks", "invert_masks", "large_masks", "ignore", "forget_edits"),
-)
-"""Options that only photographs can follow."""
 COMMAND = "clean"
 RESULTS = (COMPLETED_FILE, REMOVED_FILE, PICTURE_FILE, SUMMARY_FILE, *EDITS)
 """Files that it may write."""
@@ -87,19 +80,21 @@ class Cleaning:
         return {"given": len(self.given), "kept": len(self.given) - count, "removed": count}
 
 
-def clean_splat(options: CleanOptions) -> None:
+def clean_splat(request: CleaningRequest) -> None:
     """Clean the splat, write the result, and print a summary."""
-    options = replace(options, scene=resolve_splat(options.scene))
-    console = make_console(stderr=True, quiet=options.quiet)
-    clean = clean_alone if options.folder is None else clean_by_photographs
+    results = request.results
+    console = make_console(stderr=True, quiet=results.answer.quiet)
     with (
         show_progress(console),
-        reserve_output(options.out, options.overwrite, COMMAND, RESULTS) as output,
+        reserve_output(results.out, results.overwrite, COMMAND, RESULTS) as output,
     ):
-        if options.dry_run:
-            refuse_results(options.out)
+        if request.dry_run:
+            refuse_results(results.out)
         print_lines(console, *output.describe_others())
-        cleaning = clean(options, console)
+        if request.photographs is None:
+            cleaning = clean_alone(request)
+        else:
+            cleaning = clean_by_photographs(request, request.photographs, console)
         if cleaning.removed.all():
             raise InputError(
                 "Every Gaussian of the splat would go; check the settings, and that photographs "
@@ -107,7 +102,7 @@ def clean_splat(options: CleanOptions) -> None:
             )
         summary = {"version": __version__, **cleaning.run_info, "gaussians": cleaning.counts}
         with output.write() as folder, stage("writing"):
-            if not options.dry_run:
+            if not request.dry_run:
                 # `given[:0]`: a cleaning adds nothing.
                 save_completed_splat(
                     folder,
@@ -133,25 +128,27 @@ def clean_splat(options: CleanOptions) -> None:
                 )
                 write_image(folder / PICTURE_FILE, picture)
             (folder / SUMMARY_FILE).write_bytes(json.dumps(summary, indent=2).encode() + b"\n")
-    lines = describe_result(summary, options)
-    print_answer(options, json.loads((options.out / SUMMARY_FILE).read_bytes()), lines)
+    lines = describe_result(summary, request)
+    print_answer(results.answer, json.loads((results.out / SUMMARY_FILE).read_bytes()), lines)
 
 
-def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
+def clean_by_photographs(
+    request: CleaningRequest, photographs: PhotographsRequest, console: Console
+) -> Cleaning:
     """Find what makes the photographs worse, or what none of them needs."""
-    check_context(options.context)
-    device = choose_device(options.device)
+    splat = request.splat
+    device = request.device
     renderer = load_renderer(device)
 
     # The splat is also read before cameras are searched for, so that a damaged file is refused
     # within seconds: the search takes minutes.
-    opened = open_input(options, console, partial(load_given_splat, options))
+    opened = open_input(photographs, splat, console, partial(load_given_splat, splat))
     with stage("reading photographs"):
-        task = read_photographs(opened, options.context, device)
-    loaded = load_given_splat(options)
+        task = read_photographs(opened, photographs.context, device)
+    loaded = load_given_splat(splat)
     compile_kernels([device])
     with stage("aligning the scene"):
-        splat_file = locate_splat(options.scene, options.drop_nonfinite)
+        splat_file = locate_splat(splat.path, splat.drop_nonfinite)
         task = move_to_splat(task, loaded, splat_file, opened)
 
     # From here on the splat is that of the task, whose coordinates may have a local origin.
@@ -159,35 +156,39 @@ def clean_by_photographs(options: CleanOptions, console: Console) -> Cleaning:
     assert given is not None
     task = apply_splat_range(task, given, renderer)
 
-    task, notes = take_over_edits(task, options.forget_edits, renderer)
+    task, notes = take_over_edits(task, splat.forget_edits, renderer)
     print_lines(console, *notes)
 
     plan = f"compared with {len(task.views)} photographs on {device}"
-    plan += f", written to {quote_value(options.out)}"
+    plan += f", written to {quote_value(request.results.out)}"
     print_lines(console, *describe_opening(opened, task), f"To do: {plan}.")
 
-    config = options.config.strengthen(options.strength)
+    config = request.config.strengthen(request.strength)
     with record_seconds(()) as seconds, timed_stage("clean"):
         removed = find_superfluous(given, task.views, renderer, config)
-    run_info = describe_run(options, opened, task, config, {"strength": options.strength})
+    run_info = describe_run(
+        photographs,
+        splat,
+        opened,
+        task,
+        config,
+        {"strength": request.strength},
+        photographs.scene.masks.is_inverted,
+    )
     scores, seen = score_cleaning(given, task.views, removed, renderer, opened.files)
     run_info = {**run_info, "photographs": scores, "seconds": seconds}
     assert task.splat_file is not None
     return Cleaning(given, removed, task.splat_file, run_info, choose_cameras(seen), renderer)
 
 
-def clean_alone(options: CleanOptions, console: Console) -> Cleaning:
+def clean_alone(request: CleaningRequest) -> Cleaning:
     """Find floaters by statistics of the splat alone."""
-    defaults = {field.name: field.default for field in fields(options)}
-    for name in PHOTOGRAPH_OPTIONS:
-        if getattr(options, name) != defaults[name]:
-            raise InputError("There are no photographs to apply this to; name their SCENE.", name)
-
-    device = choose_device(options.device)
-    given = load_given_splat(options).to(device)
+    splat = request.splat
+    device = request.device
+    given = load_given_splat(splat).to(device)
     renderer = load_renderer(device)
     compile_kernels([device])
-    floaters = options.config.strengthen(options.strength).floaters
+    floaters = request.config.strengthen(request.strength).floaters
     with record_seconds(()) as seconds, timed_stage("clean"):
         reasons = find_floaters(given, floaters, renderer)
     # A Gaussian can have several reasons, so their counts may exceed the number that goes.
@@ -200,8 +201,8 @@ def clean_alone(options: CleanOptions, console: Console) -> Cleaning:
             cameras, share = look_at_removal(given, removed, renderer)
     run_info = {
         "settings": {
-            "scene": str(options.scene),
-            "strength": options.strength,
+            "scene": str(splat.path),
+            "strength": request.strength,
             "device": device,
             "config": {"floaters": asdict(floaters)},
         },
@@ -209,18 +210,18 @@ def clean_alone(options: CleanOptions, console: Console) -> Cleaning:
         "seen_from_outside": share,
         "seconds": seconds,
     }
-    splat_file = locate_splat(options.scene, options.drop_nonfinite)
+    splat_file = locate_splat(splat.path, splat.drop_nonfinite)
     return Cleaning(given, removed, splat_file, run_info, cameras, renderer)
 
 
-def load_given_splat(options: CleanOptions) -> Gaussians:
+def load_given_splat(splat: SplatRequest) -> Gaussians:
     """Read the splat to clean."""
     # A file that is not there is refused before a line says that it is read. A folder may be an
     # unpacked .sog.
-    if not os.path.isdir(options.scene):
-        check_file(options.scene)
+    if not os.path.isdir(splat.path):
+        check_file(splat.path)
     with stage("reading the scene"):
-        return load_splat(options.scene, options.drop_nonfinite, options.ignore_properties)
+        return read_splat(splat)
 
 
 def score_cleaning(
@@ -254,18 +255,18 @@ def score_cleaning(
     return rows, seen
 
 
-def describe_result(summary: Mapping[str, Any], options: CleanOptions) -> list[str]:
+def describe_result(summary: Mapping[str, Any], request: CleaningRequest) -> list[str]:
     """Describe what went, and which file is what; the last line names the cleaned splat."""
     counts = summary["gaussians"]
-    out = options.out
-    if options.dry_run:
+    out = request.results.out
+    if request.dry_run:
         lines = [f"Dry run: {describe_cleaning(summary)}"]
     else:
         lines = [describe_cleaning(summary)]
     if counts["removed"] > 0:
-        goes = "would go" if options.dry_run else "went"
+        goes = "would go" if request.dry_run else "went"
         lines.append(f"What {goes}: {out / REMOVED_FILE}; {out / PICTURE_FILE} shows it in red.")
-    if options.dry_run:
+    if request.dry_run:
         lines.append(f"Nothing was cleaned; leave out --dry-run to write {COMPLETED_FILE}.")
     else:
         lines.append(f"The cleaned splat: {out / COMPLETED_FILE}")

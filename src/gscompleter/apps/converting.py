@@ -8,7 +8,7 @@ from pathlib import Path
 
 import torch
 
-from gscompleter.apps.commands.convert import ConvertOptions
+from gscompleter.apps.requests.conversion import ConversionRequest
 from gscompleter.numerics.value_checks import check_gaussians
 from gscompleter.parts import MAX_TARGET_ID, NOT_INVENTED, find_last_target_id
 from gscompleter.splats.conversion import (
@@ -43,19 +43,19 @@ UP_TOLERANCE = 1e-3
 """Difference of a component of two upward directions that count as one."""
 
 
-def convert(options: ConvertOptions) -> Conversion:
+def convert(request: ConversionRequest) -> Conversion:
     """Convert one splat or several, and say what the result does not keep."""
-    sources = [resolve_splat(path) for path in (options.source, *options.merge)]
-    operations = make_operations(options)
+    sources = [resolve_splat(path) for path in request.sources]
+    operations = make_operations(request)
     for source in sources:
-        if options.level is None and is_streamed(source):
+        if request.level is None and is_streamed(source):
             raise InputError(
                 f"{quote_value(source)} is a streamed scene in several levels of detail; choose "
                 "one, of which 0 is the finest.",
                 "level",
             )
     try:
-        return convert_sources(sources, options, operations)
+        return convert_sources(sources, request, operations)
     except DegreeError as error:
         raise InputError(
             "A splat has harmonics of SH degree 4, and degrees 0 to 3 are read; say that the "
@@ -65,14 +65,14 @@ def convert(options: ConvertOptions) -> Conversion:
 
 
 def convert_sources(
-    sources: Sequence[Path], options: ConvertOptions, operations: Operations
+    sources: Sequence[Path], request: ConversionRequest, operations: Operations
 ) -> Conversion:
     """Convert splats whose folders are resolved."""
     plain = [source for source in sources if not is_streamed(source)]
     oddities = [line for source in plain for line in describe_oddities(source)]
-    notes = (*oddities, *describe_left_behind(sources, options.out, operations))
-    keep_labels = not options.plain
-    if can_be_streamed(sources, options, operations):
+    notes = (*oddities, *describe_left_behind(sources, request.out, operations))
+    keep_labels = not request.plain
+    if can_be_streamed(sources, request, operations):
 
         def edit(rows: Gaussians) -> Gaussians:
             edited = operations.apply_to_rows(rows)
@@ -81,19 +81,19 @@ def convert_sources(
 
         done = convert_rows(
             sources[0],
-            options.out,
-            options.drop_nonfinite,
+            request.out,
+            request.drop_nonfinite,
             keep_labels,
-            options.ignore_properties,
+            request.ignore_properties,
             edit if operations.changes else None,
         )
         return replace(done, notes=notes)
 
-    gaussians, made_by = read_all(sources, options)
+    gaussians, made_by = read_all(sources, request)
     gaussians = operations.apply(gaussians)
     if len(gaussians) == 0:
         raise InputError("No Gaussian is left; change what is cut off.")
-    done = write_converted(options.out, gaussians, made_by, keep_labels)
+    done = write_converted(request.out, gaussians, made_by, keep_labels)
     done = replace(done, notes=(*done.notes, *notes))
     # Of a splat with an origin, the notes say the rounding.
     if gaussians.origin is not None:
@@ -102,58 +102,39 @@ def convert_sources(
     scales = gaussians.scales
     # Harmonics are most of the memory, and those of the file are read now.
     del gaussians
-    return replace(done, rounding=measure_rounding(options.out, means, scales))
+    return replace(done, rounding=measure_rounding(request.out, means, scales))
 
 
-def make_operations(options: ConvertOptions) -> Operations:
-    """Make the operations that the options name."""
+def make_operations(request: ConversionRequest) -> Operations:
+    """Make the operations that are asked for."""
     return Operations(
-        bands=options.bands,
-        box=options.crop_box,
-        sphere=options.crop_sphere,
-        scale=options.scale,
-        rotate=options.rotate,
-        translate=options.translate,
-        decimate=parse_number(options.decimate),
-    )
-
-
-def parse_number(words: str | None) -> float | int | None:
-    """Parse a number of Gaussians, or a share in percent as a float from 0 to 1."""
-    if words is None:
-        return None
-    try:
-        if words.endswith("%"):
-            share = float(words[:-1]) / 100
-            if 0 < share <= 1:
-                return share
-        elif int(words) > 0:
-            return int(words)
-    except ValueError:
-        pass
-    raise InputError(
-        f"{quote_value(words)} is no number of Gaussians such as 100000, and no share such as 25%.",
-        "decimate",
+        bands=request.bands,
+        box=request.crop_box,
+        sphere=request.crop_sphere,
+        scale=request.scale,
+        rotate=request.rotate,
+        translate=request.translate,
+        decimate=request.decimate,
     )
 
 
 def can_be_streamed(
-    sources: Sequence[Path], options: ConvertOptions, operations: Operations
+    sources: Sequence[Path], request: ConversionRequest, operations: Operations
 ) -> bool:
     """Check whether some Gaussians can be in memory at a time: from one .ply to another."""
-    if len(sources) > 1 or options.level is not None or not operations.is_by_rows:
+    if len(sources) > 1 or request.level is not None or not operations.is_by_rows:
         return False
     # The origin of a moved splat is chosen by all of its Gaussians.
     if operations.similarity is not None and (
         max(map(abs, operations.translate)) > MAX_SHIFT or find_origin(sources[0]) is not None
     ):
         return False
-    return is_ply_to_ply(sources[0], options.out)
+    return is_ply_to_ply(sources[0], request.out)
 
 
-def read_all(sources: Sequence[Path], options: ConvertOptions) -> tuple[Gaussians, Provenance]:
+def read_all(sources: Sequence[Path], request: ConversionRequest) -> tuple[Gaussians, Provenance]:
     """Read all splats as one, with the record of who made them."""
-    if options.level is not None and not any(is_streamed(source) for source in sources):
+    if request.level is not None and not any(is_streamed(source) for source in sources):
         raise InputError(
             f"{quote_value(sources[0])} has no levels of detail; leave --level out.", "level"
         )
@@ -161,18 +142,18 @@ def read_all(sources: Sequence[Path], options: ConvertOptions) -> tuple[Gaussian
     runs: list[RunRecord] = []
     labels_used = 0
     for source in sources:
-        if options.level is not None and is_streamed(source):
-            part = load_level(source, options.level, options.drop_nonfinite)
+        if request.level is not None and is_streamed(source):
+            part = load_level(source, request.level, request.drop_nonfinite)
             made_by = NOTHING_KNOWN
         else:
             part = load_splat(
                 source,
-                options.drop_nonfinite,
-                options.ignore_properties,
-                leaves_out_band_4=options.bands is not None,
+                request.drop_nonfinite,
+                request.ignore_properties,
+                leaves_out_band_4=request.bands is not None,
             )
-            made_by = read_provenance(source) if not options.plain else NOTHING_KNOWN
-        if not options.plain:
+            made_by = read_provenance(source) if not request.plain else NOTHING_KNOWN
+        if not request.plain:
             part, made_by = move_labels(part, made_by, labels_used, source)
             labels_used = max(labels_used, find_last_target_id(part))
         parts.append(part)

@@ -13,8 +13,8 @@ from jaxtyping import Float, UInt8
 from rich.table import Table
 from torch import Tensor
 
-from gscompleter.apps.commands.inspect import InspectOptions
 from gscompleter.apps.report.schema import read_summary
+from gscompleter.apps.requests.viewing import InspectionRequest
 from gscompleter.apps.viewer.exhibit import (
     ViewerContent,
     load_known_cameras,
@@ -114,9 +114,9 @@ class Inspection:
     notes: tuple[str, ...] = ()
 
 
-def inspect_splat(options: InspectOptions) -> Inspection:
+def inspect_splat(request: InspectionRequest) -> Inspection:
     """Inspect a file, and the pictures of it at the cameras that are known."""
-    path, folder = locate(options.file)
+    path, folder = locate(request.file)
     # Other readers refuse a file with NaN; here those Gaussians are counted, and left out.
     decoded = decode_splat(path)
     finite = find_finite(decoded)
@@ -131,7 +131,7 @@ def inspect_splat(options: InspectOptions) -> Inspection:
     except InputError as error:
         defect = str(error)
     labels = gaussians.generated
-    cameras, notes = list_cameras(options, folder, gaussians)
+    cameras, notes = list_cameras(request, folder, gaussians)
     origins = None
     try:
         origins = count_row_kinds(path, read_edits(path), len(decoded))
@@ -156,7 +156,7 @@ def inspect_splat(options: InspectOptions) -> Inspection:
         origins,
         tuple(list_runs(labels, runs)),
         defect,
-        measure_pictures(gaussians, cameras, options.device) if cameras else (),
+        measure_pictures(gaussians, cameras, request.device) if cameras else (),
         (*describe_oddities(path), *notes),
     )
 
@@ -211,7 +211,7 @@ def list_runs(labels: UInt8[Tensor, "n"], runs: Sequence[RunRecord]) -> Iterator
 
 
 def list_cameras(
-    options: InspectOptions, folder: Path | None, gaussians: Gaussians
+    request: InspectionRequest, folder: Path | None, gaussians: Gaussians
 ) -> tuple[list[tuple[str, Camera]], tuple[str, ...]]:
     """List the cameras of pictures with their names, and notes on those that are missing."""
     # Cameras are read into the frame of the file: that of the photographs, then its transform.
@@ -219,9 +219,9 @@ def list_cameras(
     content = place_content(
         ViewerContent("", gaussians, None), None if summary is None else summary.frame
     )
-    if options.cameras is not None:
+    if request.cameras is not None:
         cameras = load_scene_cameras(
-            options.cameras, content.transform, content.origin, options.resolution
+            request.cameras, content.transform, content.origin, request.resolution
         )
         return [(f"Camera {number}", camera) for number, camera in enumerate(cameras, 1)], ()
     if folder is None or summary is None:

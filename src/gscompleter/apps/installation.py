@@ -12,7 +12,6 @@ from urllib.request import url2pathname
 import torch
 from packaging.requirements import Requirement
 
-from gscompleter.apps.bench.report import describe_machine
 from gscompleter.apps.viewer.packages import BUILT_LIBRARIES, LOCK_FILE, get_archive_path, read_lock
 from gscompleter.apps.warmup import PARTS
 from gscompleter.models.weights.fetching import find_cached
@@ -23,6 +22,7 @@ from gscompleter.render.device import choose_device
 from gscompleter.render.loading import load_renderer
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import get_download_folder
+from gscompleter.system.machine import describe_machine
 from gscompleter.types import Camera, Gaussians, make_observed, sh_from_rgb
 
 PURPOSES = {

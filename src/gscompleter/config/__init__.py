@@ -529,6 +529,12 @@ class CompleterConfig(Settings):
         holes = replace(self.holes, kind="enclosed")
         return replace(self, guards=(*others, "hull"), holes=holes)
 
+    def for_holes(self, kind: Literal["all", "enclosed"]) -> CompleterConfig:
+        """Return the same settings for holes of a kind: all, or those that an object encloses."""
+        if kind == "enclosed":
+            return self.for_object()
+        return replace(self, holes=replace(self.holes, kind=kind))
+
     def choose_margin(self, is_lifted: bool) -> CompleterConfig:
         """Return the same settings with a padding for what the scene is, unless it is given.
 

@@ -54,13 +54,16 @@ def validate(settings: S, prefix: str = "") -> S:
         return TypeAdapter(type(settings)).validate_python(settings, strict=True)
 
 
-def apply_changes(settings: S, changes: Mapping[str, Any], where: str = "") -> S:
-    """Apply nested changes; the sentences of InputErrors begin with `where`."""
+def apply_changes(settings: S, changes: Mapping[str, Any], where: str = "", prefix: str = "") -> S:
+    """Apply nested changes.
+
+    The sentences of InputErrors begin with `where`, and name `prefix` and the setting as argument.
+    """
     from pydantic import TypeAdapter
 
     # YAML has no tuples. In strict mode pydantic refuses a list for a tuple, but not in JSON.
     text = json.dumps(merge_nested(asdict(settings), changes))  # type: ignore[call-overload]
-    with translate_errors(settings, where):
+    with translate_errors(settings, where, prefix):
         return TypeAdapter(type(settings)).validate_json(text, strict=True)
 
 

@@ -11,6 +11,7 @@ from PIL import Image
 from rich.console import Console
 
 from gscompleter import save_ply
+from gscompleter.apps.commands.complete import decide_completion
 from gscompleter.apps.completing.preparation import open_input
 from gscompleter.cli import parse_command
 from gscompleter.data.formats import open_photographs
@@ -118,7 +119,8 @@ def test_the_working_size_follows_unless_it_is_given(scene, tmp_path, side, word
         ["complete", str(scene), "--scene", str(splat), "--out", str(tmp_path / "o"), *words]
     )
     console = Console(file=io.StringIO(), width=1000)
-    opened = open_input(options, console, lambda: None)
+    request = decide_completion(options)
+    opened = open_input(request.source, request.work.splat, console, lambda: None)
     assert opened.request.resolution == expected
     printed = console.file.getvalue()
     assert said in printed

@@ -5,24 +5,22 @@ Workers import this module before they set their number of threads, so it import
 
 from __future__ import annotations
 
-import os
-import re
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
-from gscompleter.apps.batch.engine import make_engine, parse_pairs
+from gscompleter.apps.batch.engine import make_engine
 from gscompleter.apps.batch.manifest import PATHS, list_results, read_manifest
-from gscompleter.apps.batch.rows import parse_row
 from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.command_line.exit_codes import choose_exit_code
-from gscompleter.apps.commands.batch import BatchOptions
+from gscompleter.apps.requests.batch import BatchRequest
+from gscompleter.apps.requests.completion import FillingRequest
 from gscompleter.system.console import make_console
-from gscompleter.system.errors import InputError, join_names, print_error, quote_value
+from gscompleter.system.errors import InputError, join_names, print_error
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.jobs.jobs import (
     JOBS,
@@ -31,12 +29,14 @@ from gscompleter.system.jobs.jobs import (
     find_missing_jobs,
     has_row,
     make_folder,
-    parse_shard,
     read_row,
     run_job,
     run_jobs,
 )
 from gscompleter.system.progress import show_preparation, show_progress, track
+
+DecideRow = Callable[[Mapping[str, Any], Path], FillingRequest]
+"""Makes the request of a row of a manifest, for an output folder."""
 
 OUTCOMES = {"nothing-gained": "nothing gained"}
 """Words for outcomes of jobs that did not fail, where they are not `completed`."""
@@ -44,40 +44,39 @@ MAX_NAMED_FAILURES = 5
 """Most failures that the terminal names."""
 
 
-def complete_batch(options: BatchOptions) -> int:
-    """Complete the scenes of a manifest, write the table and the page, and return the exit code."""
-    # Two letters at least: `C:/results` is a path of Windows.
-    if re.match(r"\w\w+:/", str(options.out)):
-        raise InputError(f"{quote_value(options.out)} is an address; name a folder.", "out")
-    number, count = parse_shard(options.shard, os.environ)
-    console = make_console(stderr=True, quiet=options.quiet)
+def complete_batch(request: BatchRequest, decide_row: DecideRow) -> int:
+    """Complete the scenes of a manifest, write the table and the page, and return the exit code.
+
+    `decide_row` makes the request of a row in the process of a worker, which imports it by name.
+    """
+    number, count = request.engine.share
+    console = make_console(stderr=True, quiet=request.answer.quiet)
     with show_progress(console):
         with show_preparation("reading the manifest"):
-            common = parse_pairs(options.each, "each")
-            jobs = read_manifest(options.manifest, common, options.out)
+            jobs = read_manifest(request.manifest, request.common, request.out)
 
             # The results may not lie in what the rows read.
             # A row whose path is no text, as JSON allows, fails by itself.
             cells = [job.options.get(name) for job in jobs for name in PATHS]
             paths = dict.fromkeys(cell for cell in cells if isinstance(cell, str) and cell)
             inputs = [Path(path) for path in paths]
-            refuse_overlap(options.out, inputs)
+            refuse_overlap(request.out, inputs)
 
             # Workers may run in another working folder, so they get an absolute path.
-            out = options.out.resolve()
-            engine = make_engine(options, out)
+            out = request.out.resolve()
+            engine = make_engine(request.engine, out)
             claim_folder(out, "batch", {"version": 1, "kind": "batch"})
 
             share = jobs[number::count]
-            left = find_missing_jobs(share, out, options.rerun == "failures")
+            left = find_missing_jobs(share, out, request.repeats_failures)
 
         # A folder of scenes can hold the results of earlier runs, which are no input.
-        if results := list_results(options.manifest, options.out):
+        if results := list_results(request.manifest, request.out):
             names = join_names([path.name for path in results], MAX_NAMED_FAILURES)
             console.print(f"Left out, as results and no scenes: {names}.", soft_wrap=True)
 
-        perform = partial(perform_job, out=out, retries=options.retries)
-        ended = run_jobs(left, perform, partial(has_row, out=out), engine, options.retries)
+        perform = partial(perform_job, out=out, retries=request.retries, decide_row=decide_row)
+        ended = run_jobs(left, perform, partial(has_row, out=out), engine, request.retries)
         counted = track(ended, "completing", len(left), has_lines=False)
         for number, job in enumerate(counted, start=1):
             state = read_row(job, out)
@@ -94,11 +93,11 @@ def complete_batch(options: BatchOptions) -> int:
         if row is not None and row["state"] == "failed":
             failures.append(f"{row['job']}: {row['reason']}")
     print_failures(console, failures, len(share))
-    sentence = f"{summarize_rows(out, share, left)} All results: {options.out}/index.html"
+    sentence = f"{summarize_rows(out, share, left)} All results: {request.out}/index.html"
     console.print(sentence, soft_wrap=True)
-    if options.json:
+    if request.answer.json:
         rows = [row for job in share if (row := read_row(job, out)) is not None]
-        print_json({"out": str(options.out), "failed": len(failures), "rows": rows})
+        print_json({"out": str(request.out), "failed": len(failures), "rows": rows})
     return choose_exit_code(len(failures), len(share))
 
 
@@ -159,12 +158,12 @@ def write_batch_results(out: Path, jobs: Sequence[Job]) -> None:
         finished = [job for job in jobs if has_row(job, out)]
 
 
-def perform_job(job: Job, out: Path, retries: int) -> None:
+def perform_job(job: Job, out: Path, retries: int, decide_row: DecideRow) -> None:
     """Complete the scene of a job in any process, and write its row."""
-    run_job(job, out, lambda: complete_job(job, out / JOBS), retries)
+    run_job(job, out, lambda: complete_job(job, out / JOBS, decide_row), retries)
 
 
-def complete_job(job: Job, jobs: Path) -> dict[str, Any]:
+def complete_job(job: Job, jobs: Path, decide_row: DecideRow) -> dict[str, Any]:
     """Complete the scene of a job in a folder of `jobs`, and return its part of a row."""
     import warnings
 
@@ -179,7 +178,7 @@ def complete_job(job: Job, jobs: Path) -> dict[str, Any]:
     make_folder(jobs)
     with measure_peak_memory() as peak:
         # The batch gives each job to one worker, and a further one only if that is lost.
-        summary = complete_folder(parse_row(job.options, jobs / job.name), takes_over=True)
+        summary = complete_folder(decide_row(job.options, jobs / job.name), takes_over=True)
 
     # A scene that did not reconstruct counts as failed. Its folder stays, to look at.
     outcome = summary["outcome"]

@@ -6,14 +6,16 @@ import json
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-from gscompleter.apps.commands.shared_options import Options
+from gscompleter.apps.requests.answer import AnswerRequest
 
 
-def print_answer(options: Options, content: Mapping[str, Any], lines: Iterable[object]) -> None:
+def print_answer(
+    answer: AnswerRequest, content: Mapping[str, Any], lines: Iterable[object]
+) -> None:
     """Print one JSON object if it is asked for, or else the lines, unless the command is quiet."""
-    if options.json:
+    if answer.json:
         print_json(content)
-    elif not options.quiet:
+    elif not answer.quiet:
         for line in lines:
             print(line)
 

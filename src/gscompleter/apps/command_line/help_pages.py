@@ -15,7 +15,7 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from gscompleter.config import CompleterConfig
+from gscompleter.apps.command_line.chosen_config import ChosenConfig
 from gscompleter.config.settings import Settings
 
 HELP = ("-h", "--help")
@@ -125,7 +125,7 @@ def tidy_field(field: StructFieldSpec, show_all: bool) -> StructFieldSpec:
 
     Unless `show_all` is set, the settings of the method become one option.
     """
-    if isinstance(field.default, CompleterConfig) and not show_all:
+    if isinstance(field.default, ChosenConfig) and not show_all:
         return CONFIG
 
     def text() -> str | None:

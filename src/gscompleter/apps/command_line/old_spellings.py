@@ -1,10 +1,15 @@
-"""Options that have another name by now, each refused with the sentence that names it."""
+"""Commands and options that have another name by now, refused with the sentence that names it."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 from gscompleter.system.errors import InputError
+
+OLD_COMMANDS = {
+    "bench": "`python benchmarks/measure_completions.py` in a checkout measures completions",
+}
+"""What takes the place of a command, by its name."""
 
 UPDATE = "`gscompleter update` adds what photographs show and a splat lacks, and invents nothing"
 
@@ -21,7 +26,9 @@ rows of the table of options, and scripts would never be changed.
 
 
 def refuse_old_spellings(words: Sequence[str]) -> None:
-    """Refuse an option of the command `words[0]` by the name that it had; raises InputError."""
+    """Refuse a command that is none any more, or its option by the name that it had."""
+    if words and words[0] in OLD_COMMANDS:
+        raise InputError(f"There is no command {words[0]} any more; {OLD_COMMANDS[words[0]]}.")
     for word in words[1:]:
         # As in `--camera=FILE`, and with the underscore of the rows of a batch.
         name = word.partition("=")[0].removeprefix("--").replace("_", "-")

@@ -5,13 +5,19 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import redirect_stderr
-from dataclasses import dataclass, is_dataclass
+from dataclasses import is_dataclass
 from io import StringIO
 from typing import Any, get_args, get_type_hints
 
 import tyro
-from tyro.constructors import ConstructorRegistry, StructTypeInfo
+from tyro.constructors import ConstructorRegistry
 
+from gscompleter.apps.command_line.chosen_config import (
+    NAME,
+    ChosenConfig,
+    make_parsing_rule,
+    make_showing_rule,
+)
 from gscompleter.apps.command_line.help_pages import (
     DESCRIPTION,
     HELP,
@@ -22,7 +28,7 @@ from gscompleter.apps.command_line.help_pages import (
     make_program,
 )
 from gscompleter.apps.command_line.old_spellings import refuse_old_spellings
-from gscompleter.apps.commands.shared_options import DEFAULT_NUM_TARGETS, CompletingOptions
+from gscompleter.apps.requests.completion import NUM_TARGETS
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.system.errors import InputError, join_names, quote_value
 
@@ -52,19 +58,13 @@ def parse_words(words: Sequence[str], kinds: Mapping[str, type]) -> Any:
 
     It raises InputError for wrong words, and SystemExit after printing the help.
     """
+    refuse_old_spellings(words)
     if words and words[0] not in kinds and words[0] not in (*HELP, HELP_ALL):
         raise InputError(
             f"There is no command {quote_value(words[0])}; choose one of {', '.join(kinds)} "
             "(see gscompleter --help)."
         )
     refuse_empty_words(words)
-    refuse_old_spellings(words)
-
-    # The rule for help pages changes the fields, so that no option could be parsed with it.
-    rules: list[Rule] = []
-    if any(word in (*HELP, HELP_ALL) for word in words):
-        rules.append(make_help_rule(show_all=HELP_ALL in words))
-    words = ["--help" if word == HELP_ALL else word for word in words]
     check_once(words)
 
     # tyro prints an error in a box and ends the process. The box is caught, and one sentence of it
@@ -72,27 +72,22 @@ def parse_words(words: Sequence[str], kinds: Mapping[str, type]) -> Any:
     printed = StringIO()
     try:
         with redirect_stderr(printed):
-            counted = insert_auto_count(words)
-            config, words = load_named_config(counted)
-            registry = make_registry(config, *rules)
+            # The rules for help pages change the fields, so that no option could be parsed by them.
+            words = insert_auto_count(words)
+            rules: list[Rule] = [make_parsing_rule()]
+            if any(word in (*HELP, HELP_ALL) for word in words):
+                words, rules = prepare_help(words)
+            registry = ConstructorRegistry()
+            for rule in rules:
+                registry.struct_rule(rule)
             # tyro prepares all options of what it is given. For 18 commands that takes 0.1 s longer
             # than for one, which is 2 % of a completion.
             if words and words[0] in kinds:
-                prog = f"gscompleter {words[0]}"
                 about = describe_command(kinds[words[0]])
+                prog = f"gscompleter {words[0]}"
                 parsed = call_tyro(kinds[words[0]], prog, about, words[1:], registry)
-                if not isinstance(parsed, CompletingOptions):
-                    return parsed
-                # Only parsed words tell that a splat comes without photographs, or with masks. Its
-                # config is another one, whose settings are then the defaults.
-                has_marks = bool(parsed.marks)
-                if not parsed.lacks_photographs and not has_marks:
-                    return parsed
-                config, words = load_named_config(
-                    counted, not parsed.lacks_photographs, has_marks=has_marks
-                )
-                registry = make_registry(config, *rules)
-                return call_tyro(kinds[words[0]], prog, about, words[1:], registry)
+                check_config(parsed)
+                return parsed
             return call_tyro(make_program(kinds), "gscompleter", DESCRIPTION, words, registry)
     except SystemExit as stop:
         # Code 0: the help was printed.
@@ -101,6 +96,13 @@ def parse_words(words: Sequence[str], kinds: Mapping[str, type]) -> Any:
         sentence = explain_words(words, kinds, printed.getvalue())
         see = " ".join(["gscompleter", *words[:1]])
         raise InputError(f"{sentence} (see {see} --help).") from None
+
+
+def check_config(options: Any) -> None:
+    """Refuse a config that there is not, and settings out of range, whatever the input is."""
+    chosen = getattr(options, NAME, None)
+    if isinstance(chosen, ChosenConfig):
+        chosen.decide(is_splat=False, has_photographs=True)
 
 
 def call_tyro(
@@ -140,7 +142,9 @@ def list_options(kind: Any, prefix: str = "") -> set[str]:
         marks = get_args(hint)[1:]
         inner: Any = get_args(hint)[0] if marks else hint
         name = f"{prefix}{field.replace('_', '-')}"
-        if is_dataclass(inner):
+        if inner is ChosenConfig:
+            options |= list_options(CompleterConfig, f"{NAME}.")
+        elif is_dataclass(inner):
             is_flat = tyro.conf.OmitArgPrefixes in marks
             options |= list_options(inner, "" if is_flat else f"{name}.")
         elif tyro.conf.Positional not in marks:
@@ -196,55 +200,36 @@ def insert_auto_count(words: Sequence[str]) -> list[str]:
     if "--auto" in counted:
         place = counted.index("--auto") + 1
         if not counted[place:] or not counted[place].isdecimal():
-            counted.insert(place, str(DEFAULT_NUM_TARGETS))
+            counted.insert(place, str(NUM_TARGETS))
     return counted
 
 
-@dataclass(frozen=True)
-class NamedConfig:
-    """The option `--config NAME`, which is parsed first."""
+def prepare_help(words: Sequence[str]) -> tuple[list[str], list[Rule]]:
+    """Prepare words that ask for help: those that tyro knows, and the rules for the page.
 
-    config: str = "default"
-
-
-def load_named_config(
-    words: Sequence[str], has_photographs: bool = True, has_marks: bool = False
-) -> tuple[CompleterConfig, Sequence[str]]:
-    """Load the config of `--config NAME`, and return it with the other words.
-
-    Its settings are the defaults of options such as `--config.holes.dilation`, so it has to be
-    known before these are parsed.
+    The page shows the settings of the config that the words name.
     """
+    shown, others = show_config(words)
+    asked = ["--help" if word == HELP_ALL else word for word in others]
+    return asked, [make_showing_rule(shown), make_help_rule(show_all=HELP_ALL in words)]
+
+
+def show_config(words: Sequence[str]) -> tuple[CompleterConfig, list[str]]:
+    """Load the config that a help page shows, and return it with the words but `--config NAME`."""
+    others: list[str] = []
+    name = ChosenConfig.name
+    left = iter(words)
+    for word in left:
+        option, sign, value = word.partition("=")
+        if option != f"--{NAME}":
+            others.append(word)
+        else:
+            name = value if sign else next(left, name)
     if not words or words[0] not in CONFIGURED:
-        return CompleterConfig(), words
-    named, others = tyro.cli(
-        NamedConfig, prog="gscompleter", args=words, return_unknown_args=True, add_help=False
-    )
-    # The default config depends on the input: a splat has settings of its own.
-    is_splat = not has_photographs
-    is_splat |= any(word.partition("=")[0] == "--scene" for word in others)
-    config = load_config(named.config, is_splat, has_photographs)
-    if words[0] == "remove":
-        config = config.for_removal()
-    if has_marks:
-        config = config.for_marks()
-    return config, others
-
-
-def make_registry(config: CompleterConfig, *rules: Rule) -> ConstructorRegistry:
-    """Create tyro's registry, with `config` as the default CompleterConfig."""
-
-    def config_flags(info: StructTypeInfo) -> Any:
-        # The call below asks all rules again. This one then sees its own default and gives way.
-        if info.type is not CompleterConfig or info.default == config:
-            return None
-        return ConstructorRegistry.get_struct_spec(StructTypeInfo.make(info.type, config, False))
-
-    registry = ConstructorRegistry()
-    registry.struct_rule(config_flags)
-    for rule in rules:
-        registry.struct_rule(rule)
-    return registry
+        return CompleterConfig(), others
+    is_splat = any(word.partition("=")[0] == "--scene" for word in others)
+    config = load_config(name, is_splat)
+    return config.for_removal() if words[0] == "remove" else config, others
 
 
 def extract_sentence(box: str, own: Collection[str]) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -9,7 +10,10 @@ from typing import Annotated, Literal
 import tyro
 from annotated_types import Interval
 
+from gscompleter.apps.commands.engines import decide_engine, parse_pairs
 from gscompleter.apps.commands.shared_options import EngineOptions, list_inputs
+from gscompleter.apps.requests.batch import BatchRequest
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.jobs.engine_names import EngineName
 from gscompleter.system.process import import_without_collection
@@ -45,9 +49,26 @@ class BatchOptions(EngineOptions):
         refuse_overlap(self.out, [path for path in list_inputs(self) if not path.is_dir()])
 
 
+def decide_batch(options: BatchOptions) -> BatchRequest:
+    """Decide which scenes are completed, and where."""
+    # Two letters at least: `C:/results` is a path of Windows.
+    if re.match(r"\w\w+:/", str(options.out)):
+        raise InputError(f"{quote_value(options.out)} is an address; name a folder.", "out")
+    return BatchRequest(
+        manifest=options.manifest,
+        out=options.out,
+        common=parse_pairs(options.each, "each"),
+        engine=decide_engine(options),
+        retries=options.retries,
+        repeats_failures=options.rerun == "failures",
+        answer=options.answer,
+    )
+
+
 def run_batch(options: BatchOptions) -> int:
     """Complete the scenes of a manifest, write the table and the page, and return the exit code."""
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
         from gscompleter.apps.batch.running import complete_batch
-    return complete_batch(options)
+        from gscompleter.apps.commands.batch_rows import decide_row
+    return complete_batch(decide_batch(options), decide_row)

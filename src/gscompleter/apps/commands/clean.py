@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 from annotated_types import Interval
 
+from gscompleter.apps.commands.shared_decisions import (
+    check_context,
+    decide_photographs,
+    decide_results,
+    decide_splat,
+)
 from gscompleter.apps.commands.shared_options import DeviceOptions, SceneOptions, Words
+from gscompleter.apps.requests.cleaning import CleaningRequest
 from gscompleter.config import CleaningConfig
+from gscompleter.system.errors import InputError
 from gscompleter.system.process import import_without_collection
+
+PHOTOGRAPH_OPTIONS = (
+    *("context", "format", "frames", "resolution", "near", "far", "no_given_depth"),
+    *("no_masks", "invert_masks", "large_masks", "ignore", "forget_edits"),
+)
+"""Options that only photographs can follow."""
 
 Strength = Annotated[float, Interval(ge=0.1, le=10)]
 
@@ -47,9 +61,35 @@ class CleanOptions(SceneOptions, DeviceOptions):
     config: CleaningConfig = CleaningConfig()
 
 
+def decide_cleaning(options: CleanOptions) -> CleaningRequest:
+    """Decide which splat is cleaned, by photographs or without."""
+    from gscompleter.render.device import choose_device  # no help page waits for torch
+
+    check_context(options.context)
+    if options.folder is None:
+        defaults = {field.name: field.default for field in fields(options)}
+        for name in PHOTOGRAPH_OPTIONS:
+            if getattr(options, name) != defaults[name]:
+                raise InputError(
+                    "There are no photographs to apply this to; name their SCENE.", name
+                )
+    photographs = None
+    if options.folder is not None:
+        photographs = decide_photographs(options, options.folder)
+    return CleaningRequest(
+        splat=decide_splat(options, options.scene),
+        photographs=photographs,
+        strength=options.strength,
+        config=options.config,
+        device=choose_device(options.device),
+        dry_run=options.dry_run,
+        results=decide_results(options),
+    )
+
+
 def run_clean(options: CleanOptions) -> None:
     """Clean the splat, write the result, and print a summary."""
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
         from gscompleter.apps.cleaning import clean_splat
-    clean_splat(options)
+    clean_splat(decide_cleaning(options))

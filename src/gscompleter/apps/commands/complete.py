@@ -8,12 +8,30 @@ from typing import Annotated, Literal
 
 from annotated_types import Interval
 
-from gscompleter.apps.commands.shared_options import (
-    DEFAULT_NUM_TARGETS,
-    CompletingOptions,
-    list_inputs,
+from gscompleter.apps.commands.shared_decisions import (
+    Adapt,
+    check_context,
+    check_generator,
+    check_presence,
+    decide_filling,
+    decide_results,
+    has_splat_alone,
 )
-from gscompleter.apps.inputs.scene_request import PosesRequest
+from gscompleter.apps.commands.shared_options import CompletingOptions, list_inputs
+from gscompleter.apps.requests.completion import (
+    NUM_TARGETS,
+    CompletionRequest,
+    ExportRequest,
+    FillingRequest,
+    PlanRequest,
+    RepairRequest,
+    Request,
+    TargetRequest,
+)
+from gscompleter.apps.requests.scene import Names
+from gscompleter.config import CompleterConfig
+from gscompleter.config.generators import GeneratorOptions, PaintedOptions
+from gscompleter.data.mask_reading import MaskReading
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.process import import_without_collection
@@ -59,11 +77,6 @@ class CompleteOptions(CompletingOptions):
     video: bool = False
     """Also write video.mp4: a flight through the holes, before beside after."""
 
-    def make_poses_request(self) -> PosesRequest:
-        """Make the request for the cameras, with the targets among the named photographs."""
-        request = super().make_poses_request()
-        return replace(request, named=(*request.named, *self.target))
-
     def check_overlap(self) -> None:
         """Refuse an output that is, holds or lies in an input or the other output."""
         super().check_overlap()
@@ -80,30 +93,127 @@ class CompleteOptions(CompletingOptions):
                 "export-holes",
             ) from error
 
-    @property
-    def results(self) -> Path:
-        """Folder that is written: that of the export, or else OUT."""
-        return self.out if self.export_holes is None else self.export_holes
 
-    @property
-    def marks(self) -> tuple[Path, ...]:
-        """Masks of what is wrong at the targets."""
-        return self.mask
+def decide_completion(options: CompleteOptions) -> Request:
+    """Decide what is done; with masks, what they mark goes first."""
+    marks = options.mask
+    if not marks:
+        return choose_ending(options, decide_holes(options, has_marks=False))
+    if options.scene is None and not has_splat_alone(options):
+        raise InputError(
+            "Without a splat there is nothing that masks could mark; name it with --scene.", "mask"
+        )
+    if not options.target:
+        raise InputError(
+            "A mask is painted on the image of a target; name the camera of each with --target.",
+            "mask",
+        )
+    completion = decide_holes(options, has_marks=True, adapt=CompleterConfig.for_marks)
+    reading = MaskReading(options.invert_masks, options.large_masks)
+    return choose_ending(options, RepairRequest(completion, marks, reading))
 
-    @property
-    def from_photographs_only(self) -> bool:
-        """True if nothing is invented and there are no targets, as `update` has it."""
-        return False
 
-    @property
-    def max_targets(self) -> int:
-        """Number of targets to search for."""
-        return DEFAULT_NUM_TARGETS if self.auto is None else self.auto
+def decide_holes(
+    options: CompleteOptions, has_marks: bool, adapt: Adapt = lambda config: config
+) -> CompletionRequest:
+    """Decide which holes are filled, and by what: a generator, or images that were painted.
+
+    `has_marks` and `adapt` are those of `decide_filling`.
+    """
+    check_context(options.context)
+    check_presence(options, has_marks)
+    if options.target and options.auto is not None:
+        raise InputError(
+            "--target and --auto are both given; use one of them, and complete the result again "
+            "with the other.",
+            "auto",
+        )
+    check_ending(options)
+    if options.images is None:
+        check_generator(options.synthesis)
+        named, context, synthesis = options.target, options.context, options.synthesis
+    else:
+        check_painted(options)
+        named, context = decide_painted(options, options.images)
+        synthesis = PaintedOptions(generator_painter=options.painter)
+    max_found = NUM_TARGETS if options.auto is None else options.auto
+    results = replace(decide_results(options), suffix=options.save_as, has_video=options.video)
+    return decide_filling(
+        options,
+        TargetRequest(named, max_found, options.images),
+        results,
+        context=context,
+        synthesis=synthesis,
+        has_marks=has_marks,
+        adapt=adapt,
+    )
+
+
+def decide_painted(options: CompleteOptions, folder: Path) -> tuple[tuple[str, ...], Names | None]:
+    """Decide on targets and context of painted images, after reading these.
+
+    Where none are named, those of `holes.json` are taken: of another context Ψ makes another scene,
+    with other holes.
+    """
+    from gscompleter.apps.inputs.holes_file import HOLES_FILE, has_holes, read_holes
+    from gscompleter.apps.inputs.paintings import check_paintings
+
+    check_paintings(folder, len(options.target))
+    named, context = options.target, options.context
+    if has_holes(folder):
+        named = named or (str(folder / HOLES_FILE),)
+        # None is listed where renders take the place of photographs, at cameras that are found.
+        context = read_holes(folder).context or None if context is None else context
+    return named, context
+
+
+def check_ending(options: CompleteOptions) -> None:
+    """Refuse options for exported holes that exclude others, and a painter of nothing."""
+    is_export = options.export_holes is not None
+    if options.path and not is_export:
+        raise InputError(
+            "--path is a video of what --export-holes writes; name its folder.", "export-holes"
+        )
+    if options.images is None and options.painter is not None:
+        raise InputError("--painter names who painted --images; name their folder.", "images")
+    if options.images is not None and is_export:
+        raise InputError(
+            "--export-holes and --images are both given; export the holes, paint them, and run the "
+            "command again with the images alone.",
+            "images",
+        )
+    if is_export and (options.dry_run or options.video):
+        raise InputError(
+            "--export-holes completes nothing; leave --dry-run and --video out.",
+            "export-holes",
+        )
+
+
+def check_painted(options: CompleteOptions) -> None:
+    """Refuse what images that were painted elsewhere leave nothing to do for."""
+    if options.synthesis not in (GeneratorOptions(), GeneratorOptions("painted")):
+        raise InputError(
+            "--images takes the place of a generator; leave --generator and its options out.",
+            "generator",
+        )
+    if options.auto is not None:
+        raise InputError(
+            "--images needs the targets that the images were painted for; leave --auto out.",
+            "images",
+        )
+
+
+def choose_ending(options: CompleteOptions, filling: FillingRequest) -> Request:
+    """Choose what is done with the holes: they are filled, exported, or only planned."""
+    if options.export_holes is not None:
+        has_number = options.auto is not None
+        return ExportRequest(filling, options.export_holes, options.path, has_number)
+    return PlanRequest(filling) if options.dry_run else filling
 
 
 def run_complete(options: CompleteOptions) -> int:
     """Complete the scene, and print a summary. Exit code 1 if the scene did not reconstruct."""
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
-        from gscompleter.apps.completing.complete import complete_scene
-    return complete_scene(options)
+        from gscompleter.apps.completing.complete import run_request
+    return run_request(decide_completion(options))

@@ -11,6 +11,8 @@ from annotated_types import Interval
 
 from gscompleter.apps.command_line.answers import print_answer
 from gscompleter.apps.commands.shared_options import WritingOptions, list_inputs
+from gscompleter.apps.requests.conversion import ConversionRequest
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.overlap import refuse_input_file
 from gscompleter.system.process import import_without_collection
 
@@ -82,6 +84,44 @@ class ConvertOptions(WritingOptions):
         refuse_input_file(self.out, list_inputs(self))
 
 
+def decide_conversion(options: ConvertOptions) -> ConversionRequest:
+    """Decide what is converted, and what is changed on the way."""
+    return ConversionRequest(
+        sources=(options.source, *options.merge),
+        out=options.out,
+        level=options.level,
+        bands=options.bands,
+        crop_box=options.crop_box,
+        crop_sphere=options.crop_sphere,
+        scale=options.scale,
+        rotate=options.rotate,
+        translate=options.translate,
+        decimate=parse_number(options.decimate),
+        drop_nonfinite=options.drop_nonfinite,
+        ignore_properties=options.ignore_properties,
+        plain=options.plain,
+    )
+
+
+def parse_number(words: str | None) -> float | int | None:
+    """Parse a number of Gaussians, or a share in percent as a float from 0 to 1."""
+    if words is None:
+        return None
+    try:
+        if words.endswith("%"):
+            share = float(words[:-1]) / 100
+            if 0 < share <= 1:
+                return share
+        elif int(words) > 0:
+            return int(words)
+    except ValueError:
+        pass
+    raise InputError(
+        f"{quote_value(words)} is no number of Gaussians such as 100000, and no share such as 25%.",
+        "decimate",
+    )
+
+
 def run_convert(options: ConvertOptions) -> None:
     """Convert A to B, and print the number of Gaussians."""
     # Imported here, so that help pages do not wait for torch.
@@ -93,12 +133,13 @@ def run_convert(options: ConvertOptions) -> None:
         from gscompleter.system.console import make_console
         from gscompleter.system.progress import show_progress, stage
 
+    request = decide_conversion(options)
     with (
         reserve_splat(options.out, options.overwrite),
         show_progress(make_console(stderr=True, quiet=options.quiet)),
         stage("converting"),
     ):
-        done = convert(options)
+        done = convert(request)
     lines = list(done.notes)
     if done.rounding is not None:
         lines.append(done.rounding.describe())
@@ -110,4 +151,4 @@ def run_convert(options: ConvertOptions) -> None:
         "rounding": None if done.rounding is None else asdict(done.rounding),
     }
     sentence = f"{done.gaussians:,} Gaussians, {done.generated:,} of them generated: {options.out}"
-    print_answer(options, content, [*lines, sentence])
+    print_answer(options.answer, content, [*lines, sentence])

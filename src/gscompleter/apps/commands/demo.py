@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from gscompleter.apps.commands.shared_options import RunOptions, WritingOptions
+from gscompleter.apps.requests.completion import ResultsRequest
+from gscompleter.apps.requests.models import ModelRequest
 from gscompleter.system.process import import_without_collection
 
 
@@ -25,4 +27,10 @@ def run_demo(options: DemoOptions) -> None:
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
         from gscompleter.apps.completing.demo import complete_demo
-    complete_demo(options)
+        from gscompleter.render.device import choose_devices
+    devices = choose_devices(options.device)
+    models = ModelRequest(
+        device=devices.renderer, network_device=devices.networks, seed=options.seed
+    )
+    results = ResultsRequest(out=options.out, overwrite=options.overwrite, answer=options.answer)
+    complete_demo(models, results)

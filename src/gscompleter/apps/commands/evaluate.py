@@ -2,21 +2,30 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
 from annotated_types import Interval
 
+from gscompleter.apps.commands.engines import decide_engine
 from gscompleter.apps.commands.shared_options import (
     EngineOptions,
     MaskOptions,
-    Size,
     SynthesisOptions,
     list_inputs,
     replace_by_scenes,
 )
+from gscompleter.apps.requests.evaluation import (
+    CasesRequest,
+    ComparisonRequest,
+    EvaluationRequest,
+    ReproductionRequest,
+)
+from gscompleter.apps.requests.models import ModelRequest
+from gscompleter.apps.requests.scene import Size
 from gscompleter.config.generators import (
     PREFIX,
     GeneratorOptions,
@@ -24,7 +33,7 @@ from gscompleter.config.generators import (
     get_settings_class,
 )
 from gscompleter.data.mask_reading import MaskReading
-from gscompleter.system.errors import InputError
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.jobs.engine_names import EngineName
 from gscompleter.system.process import import_without_collection
@@ -40,6 +49,8 @@ FigureName = Literal[
 # fmt: on
 AUTO = "auto"
 """Generator of the preset, or else the default one."""
+
+
 WEIGHTS = "generator_weights"
 """Setting that belongs to one generator."""
 
@@ -174,14 +185,141 @@ class EvaluateOptions(SynthesisOptions, EngineOptions, MaskOptions):
     """Use also the cases that their file keeps apart, for reports of what was decided without them.
     run.json and the tables say so, and apart_uses.md beside the file counts it."""
 
-    @property
-    def mask_reading(self) -> MaskReading:
-        """How masks are read."""
-        return MaskReading(self.invert_masks, self.large_masks)
-
     def check_overlap(self) -> None:
         """Refuse an output that is, holds or lies in an input."""
         refuse_overlap(self.out, replace_by_scenes(list_inputs(self), self.paths))
+
+
+def decide_evaluation(
+    options: EvaluateOptions,
+) -> EvaluationRequest | ComparisonRequest | ReproductionRequest:
+    """Decide which methods run with which models, or which tables and figures need them."""
+    from gscompleter.evaluation.paper import get_data_set  # no help page waits for torch
+
+    # What is not given is as in the preset, or as without one.
+    preset = get_data_set(options.preset)
+    is_reproduction = bool(options.preset or options.table or options.figure)
+    models = options.reconstructor or preset.reconstructor
+    if len(set(models)) < len(models):
+        raise InputError("A reconstructor is named twice; change --reconstructor.")
+    if not options.depth or len(set(options.depth)) < len(options.depth):
+        raise InputError("A depth is named twice, or none is; change --depth.", "depth")
+    weights = assign_weights(models, options.weights)
+    depth_weights = assign_weights(options.depth, options.depth_weights, "depth", "depth-weights")
+    named = [preset.generator if name == AUTO else name for name in options.synthesis.generator]
+    if not named or len(set(named)) < len(named):
+        raise InputError("A generator is named twice, or none is; change --generator.", "generator")
+    compared = {"depth": options.depth, "generator": named}
+    several = [kind for kind, names in compared.items() if len(names) > 1]
+    if several and (is_reproduction or len(models) > 1 or len(several) > 1):
+        raise InputError(
+            f"Several {several[0]}s are compared with one reconstructor in a table of their own; "
+            "leave --preset, --table and --figure out, and name one of the others.",
+            several[0],
+        )
+    if not options.paths:
+        raise InputError("No data is given; name a cases.json, or scenes with --protocol.")
+    synthesis = replace(options.synthesis, generator=tuple(named))
+    shared = synthesis.share_settings() if len(named) > 1 else {named[0]: synthesis}
+    decided = {
+        name: decide_run_models(options, models[0], weights[models[0]], depth_weights, own)
+        for name, own in shared.items()
+    }
+    run = EvaluationRequest(
+        cases=CasesRequest(
+            paths=options.paths,
+            protocol=options.protocol,
+            preset=options.preset,
+            resolution=preset.resolution if options.resolution is None else options.resolution,
+            near=preset.near if options.near is None else options.near,
+            far=preset.far if options.far is None else options.far,
+            uses_masks=not options.no_masks,
+            masks=MaskReading(options.invert_masks, options.large_masks),
+            ignore_moving=options.ignore_moving,
+            one_per_scene=options.one_per_scene,
+            ego_mask=not options.no_ego_mask,
+            limit=options.limit,
+            apart=options.apart,
+        ),
+        methods=options.methods,
+        models=decided[named[0]],
+        out=options.out,
+        rerun=options.rerun,
+        engine=decide_engine(options),
+        answer=options.answer,
+    )
+    if "depth" in several:
+        depths = {
+            depth: replace(run.models, depth=depth, depth_weights=own)
+            for depth, own in depth_weights.items()
+        }
+        return ComparisonRequest(run=run, kind="depth", models=depths)
+    if several:
+        return ComparisonRequest(run=run, kind="generator", models=decided)
+    if not is_reproduction and len(models) == 1:
+        return run
+    return ReproductionRequest(
+        run=run,
+        weights=weights,
+        tables=options.table,
+        figures=options.figure,
+        figure_cases=options.figure_cases,
+        has_outlines=options.outlines,
+        has_crops=options.crops,
+    )
+
+
+def decide_run_models(
+    options: EvaluateOptions,
+    reconstructor: str,
+    weights: Path | None,
+    depth_weights: Mapping[str, Path | None],
+    synthesis: PresetGeneratorOptions,
+) -> ModelRequest:
+    """Decide on the models of a run and their devices."""
+    from gscompleter.render.device import choose_devices
+
+    devices = choose_devices(options.device, options.renderer_device, options.network_device)
+    return ModelRequest(
+        reconstructor=reconstructor,
+        weights=weights,
+        depth=options.depth[0],
+        depth_weights=depth_weights[options.depth[0]],
+        generator=synthesis.generator[0],
+        generator_settings=synthesis.make_settings(),
+        device=devices.renderer,
+        network_device=devices.networks,
+        seed=options.seed,
+    )
+
+
+def assign_weights(
+    models: Sequence[str],
+    weights: Sequence[Path],
+    kind: str = "reconstructor",
+    option: str = "weights",
+) -> dict[str, Path | None]:
+    """Assign files of weights to models: one for each in their order, or by `NAME=FILE`.
+
+    None for those without a file, which take the published one. Raise InputError if a file has no
+    model.
+    """
+    named: dict[str, Path] = {}
+    plain: list[Path] = []
+    for word in weights:
+        # A path may contain `=`, too; only a known name before it makes it NAME=FILE.
+        name, _, file = str(word).partition("=")
+        if file and name in models:
+            named[name] = Path(file)
+        else:
+            plain.append(word)
+    if plain and (named or len(plain) != len(models)):
+        raise InputError(
+            f"{quote_value(plain[0])} belongs to no {kind}; give --{option} one file for "
+            f"each of {', '.join(models)} in this order, or {models[0]}=FILE for some of them."
+        )
+    named = named or dict(zip(models, plain, strict=False))
+    return {model: named.get(model) for model in models}
 
 
 def run_evaluate(options: EvaluateOptions) -> int:
@@ -189,4 +327,4 @@ def run_evaluate(options: EvaluateOptions) -> int:
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
         from gscompleter.apps.evaluating.reproduction import run_evaluation
-    return run_evaluation(options)
+    return run_evaluation(decide_evaluation(options))

@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from gscompleter.apps.commands.shared_options import WritingOptions, list_inputs, replace_by_scenes
+from gscompleter.apps.requests.evaluation import IndexRequest
 from gscompleter.system.files.overlap import refuse_input_file
 from gscompleter.system.process import import_without_collection
 
@@ -37,4 +38,12 @@ def run_index(options: IndexOptions) -> None:
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
         from gscompleter.apps.evaluating.index import write_index
-    write_index(options)
+    write_index(
+        IndexRequest(
+            path=options.path,
+            protocol=options.protocol,
+            out=options.out,
+            overwrite=options.overwrite,
+            answer=options.answer,
+        )
+    )

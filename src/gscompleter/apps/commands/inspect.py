@@ -9,6 +9,7 @@ from typing import Annotated
 import tyro
 
 from gscompleter.apps.commands.shared_options import DeviceOptions
+from gscompleter.apps.requests.viewing import InspectionRequest
 from gscompleter.system.process import import_without_collection
 
 
@@ -38,5 +39,12 @@ def run_inspect(options: InspectOptions) -> None:
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
         from gscompleter.apps.inspection import inspect_splat, print_inspection
+        from gscompleter.render.device import choose_device
 
-    print_inspection(inspect_splat(options), options.json)
+    request = InspectionRequest(
+        file=options.file,
+        cameras=options.cameras,
+        resolution=options.resolution,
+        device=choose_device(options.device),
+    )
+    print_inspection(inspect_splat(request), options.json)

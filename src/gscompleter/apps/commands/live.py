@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import tyro
 
-from gscompleter.apps.commands.shared_options import CompletingOptions, Port, Size
+from gscompleter.apps.commands.shared_options import CompletingOptions, Port
+from gscompleter.apps.requests.scene import Size
 from gscompleter.system.process import import_without_collection
+
+if TYPE_CHECKING:
+    from gscompleter.apps.live.opening import LiveRequest
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +47,16 @@ class LiveOptions(CompletingOptions):
     """Print the address without opening a browser."""
 
     def check_overlap(self) -> None:
-        """Leave it to `find_opening`, which knows the inputs of a session that goes on."""
+        """Leave it to `decide_live`, which knows the inputs of a session that goes on."""
+
+
+def decide_live(options: LiveOptions) -> LiveRequest:
+    """Decide what a session begins with, and where its page is."""
+    from gscompleter.apps.commands.sessions import decide_session  # no help page waits for torch
+    from gscompleter.apps.live.opening import LiveRequest
+
+    session = decide_session(replace(options, strokes=None), options.strokes)
+    return LiveRequest(session, options.host, options.port, not options.no_open)
 
 
 def run_live(options: LiveOptions) -> None:
@@ -51,4 +64,4 @@ def run_live(options: LiveOptions) -> None:
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
         from gscompleter.apps.live.serving import serve_live
-    serve_live(options)
+    serve_live(decide_live(options))

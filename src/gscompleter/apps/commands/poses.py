@@ -65,4 +65,4 @@ def run_poses(options: PosesOptions) -> None:
         "reused": poses.reused,
         "notes": list(poses.notes),
     }
-    print_answer(options, content, [*poses.notes, sentence])
+    print_answer(options.answer, content, [*poses.notes, sentence])

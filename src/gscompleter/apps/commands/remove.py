@@ -8,12 +8,12 @@ from typing import Annotated
 
 import tyro
 
-from gscompleter.apps.commands.complete import CompleteOptions
-from gscompleter.apps.inputs.scene_request import SceneRequest
+from gscompleter.apps.commands.complete import CompleteOptions, choose_ending, decide_holes
+from gscompleter.apps.requests.completion import RemovalRequest, Request
+from gscompleter.apps.requests.splat import Selection
 from gscompleter.config import CompleterConfig
+from gscompleter.data.mask_reading import MaskReading
 from gscompleter.system.process import import_without_collection
-
-REMOVAL_CONFIG = CompleterConfig.splat().for_removal()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -42,29 +42,32 @@ class RemoveOptions(CompleteOptions):
     cut out, what is opaque goes."""
     select: Path | None = None
     """Remove the Gaussians of this file, a selection that another program saved."""
-    config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = REMOVAL_CONFIG
-    """Settings of the method, which change those of `--config NAME`."""
 
-    @property
-    def marks(self) -> tuple[Path, ...]:
-        """No masks of targets: here they select what goes."""
-        return ()
 
-    def make_scene_request(self) -> SceneRequest:
-        """Make the request for the photographs, of which masks of the removal hide nothing."""
-        request = super().make_scene_request()
-        return replace(request, removal_masks=self.mask, removal_reading=self.mark_reading)
-
-    @property
-    def has_marks(self) -> bool:
-        """True if masks say what goes, which `--invert-masks` then turns."""
-        return self.mask is not None
+def decide_removal(options: RemoveOptions) -> Request:
+    """Decide what is removed, and how its hole is filled."""
+    reading = MaskReading(options.invert_masks, options.large_masks)
+    has_marks = options.mask is not None
+    completion = decide_holes(options, has_marks, CompleterConfig.for_removal)
+    # Masks of the removal may lie in the scene, and are not those of what to ignore.
+    source = completion.source
+    scene = replace(source.scene, removal_masks=options.mask, removal_reading=reading)
+    completion = replace(completion, source=replace(source, scene=scene))
+    selection = Selection(
+        options.box,
+        options.box_rotation,
+        options.sphere,
+        options.mask,
+        options.select,
+        options.drop_nonfinite,
+        mask_reading=reading,
+    )
+    return choose_ending(options, RemovalRequest(completion, selection))
 
 
 def run_remove(options: RemoveOptions) -> int:
     """Remove the selection, complete the hole, and print a summary; exit codes as of `complete`."""
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
-        from gscompleter.apps.completing.complete import complete_scene
-        from gscompleter.apps.completing.remove import prepare_removal
-    return complete_scene(options, prepare_removal)
+        from gscompleter.apps.completing.complete import run_request
+    return run_request(decide_removal(options))

@@ -8,13 +8,19 @@ from typing import Annotated
 
 import tyro
 
-from gscompleter.apps.commands.complete import CompleteOptions
+from gscompleter.apps.commands.shared_decisions import (
+    check_context,
+    check_generator,
+    decide_filling,
+    decide_results,
+    has_splat_alone,
+)
 from gscompleter.apps.commands.shared_options import CompletingOptions
+from gscompleter.apps.requests.completion import RepairRequest, TargetRequest
 from gscompleter.config import CompleterConfig
+from gscompleter.data.mask_reading import MaskReading
 from gscompleter.system.errors import InputError
 from gscompleter.system.process import import_without_collection
-
-REPAIR_CONFIG = CompleterConfig.splat().for_marks()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -45,19 +51,27 @@ class RepairOptions(CompletingOptions):
     out: Path
     """Write results here. A folder, for completed.ply, the report (report.html), images and
     summary.json."""
-    config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = REPAIR_CONFIG
-    """Settings of the method, which change those of `--config NAME`."""
 
-    @property
-    def marks(self) -> tuple[Path, ...]:
-        """Masks of what is wrong."""
-        return self.mask
 
-    def make_completion(self) -> CompleteOptions:
-        """Make the options of the completion, at the cameras of the masks, that a repair is."""
-        shared = {**vars(self)}
-        del shared["strokes"]
-        return CompleteOptions(**shared)
+def decide_repair(options: RepairOptions) -> RepairRequest:
+    """Decide what is repaired at the cameras of masks."""
+    if options.scene is None and not has_splat_alone(options):
+        raise InputError(
+            "Without a splat there is nothing that masks could mark; name it with --scene.", "mask"
+        )
+    check_context(options.context)
+    check_generator(options.synthesis)
+    completion = decide_filling(
+        options,
+        TargetRequest(options.target),
+        decide_results(options),
+        context=options.context,
+        synthesis=options.synthesis,
+        has_marks=True,
+        adapt=CompleterConfig.for_marks,
+    )
+    reading = MaskReading(options.invert_masks, options.large_masks)
+    return RepairRequest(completion, options.mask, reading)
 
 
 def run_repair(options: RepairOptions) -> int:
@@ -66,11 +80,12 @@ def run_repair(options: RepairOptions) -> int:
     check_marks_named(options)
     if options.strokes is not None:
         with import_without_collection():
-            from gscompleter.apps.live.replay import replay_strokes
-        return replay_strokes(options, options.strokes)
+            from gscompleter.apps.commands.sessions import decide_replay
+            from gscompleter.apps.live.replay import replay_session
+        return replay_session(decide_replay(options, options.strokes))
     with import_without_collection():
-        from gscompleter.apps.completing.complete import complete_scene
-    return complete_scene(options.make_completion())
+        from gscompleter.apps.completing.complete import run_request
+    return run_request(decide_repair(options))
 
 
 def check_marks_named(options: RepairOptions) -> None:

@@ -31,4 +31,4 @@ def run_report(options: ReportOptions) -> None:
         from gscompleter.apps.report.page import REPORT_FILE, write_completion_page
     write_completion_page(options.out)
     path = options.out / REPORT_FILE
-    print_answer(options, {"report": str(path)}, [path])
+    print_answer(options.answer, {"report": str(path)}, [path])

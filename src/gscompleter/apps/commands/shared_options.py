@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,21 +10,18 @@ from typing import Annotated, Literal
 import tyro
 from annotated_types import Interval
 
-from gscompleter.apps.inputs.scene_request import LONG_SIDE, PosesRequest, SceneRequest
-from gscompleter.config import CompleterConfig
+from gscompleter.apps.command_line.chosen_config import ChosenConfig
+from gscompleter.apps.requests.answer import AnswerRequest
+from gscompleter.apps.requests.scene import NUM_VIDEO_FRAMES, Names, Size
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Device, Seed, Settings
-from gscompleter.data.mask_reading import MaskReading
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.jobs.engine_names import EngineName
 
-Words = Annotated[tuple[int | str, ...] | None, tyro.conf.arg(metavar="PHOTO [PHOTO ...]")]
+Words = Annotated[Names | None, tyro.conf.arg(metavar="PHOTO [PHOTO ...]")]
 Threads = Annotated[int, Interval(ge=1, le=1024)]
 Port = Annotated[int, Interval(ge=0, le=65535)]
 NumFrames = Annotated[int, Interval(ge=3, le=1000)]
-Size = tuple[int, int] | int | Literal["full"]
-"""Height and width, the longest side, or `full` for the photographs' own size."""
-DEFAULT_NUM_TARGETS = 4
 OUTPUTS = ("out", "save", "export_holes")
 """Options that name what a command writes."""
 WORDS_OR_PATHS = ("target", "protocol", "generator_weights")
@@ -40,6 +36,11 @@ class Options(Settings):
     """Print errors only, and what --json asks for."""
     json: bool = False
     """Print the result as JSON."""
+
+    @property
+    def answer(self) -> AnswerRequest:
+        """What the command prints."""
+        return AnswerRequest(self.quiet, self.json)
 
     def check_overlap(self) -> None:
         """Raise an InputError if the output of the command is, holds or lies in an input."""
@@ -137,7 +138,7 @@ class SceneOptions(ComputeOptions, WritingOptions, MaskOptions):
 
     folder: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")]
     """Folder of the photographs of the splat, in any layout that `complete` reads."""
-    frames: NumFrames = 40
+    frames: NumFrames = NUM_VIDEO_FRAMES
     """Most frames of a video to take as photographs, sharp ones at even steps of the camera."""
     context: Words = None
     """Photographs to work with: file names, or numbers from 0 in the order of the file paths. If
@@ -175,38 +176,6 @@ class SceneOptions(ComputeOptions, WritingOptions, MaskOptions):
     ignore_properties: bool = False
     """Go on with a splat whose further properties change what is seen, such as a moving one."""
 
-    def make_scene_request(self) -> SceneRequest:
-        """Make the request for the photographs."""
-        return SceneRequest(
-            self.folder,
-            self.format,
-            parse_resolution(self.resolution),
-            self.near,
-            self.far,
-            uses_given_depth=not self.no_given_depth,
-            uses_masks=not self.no_masks,
-            masks=MaskReading(
-                self.invert_masks and not self.has_marks,
-                self.large_masks,
-                is_turned_by_option=not self.has_marks,
-                folder=self.ignore,
-            ),
-        )
-
-    @property
-    def has_marks(self) -> bool:
-        """True if masks say what goes, which `--invert-masks` then turns."""
-        return False
-
-    @property
-    def mark_reading(self) -> MaskReading:
-        """How masks of what goes are read."""
-        return MaskReading(self.invert_masks, self.large_masks)
-
-    def make_poses_request(self) -> PosesRequest:
-        """Make the request for the cameras of photographs that have none; OUT keeps them."""
-        return PosesRequest(self.out, self.overwrite, self.frames, self.context or ())
-
 
 @dataclass(frozen=True, kw_only=True)
 class CompletingOptions(SceneOptions, ModelOptions):
@@ -235,23 +204,8 @@ class CompletingOptions(SceneOptions, ModelOptions):
     by what is around it."""
     no_recolor: bool = False
     """Keep the colours of the splat, too; Gaussians are only added."""
-    config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()
+    config: Annotated[ChosenConfig, tyro.conf.FlagConversionOff] = ChosenConfig()
     """Settings of the method, which change those of `--config NAME`."""
-
-    @property
-    def marks(self) -> tuple[Path, ...]:
-        """Masks of what is wrong at the targets."""
-        return ()
-
-    @property
-    def has_marks(self) -> bool:
-        """True if masks say what goes, which `--invert-masks` then turns."""
-        return bool(self.marks)
-
-    @property
-    def lacks_photographs(self) -> bool:
-        """True for a splat without photographs: SCENE is left out, or is the splat itself."""
-        return self.folder is None or is_splat(self.folder)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -289,29 +243,9 @@ def list_inputs(options: Settings) -> list[Path]:
     return inputs
 
 
-def is_splat(path: Path) -> bool:
-    """Check whether a path names an existing file of Gaussians, or a folder of nothing else."""
-    # As in `replace_by_scenes`.
-    if os.path.isdir(path):
-        from gscompleter.splats.foreign import holds_splat_alone
-
-        return holds_splat_alone(path)
-    if not os.path.isfile(path):
-        return False
-    from gscompleter.splats.formats import has_splat_extension
-
-    return has_splat_extension(path)
-
-
 def replace_by_scenes(inputs: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
     """Replace folders of scenes by their scenes, beside which results may lie."""
     from gscompleter.evaluation.cases import list_scenes  # it needs torch, for which no help waits
 
     scenes = {path: list_scenes(path) for path in folders}
     return [place for path in inputs for place in scenes.get(path, [path])]
-
-
-def parse_resolution(given: Size | None) -> tuple[int, int] | int | None:
-    """Return `--resolution` as the readers of photographs take it."""
-    size = LONG_SIDE if given is None else given
-    return None if size == "full" else size

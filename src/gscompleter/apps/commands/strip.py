@@ -67,4 +67,4 @@ def run_strip(options: StripOptions) -> None:
     }
     line = f"{undone.kept:,} Gaussians, {undone.dropped:,} generated ones removed: {options.out}"
     same = ["The file is the one before this edit, byte for byte."] if undone.is_same_file else []
-    print_answer(options, content, [line, *same])
+    print_answer(options.answer, content, [line, *same])

@@ -9,29 +9,21 @@ from typing import Annotated
 import tyro
 from annotated_types import Interval
 
-from gscompleter.apps.commands.complete import CompleteOptions
+from gscompleter.apps.command_line.chosen_config import ChosenConfig
+from gscompleter.apps.commands.shared_decisions import (
+    check_context,
+    decide_models,
+    decide_photographs,
+    decide_results,
+    decide_splat,
+    is_splat,
+    stop_recoloring,
+)
 from gscompleter.apps.commands.shared_options import ReconstructorOptions, SceneOptions
-from gscompleter.config import CompleterConfig
+from gscompleter.apps.requests.completion import UpdateRequest, WorkRequest
+from gscompleter.config.generators import GeneratorOptions
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.process import import_without_collection
-
-
-@dataclass(frozen=True, kw_only=True)
-class PhotographsOnlyOptions(CompleteOptions):
-    """Options of the completion that an update is: nothing is invented, and there are no targets.
-
-    On the command line `complete` has no such option: `update` is the one way to it, and looks at
-    all photographs.
-    """
-
-    @property
-    def from_photographs_only(self) -> bool:
-        """True: nothing is invented."""
-        return True
-
-    @property
-    def max_targets(self) -> int:
-        """No target is searched for."""
-        return 0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -53,20 +45,41 @@ class UpdateOptions(SceneOptions, ReconstructorOptions):
     not used, and the report compares the splat with them."""
     no_recolor: bool = False
     """Keep the colours of the splat, too; Gaussians are only added."""
-    config: Annotated[CompleterConfig, tyro.conf.FlagConversionOff] = CompleterConfig()
+    config: Annotated[ChosenConfig, tyro.conf.FlagConversionOff] = ChosenConfig()
     """Settings of the method, which change those of `--config NAME`."""
 
-    def make_completion(self) -> PhotographsOnlyOptions:
-        """Make the options of the completion without targets that an update is."""
-        shared = {**vars(self)}
-        for name in ("photos", "hold_out"):
-            del shared[name]
-        return PhotographsOnlyOptions(**shared)
+
+def decide_update(options: UpdateOptions) -> UpdateRequest:
+    """Decide which splat is updated, by which photographs."""
+    check_context(options.context)
+    if is_splat(options.folder):
+        raise InputError(
+            f"Two splats are named, {quote_value(options.folder, 80)} and "
+            f"{quote_value(options.scene, 80)}; name one, and as SCENE only its photographs.",
+            "scene",
+        )
+    config = options.config.decide(is_splat=True, has_photographs=True)
+    if not config.add_observed:
+        raise InputError(
+            "With config.add_observed off nothing is added from photographs, as in the config "
+            "paper; choose another config.",
+            "config",
+        )
+    config = stop_recoloring(config) if options.no_recolor else config
+    models = decide_models(options, GeneratorOptions())
+    splat = decide_splat(options, options.scene)
+    return UpdateRequest(
+        source=decide_photographs(options, options.folder),
+        work=WorkRequest(splat=splat, models=models, config=config),
+        photos=options.photos,
+        hold_out=options.hold_out,
+        results=decide_results(options),
+    )
 
 
 def run_update(options: UpdateOptions) -> int:
     """Update the splat, and print a summary; exit codes as of `complete`."""
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
-        from gscompleter.apps.completing.update import update_splat
-    return update_splat(options)
+        from gscompleter.apps.completing.complete import run_request
+    return run_request(decide_update(options))

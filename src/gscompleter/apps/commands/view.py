@@ -9,6 +9,8 @@ from typing import Annotated
 import tyro
 
 from gscompleter.apps.commands.shared_options import Port, WritingOptions, list_inputs
+from gscompleter.apps.requests.viewing import ViewRequest
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.overlap import refuse_input_file
 from gscompleter.system.process import import_without_collection
 
@@ -53,9 +55,29 @@ class ViewOptions(WritingOptions):
             refuse_input_file(self.save, list_inputs(self), "save")
 
 
+def decide_view(options: ViewOptions) -> ViewRequest:
+    """Decide what is shown, and where."""
+    if options.save is not None and options.save.suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"{quote_value(options.save)} is no .html file; name it *.html.", "save")
+    return ViewRequest(
+        scene=options.scene,
+        other=options.other,
+        cameras=options.cameras,
+        resolution=options.resolution,
+        up=options.up,
+        save=options.save,
+        overwrite=options.overwrite,
+        port=options.port,
+        opens_browser=not options.no_open,
+        drop_nonfinite=options.drop_nonfinite,
+        ignore_properties=options.ignore_properties,
+        answer=options.answer,
+    )
+
+
 def run_view(options: ViewOptions) -> None:
     """Make the page, and write it or serve it until Ctrl-C."""
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
         from gscompleter.apps.viewer.serving import show_scenes
-    show_scenes(options)
+    show_scenes(decide_view(options))

@@ -40,4 +40,4 @@ def run_warmup(options: WarmupOptions) -> None:
     lines = [f"All kernels are compiled{done}: {get_cache_folder()}"]
     lines += [] if about_gpu is None else [about_gpu]
     content = {"folder": str(get_cache_folder()), "seconds": seconds, "gpu": about_gpu}
-    print_answer(options, content, lines)
+    print_answer(options.answer, content, lines)

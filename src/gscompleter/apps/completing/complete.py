@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,34 +10,45 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.command_line.exit_codes import DONE, ERROR
-from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.completing.holes import EXPORTED, refuse_painted, write_holes
 from gscompleter.apps.completing.keeping import keep_small
 from gscompleter.apps.completing.maker import describe_maker
-from gscompleter.apps.completing.marking import prepare_marked
-from gscompleter.apps.completing.preparation import Prepared
+from gscompleter.apps.completing.marking import prepare_repair
+from gscompleter.apps.completing.preparation import (
+    Prepared,
+    describe_settings,
+    prepare_completion,
+)
 from gscompleter.apps.completing.printing import (
     answer_completion,
-    describe_plan,
-    print_export,
-    print_plan,
+    answer_export,
+    answer_plan,
 )
+from gscompleter.apps.completing.remove import prepare_removal
 from gscompleter.apps.completing.run_info import describe_run, read_held_out, refuse_results
+from gscompleter.apps.completing.update import prepare_update
 from gscompleter.apps.inputs.describing import describe_task, print_lines
-from gscompleter.apps.inputs.holes_file import HOLES_FILE
 from gscompleter.apps.inputs.task import CompletionTask
-from gscompleter.apps.report.completion import (
-    IMAGES,
-    write_images,
-    write_report,
-)
+from gscompleter.apps.report.completion import write_report
 from gscompleter.apps.report.film import write_comparison_video
 from gscompleter.apps.report.page import write_completion_page
+from gscompleter.apps.report.pictures import IMAGES, write_images
 from gscompleter.apps.report.results import COMMAND, RESULTS
 from gscompleter.apps.report.schema import read_summary
+from gscompleter.apps.requests.completion import (
+    ExportRequest,
+    FillingRequest,
+    PlanRequest,
+    RemovalRequest,
+    RepairRequest,
+    Request,
+    ResultsRequest,
+    UpdateRequest,
+    get_completion,
+)
 from gscompleter.completer import check_target_ids
+from gscompleter.config.generators import PaintedSettings
 from gscompleter.data.scene import describe_camera, write_cameras
 from gscompleter.editing.removal import restore_surroundings
 from gscompleter.evaluation.metrics.coverage import render_pairs, sample_held_out_cameras
@@ -61,98 +70,151 @@ REGIONS = ("box", "box_rotation", "sphere", "margin")
 """Settings of a place."""
 NAMED_FILES = ("mask", "select", "images", "photos")
 """Settings that name files."""
-Prepare = Callable[[Any, Console], Prepared]
-"""Opens the input of a command, whose options it takes, and loads the models."""
 
 
-def complete_scene(options: CompleteOptions, prepare: Prepare = prepare_marked) -> int:
+def run_request(request: Request) -> int:
+    """Do what is asked, print the result, and return the exit code."""
+    if isinstance(request, ExportRequest):
+        return export_holes(request)
+    if isinstance(request, PlanRequest):
+        return plan_targets(request)
+    return complete_scene(request)
+
+
+def prepare(request: FillingRequest | UpdateRequest, console: Console) -> Prepared:
+    """Open the scene, and load the models; what is taken out first is chosen when it begins."""
+    if isinstance(request, UpdateRequest):
+        return prepare_update(request, console)
+    if isinstance(request, RemovalRequest):
+        return prepare_removal(request, console)
+    if isinstance(request, RepairRequest):
+        return prepare_repair(request, console)
+    return prepare_completion(request, console)
+
+
+def get_results(request: FillingRequest | UpdateRequest) -> ResultsRequest:
+    """Return what is written, and where."""
+    if isinstance(request, UpdateRequest):
+        return request.results
+    return get_completion(request).results
+
+
+def complete_scene(request: FillingRequest | UpdateRequest) -> int:
     """Complete the scene, print a summary, and return the exit code."""
-    if options.export_holes is not None:
-        export_folder(options, prepare)
-        return DONE
-    if options.dry_run:
-        plan_folder(options, prepare)
-        return DONE
-    complete_folder(options, prepare)
-    outcome = read_summary(options.out).outcome
-    answer_completion(options)
+    results = get_results(request)
+    complete_folder(request)
+    outcome = read_summary(results.out).outcome
+    answer_completion(results)
     if outcome.status != "not-reconstructed":
         return DONE
     # A quiet run that fails says why, and so does one whose answer is for a program.
-    if options.quiet or options.json:
+    if results.answer.quiet or results.answer.json:
         print_error(outcome.headline)
     return ERROR
 
 
 def complete_folder(
-    options: CompleteOptions, prepare: Prepare = prepare_marked, takes_over: bool = False
+    request: FillingRequest | UpdateRequest, takes_over: bool = False
 ) -> dict[str, Any]:
-    """Complete the scene, write `options.out`, and return the summary."""
-    # A missing ffmpeg ends the command at its beginning, not after the completion.
-    if options.video:
-        find_ffmpeg()
-    with open_completion(options, prepare, takes_over) as (ready, folder):
-        completion, ready = complete_targets(ready)
+    """Complete the scene, write the results, and return the summary.
 
-        # Frozen views of the scene take memory, and the report does not use them.
-        ready.completer.scenes.clear()
-        release_free_memory()
-        with stage("report"):
-            summary = write_done(folder, ready, completion)
-            write_targets(folder, ready.task)
-        if options.video:
-            photographs = list(ready.cameras.values())
-            write_comparison_video(folder, completion, photographs, ready.completer.renderer)
-        if options.save_as is not None:
-            given = ready.options.scene
-            # An earlier result in OUT may be the input, and is replaced.
-            if given is not None and options.out.resolve() in given.resolve().parents:
-                given = None
-            summary = keep_small(folder, options.save_as, summary, given)
+    `takes_over` is that of `reserve_output`.
+    """
+    results = get_results(request)
+    # A missing ffmpeg ends the command at its beginning, not after the completion.
+    if results.has_video:
+        find_ffmpeg()
+    console = make_console(stderr=True, quiet=results.answer.quiet)
+    with (
+        show_progress(console),
+        reserve_output(results.out, results.overwrite, COMMAND, RESULTS, takes_over) as output,
+    ):
+        print_lines(console, *output.describe_others())
+        ready = prepare(request, console)
+        print_lines(console, *describe_work(ready))
+        with output.write() as folder:
+            return write_completion(folder, ready)
+
+
+def write_completion(folder: Path, ready: Prepared) -> dict[str, Any]:
+    """Complete the targets, write all results to a folder, and return the summary."""
+    results = ready.results
+    completion, ready = complete_targets(ready)
+
+    # Frozen views of the scene take memory, and the report does not use them.
+    ready.completer.scenes.clear()
+    release_free_memory()
+    with stage("report"):
+        summary = write_done(folder, ready, completion)
+        write_targets(folder, ready.task)
+    if results.has_video:
+        photographs = list(ready.cameras.values())
+        write_comparison_video(folder, completion, photographs, ready.completer.renderer)
+    if results.suffix is not None:
+        given = None if ready.work.splat is None else ready.work.splat.path
+        # An earlier result in OUT may be the input, and is replaced.
+        if given is not None and results.out.resolve() in given.resolve().parents:
+            given = None
+        summary = keep_small(folder, results.suffix, summary, given)
     return summary
 
 
-def plan_folder(options: CompleteOptions, prepare: Prepare) -> None:
+def plan_targets(request: PlanRequest) -> int:
     """Write the targets and print the plan, without completing the scene.
 
     The hole fraction of each target is that after those before it are completed.
     """
-    with open_completion(options, prepare) as (ready, folder):
-        begun = ready.begin()
-        targets = ready.task.target_cameras
-        if targets:
-            holes = ready.explorer.compute_hole_fractions(begun, targets)
-        else:
-            cameras = list(ready.cameras.values())
-            choices = ready.explorer.plan(begun, cameras, ready.options.max_targets)
-            ready = ready.with_choices(choices)
-            holes = [choice.hole_fraction for choice in choices]
-        write_targets(folder, ready.task)
-        write_render_cameras(folder, ready)
-        if ready.task.targets:
-            write_plan_pictures(folder / IMAGES, ready, begun)
-    if options.json:
-        print_json(describe_plan(options, ready.opened, ready.task.targets, holes))
-    elif not options.quiet:
-        print_plan(options, ready.opened, ready.task.targets, holes)
+    results = get_results(request.filling)
+    console = make_console(stderr=True, quiet=results.answer.quiet)
+    with (
+        show_progress(console),
+        reserve_output(results.out, results.overwrite, COMMAND, RESULTS) as output,
+    ):
+        refuse_results(results.out)
+        print_lines(console, *output.describe_others())
+        ready = prepare(request.filling, console)
+        print_lines(console, *describe_work(ready))
+        with output.write() as folder:
+            begun = ready.begin()
+            targets = ready.task.target_cameras
+            if targets:
+                holes = ready.explorer.compute_hole_fractions(begun, targets)
+            else:
+                cameras = list(ready.cameras.values())
+                choices = ready.explorer.plan(begun, cameras, ready.max_targets)
+                ready = ready.with_choices(choices)
+                holes = [choice.hole_fraction for choice in choices]
+            write_targets(folder, ready.task)
+            write_render_cameras(folder, ready)
+            if ready.task.targets:
+                write_plan_pictures(folder / IMAGES, ready, begun)
+    answer_plan(results, ready.opened, ready.task.targets, holes)
+    return DONE
 
 
-def export_folder(options: CompleteOptions, prepare: Prepare) -> None:
+def export_holes(request: ExportRequest) -> int:
     """Write the holes of the targets to be painted, and print how to go on."""
-    refuse_painted(options.results)
-    if options.path:
+    refuse_painted(request.folder)
+    if request.has_path:
         find_ffmpeg()
-    with open_completion(options, prepare) as (ready, folder):
-        begun = ready.begin()
-        if not ready.task.targets:
-            cameras = list(ready.cameras.values())
-            ready = ready.with_choices(ready.explorer.plan(begun, cameras, options.max_targets))
-        lines = write_holes(folder, ready, begun)
-    if options.json:
-        content = json.loads((options.results / HOLES_FILE).read_bytes())
-        print_json({"out": str(options.results), "notes": list(lines), "holes": content})
-    elif not options.quiet:
-        print_export(options, lines)
+    results = get_results(request.filling)
+    console = make_console(stderr=True, quiet=results.answer.quiet)
+    with (
+        show_progress(console),
+        reserve_output(request.folder, results.overwrite, COMMAND, EXPORTED) as output,
+    ):
+        print_lines(console, *output.describe_others())
+        ready = prepare(request.filling, console)
+        print_lines(console, *describe_export(ready, request.folder))
+        with output.write() as folder:
+            begun = ready.begin()
+            if not ready.task.targets:
+                cameras = list(ready.cameras.values())
+                choices = ready.explorer.plan(begun, cameras, ready.max_targets)
+                ready = ready.with_choices(choices)
+            lines = write_holes(folder, ready, begun, request.has_path)
+    answer_export(request, results.answer, lines)
+    return DONE
 
 
 def write_plan_pictures(folder: Path, ready: Prepared, begun: Completion) -> None:
@@ -171,60 +233,28 @@ def write_plan_pictures(folder: Path, ready: Prepared, begun: Completion) -> Non
             write_images(folder, f"target{number}", {"beside": beside.image})
 
 
-@contextmanager
-def open_completion(
-    options: CompleteOptions, prepare: Prepare, takes_over: bool = False
-) -> Iterator[tuple[Prepared, Path]]:
-    """Reserve the output folder, load everything, print the input, and open the folder.
-
-    `takes_over` is that of `reserve_output`.
-    """
-    console = make_console(stderr=True, quiet=options.quiet)
-    with (
-        show_progress(console),
-        reserve_output(
-            options.results, options.overwrite, COMMAND, list_results(options), takes_over
-        ) as output,
-    ):
-        if options.dry_run:
-            refuse_results(options.out)
-        print_lines(console, *output.describe_others())
-        ready = prepare(options, console)
-        plan = describe_task(
-            ready.opened,
-            ready.task,
-            options.max_targets,
-            describe_models(ready.options),
-            options.results,
-            describe_doing(ready),
-        )
-        print_lines(console, *plan)
-        with output.write() as folder:
-            yield ready, folder
+def describe_work(ready: Prepared) -> list[str]:
+    """Write the lines before a completion."""
+    models = ready.work.models
+    settings = models.generator_settings
+    names = models.reconstructor
+    if isinstance(settings, PaintedSettings):
+        names += f" and images of {quote_value(settings.painter)}"
+    elif ready.targets is not None:
+        names += f" and {models.generator}"
+    return describe_task(ready.opened, ready.task, ready.max_targets, names, ready.results.out)
 
 
-def list_results(options: CompleteOptions) -> tuple[str, ...]:
-    """List globs of the files that a command may write to its folder."""
-    return RESULTS if options.export_holes is None else EXPORTED
-
-
-def describe_doing(ready: Prepared) -> str:
-    """Say what is done with the scene, for the lines before the work."""
-    if ready.options.export_holes is not None:
-        return "export holes of the scene"
-    if ready.command == "remove":
-        return "remove the selection and fill its place"
-    return "complete the scene"
-
-
-def describe_models(options: CompleteOptions) -> str:
-    """Name Ψ and Φ for the lines before the work."""
-    if options.from_photographs_only or options.export_holes is not None:
-        return options.reconstructor
-    if options.images is None:
-        return f"{options.reconstructor} and {options.synthesis.generator}"
-    painter = options.painter or "an unnamed painter"
-    return f"{options.reconstructor} and images of {quote_value(painter)}"
+def describe_export(ready: Prepared, folder: Path) -> list[str]:
+    """Write the lines before an export."""
+    return describe_task(
+        ready.opened,
+        ready.task,
+        ready.max_targets,
+        ready.work.models.reconstructor,
+        folder,
+        "export holes of the scene",
+    )
 
 
 def write_done(
@@ -234,7 +264,7 @@ def write_done(
 
     `command` is that of the record of edits, if it is not that of `ready`.
     """
-    options = ready.options
+    seed = ready.work.models.seed
     task = ready.task
     renderer = ready.completer.renderer
 
@@ -246,22 +276,30 @@ def write_done(
     # Coverage is measured from cameras beside the photographs, not from the targets themselves.
     # They are rendered while the files are written.
     cameras = tuple(ready.cameras.values())
-    aside = sample_held_out_cameras(cameras, options.seed)
-    facts = describe_run(options, ready.opened, task, completion.config, ready.describe_settings())
+    aside = sample_held_out_cameras(cameras, seed)
+    facts = describe_run(
+        ready.source,
+        ready.work.splat,
+        ready.opened,
+        task,
+        completion.config,
+        describe_settings(ready),
+        ready.inverts_masks,
+    )
     with run_in_background(render_pairs, completion, aside, renderer) as looks:
         summary = write_report(
             folder,
             completion,
             task.targets,
             renderer,
-            {**facts, "seed": options.seed},
+            {**facts, "seed": seed},
             task.splat_file,
             cameras,
             looks,
             read_held_out(ready.opened, task, ready.cameras),
             ready.opened.files,
-            has_searched=not options.from_photographs_only,
-            run=describe_maker(options, task, completion),
+            has_searched=ready.targets is not None,
+            run=describe_maker(ready.work.models, task, completion),
             testing=[completion.with_depth_range(camera) for camera in task.witnesses.testing],
             edit=EditDraft(command or ready.command, describe_edit(ready)),
         )
@@ -276,7 +314,7 @@ def describe_edit(ready: Prepared) -> dict[str, Any]:
     Paths are without their folders, which tell about the machine.
     """
     files = ready.opened.files
-    settings = ready.describe_settings()
+    settings = describe_settings(ready)
     # Those of a place are numbers, in the coordinates of the splat's file.
     place = {name: settings[name] for name in REGIONS if settings.get(name)}
     named = {name: settings[name] for name in NAMED_FILES if settings.get(name)}
@@ -290,8 +328,8 @@ def describe_edit(ready: Prepared) -> dict[str, Any]:
         **{name: strip_folders(value) for name, value in named.items()},
         "cameras": cameras,
         "photographs": [files.get(frame) for frame in ready.task.context_frames],
-        "reconstructor": strip_folders(ready.options.reconstructor),
-        "generator": strip_folders(ready.options.synthesis.generator),
+        "reconstructor": strip_folders(ready.work.models.reconstructor),
+        "generator": strip_folders(ready.work.models.generator),
     }
 
 
@@ -305,10 +343,10 @@ def strip_folders(value: str | Sequence[str]) -> str | list[str]:
 def complete_targets(ready: Prepared) -> tuple[Completion, Prepared]:
     """Complete the scene for the named targets, or for targets that it finds."""
     task = ready.task
-    count = ready.options.max_targets
+    count = ready.max_targets
 
     # What photographs show is added when the completion begins, before any target.
-    if ready.options.from_photographs_only:
+    if ready.targets is None:
         return ready.begin(), ready
 
     # Too many targets for the labels of a .ply are refused before the first one is completed.

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
-from gscompleter.apps.commands.complete import CompleteOptions
-from gscompleter.apps.commands.demo import DemoOptions
 from gscompleter.apps.completing.complete import complete_folder
 from gscompleter.apps.completing.printing import answer_completion
 from gscompleter.apps.inputs.describing import print_lines
-from gscompleter.apps.report.completion import join_images
+from gscompleter.apps.report.pictures import join_images
+from gscompleter.apps.requests.answer import AnswerRequest
+from gscompleter.apps.requests.completion import (
+    CompletionRequest,
+    ResultsRequest,
+    TargetRequest,
+    WorkRequest,
+)
+from gscompleter.apps.requests.models import ModelRequest
+from gscompleter.apps.requests.scene import PhotographsRequest, PosesRequest, SceneRequest
 from gscompleter.data.demo_scene import write_motorcycle_scene
 from gscompleter.system.console import make_console
 from gscompleter.system.files.image import read_image, write_image
@@ -32,36 +38,38 @@ def name_scene(summary: Path, scene: Path) -> None:
     summary.write_bytes(json.dumps(content, indent=2).encode() + b"\n")
 
 
-def complete_demo(options: DemoOptions) -> None:
+def complete_demo(models: ModelRequest, results: ResultsRequest) -> None:
     """Write the scene, complete it for both targets, and join before and after."""
+    answer = results.answer
+    out = results.out
     with (
-        reserve_output(options.out, options.overwrite, COMMAND, RESULTS) as output,
+        reserve_output(out, results.overwrite, COMMAND, RESULTS) as output,
         output.write() as folder,
     ):
-        print_lines(make_console(stderr=True, quiet=options.quiet), *output.describe_others())
+        print_lines(make_console(stderr=True, quiet=answer.quiet), *output.describe_others())
         scene = folder / "scene"
         write_motorcycle_scene(scene)
-        complete_options = CompleteOptions(
-            folder=scene,
-            context=(0, 1),
-            target=(str(scene / "targets.json"),),
-            out=folder / "completion",
-            resolution=RESOLUTION,
-            device=options.device,
-            seed=options.seed,
-            quiet=options.quiet,
+        inside = ResultsRequest(out=folder / "completion", answer=AnswerRequest(answer.quiet))
+        complete_folder(
+            CompletionRequest(
+                source=PhotographsRequest(
+                    SceneRequest(scene, resolution=RESOLUTION), PosesRequest(inside.out), (0, 1)
+                ),
+                work=WorkRequest(models=models),
+                targets=TargetRequest((str(scene / TARGETS_FILE),)),
+                results=inside,
+            )
         )
-        complete_folder(complete_options)
-        name_scene(folder / "completion" / SUMMARY_FILE, options.out / "scene")
+        name_scene(inside.out / SUMMARY_FILE, out / "scene")
 
         # One row of four images: before and after at the first target, then at the second.
-        images = folder / "completion" / "images"
+        images = inside.out / "images"
         names = [f"target{n}_{when}" for n in (1, 2) for when in ("before", "after")]
         picture = join_images([read_image(images / f"{name}.png") for name in names])
         write_image(folder / PICTURE_FILE, picture)
 
     # `output.write` has moved the results from its temporary folder to OUT by now.
-    done = replace(complete_options, out=options.out / "completion", json=options.json)
-    answer_completion(done, {"before_after": str(options.out / PICTURE_FILE)})
-    if not options.quiet and not options.json:
-        print(f"Before and after, beyond either camera: {options.out / PICTURE_FILE}")
+    done = ResultsRequest(out=out / "completion", answer=answer)
+    answer_completion(done, {"before_after": str(out / PICTURE_FILE)})
+    if not answer.quiet and not answer.json:
+        print(f"Before and after, beyond either camera: {out / PICTURE_FILE}")

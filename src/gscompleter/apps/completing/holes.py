@@ -76,11 +76,12 @@ def refuse_painted(folder: Path) -> None:
             )
 
 
-def write_holes(folder: Path, ready: Prepared, begun: Completion) -> list[str]:
+def write_holes(folder: Path, ready: Prepared, begun: Completion, has_path: bool) -> list[str]:
     """Write the files of an export; return the lines about targets that have no hole.
 
     All targets are seen in the scene as it is, so that a hole which several of them see is exported
-    with each. Raise InputError if no target has a hole.
+    with each. `has_path` is True for a video along the targets. Raise InputError if no
+    target has a hole.
     """
     exported = []
     skipped = []
@@ -99,7 +100,7 @@ def write_holes(folder: Path, ready: Prepared, begun: Completion) -> list[str]:
     unit = (farthest or 1.0) / DEPTH_STEPS
     rows = [write_hole(folder, hole, unit, ready) for hole in exported]
     path = None
-    if ready.options.path:
+    if has_path:
         targets = [begun.with_depth_range(hole.target.camera) for hole in exported]
         context = [view.camera for view in begun.views]
         planned = plan_path(context, targets, list(ready.cameras.values()))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.inputs.task import CompletionTask
 from gscompleter.apps.report.run_record import LICENCE, OWN_MODELS, make_run_record
+from gscompleter.apps.requests.models import ModelRequest
 from gscompleter.models.diffusion.published import PE_FIELD, find_usual_licence
 from gscompleter.models.weights.published import PUBLISHED, UNSTATED
 from gscompleter.splats.provenance import ModelRecord, RunRecord, shorten
@@ -19,17 +19,14 @@ PUBLISHED_BY_AUTHORS = {
 """Generators whose default weights are not in the table of published weights."""
 
 
-def describe_maker(
-    options: CompleteOptions, task: CompletionTask, completion: Completion
-) -> RunRecord:
+def describe_maker(models: ModelRequest, task: CompletionTask, completion: Completion) -> RunRecord:
     """Describe a completion as the run that made its files."""
-    synthesis = options.synthesis
-    weights = getattr(synthesis.make_settings(), "weights", None)
+    weights = getattr(models.generator_settings, "weights", None)
     return make_run_record(
         completion,
-        describe_model(options.reconstructor, options.weights),
-        None if options.depth == "none" else describe_model(options.depth, options.depth_weights),
-        describe_model(synthesis.generator, weights),
+        describe_model(models.reconstructor, models.weights),
+        None if models.depth == "none" else describe_model(models.depth, models.depth_weights),
+        describe_model(models.generator, weights),
         None if task.splat_file is None else task.splat_file.path,
     )
 

@@ -17,13 +17,13 @@ from jaxtyping import UInt8
 
 from gscompleter.apps.completing.preparation import Prepared
 from gscompleter.apps.inputs.holes_file import PathRow
-from gscompleter.apps.report.completion import MAX_PHOTOGRAPHS, thin_evenly
 from gscompleter.apps.report.film import (
     FRAMES_PER_SECOND,
     MIN_LEG_SECONDS,
     ONE_WAY_SECONDS,
     plan_camera_path,
 )
+from gscompleter.apps.report.record import MAX_PHOTOGRAPHS, thin_evenly
 from gscompleter.data.scene import describe_camera
 from gscompleter.generators.warp import BORDER_WIDTH
 from gscompleter.numerics.geometry import measure_baseline, pad_camera, resize_camera

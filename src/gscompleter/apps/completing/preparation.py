@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, is_dataclass, replace
+from dataclasses import dataclass, field, is_dataclass, replace
 from functools import partial
-from typing import Any, Literal
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from rich.console import Console
+from torch import Tensor
 
-from gscompleter.apps.commands.complete import CompleteOptions
-from gscompleter.apps.commands.shared_options import SceneOptions, parse_resolution
-from gscompleter.apps.completing.paintings import add_paintings, choose_paintings
 from gscompleter.apps.inputs.captures import RenderRequest
 from gscompleter.apps.inputs.depth_range import (
     apply_scene_range,
@@ -22,80 +21,108 @@ from gscompleter.apps.inputs.depth_range import (
 from gscompleter.apps.inputs.describing import list_missing as list_missing_photographs
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.inputs.memory import check_scene
-from gscompleter.apps.inputs.named_photographs import check_context, check_target_files
+from gscompleter.apps.inputs.named_photographs import check_target_files
 from gscompleter.apps.inputs.opening import choose_working_size, open_scene
+from gscompleter.apps.inputs.paintings import read_paintings
 from gscompleter.apps.inputs.reading import read_task
-from gscompleter.apps.inputs.removal import Selection
 from gscompleter.apps.inputs.renders import open_renders
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.inputs.splat import add_check_views, locate_splat, move_to_splat
 from gscompleter.apps.inputs.taken_out import take_over_edits
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened, Target
+from gscompleter.apps.requests.completion import (
+    CompletionRequest,
+    ResultsRequest,
+    TargetRequest,
+    WorkRequest,
+)
+from gscompleter.apps.requests.models import ModelRequest
+from gscompleter.apps.requests.scene import AloneRequest, PhotographsRequest
+from gscompleter.apps.requests.splat import Selection, SplatRequest
 from gscompleter.apps.warmup import SPLAT_PART, compile_beside, compile_kernels, list_missing
 from gscompleter.completer import GSCompleter
+from gscompleter.config import CompleterConfig
 from gscompleter.data.local_origin import compute_frame_from_photographs
+from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photograph_names import describe_offset
+from gscompleter.editing.cutting import Region
+from gscompleter.editing.removal import remove_gaussians
 from gscompleter.generators import load_generator
+from gscompleter.generators.painted import Painting
 from gscompleter.planning.planner import Choice, ViewPlanner
-from gscompleter.reconstructors import DepthAware, check_reconstructor, load_reconstructor
+from gscompleter.reconstructors import DepthAware, load_reconstructor
 from gscompleter.reconstructors.depth_predictors import StoredDepth
-from gscompleter.render.device import choose_devices
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.alignment.similarity import transform_camera
-from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import find_origin, load_splat
 from gscompleter.splats.morton import sort_nearby
 from gscompleter.stages.context import prepare_single
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.progress import show_preparation
+from gscompleter.system.progress import show_preparation, stage
 from gscompleter.system.timing import record_seconds, timed_stage
-from gscompleter.types import Camera, Gaussians
+from gscompleter.types import Camera, Gaussians, View
 
-PHOTOGRAPH_OPTIONS = {
-    "format": None,
-    "frames": 40,
-    "no_masks": False,
-    "ignore": None,
-    "forget_edits": False,
-}
-"""Options that only photographs can follow, with their defaults."""
+
+@dataclass(frozen=True)
+class Gone:
+    """What a command takes out of the splat before anything is completed."""
+
+    chosen: Bool[Tensor, "n"]
+    contains: Region
+    """Tells points of its place, at whose border Gaussians are cut."""
 
 
 @dataclass(frozen=True)
 class Prepared:
     """Everything that is loaded before the first completion."""
 
-    options: CompleteOptions
+    command: str
+    """The command, for the record of edits."""
+    source: PhotographsRequest | AloneRequest
+    work: WorkRequest
+    targets: TargetRequest | None
+    """None where nothing is invented, as in an update."""
+    results: ResultsRequest
     opened: Opened
     task: CompletionTask
     explorer: ViewPlanner
     cameras: Mapping[int, Camera]
     """Cameras of all usable photographs by frame, in the frame of the result."""
     seconds: Mapping[str, float]
+    inverts_masks: bool = False
+    """True if masks are read the other way round: those of what goes, or else of photographs."""
+    choose_gone: Callable[[Prepared], Gone] | None = None
+    """Chooses what goes before anything is completed; None for nothing."""
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    """Settings of this command alone, for `summary.json`."""
 
     @property
     def completer(self) -> GSCompleter:
         """The completer with its models."""
         return self.explorer.completer
 
+    @property
+    def max_targets(self) -> int:
+        """Most cameras to search for."""
+        return 0 if self.targets is None else self.targets.max_found
+
     def begin(self) -> Completion:
-        """Initialize the context."""
+        """Initialize the context, and take out what goes first."""
+        gone = None
+        if self.choose_gone is not None:
+            # Before the context, so that a wrong selection is refused without waiting for it.
+            with stage("removing"):
+                gone = self.choose_gone(self)
         task = self.task
         begun = self.completer.begin(task.views, task.scene, task.check_views, task.target_cameras)
         guarding = tuple(begun.with_depth_range(camera) for camera in task.witnesses.guarding)
-        return replace(begun, free_space_cameras=guarding)
-
-    @property
-    def command(self) -> str:
-        """The command, for the record of edits."""
-        return "update" if self.options.from_photographs_only else "complete"
-
-    # `PreparedRemoval` adds the selection to them.
-    def describe_settings(self) -> dict[str, Any]:
-        """Describe the settings of targets and models for `summary.json`."""
-        return describe_settings(self.options)
+        begun = replace(begun, free_space_cameras=guarding)
+        if gone is None:
+            return begun
+        with stage("removing"):
+            return remove_gaussians(begun, gone.chosen, gone.contains, self.completer.scenes)
 
     def with_choices(self, choices: Iterable[Choice]) -> Prepared:
         """Return a copy with chosen candidates as targets."""
@@ -111,90 +138,150 @@ class Prepared:
         return replace(self, task=replace(self.task, targets=targets))
 
 
+@dataclass(frozen=True)
+class Loaded:
+    """A scene that was read, with its models."""
+
+    opened: Opened
+    task: CompletionTask
+    completer: GSCompleter
+    cameras: Mapping[int, Camera]
+    """Cameras of all usable photographs by frame, in the frame of the result."""
+    seconds: Mapping[str, float]
+    """Seconds that count as those of the context stage."""
+
+
+@dataclass(frozen=True)
+class Marks:
+    """Masks that mark what is wrong at the targets."""
+
+    masks: tuple[Path, ...] = ()
+    reading: MaskReading = MaskReading()
+
+
 def prepare_completion(
-    options: CompleteOptions, console: Console, place: Selection | None = None
+    request: CompletionRequest,
+    console: Console,
+    marks: Marks = Marks(),
+    place: Selection | None = None,
 ) -> Prepared:
     """Open the scene and load the models.
 
-    `place` is what will be removed, around which cameras are found if there are no photographs.
+    `marks` and `place` say what will go. Around a place cameras are found if there are no
+    photographs; what is marked is the hole.
     """
-    options = check_options(options)
-    if options.folder is None:
-        options, opened, task = read_splat_alone(options, place)
-        task = add_paintings(task, options, opened)
+    source = request.source
+    work = request.work
+    targets = request.targets
+    check_models(work)
+    if isinstance(source, AloneRequest):
+        opened, task, config = read_splat_alone(work, source, targets, marks, place)
         print_lines(console, *opened.photographs.notes)
     else:
-        # With photographs, a scene is what they show, unless the user says otherwise.
-        options = options if options.holes == "auto" else with_holes(options, options.holes)
-        opened = open_for_completion(options, console)
-        task = read_inputs(options, opened)
-    return load_models(options, opened, task, console)
-
-
-def check_options(options: CompleteOptions) -> CompleteOptions:
-    """Refuse what is wrong whatever the scene is; return the options with the chosen devices."""
-    check_context(options.context)
-    options = check_photographs(options)
-    check_targets(options)
-    options = choose_paintings(options)
-    check_reconstructor(options.reconstructor)
-    options.synthesis.make_settings()
-    devices = choose_devices(options.device, options.renderer_device, options.network_device)
-    options = replace(
-        options,
-        device=devices.renderer,
-        renderer_device=devices.renderer,
-        network_device=devices.networks,
+        config = work.config
+        opened = open_for_completion(work, source, targets, console)
+        task = read_inputs(work, source, targets, opened)
+    loaded = load_models(work, config, targets, opened, task, console)
+    return Prepared(
+        request.command,
+        source,
+        work,
+        targets,
+        request.results,
+        loaded.opened,
+        loaded.task,
+        ViewPlanner(loaded.completer),
+        loaded.cameras,
+        loaded.seconds,
+        source.scene.masks.is_inverted,
     )
-    if options.scene is not None:
-        options = replace(options, scene=resolve_splat(options.scene))
-    # What is wrong with a model is told before kernels are compiled, which takes a minute or two.
+
+
+def check_models(work: WorkRequest) -> None:
+    """Refuse what is wrong with a model before kernels are compiled, which takes minutes."""
     # Where there are kernels, it is told soon enough when the photographs are read.
-    if list_missing(list_parts(options)):
-        load_completer(options, ())
-    return options
+    if list_missing(list_parts(work)):
+        load_completer(work.models, work.config, ())
 
 
-def list_parts(options: CompleteOptions) -> list[str]:
+def list_parts(work: WorkRequest) -> list[str]:
     """List the parts whose kernels a completion needs."""
-    parts = [options.device, options.reconstructor, options.synthesis.generator]
-    return [*parts, SPLAT_PART] if options.scene is not None and "cpu" in parts else parts
+    models = work.models
+    parts = [models.device, models.reconstructor, models.generator]
+    return [*parts, SPLAT_PART] if work.splat is not None and "cpu" in parts else parts
 
 
-def open_for_completion(options: CompleteOptions, console: Console) -> Opened:
+def open_for_completion(
+    work: WorkRequest,
+    photographs: PhotographsRequest,
+    targets: TargetRequest,
+    console: Console,
+) -> Opened:
     """Open the photographs, after reading what can be wrong without their cameras."""
-    opened = open_input(options, console, partial(check_completion_inputs, options))
-    if not options.config.ego_mask:
+    check = partial(check_completion_inputs, work, photographs, targets)
+    opened = open_input(photographs, work.splat, console, check)
+    if not work.config.ego_mask:
         opened = replace(opened, photographs=opened.photographs.keep_ego_vehicle())
     return opened
 
 
-def read_inputs(options: CompleteOptions, opened: Opened) -> CompletionTask:
+def read_inputs(
+    work: WorkRequest,
+    photographs: PhotographsRequest,
+    targets: TargetRequest,
+    opened: Opened,
+) -> CompletionTask:
     """Read the context and the targets, and add the input splat; compile the kernels."""
-    device = options.device
-    has_splat = options.scene is not None
-    with compile_beside(list_parts(options)):
+    device = work.models.device
+    splat = work.splat
+    given = None
+    with compile_beside(list_parts(work)):
         with show_preparation("reading photographs"):
-            task = read_task(opened, options.context, options.target, device, has_splat)
-            task = add_paintings(task, options, opened)
-        given = read_splat(task, options, opened) if has_splat else None
-    if given is None:
+            has_splat = splat is not None
+            task = read_task(opened, photographs.context, targets.named, device, has_splat)
+            task = add_paintings(task, targets, opened)
+        if splat is not None:
+            with show_preparation("reading the scene"):
+                task = add_check_views(task, opened)
+                given = read_splat(splat)
+                if device == "cpu":
+                    check_scene(task, given)
+    if splat is None or given is None:
         return task
-    return add_splat(*given, options, opened)
+    return add_splat(task, splat, given, opened)
+
+
+def add_paintings(task: CompletionTask, targets: TargetRequest, opened: Opened) -> CompletionTask:
+    """Add the painted images to the targets of a task, if there are any."""
+    if targets.images is None:
+        return task
+    resolution = opened.request.resolution
+    painted = read_paintings(task.targets, opened.photographs, resolution, targets.images)
+    return replace(task, targets=painted)
 
 
 def load_models(
-    options: CompleteOptions, opened: Opened, task: CompletionTask, console: Console
-) -> Prepared:
-    """Load the models, and set the depth range of the photographs."""
+    work: WorkRequest,
+    config: CompleterConfig,
+    targets: TargetRequest,
+    opened: Opened,
+    task: CompletionTask,
+    console: Console,
+) -> Loaded:
+    """Load the models, and set the depth range of the photographs.
+
+    `config` is that of the request, with what was found of a splat alone.
+    """
+    models = work.models
     # Only here, because the oracle is given the photographs of the targets.
     with show_preparation("loading models"):
-        completer = load_completer(options, task.targets)
-    completer, task = use_predicted_depth(options, completer, task)
+        known = [t.view if targets.images is None else t.placed_painting for t in task.targets]
+        completer = load_completer(models, config, [image for image in known if image is not None])
+    completer, task = use_predicted_depth(models, completer, task)
     reconstructor = completer.reconstructor
 
     # A single photograph has no stereo, so a network predicts its depth; a splat needs neither.
-    if options.scene is None:
+    if work.splat is None:
         try:
             task = replace(task, views=prepare_single(reconstructor, task.views))
         except InputError as error:
@@ -210,21 +297,19 @@ def load_models(
     # The depth range is counted as a part of the context stage, whose seconds it is added to.
     with show_preparation("depth range"), record_seconds() as seconds, timed_stage("context"):
         notes: tuple[str, ...] = ()
-        if task.scene is None:
+        if work.splat is None or task.scene is None:
             task, notes = apply_scene_range(task, reconstructor)
         else:
             task = apply_splat_range(task, task.scene, completer.renderer)
             # Renders of the splat itself show nothing that it lacks.
             if opened.renders_from is None:
-                task, notes = take_over_edits(task, options.forget_edits, completer.renderer)
+                task, notes = take_over_edits(task, work.splat.forget_edits, completer.renderer)
     print_lines(console, *notes)
-
-    cameras = collect_cameras(opened, task)
-    return Prepared(options, opened, task, ViewPlanner(completer), cameras, seconds)
+    return Loaded(opened, task, completer, collect_cameras(opened, task), seconds)
 
 
 def use_predicted_depth(
-    options: CompleteOptions, completer: GSCompleter, task: CompletionTask
+    models: ModelRequest, completer: GSCompleter, task: CompletionTask
 ) -> tuple[GSCompleter, CompletionTask]:
     """Let predicted depth that lies beside the photographs support stereo, or say why it does not.
 
@@ -234,125 +319,65 @@ def use_predicted_depth(
     if not task.predicted_depths:
         return completer, task
     is_aware = isinstance(reconstructor, DepthAware) and is_dataclass(reconstructor)
-    if options.depth == "none" and is_aware:
+    if models.depth == "none" and is_aware:
         stored = StoredDepth(task.predicted_depths)
         supported = replace(reconstructor, predict_depth=stored)  # type: ignore[type-var]
         return replace(completer, reconstructor=supported), task
-    reason = f"the reconstructor {options.reconstructor} takes none"
+    reason = f"the reconstructor {models.reconstructor} takes none"
     if is_aware:
-        reason = f"--depth {options.depth} takes its place"
+        reason = f"--depth {models.depth} takes its place"
     note = f"Inverse depth that only supports stereo is not used: {reason}."
     return completer, replace(task, depth_notes=(*task.depth_notes, note))
 
 
-def open_input(options: SceneOptions, console: Console, check: Callable[[], object]) -> Opened:
+def open_input(
+    photographs: PhotographsRequest,
+    splat: SplatRequest | None,
+    console: Console,
+    check: Callable[[], object],
+) -> Opened:
     """Open the photographs, and choose their working size unless it is given.
 
     `check` is that of `open_scene`.
     """
-    opened = open_scene(options.make_scene_request(), options.make_poses_request(), console, check)
+    opened = open_scene(photographs.scene, photographs.poses, console, check)
+    if splat is None:
+        return opened
     # Photographs in the map of a splat are relative to its origin from here on.
-    origin = None if options.scene is None else find_origin(options.scene)
+    origin = find_origin(splat.path)
     if origin is not None:
         opened = replace(opened, photographs=opened.photographs.at_origin(np.array(origin)))
-    if options.scene is not None and options.resolution is None:
-        opened = choose_working_size(opened, options.scene, console)
+    if photographs.scene.follows_training:
+        opened = choose_working_size(opened, splat.path, console)
     return opened
 
 
-def check_photographs(options: CompleteOptions) -> CompleteOptions:
-    """Refuse what does not fit the photographs or their absence.
-
-    A splat that is named as SCENE is returned as `scene`.
-    """
-    if not options.lacks_photographs:
-        if options.cameras is not None:
-            raise InputError(
-                "The photographs of SCENE have cameras of their own; leave --cameras out, or name "
-                "the splat alone.",
-                "cameras",
-            )
-        if options.up is not None:
-            raise InputError(
-                "The photographs of SCENE tell what is up; leave --up out.",
-                "up",
-            )
-        return options
-    if options.folder is not None and options.scene is not None:
-        raise InputError(
-            f"Two splats are named, {quote_value(options.folder, 80)} and "
-            f"{quote_value(options.scene, 80)}; name one, and as SCENE only its photographs.",
-            "scene",
-        )
-    if options.folder is None and options.scene is None:
-        raise InputError(
-            "Nothing is named that is to be completed; name SCENE, the folder of photographs, or "
-            "a splat."
-        )
-    for name, default in PHOTOGRAPH_OPTIONS.items():
-        if getattr(options, name) != default:
-            raise InputError(
-                "There are no photographs to apply this to; name their folder as SCENE.", name
-            )
-    if options.invert_masks and not options.has_marks:
-        raise InputError(
-            "There are no photographs whose masks could be read the other way round, and no --mask "
-            "is given; leave it out.",
-            "invert-masks",
-        )
-    if options.large_masks and not options.has_marks:
-        raise InputError("There are no masks that could be too large; leave it out.", "large-masks")
-    return replace(options, folder=None, scene=options.scene or options.folder)
-
-
-def check_targets(options: CompleteOptions) -> None:
-    """Refuse options for targets that exclude each other."""
-    if options.target and options.auto is not None:
-        raise InputError(
-            "--target and --auto are both given; use one of them, and complete the result again "
-            "with the other.",
-            "auto",
-        )
-    if options.from_photographs_only and not options.config.add_observed:
-        raise InputError(
-            "With config.add_observed off nothing is added from photographs, as in the config "
-            "paper; choose another config.",
-            "config",
-        )
-
-
-def check_completion_inputs(options: CompleteOptions) -> None:
+def check_completion_inputs(
+    work: WorkRequest, photographs: PhotographsRequest, targets: TargetRequest
+) -> None:
     """Read what can be read without the cameras of the photographs, and refuse it if it is wrong.
 
     It takes seconds, and the search for cameras after it minutes.
     """
-    load_completer(options, ())
-    check_target_files(options.target, parse_resolution(options.resolution))
-    if options.scene is not None:
-        load_splat(options.scene, options.drop_nonfinite, options.ignore_properties)
+    load_completer(work.models, work.config, ())
+    check_target_files(targets.named, photographs.scene.resolution)
+    if work.splat is not None:
+        read_splat(work.splat)
 
 
-def read_splat(
-    task: CompletionTask, options: CompleteOptions, opened: Opened
-) -> tuple[CompletionTask, Gaussians]:
-    """Read the input splat, and add check views to the task."""
-    assert options.scene is not None
-    with show_preparation("reading the scene"):
-        task = add_check_views(task, opened)
-        gaussians = load_splat(options.scene, options.drop_nonfinite, options.ignore_properties)
-        if options.device == "cpu":
-            check_scene(task, gaussians)
-    return task, gaussians
+def read_splat(splat: SplatRequest) -> Gaussians:
+    """Read the Gaussians of a splat."""
+    return load_splat(splat.path, splat.drop_nonfinite, splat.ignore_properties)
 
 
 def add_splat(
-    task: CompletionTask, gaussians: Gaussians, options: CompleteOptions, opened: Opened
+    task: CompletionTask, splat: SplatRequest, gaussians: Gaussians, opened: Opened
 ) -> CompletionTask:
     """Add the input splat to the task."""
-    assert options.scene is not None
     with show_preparation("aligning the scene"):
-        splat_file = locate_splat(options.scene, options.drop_nonfinite)
-        gaussians, splat_file = sort_splat(gaussians, splat_file)
+        gaussians, splat_file = sort_splat(
+            gaussians, locate_splat(splat.path, splat.drop_nonfinite)
+        )
         return move_to_splat(task, gaussians, splat_file, opened)
 
 
@@ -369,33 +394,37 @@ def sort_splat(
 
 
 def read_splat_alone(
-    options: CompleteOptions, place: Selection | None
-) -> tuple[CompleteOptions, Opened, CompletionTask]:
+    work: WorkRequest,
+    source: AloneRequest,
+    targets: TargetRequest,
+    marks: Marks,
+    place: Selection | None,
+) -> tuple[Opened, CompletionTask, CompleterConfig]:
     """Read a splat without photographs, and render it in their place; compile the kernels.
 
-    Returns the options with what a hole of this splat is, and with its padding.
+    Also returns the config with what a hole of this splat is, and with its padding.
     """
-    assert options.scene is not None
-    device = options.device
+    splat = work.splat
+    assert splat is not None
+    device = work.models.device
     # What can be wrong is read before anything that takes time.
-    load_completer(options, ())
+    load_completer(work.models, work.config, ())
     with show_preparation("reading the scene"):
-        gaussians = load_splat(options.scene, options.drop_nonfinite, options.ignore_properties)
-        splat_file = locate_splat(options.scene, options.drop_nonfinite)
+        gaussians = read_splat(splat)
+        splat_file = locate_splat(splat.path, splat.drop_nonfinite)
         gaussians, splat_file = sort_splat(gaussians, splat_file)
-    compile_kernels(list_parts(options))
+    compile_kernels(list_parts(work))
 
-    reading = replace(options, folder=options.scene).make_scene_request()
     request = RenderRequest(
-        reading,
-        options.cameras,
-        options.target,
-        options.context,
-        options.marks,
-        options.mark_reading,
-        options.config.holes,
-        options.holes,
-        options.up,
+        source.scene,
+        source.cameras,
+        targets.named,
+        source.context,
+        marks.masks,
+        marks.reading,
+        work.config.holes,
+        source.holes,
+        source.up,
         place,
     )
     with show_preparation("choosing cameras"):
@@ -403,39 +432,35 @@ def read_splat_alone(
         opened, task, kind = open_renders(request, splat_file, gaussians, renderer, device)
         if device == "cpu":
             check_scene(task, gaussians)
-    options = replace(options, config=options.config.choose_margin(kind.is_lifted))
-    return with_holes(options, kind.holes), opened, task
+    config = work.config.choose_margin(kind.is_lifted).for_holes(kind.holes)
+    return opened, add_paintings(task, targets, opened), config
 
 
-def with_holes(options: CompleteOptions, kind: Literal["all", "enclosed"]) -> CompleteOptions:
-    """Return the options with the kind of holes."""
-    config = options.config
-    if kind == "enclosed":
-        return replace(options, config=config.for_object())
-    return replace(options, config=replace(config, holes=replace(config.holes, kind=kind)))
+def load_completer(
+    models: ModelRequest, config: CompleterConfig, images: Sequence[View | Painting]
+) -> GSCompleter:
+    """Load the models of a request.
 
-
-def load_completer(options: CompleteOptions, targets: Sequence[Target]) -> GSCompleter:
-    """Load the models of the options."""
-    # Only the oracle reads the photographs of the targets, and only `painted` what was painted.
-    images = [t.view if options.images is None else t.placed_painting for t in targets]
-    photographs = [image for image in images if image is not None]
-    synthesis = options.synthesis
-    # `check_options` has chosen both devices.
-    networks = options.network_device or options.device
-    config = options.config
-    if options.no_recolor:
-        config = replace(config, recolor=replace(config.recolor, iterations=0))
+    Only the oracle reads the photographs of the targets, and only `painted` what was painted.
+    """
     return GSCompleter(
         load_reconstructor(
-            options.reconstructor, options.weights, networks, options.depth, options.depth_weights
+            models.reconstructor,
+            models.weights,
+            models.network_device,
+            models.depth,
+            models.depth_weights,
         ),
         load_generator(
-            synthesis.generator, options.seed, photographs, networks, synthesis.make_settings()
+            models.generator,
+            models.seed,
+            images,
+            models.network_device,
+            models.generator_settings,
         ),
-        load_renderer(options.device),
+        load_renderer(models.device),
         config,
-        options.seed,
+        models.seed,
     )
 
 
@@ -463,16 +488,19 @@ def collect_cameras(opened: Opened, task: CompletionTask) -> dict[int, Camera]:
     }
 
 
-def describe_settings(options: CompleteOptions) -> dict[str, Any]:
+def describe_settings(ready: Prepared) -> dict[str, Any]:
     """Describe the settings of targets and models for `summary.json`."""
+    models = ready.work.models
+    targets = TargetRequest(max_found=0) if ready.targets is None else ready.targets
     return {
-        "target": list(options.target),
-        "auto": None if options.target else options.max_targets,
-        "reconstructor": options.reconstructor,
-        "weights": None if options.weights is None else str(options.weights),
-        "depth": options.depth,
-        "network_device": options.network_device,
-        **options.synthesis.describe(),
-        "images": None if options.images is None else str(options.images),
-        "uses_target_photographs": options.synthesis.generator == "oracle",
+        "target": list(targets.named),
+        "auto": None if targets.named else targets.max_found,
+        "reconstructor": models.reconstructor,
+        "weights": None if models.weights is None else str(models.weights),
+        "depth": models.depth,
+        "network_device": models.network_device,
+        **models.describe_generator(),
+        "images": None if targets.images is None else str(targets.images),
+        "uses_target_photographs": models.generator == "oracle",
+        **ready.settings,
     }

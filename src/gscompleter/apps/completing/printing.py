@@ -4,21 +4,23 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 from rich.table import Table
 
 from gscompleter.apps.command_line.answers import print_json
-from gscompleter.apps.commands.complete import CompleteOptions
 from gscompleter.apps.completing.keeping import describe_size
-from gscompleter.apps.inputs.holes_file import read_holes
+from gscompleter.apps.inputs.holes_file import HOLES_FILE, read_holes
 from gscompleter.apps.inputs.task import Opened, Target
-from gscompleter.apps.report.completion import IMAGES
 from gscompleter.apps.report.film import VIDEO_FILE
 from gscompleter.apps.report.page import REPORT_FILE
+from gscompleter.apps.report.pictures import IMAGES
 from gscompleter.apps.report.plain_words import group_target_warnings, list_warnings
 from gscompleter.apps.report.schema import CompletionSummary, find_completed, read_summary
+from gscompleter.apps.requests.answer import AnswerRequest
+from gscompleter.apps.requests.completion import ExportRequest, ResultsRequest
 from gscompleter.evaluation.verdict.numbers import format_number, format_percent
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import quote_value
@@ -26,20 +28,20 @@ from gscompleter.system.files.writing import SUMMARY_FILE, TARGETS_FILE
 
 
 def answer_completion(
-    options: CompleteOptions, further: Mapping[str, Any] = MappingProxyType({})
+    results: ResultsRequest, further: Mapping[str, Any] = MappingProxyType({})
 ) -> None:
     """Print a completion for people, or its summary and `further` entries as JSON."""
-    if options.json:
-        summary = json.loads((options.out / SUMMARY_FILE).read_bytes())
-        print_json({"out": str(options.out), **summary, **further})
-    elif not options.quiet:
-        print_completion(options)
+    if results.answer.json:
+        summary = json.loads((results.out / SUMMARY_FILE).read_bytes())
+        print_json({"out": str(results.out), **summary, **further})
+    elif not results.answer.quiet:
+        print_completion(results)
 
 
-def print_completion(options: CompleteOptions) -> None:
+def print_completion(results: ResultsRequest) -> None:
     """Print the scores per camera, the notes, and the location of the results."""
     console = make_console()
-    summary = read_summary(options.out)
+    summary = read_summary(results.out)
     console.print(summary.outcome.headline, soft_wrap=True)
     console.print(make_score_table(summary))
 
@@ -51,7 +53,7 @@ def print_completion(options: CompleteOptions) -> None:
             if len(numbers) == 1:
                 name = summary.targets[numbers[0] - 1].name
                 sentences.append(f"{name}: {' '.join(warnings)}")
-    sentences += describe_result(summary, options)
+    sentences += describe_result(summary, results)
     for sentence in sentences:
         console.print(sentence, soft_wrap=True)
 
@@ -78,22 +80,32 @@ def make_score_table(summary: CompletionSummary) -> Table:
     return table
 
 
-def describe_result(summary: CompletionSummary, options: CompleteOptions) -> Iterator[str]:
+def describe_result(summary: CompletionSummary, results: ResultsRequest) -> Iterator[str]:
     """Write the sentences below the table."""
     counts = summary.gaussians
     seconds = summary.seconds["total"]
     yield (
         f"Added {counts['added']:,} Gaussians to {counts['context']:,} in {seconds:.1f} s: "
-        f"{find_completed(options.out)}"
+        f"{find_completed(results.out)}"
     )
-    yield describe_size(options.out, options.save_as is None)
-    yield f"Report: {options.out / REPORT_FILE}"
-    if options.video and summary.targets:
-        yield f"Video: {options.out / VIDEO_FILE}"
+    yield describe_size(results.out, results.suffix is None)
+    yield f"Report: {results.out / REPORT_FILE}"
+    if results.has_video and summary.targets:
+        yield f"Video: {results.out / VIDEO_FILE}"
+
+
+def answer_plan(
+    results: ResultsRequest, opened: Opened, targets: Sequence[Target], holes: Sequence[float]
+) -> None:
+    """Print the targets and their holes for people, or as JSON."""
+    if results.answer.json:
+        print_json(describe_plan(results.out, opened, targets, holes))
+    elif not results.answer.quiet:
+        print_plan(results.out, opened, targets, holes)
 
 
 def describe_plan(
-    options: CompleteOptions, opened: Opened, targets: Sequence[Target], holes: Sequence[float]
+    out: Path, opened: Opened, targets: Sequence[Target], holes: Sequence[float]
 ) -> dict[str, Any]:
     """Describe the targets and their holes as JSON."""
     rows = [
@@ -101,14 +113,14 @@ def describe_plan(
         for target, hole in zip(targets, holes, strict=True)
     ]
     return {
-        "out": str(options.out),
-        "cameras": str(options.out / TARGETS_FILE) if rows else None,
+        "out": str(out),
+        "cameras": str(out / TARGETS_FILE) if rows else None,
         "targets": rows,
     }
 
 
 def print_plan(
-    options: CompleteOptions, opened: Opened, targets: Sequence[Target], holes: Sequence[float]
+    out: Path, opened: Opened, targets: Sequence[Target], holes: Sequence[float]
 ) -> None:
     """Print the targets and their holes."""
     console = make_console()
@@ -119,27 +131,35 @@ def print_plan(
     for number, (target, hole) in enumerate(zip(targets, holes, strict=True), 1):
         table.add_row(f"{number}: {opened.name_target(target)}", format_percent(hole))
     console.print(table)
-    console.print(f"Edit the cameras in {quote_value(options.out / TARGETS_FILE)}.", soft_wrap=True)
+    console.print(f"Edit the cameras in {quote_value(out / TARGETS_FILE)}.", soft_wrap=True)
     # New photographs from there are the best help, and `update` adds what they show.
     console.print(
-        "What each camera sees now, and the photograph beside it: "
-        f"{quote_value(options.out / IMAGES)}",
+        f"What each camera sees now, and the photograph beside it: {quote_value(out / IMAGES)}",
         soft_wrap=True,
     )
 
 
-def print_export(options: CompleteOptions, lines: Sequence[str]) -> None:
+def answer_export(request: ExportRequest, answer: AnswerRequest, lines: Sequence[str]) -> None:
+    """Print an export for people, or its `holes.json` and lines as JSON."""
+    if answer.json:
+        content = json.loads((request.folder / HOLES_FILE).read_bytes())
+        print_json({"out": str(request.folder), "notes": list(lines), "holes": content})
+    elif not answer.quiet:
+        print_export(request, lines)
+
+
+def print_export(request: ExportRequest, lines: Sequence[str]) -> None:
     """Print what was exported, and how to go on."""
     console = make_console()
-    folder = options.results
+    folder = request.folder
     holes = read_holes(folder)
     table = Table("image", "hole", box=None)
     for row in holes.frames:
         table.add_row(row.image_path, format_percent(row.hole_fraction))
     console.print(table)
     replaced = ["--export-holes"]
-    replaced += ["--path"] if options.path else []
-    replaced += [] if options.auto is None else ["--auto"]
+    replaced += ["--path"] if request.has_path else []
+    replaced += ["--auto"] if request.names_number else []
     sentences = [
         *lines,
         f"Nothing was completed. The holes are in {quote_value(folder)}: paint each image where "

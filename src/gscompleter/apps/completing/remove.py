@@ -2,101 +2,77 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from rich.console import Console
 from torch import Tensor
 
-from gscompleter.apps.commands.remove import RemoveOptions
-from gscompleter.apps.completing.preparation import Prepared, prepare_completion
+from gscompleter.apps.completing.preparation import Gone, Prepared, prepare_completion
 from gscompleter.apps.inputs.removal import (
-    Selection,
     check_removal_masks,
     check_selection,
     choose_gaussians,
     find_in_region,
     widen_regions,
 )
-from gscompleter.editing.removal import remove_gaussians
+from gscompleter.apps.requests.completion import RemovalRequest
+from gscompleter.apps.requests.splat import Selection
 from gscompleter.planning.photographs import PhotographPlanner
-from gscompleter.state import Completion
-from gscompleter.system.progress import stage
-
-SELECTIONS = ("box", "box_rotation", "sphere", "mask", "select")
 
 
-@dataclass(frozen=True)
-class PreparedRemoval(Prepared):
-    """A completion that begins with the removal."""
-
-    options: RemoveOptions
-
-    @cached_property
-    def selection(self) -> Selection:
-        """The Gaussians to remove, as the options select them, with the margin of regions."""
-        assert self.task.scene is not None
-        return widen_regions(make_selection(self.options), self.task.scene, self.task.origin)
-
-    def begin(self) -> Completion:
-        """Initialize the context, and remove the selected Gaussians from it."""
-        completer = self.completer
-        # Before the context, so that a wrong selection is refused without waiting for it.
-        with stage("removing"):
-            chosen = choose_gaussians(
-                self.selection, self.task, self.opened, self.cameras, completer.renderer
-            )
-        begun = super().begin()
-        with stage("removing"):
-            # Gaussians that reach out of a box or the sphere are cut at its border. Those that a
-            # mask or a file selects go as a whole.
-            return remove_gaussians(begun, chosen, self.contains, completer.scenes)
-
-    def contains(self, points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-        """Find points, in the frame of the result, in the boxes and the sphere."""
-        # The region is given in the coordinates of the file, which float32 may not resolve.
-        origin = torch.from_numpy(self.task.origin).to(points.device)
-        return find_in_region(points.double() + origin, self.selection)
-
-    @property
-    def command(self) -> str:
-        """The command, for the record of edits."""
-        return "remove"
-
-    def describe_settings(self) -> dict[str, Any]:
-        """Describe the settings, with the selection."""
-        selection = {name: getattr(self.options, name) for name in SELECTIONS}
-        # JSON has no paths.
-        texts = {name: str(selection[name]) for name in ("mask", "select") if selection[name]}
-        margin = {"margin": self.selection.margin}
-        return {**super().describe_settings(), **selection, **texts, **margin}
-
-
-def prepare_removal(options: RemoveOptions, console: Console) -> PreparedRemoval:
+def prepare_removal(request: RemovalRequest, console: Console) -> Prepared:
     """Open the scene, and load the models; targets are searched for among the photographs."""
-    selection = make_selection(options)
+    selection = request.selection
     check_selection(selection)
-    ready = prepare_completion(options, console, selection)
+    ready = prepare_completion(request.completion, console, place=selection)
     # Of photographs they were checked as soon as these were opened.
-    if options.mask is not None and options.lacks_photographs:
+    if selection.masks is not None and ready.opened.renders_from is not None:
         names = [frame.name for frame in ready.opened.photographs.frames]
-        check_removal_masks(options.mask, names, options.mark_reading)
+        check_removal_masks(selection.masks, names, selection.mask_reading)
 
-    explorer = PhotographPlanner(ready.completer)
-    return PreparedRemoval(**{**vars(ready), "explorer": explorer})
-
-
-def make_selection(options: RemoveOptions) -> Selection:
-    """Make the selection that the options describe."""
-    return Selection(
-        options.box,
-        options.box_rotation,
-        options.sphere,
-        options.mask,
-        options.select,
-        options.drop_nonfinite,
-        mask_reading=options.mark_reading,
+    assert ready.task.scene is not None
+    widened = widen_regions(selection, ready.task.scene, ready.task.origin)
+    return replace(
+        ready,
+        command=request.command,
+        explorer=PhotographPlanner(ready.completer),
+        inverts_masks=selection.mask_reading.is_inverted,
+        choose_gone=partial(choose_selected, widened),
+        settings=describe_selection(widened),
     )
+
+
+def choose_selected(selection: Selection, ready: Prepared) -> Gone:
+    """Choose the selected Gaussians."""
+    chosen = choose_gaussians(
+        selection, ready.task, ready.opened, ready.cameras, ready.completer.renderer
+    )
+    # Gaussians that reach out of a box or the sphere are cut at its border. Those that a mask or a
+    # file selects go as a whole.
+    return Gone(chosen, partial(contain_points, selection, ready.task.origin))
+
+
+def contain_points(
+    selection: Selection, origin: Float[np.ndarray, "3"], points: Float[Tensor, "n 3"]
+) -> Bool[Tensor, "n"]:
+    """Find points, in the frame of the result, in the boxes and the sphere."""
+    # The region is given in the coordinates of the file, which float32 may not resolve.
+    return find_in_region(points.double() + torch.from_numpy(origin).to(points.device), selection)
+
+
+def describe_selection(selection: Selection) -> dict[str, Any]:
+    """Describe a selection for `summary.json`, with the margin of its regions."""
+    # JSON has no paths.
+    return {
+        "box": selection.boxes,
+        "box_rotation": selection.box_rotation,
+        "sphere": selection.sphere,
+        "mask": selection.masks and str(selection.masks),
+        "select": selection.file and str(selection.file),
+        "margin": selection.margin,
+    }

@@ -13,11 +13,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.apps.commands.shared_options import SceneOptions
 from gscompleter.apps.inputs.describing import describe_missing
 from gscompleter.apps.inputs.selection import select_closest
 from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.apps.report.schema import find_completed
+from gscompleter.apps.requests.scene import (
+    NUM_VIDEO_FRAMES,
+    AloneRequest,
+    PhotographsRequest,
+)
+from gscompleter.apps.requests.splat import SplatRequest
 from gscompleter.config import CleaningConfig, CompleterConfig
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.evaluation.verdict.held_out import HeldOut
@@ -28,31 +33,43 @@ MAX_HELD_OUT = 8
 
 
 def describe_run(
-    options: SceneOptions,
+    source: PhotographsRequest | AloneRequest,
+    given: SplatRequest | None,
     opened: Opened,
     task: CompletionTask,
     config: CompleterConfig | CleaningConfig,
     settings: Mapping[str, Any] = MappingProxyType({}),
+    inverts_masks: bool = False,
 ) -> dict[str, Any]:
-    """Describe the input and all settings that determine the result, with further `settings`."""
+    """Describe the input and all settings that determine the result, with further `settings`.
+
+    `inverts_masks` is True if masks were read the other way round, whichever they are.
+    """
     camera = task.views[0].camera
     resolution = opened.request.resolution
-    splat = None if options.scene is None else str(options.scene)
+    splat = None if given is None else str(given.path)
+    reading = source.scene
+    # Of a splat alone the folder is its file, which is named below, and there is no video.
+    folder: str | None = None
+    num_frames = NUM_VIDEO_FRAMES
+    if isinstance(source, PhotographsRequest):
+        folder = str(reading.folder)
+        num_frames = source.poses.num_frames
     return {
         "settings": {
-            "folder": None if options.folder is None else str(options.folder),
-            "format": options.format,
-            "frames": options.frames,
-            "context": None if options.context is None else list(options.context),
+            "folder": folder,
+            "format": reading.format,
+            "frames": num_frames,
+            "context": None if source.context is None else list(source.context),
             "scene": splat,
             **settings,
             "resolution": "full" if resolution is None else resolution,
-            "near": options.near,
-            "far": options.far,
-            "no_given_depth": options.no_given_depth,
-            "masks": not options.no_masks,
-            "invert_masks": options.invert_masks,
-            "large_masks": options.large_masks,
+            "near": reading.near,
+            "far": reading.far,
+            "no_given_depth": not reading.uses_given_depth,
+            "masks": reading.uses_masks,
+            "invert_masks": inverts_masks,
+            "large_masks": reading.masks.may_be_large,
             "config": asdict(config),
         },
         "device": task.device.type,

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
-from functools import partial
-from typing import Any
+from dataclasses import replace
+from pathlib import Path
 
 from rich.console import Console
 
-from gscompleter.apps.commands.complete import CompleteOptions
-from gscompleter.apps.commands.update import UpdateOptions
-from gscompleter.apps.completing.complete import complete_scene
 from gscompleter.apps.completing.preparation import (
+    Loaded,
     Prepared,
-    check_options,
+    check_models,
     collect_cameras,
     compute_view_transform,
     load_models,
@@ -30,6 +27,13 @@ from gscompleter.apps.inputs.selection import CHECK_VIEW_SIZE, collect_usable_ca
 from gscompleter.apps.inputs.splat import add_check_views
 from gscompleter.apps.inputs.taken_out import hide_taken_out
 from gscompleter.apps.inputs.task import Opened
+from gscompleter.apps.requests.completion import (
+    ResultsRequest,
+    TargetRequest,
+    UpdateRequest,
+)
+from gscompleter.apps.requests.models import ModelRequest
+from gscompleter.apps.requests.scene import Names
 from gscompleter.config import CompleterConfig
 from gscompleter.data.formats import find_format
 from gscompleter.data.sfm.placing import place_photographs
@@ -47,59 +51,59 @@ MIN_LEFT = 2
 """Fewest photographs that are not kept back."""
 
 
-@dataclass(frozen=True)
-class PreparedUpdate(Prepared):
-    """A completion without targets, with the options of the update."""
-
-    update: UpdateOptions
-
-    def describe_settings(self) -> dict[str, Any]:
-        """Describe the settings, with the new photographs and those that are kept back."""
-        photos = self.update.photos
-        return {
-            **super().describe_settings(),
-            "photos": None if photos is None else str(photos),
-            "hold_out": self.update.hold_out,
-        }
+NO_TARGETS = TargetRequest(max_found=0)
 
 
-def update_splat(options: UpdateOptions) -> int:
-    """Update the splat, print a summary, and return the exit code."""
-    return complete_scene(options.make_completion(), partial(prepare_update, options))
-
-
-def prepare_update(
-    update: UpdateOptions, options: CompleteOptions, console: Console
-) -> PreparedUpdate:
+def prepare_update(request: UpdateRequest, console: Console) -> Prepared:
     """Open the scene with new photographs, and choose those that show what the splat lacks."""
-    options = check_options(options)
+    work = request.work
+    source = request.source
+    check_models(work)
     # Cameras for all of SCENE would be searched for minutes, in the folder meant for the new ones.
-    if update.photos is not None and (update.format or find_format(update.folder)) is None:
+    scene = source.scene
+    if request.photos is not None and (scene.format or find_format(scene.folder)) is None:
         raise InputError(
             "SCENE has no cameras to place new photographs among; put all photographs into one "
             "folder, whose cameras are found together.",
             "photos",
         )
-    opened = open_for_completion(options, console)
+    opened = open_for_completion(work, source, NO_TARGETS, console)
     num_known = len(opened.photographs)
-    if update.photos is not None:
-        opened = add_new_photographs(update, opened, console)
+    if request.photos is not None:
+        opened = add_new_photographs(request.photos, request.results, opened, console)
     new = list(range(num_known, len(opened.photographs)))
-    opened = hold_out(opened, update, new)
+    opened = hold_out(opened, request.hold_out, source.context, new)
 
-    task = read_inputs(options, opened)
-    ready = load_models(options, opened, task, console)
-    ready = choose_evidence(ready, new)
-    return PreparedUpdate(**vars(ready), update=update)
+    task = read_inputs(work, source, NO_TARGETS, opened)
+    loaded = load_models(work, work.config, NO_TARGETS, opened, task, console)
+    loaded = choose_evidence(work.models, source.context, loaded, new)
+    return Prepared(
+        request.command,
+        source,
+        work,
+        None,
+        request.results,
+        loaded.opened,
+        loaded.task,
+        ViewPlanner(loaded.completer),
+        loaded.cameras,
+        loaded.seconds,
+        source.scene.masks.is_inverted,
+        settings={
+            "photos": None if request.photos is None else str(request.photos),
+            "hold_out": request.hold_out,
+        },
+    )
 
 
-def add_new_photographs(update: UpdateOptions, opened: Opened, console: Console) -> Opened:
+def add_new_photographs(
+    photos: Path, results: ResultsRequest, opened: Opened, console: Console
+) -> Opened:
     """Place new photographs among those of the scene, and add them."""
-    assert update.photos is not None
-    kept = update.out / POSES
+    kept = results.out / POSES
     refuse_link(kept)
     photographs, placed = place_photographs(
-        update.photos, opened.photographs, kept, update.overwrite, opened.request.masks
+        photos, opened.photographs, kept, results.overwrite, opened.request.masks
     )
     print_lines(console, *placed.notes)
     photographs = replace(photographs, notes=(*photographs.notes, *placed.notes))
@@ -110,13 +114,12 @@ def add_new_photographs(update: UpdateOptions, opened: Opened, console: Console)
     )
 
 
-def hold_out(opened: Opened, update: UpdateOptions, new: Sequence[int]) -> Opened:
-    """Keep back as many photographs as the options ask for, at even steps."""
-    count = update.hold_out
+def hold_out(opened: Opened, count: int, context: Names | None, new: Sequence[int]) -> Opened:
+    """Keep back `count` photographs at even steps, none of them of a context that is named."""
     if count == 0:
         return opened
     photographs = opened.photographs
-    named = find_context(photographs, update.context)
+    named = find_context(photographs, context)
     resolution = opened.request.resolution
     usable = list(collect_usable_cameras(photographs, range(len(photographs)), resolution))
     # New photographs are what the update is judged by; of others the splat may have been trained
@@ -132,23 +135,25 @@ def hold_out(opened: Opened, update: UpdateOptions, new: Sequence[int]) -> Opene
     return replace(opened, held_out=tuple(candidates[step] for step in steps))
 
 
-def choose_evidence(ready: Prepared, new: Sequence[int]) -> Prepared:
+def choose_evidence(
+    models: ModelRequest, context: Names | None, loaded: Loaded, new: Sequence[int]
+) -> Loaded:
     """Add new photographs to the context, and photographs that show what the splat lacks.
 
     A context is chosen to overlook the scene, and what it leaves out only checks, at a low
     resolution. A context that the user named only gets the new photographs.
     """
-    task = ready.task
-    opened = ready.opened
+    task = loaded.task
+    opened = loaded.opened
     frames = set(task.context_frames)
     frames.update(frame for frame in new if frame not in opened.held_out)
-    if ready.options.context is None:
-        shares = measure_lacks(ready)
+    if context is None:
+        shares = measure_lacks(loaded)
         lacking = [frame for frame, share in shares.items() if share >= MIN_SHARE]
         lacking.sort(key=lambda frame: -shares[frame])
         frames.update(lacking[:MAX_LACKING])
     if frames == set(task.context_frames):
-        return ready
+        return loaded
 
     with show_preparation("reading photographs"):
         read = add_check_views(
@@ -163,21 +168,17 @@ def choose_evidence(ready: Prepared, new: Sequence[int]) -> Prepared:
         predicted_depths=read.predicted_depths,
     )
     assert task.scene is not None
-    task = apply_splat_range(task, task.scene, ready.completer.renderer)
+    task = apply_splat_range(task, task.scene, loaded.completer.renderer)
     task = hide_taken_out(task)
-    completer, task = use_predicted_depth(ready.options, ready.completer, task)
-    return replace(
-        ready,
-        task=task,
-        explorer=ViewPlanner(completer),
-        cameras=collect_cameras(opened, task),
-    )
+    completer, task = use_predicted_depth(models, loaded.completer, task)
+    cameras = collect_cameras(opened, task)
+    return replace(loaded, task=task, completer=completer, cameras=cameras)
 
 
-def measure_lacks(ready: Prepared) -> dict[int, float]:
+def measure_lacks(loaded: Loaded) -> dict[int, float]:
     """Measure the share of each photograph that the splat lacks, in small images, by frame."""
-    opened = ready.opened.with_resolution(CHECK_VIEW_SIZE)
-    task = ready.task
+    opened = loaded.opened.with_resolution(CHECK_VIEW_SIZE)
+    task = loaded.task
     scene = task.scene
     assert scene is not None
     cameras = collect_cameras(opened, task)
@@ -199,7 +200,7 @@ def measure_lacks(ready: Prepared) -> dict[int, float]:
             view = task.taken_out.hide(view)
         frames.append(frame)
         views.append(view)
-        renders.append(ready.completer.renderer.render(scene, view.camera))
-    config = ready.completer.config or CompleterConfig.splat()
+        renders.append(loaded.completer.renderer.render(scene, view.camera))
+    config = loaded.completer.config or CompleterConfig.splat()
     lacks = find_lacks(views, renders, config.holes)
     return {frame: lack.share for frame, lack in zip(frames, lacks, strict=True)}

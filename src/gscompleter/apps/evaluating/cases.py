@@ -1,4 +1,4 @@
-"""The cases that the options of `evaluate` name."""
+"""The cases of an evaluation."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ from pathlib import Path
 
 from rich.console import Console
 
-from gscompleter.apps.commands.evaluate import EvaluateOptions
-from gscompleter.apps.commands.shared_options import parse_resolution
-from gscompleter.apps.inputs.scene_request import LONG_SIDE
+from gscompleter.apps.requests.evaluation import CasesRequest
+from gscompleter.apps.requests.scene import LONG_SIDE, parse_resolution
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.limits import check_planes
 from gscompleter.data.mask_checks import read_masks_as_asked
@@ -39,37 +38,37 @@ from gscompleter.system.errors import InputError, quote_value
 
 
 def collect_tasks(
-    options: EvaluateOptions, skipped: list[SkippedScene], notes: list[str]
+    request: CasesRequest, skipped: list[SkippedScene], notes: list[str]
 ) -> list[protocols.Task]:
-    """Collect the tasks of the options, and append to `skipped` and `notes`."""
+    """Collect the tasks of a request, and append to `skipped` and `notes`."""
     left_out: list[Apartable] = []
-    if options.protocol:
+    if request.protocol:
         # The iterator opens clips one by one, so those beyond the limit are not opened.
-        tasks = list(islice(iterate_tasks(options, skipped, notes, left_out), options.limit))
+        tasks = list(islice(iterate_tasks(request, skipped, notes, left_out), request.limit))
         notes += describe_apart(left_out, len(tasks), "scenes")
         return tasks
 
-    listed = [case for path in options.paths for case in read_cases(find_cases_file(path))]
-    cases = list(leave_out_apart(listed, options.apart, left_out))
+    listed = [case for path in request.paths for case in read_cases(find_cases_file(path))]
+    cases = list(leave_out_apart(listed, request.apart, left_out))
     notes += describe_apart(left_out, len(cases), "cases")
-    if options.one_per_scene:
+    if request.one_per_scene:
         # The first case of a scene is the last that overwrites its entry in reversed order.
         first = {case.scene: case for case in reversed(cases)}
         cases = [case for case in cases if case is first[case.scene]]
-    cases = cases[: options.limit]
+    cases = cases[: request.limit]
 
     tasks = []
     # Cases of one scene stand together in a file, so that each scene is opened once for its notes.
     for scene, group in groupby(cases, lambda case: case.scene):
-        own = [protocols.make_case_task(apply_options(case, options)) for case in group]
+        own = [protocols.make_case_task(apply_request(case, request)) for case in group]
         clip = None
         # A scene that cannot be opened fails later, and its row in the table has the reason.
         with suppress(InputError):
             clip = open_photographs(scene)
         if clip is not None:
             notes += clip.notes
-            clip = clip.leave_out_masks() if options.no_masks else clip
-            own = mark_masked(read_masks_as_asked(clip, options.mask_reading), own, notes)
+            clip = clip.leave_out_masks() if not request.uses_masks else clip
+            own = mark_masked(read_masks_as_asked(clip, request.masks), own, notes)
         tasks += own
     return tasks
 
@@ -93,33 +92,33 @@ def mark_masked(
     return [replace(task, has_masks=True) for task in tasks]
 
 
-def apply_options(case: Case, options: EvaluateOptions) -> Case:
-    """Return a case with masks, resolution and depth range of the options."""
-    size = options.resolution
+def apply_request(case: Case, request: CasesRequest) -> Case:
+    """Return a case with masks, resolution and depth range of the request."""
+    size = request.resolution
     return replace(
         case,
-        near=case.near if options.near is None else options.near,
-        far=case.far if options.far is None else options.far,
+        near=case.near if request.near is None else request.near,
+        far=case.far if request.far is None else request.far,
         resolution=case.resolution if size is None else parse_resolution(size),
-        masks=not options.no_masks,
-        invert_masks=options.invert_masks,
-        ignore_moving=options.ignore_moving,
-        ego_mask=not options.no_ego_mask,
+        masks=request.uses_masks,
+        invert_masks=request.masks.is_inverted,
+        ignore_moving=request.ignore_moving,
+        ego_mask=request.ego_mask,
     )
 
 
 def iterate_tasks(
-    options: EvaluateOptions,
+    request: CasesRequest,
     skipped: list[SkippedScene],
     notes: list[str],
     left_out: list[Apartable],
 ) -> Iterator[protocols.Task]:
     """Iterate over the tasks of the protocols, clip by clip."""
-    rules = [protocols.parse_protocol(text) for text in options.protocol]
+    rules = [protocols.parse_protocol(text) for text in request.protocol]
 
     # With a preset, images are cropped and scenes left out as by its authors' code (decision 047).
-    loader = find_loader(options)
-    resolution = LONG_SIDE if options.resolution is None else options.resolution
+    loader = find_loader(request)
+    resolution = LONG_SIDE if request.resolution is None else request.resolution
     size: Resolution
     if loader is not None and isinstance(resolution, tuple):
         height, width = resolution
@@ -128,11 +127,11 @@ def iterate_tasks(
         size = parse_resolution(resolution)
     # Their code also keeps clips whose coordinates are large.
     max_translation = MAX_TRANSLATION if loader is None else None
-    listed = [place for path in options.paths for place in list_places(path)]
-    for place in leave_out_apart(listed, options.apart, left_out):
+    listed = [place for path in request.paths for place in list_places(path)]
+    for place in leave_out_apart(listed, request.apart, left_out):
         for clip in filter_usable(open_clips(place.path), skipped, max_translation):
             notes += clip.notes
-            if options.ignore_moving and not clip.has_boxes:
+            if request.ignore_moving and not clip.has_boxes:
                 raise InputError(
                     f"{clip.name} has no boxes of moving objects; leave --ignore-moving out. Masks "
                     "are always read (--no-masks leaves them out)."
@@ -140,16 +139,16 @@ def iterate_tasks(
 
             # The authors' code scores every pixel of their data sets.
             scores_all = loader is not None
-            if scores_all or options.no_ego_mask:
+            if scores_all or not request.ego_mask:
                 clip = clip.keep_ego_vehicle()
-            if scores_all or options.no_masks:
+            if scores_all or not request.uses_masks:
                 clip = clip.leave_out_masks()
-            clip = read_masks_as_asked(clip, options.mask_reading)
-            if options.ignore_moving:
+            clip = read_masks_as_asked(clip, request.masks)
+            if request.ignore_moving:
                 clip = clip.ignore_moving()
 
-            near = clip.near if options.near is None else options.near
-            far = clip.far if options.far is None else options.far
+            near = clip.near if request.near is None else request.near
+            far = clip.far if request.far is None else request.far
             check_planes(near, far)
             clip = replace(clip, near=near, far=far)
 
@@ -163,13 +162,13 @@ def iterate_tasks(
                 tasks = protocols.make_tasks(kept, clip, size, keeps_order)
                 tasks = [replace(task, apart_by=place.apart_by) for task in tasks]
                 tasks = mark_masked(clip, tasks, notes)
-                yield from tasks[:1] if options.one_per_scene else tasks
+                yield from tasks[:1] if request.one_per_scene else tasks
 
 
-def find_loader(options: EvaluateOptions) -> AuthorsLoader | None:
+def find_loader(request: CasesRequest) -> AuthorsLoader | None:
     """Find the loader to follow; none without a preset, or at another size than the preset's."""
-    preset = get_data_set(options.preset)
-    return preset.loader if options.resolution == preset.resolution else None
+    preset = get_data_set(request.preset)
+    return preset.loader if request.resolution == preset.resolution else None
 
 
 def find_cases_file(path: Path) -> Path:

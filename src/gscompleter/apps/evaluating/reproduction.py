@@ -3,16 +3,21 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from gscompleter.apps.bench.report import describe_machine
 from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.command_line.exit_codes import choose_exit_code
-from gscompleter.apps.commands.evaluate import AUTO, EvaluateOptions, PresetGeneratorOptions
 from gscompleter.apps.evaluating.scoring import Scored, run_methods, score_methods
+from gscompleter.apps.requests.evaluation import (
+    CasesRequest,
+    ComparisonRequest,
+    EvaluationRequest,
+    ReproductionRequest,
+)
+from gscompleter.config.generators import GeneratorOptions
 from gscompleter.evaluation.claims import HEAD, tabulate_claims
 from gscompleter.evaluation.figures import draw_figure
 from gscompleter.evaluation.measured_code import find_commit
@@ -34,11 +39,11 @@ from gscompleter.evaluation.paper_tables import (
 from gscompleter.evaluation.protocols import list_indices
 from gscompleter.evaluation.store import make_file_name
 from gscompleter.evaluation.tables import format_markdown, write_tables
-from gscompleter.render.device import choose_device
 from gscompleter.system.console import make_console
-from gscompleter.system.errors import InputError, NoCaseError, OutputError, quote_value
+from gscompleter.system.errors import InputError, NoCaseError, OutputError
 from gscompleter.system.files.writing import encode_text, replace_file
 from gscompleter.system.jobs.jobs import make_folder
+from gscompleter.system.machine import describe_machine
 
 UNUSUAL = ("stress", "sequence")
 """Kinds of the protocols that only tables of their own use."""
@@ -48,185 +53,95 @@ FIGURES = "figures"
 """Folder of the figures in OUT."""
 RUNS = "runs"
 """Folder in OUT with the scores of each run, as `evaluate` writes them."""
-DEPTH_COLUMNS = (
-    *("psnr", "hole_psnr", "neighbours", "context_change"),
-    *("depth_observed", "depth_hole", "depth_hole_median"),
-)
-"""Columns of the table that compares depths."""
-GENERATOR_COLUMNS = (
-    *("psnr", "hole_psnr", "neighbours", "context_change"),
-    *("st_lpips", "hole_flip", "hole_haarpsi", "hole_gradients"),
-)
-"""Columns of the table that compares generators."""
+COMPARED_COLUMNS = {
+    "depth": (
+        *("psnr", "hole_psnr", "neighbours", "context_change"),
+        *("depth_observed", "depth_hole", "depth_hole_median"),
+    ),
+    "generator": (
+        *("psnr", "hole_psnr", "neighbours", "context_change"),
+        *("st_lpips", "hole_flip", "hole_haarpsi", "hole_gradients"),
+    ),
+}
+"""Columns of the table that compares models of a kind."""
+COMPARED_TITLES = {"depth": "depth", "generator": "Φ"}
+"""Title of the column that names them."""
 RESULTS = "results.md"
 """Page in OUT with all tables, claims and figures."""
 
 
-def run_evaluation(options: EvaluateOptions) -> int:
-    """Run the methods of the options, or those that tables and figures of the paper need.
-
-    Return the exit code.
-    """
-    is_reproduction = bool(options.preset or options.table or options.figure)
-    options = apply_preset(options)
-    models = options.reconstructor
-    if len(set(models)) < len(models):
-        raise InputError("A reconstructor is named twice; change --reconstructor.")
-    if not options.depth or len(set(options.depth)) < len(options.depth):
-        raise InputError("A depth is named twice, or none is; change --depth.", "depth")
-    generators = options.synthesis.generator
-    if not generators or len(set(generators)) < len(generators):
-        raise InputError("A generator is named twice, or none is; change --generator.", "generator")
-    weights = assign_weights(models, options.weights)
-    depth_weights = assign_weights(options.depth, options.depth_weights, "depth", "depth-weights")
-
-    several = [kind for kind in ("depth", "generator") if len(get_compared(options, kind)) > 1]
-    if several:
-        if is_reproduction or len(models) > 1 or len(several) > 1:
-            raise InputError(
-                f"Several {several[0]}s are compared with one reconstructor in a table of their "
-                "own; leave --preset, --table and --figure out, and name one of the others.",
-                several[0],
-            )
-        options = replace(options, weights=tuple(weights.values()))
-        if several == ["depth"]:
-            return compare_depths(options, depth_weights)
-        return compare_generators(replace(options, depth_weights=tuple(depth_weights.values())))
-    options = replace(options, depth_weights=tuple(depth_weights.values()))
-    if is_reproduction or len(models) > 1:
-        return reproduce(options)
-    return run_methods(replace(options, weights=tuple(weights.values())))
+def run_evaluation(request: EvaluationRequest | ComparisonRequest | ReproductionRequest) -> int:
+    """Run the methods, or what tables and figures need; return the exit code."""
+    if isinstance(request, ComparisonRequest):
+        return compare_runs(request)
+    if isinstance(request, ReproductionRequest):
+        return reproduce(request)
+    return run_methods(request)
 
 
-def get_compared(options: EvaluateOptions, kind: str) -> tuple[str, ...]:
-    """Return the names of one kind, of which several are compared."""
-    return options.depth if kind == "depth" else options.synthesis.generator
-
-
-def compare_depths(options: EvaluateOptions, weights: Mapping[str, Path]) -> int:
-    """Run the methods with each depth, and write one table of all; return the exit code."""
-
-    def choose(depth: str) -> EvaluateOptions:
-        own = weights.get(depth)
-        return replace(options, depth=(depth,), depth_weights=() if own is None else (own,))
-
-    runs = {depth: choose(depth) for depth in options.depth}
-    return compare_runs(options, "depth", "depth", runs, DEPTH_COLUMNS)
-
-
-def compare_generators(options: EvaluateOptions) -> int:
-    """Run the methods with each generator, and write one table of all; return the exit code."""
-    shared = options.synthesis.share_settings()
-    runs = {name: replace(options, synthesis=own) for name, own in shared.items()}
-    return compare_runs(options, "generator", "Φ", runs, GENERATOR_COLUMNS)
-
-
-def compare_runs(
-    options: EvaluateOptions,
-    kind: str,
-    compared: str,
-    runs: Mapping[str, EvaluateOptions],
-    columns: Sequence[str],
-) -> int:
+def compare_runs(request: ComparisonRequest) -> int:
     """Run the methods with each model of a kind, and write one table; return the exit code."""
-    console = make_console(stderr=True, quiet=options.quiet)
+    shared = request.run
+    kind = request.kind
+    console = make_console(stderr=True, quiet=shared.answer.quiet)
     folders = {}
     scored = []
-    for name, run in runs.items():
+    for name, models in request.models.items():
         console.print(f"{kind} {name}")
-        folder = options.out / RUNS / make_file_name(f"{kind} {name}")
-        scored.append(score_methods(replace(run, out=folder)))
+        folder = shared.out / RUNS / make_file_name(f"{kind} {name}")
+        scored.append(score_methods(replace(shared, models=models, out=folder)))
         write_tables(folder)
         folders[name] = folder
-    methods = expand_methods(options.methods)
-    table = fill_comparison(f"{kind.title()}s compared", compared, methods, columns, folders)
-    make_folder(options.out / TABLES)
-    write_paper_table(options.out / TABLES / f"{kind}s", table)
-    if options.json:
-        print_json(collect_outputs(options.out))
-    elif not options.quiet:
+    methods = expand_methods(shared.methods)
+    title = f"{kind.title()}s compared"
+    columns = COMPARED_COLUMNS[kind]
+    table = fill_comparison(title, COMPARED_TITLES[kind], methods, columns, folders)
+    make_folder(shared.out / TABLES)
+    write_paper_table(shared.out / TABLES / f"{kind}s", table)
+    if shared.answer.json:
+        print_json(collect_outputs(shared.out))
+    elif not shared.answer.quiet:
         print(format_paper_markdown(table))
     failed = sum(len(run.failures) for run in scored)
     return choose_exit_code(failed, sum(run.num_own_rows for run in scored))
 
 
-def assign_weights(
-    models: Sequence[str],
-    weights: Sequence[Path],
-    kind: str = "reconstructor",
-    option: str = "weights",
-) -> dict[str, Path]:
-    """Assign files of weights to models: one for each in their order, or by `NAME=FILE`.
-
-    Those without a file take the published one. Raise InputError if a file has no model.
-    """
-    named: dict[str, Path] = {}
-    plain: list[Path] = []
-    for word in weights:
-        # A path may contain `=`, too; only a known name before it makes it NAME=FILE.
-        name, _, file = str(word).partition("=")
-        if file and name in models:
-            named[name] = Path(file)
-        else:
-            plain.append(word)
-    if plain and (named or len(plain) != len(models)):
-        raise InputError(
-            f"{quote_value(plain[0])} belongs to no {kind}; give --{option} one file for "
-            f"each of {', '.join(models)} in this order, or {models[0]}=FILE for some of them."
-        )
-    return named or dict(zip(models, plain, strict=False))
-
-
-def apply_preset(options: EvaluateOptions) -> EvaluateOptions:
-    """Set what is not given as the preset does, or as without one."""
-    preset = get_data_set(options.preset)
-    synthesis = options.synthesis
-    named = (preset.generator if name == AUTO else name for name in synthesis.generator)
-    synthesis = replace(synthesis, generator=tuple(named))
-    return replace(
-        options,
-        resolution=preset.resolution if options.resolution is None else options.resolution,
-        reconstructor=options.reconstructor or preset.reconstructor,
-        near=preset.near if options.near is None else options.near,
-        far=preset.far if options.far is None else options.far,
-        synthesis=synthesis,
-    )
-
-
-def reproduce(options: EvaluateOptions) -> int:
-    """Write the tables and figures of the options, and all results in OUT as one page.
+def reproduce(request: ReproductionRequest) -> int:
+    """Write the tables and figures that are asked for, and all results in OUT as one page.
 
     Return the exit code, which counts the cases of all tables and figures.
     """
     paper = load_paper()
-    console = make_console(stderr=True, quiet=options.quiet)
-    (generator,) = options.synthesis.generator
+    answer = request.run.answer
+    console = make_console(stderr=True, quiet=answer.quiet)
+    generator = request.run.models.generator
 
     # A preset or several reconstructors alone stand for the table of models.
-    names = options.table
-    if not names and not options.figure:
+    names = request.tables
+    if not names and not request.figures:
         names = ("models",)
     tables = select_names(names, paper.tables, generator)
-    figures = select_names(options.figure, paper.figures, generator)
+    figures = select_names(request.figures, paper.figures, generator)
 
     scored: list[Scored] = []
     for name, spec in [*tables.items(), *figures.items()]:
         console.print(f"{name}: {spec.title}")
         try:
-            write_output(options, name, spec, scored)
+            write_output(request, name, spec, scored)
         except InputError as error:
             # Of `all`, those are left out whose data or models are not here. One that is named has
             # to succeed.
-            if "all" not in (*options.table, *options.figure):
+            if "all" not in (*request.tables, *request.figures):
                 raise
             console.print(f"Left out {name}: {error}", soft_wrap=True)
     if not scored:
         raise InputError("None of the tables and figures could be begun; the lines above say why.")
 
-    text = write_results(options)
-    if options.json:
-        print_json(collect_outputs(options.out))
-    elif not options.quiet:
+    out = request.run.out
+    text = write_results(out, request.run.models.device)
+    if answer.json:
+        print_json(collect_outputs(out))
+    elif not answer.quiet:
         make_console().print(text, soft_wrap=True)
     failed = sum(len(run.failures) for run in scored)
     return choose_exit_code(failed, sum(run.num_own_rows for run in scored))
@@ -243,12 +158,12 @@ def collect_outputs(out: Path) -> dict[str, Any]:
 
 
 def write_output(
-    options: EvaluateOptions, name: str, spec: Requirements, scored: list[Scored]
+    request: ReproductionRequest, name: str, spec: Requirements, scored: list[Scored]
 ) -> None:
     """Run what a table or figure needs, append the outcome to `scored`, and write it."""
-    runs = run_all(options, spec, scored)
+    runs = run_all(request, spec, scored)
     try:
-        write_from_runs(options, name, spec, runs)
+        write_from_runs(request, name, spec, runs)
     except OutputError:  # an InputError, too, which keeps its exit code
         raise
     except InputError as error:
@@ -257,61 +172,65 @@ def write_output(
 
 
 def write_from_runs(
-    options: EvaluateOptions, name: str, spec: Requirements, runs: Mapping[tuple[str, str], Path]
+    request: ReproductionRequest,
+    name: str,
+    spec: Requirements,
+    runs: Mapping[tuple[str, str], Path],
 ) -> None:
     """Write a table or figure from the folders of its runs."""
+    out = request.run.out
     if isinstance(spec, TableSpec):
         table = fill_table(spec, runs)
         if not any(table.num_cases.values()):
             reason = (*table.notes, "no row is there")[0]
             raise InputError(f"No case of the table was completed. {reason}")
-        make_folder(options.out / TABLES)
-        write_paper_table(options.out / TABLES / name, table)
+        make_folder(out / TABLES)
+        write_paper_table(out / TABLES / name, table)
     if isinstance(spec, FigureSpec):
         # A figure compares models on one protocol.
         by_model = {model: folder for (model, _), folder in runs.items()}
-        make_folder(options.out / FIGURES)
+        make_folder(out / FIGURES)
         draw_figure(
-            options.out / FIGURES / name,
+            out / FIGURES / name,
             spec,
             by_model,
-            options.figure_cases,
-            options.outlines,
-            options.crops,
+            request.figure_cases,
+            request.has_outlines,
+            request.has_crops,
         )
 
 
 def run_all(
-    options: EvaluateOptions, spec: Requirements, scored: list[Scored]
+    request: ReproductionRequest, spec: Requirements, scored: list[Scored]
 ) -> dict[tuple[str, str], Path]:
     """Run what a table or figure needs; return the folder of each model and protocol.
 
     The outcome of each run is appended to `scored`.
     """
     runs = {}
-    for number, model in enumerate(options.reconstructor):
-        for protocol in choose_protocols(options, spec):
+    for model in request.weights:
+        for protocol in choose_protocols(request.run.cases, spec):
             # Tables share runs: rows that an earlier one has scored are read, not computed again.
-            run = make_run(options, spec, number, protocol)
+            run = make_run(request, spec, model, protocol)
             scored.append(score_methods(run))
             write_tables(run.out)
             runs[model, Path(protocol).stem] = run.out
     return runs
 
 
-def choose_protocols(options: EvaluateOptions, spec: Requirements) -> tuple[str, ...]:
+def choose_protocols(cases: CasesRequest, spec: Requirements) -> tuple[str, ...]:
     """Choose the given protocols of the kind that a table needs, or else those of the paper.
 
     A file of cases, which needs no protocol, has an empty one.
     """
     kinds = {get_kind(name) for name in spec.protocol}
     if kinds:
-        suitable = tuple(name for name in options.protocol if get_kind(name) in kinds)
+        suitable = tuple(name for name in cases.protocol if get_kind(name) in kinds)
         return suitable or spec.protocol
 
     # A table without a kind of its own takes a given protocol, or that of the data set.
-    usual = [name for name in options.protocol if get_kind(name) not in UNUSUAL]
-    return tuple(usual[:1]) or get_data_set(options.preset).protocol or ("",)
+    usual = [name for name in cases.protocol if get_kind(name) not in UNUSUAL]
+    return tuple(usual[:1]) or get_data_set(cases.preset).protocol or ("",)
 
 
 def get_kind(protocol: str) -> str:
@@ -321,38 +240,35 @@ def get_kind(protocol: str) -> str:
 
 
 def make_run(
-    options: EvaluateOptions, spec: Requirements, number: int, protocol: str
-) -> EvaluateOptions:
-    """Return the options of a run of one model with one protocol, in a folder of its own."""
+    request: ReproductionRequest, spec: Requirements, model: str, protocol: str
+) -> EvaluationRequest:
+    """Make the request for a run of one model with one protocol, in a folder of its own."""
+    shared = request.run
+    models = replace(shared.models, reconstructor=model, weights=request.weights[model])
     # Settings belong to the generator that was chosen, so that of the table has its defaults.
-    synthesis = options.synthesis
-    if spec.generator and (spec.generator,) != synthesis.generator:
-        synthesis = PresetGeneratorOptions((spec.generator,))
-    one_per_scene = options.one_per_scene or spec.one_per_scene
-    model = options.reconstructor[number]
+    if spec.generator and spec.generator != models.generator:
+        settings = GeneratorOptions(spec.generator).make_settings()
+        models = replace(models, generator=spec.generator, generator_settings=settings)
+    one_per_scene = shared.cases.one_per_scene or spec.one_per_scene
 
     # The folder is named by all that differs between the runs of one reproduction.
-    parts = [model, Path(protocol).stem or "cases", *synthesis.generator]
+    parts = [model, Path(protocol).stem or "cases", models.generator]
     if one_per_scene:
         parts.append("one-per-scene")
-    own = assign_weights(options.reconstructor, options.weights).get(model)
     return replace(
-        options,
-        out=options.out / RUNS / make_file_name(" ".join(parts)),
-        reconstructor=(model,),
-        weights=() if own is None else (own,),
-        protocol=(protocol,) if protocol else (),
+        shared,
+        cases=replace(
+            shared.cases, protocol=(protocol,) if protocol else (), one_per_scene=one_per_scene
+        ),
         methods=spec.list_methods(),
-        synthesis=synthesis,
-        one_per_scene=one_per_scene,
+        models=models,
+        out=shared.out / RUNS / make_file_name(" ".join(parts)),
     )
 
 
-def write_results(options: EvaluateOptions) -> str:
+def write_results(out: Path, device: str) -> str:
     """Write all tables, claims and figures in OUT as one page, and return its text."""
-    out = options.out
     paper = load_paper()
-    device = choose_device(options.renderer_device or options.device)
     commit = find_commit()
     machine = {**describe_machine(device), **({} if commit is None else {"commit": commit})}
     facts = ", ".join(f"{key} {value}" for key, value in machine.items())

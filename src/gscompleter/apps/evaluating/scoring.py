@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -13,11 +12,10 @@ from gscompleter.apps.batch.engine import make_engine
 from gscompleter.apps.batch.running import print_failures
 from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.command_line.exit_codes import choose_exit_code
-from gscompleter.apps.commands.evaluate import EvaluateOptions
-from gscompleter.apps.commands.shared_options import parse_resolution
 from gscompleter.apps.evaluating.cases import collect_tasks, find_loader, print_skipped
 from gscompleter.apps.evaluating.tables import write_and_print_tables
-from gscompleter.apps.inputs.scene_request import LONG_SIDE
+from gscompleter.apps.requests.evaluation import CasesRequest, EvaluationRequest
+from gscompleter.apps.requests.scene import LONG_SIDE, parse_resolution
 from gscompleter.apps.warmup import compile_kernels
 from gscompleter.data.photographs import check_resolution
 from gscompleter.evaluation.apart import record_uses
@@ -26,26 +24,25 @@ from gscompleter.evaluation.methods import expand_methods
 from gscompleter.evaluation.protocols import Task
 from gscompleter.evaluation.runner import RunConfig, collect_context_notes, evaluate
 from gscompleter.evaluation.store import get_score_path, list_row_paths
-from gscompleter.render.device import choose_devices
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError
-from gscompleter.system.jobs.jobs import parse_shard
 from gscompleter.system.progress import show_preparation, show_progress
 
 MAX_NAMED = 5
 """Most cases of which a line says what Ψ said about their photographs."""
 
 
-def run_methods(options: EvaluateOptions) -> int:
+def run_methods(request: EvaluationRequest) -> int:
     """Run and score the methods on the cases, write and print the tables; return the exit code."""
-    scored = score_methods(options)
+    scored = score_methods(request)
+    answer = request.answer
     # A shard without cases has no tables.
-    if list_row_paths(options.out):
-        with show_progress(make_console(stderr=True, quiet=options.quiet)):
+    if list_row_paths(request.out):
+        with show_progress(make_console(stderr=True, quiet=answer.quiet)):
             write_and_print_tables(
-                options.out, options.quiet, num_rows=scored.num_rows, as_json=options.json
+                request.out, answer.quiet, num_rows=scored.num_rows, as_json=answer.json
             )
-    elif options.json:
+    elif answer.json:
         print_json({"cases": 0, "methods": {}, "failures": list(scored.failures)})
     return choose_exit_code(len(scored.failures), scored.num_own_rows)
 
@@ -62,21 +59,19 @@ class Scored:
     """Rows of this shard without a score, with the reasons."""
 
 
-def score_methods(options: EvaluateOptions) -> Scored:
+def score_methods(request: EvaluationRequest) -> Scored:
     """Run and score the methods on the cases, and print the first failures."""
-    if not options.paths:
-        raise InputError("No data is given; name a cases.json, or scenes with --protocol.")
-    console = make_console(stderr=True, quiet=options.quiet)
-    methods = expand_methods(options.methods)
-    shard = parse_shard(options.shard, os.environ)
-    if options.resolution is not None:
-        check_resolution(parse_resolution(options.resolution))
+    console = make_console(stderr=True, quiet=request.answer.quiet)
+    methods = expand_methods(request.methods)
+    cases = request.cases
+    if cases.resolution is not None:
+        check_resolution(parse_resolution(cases.resolution))
 
     skipped: list[SkippedScene] = []
     notes: list[str] = []
     with show_progress(console), show_preparation("reading cases"):
-        tasks = collect_tasks(options, skipped, notes)
-    if options.invert_masks and not any(task.has_masks for task in tasks):
+        tasks = collect_tasks(cases, skipped, notes)
+    if cases.masks.is_inverted and not any(task.has_masks for task in tasks):
         raise InputError(
             "No scene has masks that could be read the other way round; leave it out.",
             "invert-masks",
@@ -86,31 +81,32 @@ def score_methods(options: EvaluateOptions) -> Scored:
         console.print(note, soft_wrap=True)
     print_skipped(skipped, console)
 
-    devices = choose_devices(options.device, options.renderer_device, options.network_device)
+    models = request.models
     config = RunConfig(
-        reconstructor=options.reconstructor[0],
-        weights=str(options.weights[0]) if options.weights else None,
-        depth=options.depth[0],
-        depth_weights=str(options.depth_weights[0]) if options.depth_weights else None,
-        generator=options.synthesis.generator[0],
-        generator_settings=options.synthesis.make_settings(),
-        device=devices.renderer,
-        network_device=devices.networks,
-        seed=options.seed,
-        source=describe_source(options, tasks),
+        reconstructor=models.reconstructor,
+        weights=None if models.weights is None else str(models.weights),
+        depth=models.depth,
+        depth_weights=None if models.depth_weights is None else str(models.depth_weights),
+        generator=models.generator,
+        generator_settings=models.generator_settings,
+        device=models.device,
+        network_device=models.network_device,
+        seed=models.seed,
+        source=describe_source(cases, tasks),
     )
-    engine = make_engine(options, options.out.resolve())
+    engine = make_engine(request.engine, request.out.resolve())
+    share = request.engine.share
 
     apart = [task for task in tasks if task.apart_by is not None]
-    if apart and shard[0] == 0 and will_score(apart, methods, options):
-        record_uses(apart, f"evaluate --methods {' '.join(options.methods)}")
+    if apart and share[0] == 0 and will_score(apart, methods, request):
+        record_uses(apart, f"evaluate --methods {' '.join(request.methods)}")
 
     # Kernels are compiled here once, before workers would each compile them.
     with show_progress(console):
         compile_kernels((config.device, config.reconstructor, config.generator))
-        counts = evaluate(tasks, methods, options.out, config, shard, options.rerun, engine)
+        counts = evaluate(tasks, methods, request.out, config, share, request.rerun, engine)
 
-    print_context_notes(collect_context_notes(options.out, tasks), console)
+    print_context_notes(collect_context_notes(request.out, tasks), console)
     own = counts.done + counts.failed + counts.skipped
     print_failures(console, counts.failures, own)
     line = f"Scored {counts.done}, failed {counts.failed}, done earlier {counts.skipped}"
@@ -118,10 +114,10 @@ def score_methods(options: EvaluateOptions) -> Scored:
     return Scored(len(tasks) * len(methods), own, counts.failures)
 
 
-def will_score(tasks: Sequence[Task], methods: Sequence[str], options: EvaluateOptions) -> bool:
+def will_score(tasks: Sequence[Task], methods: Sequence[str], request: EvaluationRequest) -> bool:
     """Check whether this call computes scores of some tasks, rather than reading earlier ones."""
-    rows = (get_score_path(options.out, task.name, m) for task in tasks for m in methods)
-    return options.rerun == "scores" or not all(row.exists() for row in rows)
+    rows = (get_score_path(request.out, task.name, m) for task in tasks for m in methods)
+    return request.rerun == "scores" or not all(row.exists() for row in rows)
 
 
 def print_context_notes(notes: Mapping[str, str], console: Console) -> None:
@@ -134,7 +130,7 @@ def print_context_notes(notes: Mapping[str, str], console: Console) -> None:
         )
 
 
-def describe_source(options: EvaluateOptions, tasks: Sequence[Task]) -> dict[str, Any]:
+def describe_source(cases: CasesRequest, tasks: Sequence[Task]) -> dict[str, Any]:
     """Describe the cases, as an output folder records them.
 
     Scores with masks are not continued with scores without, nor the other way round.
@@ -142,19 +138,19 @@ def describe_source(options: EvaluateOptions, tasks: Sequence[Task]) -> dict[str
     has_masks = any(task.has_masks for task in tasks)
     num_apart = sum(task.apart_by is not None for task in tasks)
     # A cases.json has the resolution of each case; scenes of a protocol have none.
-    size = LONG_SIDE if options.resolution is None and options.protocol else options.resolution
-    loader = find_loader(options)
+    size = LONG_SIDE if cases.resolution is None and cases.protocol else cases.resolution
+    loader = find_loader(cases)
     return {
-        "paths": [path.resolve().name for path in options.paths],
-        "protocols": list(options.protocol),
+        "paths": [path.resolve().name for path in cases.paths],
+        "protocols": list(cases.protocol),
         "resolution": list(size) if isinstance(size, tuple) else size,
         **({"masks": True} if has_masks else {}),
-        **({"invert_masks": True} if has_masks and options.invert_masks else {}),
-        **({"ignore_moving": True} if options.ignore_moving else {}),
+        **({"invert_masks": True} if has_masks and cases.masks.is_inverted else {}),
+        **({"ignore_moving": True} if cases.ignore_moving else {}),
         **({"apart": num_apart} if num_apart else {}),
-        **({"one_per_scene": True} if options.one_per_scene else {}),
-        **({"ego_mask": False} if options.no_ego_mask else {}),
+        **({"one_per_scene": True} if cases.one_per_scene else {}),
+        **({"ego_mask": False} if not cases.ego_mask else {}),
         **({} if loader is None else {"loader": asdict(loader)}),
-        **({} if options.near is None else {"near": options.near}),
-        **({} if options.far is None else {"far": options.far}),
+        **({} if cases.near is None else {"near": cases.near}),
+        **({} if cases.far is None else {"far": cases.far}),
     }

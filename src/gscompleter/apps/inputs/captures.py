@@ -12,8 +12,9 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.apps.inputs.named_photographs import PhotographNames
-from gscompleter.apps.inputs.removal import Selection, select_gaussians
-from gscompleter.apps.inputs.scene_request import LONG_SIDE, SceneRequest
+from gscompleter.apps.inputs.removal import select_gaussians
+from gscompleter.apps.requests.scene import LONG_SIDE, SceneRequest
+from gscompleter.apps.requests.splat import Selection
 from gscompleter.config import HoleConfig
 from gscompleter.data.camera_files import NAME, has_camera_list
 from gscompleter.data.mask_reading import MaskReading

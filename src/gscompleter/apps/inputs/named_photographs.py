@@ -23,21 +23,10 @@ PhotographNames = Sequence[int | str]
 """Photographs by number or by name."""
 
 
-def check_context(context: PhotographNames | None) -> None:
-    """Refuse an empty context, and repeated frames."""
-    if context is None:
-        return
-    if len(context) == 0 or len(set(context)) < len(context):
-        raise InputError(
-            "--context names no frame, or one twice; name different ones, as in --context 0 4, or "
-            "leave it out."
-        )
-
-
 def find_context(photographs: Photographs, context: PhotographNames | None) -> tuple[int, ...]:
     """Find the context frames that are named; none if there are none."""
     frames = tuple(find_frame(photographs, word, "context") for word in context or ())
-    # Words differ by now (`check_context`), but a name and a number can mean one photograph.
+    # Words differ by now, but a name and a number can mean one photograph.
     if len(set(frames)) < len(frames):
         twice = next(frame for frame in frames if frames.count(frame) > 1)
         name = quote_value(photographs.frame(twice).file_name)

@@ -12,9 +12,9 @@ from rich.console import Console
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.inputs.named_photographs import check_frame_numbers
 from gscompleter.apps.inputs.removal import check_removal_masks
-from gscompleter.apps.inputs.scene_request import LONG_SIDE, PosesRequest, SceneRequest
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.inputs.task import Opened
+from gscompleter.apps.requests.scene import LONG_SIDE, PosesRequest, SceneRequest
 from gscompleter.data.camera_files import refuse_other_exports
 from gscompleter.data.formats import find_format, open_photographs, refuse_scenes_below
 from gscompleter.data.frame import FOLDERS

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.apps.inputs.task import CompletionTask, Opened
+from gscompleter.apps.requests.splat import Selection
 from gscompleter.data.frame import ENDINGS, find_file
 from gscompleter.data.mask_checks import check_selected_share, check_selecting_masks
 from gscompleter.data.mask_reading import MaskReading
@@ -29,28 +30,6 @@ from gscompleter.types import Camera, Gaussians, find_equal_positions
 
 MAX_MARGIN = 0.05
 """Largest margin of a region, relative to its smallest side or its radius."""
-
-
-@dataclass(frozen=True)
-class Selection:
-    """Gaussians of a splat that are selected in any of these ways; coordinates are the file's."""
-
-    boxes: Sequence[float] = ()
-    """Six numbers per box: its smallest x, y and z, then its largest."""
-    box_rotation: Sequence[float] = (1.0, 0.0, 0.0, 0.0)
-    """Quaternion wxyz that rotates the boxes about their centres."""
-    sphere: Sequence[float] | None = None
-    """Centre and radius."""
-    masks: Path | None = None
-    """Folder of images that are named as photographs, white where something goes."""
-    file: Path | None = None
-    """File of selected Gaussians."""
-    drop_nonfinite: bool = False
-    """True to drop Gaussians of that file that contain NaN or infinity."""
-    margin: float = 0.0
-    """Distance by which boxes and the sphere reach farther than given, on every side."""
-    mask_reading: MaskReading = MaskReading()
-    """How masks are read."""
 
 
 def check_selection(selection: Selection) -> None:

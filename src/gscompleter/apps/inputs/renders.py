@@ -33,10 +33,10 @@ from gscompleter.apps.inputs.hole_kinds import (
 )
 from gscompleter.apps.inputs.named_photographs import find_context, read_targets
 from gscompleter.apps.inputs.reading import check_sizes
-from gscompleter.apps.inputs.scene_request import SceneRequest
 from gscompleter.apps.inputs.selection import choose_context
 from gscompleter.apps.inputs.splat import place_scene
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened, Target
+from gscompleter.apps.requests.scene import SceneRequest
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.frame import Frame

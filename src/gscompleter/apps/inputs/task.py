@@ -12,7 +12,7 @@ import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
-from gscompleter.apps.inputs.scene_request import SceneRequest
+from gscompleter.apps.requests.scene import SceneRequest
 from gscompleter.data.photograph_names import name_target
 from gscompleter.data.photographs import Photographs
 from gscompleter.editing.taken_out import TakenOut

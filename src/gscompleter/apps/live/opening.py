@@ -1,51 +1,27 @@
-"""Find what a session begins with: a scene, or a session that was kept in a folder."""
+"""Requests of sessions, with the steps that they go on from."""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gscompleter.apps.commands.live import LiveOptions
-from gscompleter.apps.commands.shared_options import CompletingOptions, list_inputs
-from gscompleter.apps.live.replay import add_saved_options
 from gscompleter.apps.live.session import Step
-from gscompleter.apps.live.strokes import (
-    OF_MACHINE,
-    OF_STROKES,
-    StrokesFile,
-    describe_options,
-    describe_value,
-    find_strokes_file,
-    read_steps,
-    read_strokes,
-)
-from gscompleter.apps.report.schema import find_completed
-from gscompleter.config import load_config
-from gscompleter.splats.edits import read_edits
-from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.output_folder import holds_results, holds_session
-from gscompleter.system.files.overlap import refuse_overlap
-from gscompleter.system.files.reading import hash_file
-from gscompleter.system.files.typed_json import validate_typed
-from gscompleter.system.files.writing import COMPLETED_FILES, STROKES_FILE
-from gscompleter.system.plugins import is_in_file
-
-DEFAULT_OUT = Path("live")
-"""Output folder of a session that begins with a scene."""
-DEFAULT_RESOLUTION = (256, 256)
-"""Working size of such a session."""
-NAMES_SCENE = ("folder", "scene")
+from gscompleter.apps.requests.completion import CompletionRequest
+from gscompleter.apps.requests.scene import Size
 
 
 @dataclass(frozen=True)
-class Opening:
-    """What a session begins with."""
+class SessionRequest:
+    """A scene, and steps that are done again on it."""
 
-    options: LiveOptions
-    """With the scene, and the output folder."""
+    completion: CompletionRequest
+    """How the scene is opened, and where results are written."""
+    record: Mapping[str, Any]
+    """Options that the session began with, as `strokes.json` keeps them."""
+    resolution: Size | None = None
+    """Working size as it was asked for; None for the default of `complete`."""
     steps: tuple[Step, ...] = ()
     undone: tuple[Step, ...] = ()
     """Steps that were undone, the next to be done again first."""
@@ -56,184 +32,15 @@ class Opening:
     @property
     def out(self) -> Path:
         """The output folder."""
-        assert self.options.out is not None
-        return self.options.out
+        return self.completion.results.out
 
 
-def find_opening(options: LiveOptions) -> Opening:
-    """Find what a session begins with, or raise InputError if its folder is not free."""
-    options, path = find_session(options)
-    if path is None:
-        out = options.out or DEFAULT_OUT
-        size = options.resolution or DEFAULT_RESOLUTION
-        options = replace(options, out=out, resolution=size)
-        if holds_session(out) and not options.overwrite:
-            raise InputError(
-                f"{quote_value(out)} holds a session; go on with it by `gscompleter live "
-                f"{quote_value(out)}`, name another folder, or begin anew in it.",
-                "overwrite",
-            )
-        # A session saves several times, and reads its splat each time.
-        refuse_overlap(out, list_inputs(options), may_continue=False)
-        return Opening(options)
+@dataclass(frozen=True)
+class LiveRequest:
+    """A session, and the address of its page."""
 
-    saved = read_strokes(path)
-    is_named = options.folder is not None or options.scene is not None
-    out = options.out or (DEFAULT_OUT if is_named else path.parent)
-    continues = path.name == STROKES_FILE and os.path.realpath(path.parent) == os.path.realpath(out)
-    if is_named:
-        options = add_saved_options(options, saved)
-    else:
-        options = restore_options(options, saved, path)
-    options = replace(options, out=out, strokes=None, overwrite=options.overwrite or continues)
-    inputs = [*list_inputs(options), *(() if continues else (path,))]
-    refuse_overlap(out, inputs, may_continue=False)
-    return Opening(
-        options,
-        read_steps(saved.frames, path.parent),
-        read_steps(saved.undone, path.parent),
-        saved.saved if continues else None,
-        tuple(describe_changes(options, saved, out if continues else None)),
-    )
-
-
-def find_session(options: LiveOptions) -> tuple[LiveOptions, Path | None]:
-    """Find the steps to go on with, if any; the options then name a scene only with `--strokes`.
-
-    An output folder without steps stands for the completed scene in it.
-    """
-    folder = options.folder
-    path = None if options.strokes is None else find_strokes_file(options.strokes)
-    if folder is None or options.scene is not None:
-        return options, path
-    if os.path.isdir(folder):
-        if holds_session(folder):
-            own = folder / STROKES_FILE
-            if path is not None and not os.path.samefile(own, path):
-                raise InputError(
-                    f"{quote_value(folder)} holds steps of its own; name its scene, or leave "
-                    "the others out.",
-                    "strokes",
-                )
-            return replace(options, folder=None), own
-        completed = find_completed(folder)
-        if holds_results(folder) and completed.is_file():
-            return replace(options, folder=completed), path
-    elif is_saved_session(folder):
-        own = folder.with_name(STROKES_FILE)
-        if path is None or os.path.realpath(own) == os.path.realpath(path):
-            return replace(options, folder=None), own
-    return options, path
-
-
-def is_saved_session(path: Path) -> bool:
-    """Return True for the completed scene of a session, as the session saved it."""
-    if path.name not in COMPLETED_FILES or not holds_session(path.parent):
-        return False
-    if read_strokes(path.with_name(STROKES_FILE)).session is None:
-        return False
-    # What another program or command changed is a splat of its own.
-    edits = read_edits(path)
-    return edits.is_unchanged and bool(edits) and edits.edits[-1].command == "live"
-
-
-def restore_options(options: LiveOptions, saved: StrokesFile, path: Path) -> LiveOptions:
-    """Return the options that a session began with, and those of this machine as they are given."""
-    if saved.session is None:
-        raise InputError(
-            f"{quote_value(path)} does not tell of which scene it is; name the scene, as in "
-            f"`gscompleter live splat.ply --strokes {quote_value(path)}`.",
-        )
-    given = describe_options(options)
-    known = {**saved.session, **{name: getattr(saved, name) for name in OF_STROKES}}
-    asked = {**given, **{name: describe_value(name, getattr(options, name)) for name in OF_STROKES}}
-    for name, value in known.items():
-        refuse_other_value(name, asked.get(name), value)
-        refuse_code(name, asked.get(name), value)
-
-    own = {field.name for field in fields(LiveOptions)}
-    own -= {field.name for field in fields(CompletingOptions)} - set(OF_MACHINE)
-    values = {**known, **{name: getattr(options, name) for name in own}}
-    restored = validate_typed(LiveOptions, values, quote_value(path), "save the session again")
-    for name in NAMES_SCENE:
-        scene = getattr(restored, name)
-        if scene is not None and not scene.exists():
-            raise InputError(
-                f"{quote_value(scene)} is missing, with which the session began; name it where it "
-                f"is now, as in `gscompleter live splat.ply --strokes {quote_value(path)}`.",
-            )
-    return restored
-
-
-def refuse_other_value(name: str, given: Any, known: Any) -> None:
-    """Refuse an option that would change what the steps did, unless it has its default."""
-    if isinstance(known, Mapping) and isinstance(given, Mapping) and name != "config":
-        for inner, value in known.items():
-            refuse_other_value(inner, given.get(inner), value)
-    elif normalize(given) not in [normalize(known), *list_defaults(name)]:
-        raise InputError(
-            "A session goes on with the settings that it began with; leave this one out, or begin "
-            "anew with it.",
-            name,
-        )
-
-
-def refuse_code(name: str, given: Any, known: Any) -> None:
-    """Refuse to run a file of Python because a session names it, which may come from elsewhere."""
-    words = [word for word in list_words(known) if is_in_file(word)]
-    if words and not set(words) <= set(list_words(given)):
-        raise InputError(
-            f"The session ran {quote_value(words[0])}, a program; name it again if you trust it.",
-            "config.guards" if name == "config" else "generator" if name == "synthesis" else name,
-        )
-
-
-def list_words(value: Any) -> Iterator[str]:
-    """List all texts in values of JSON."""
-    if isinstance(value, str):
-        yield value
-    elif isinstance(value, Mapping):
-        for inner in value.values():
-            yield from list_words(inner)
-    elif isinstance(value, list | tuple):
-        for inner in value:
-            yield from list_words(inner)
-
-
-def list_defaults(name: str) -> list[Any]:
-    """List the values of an option, as JSON, that mean that it was not given."""
-    if name == "config":
-        presets = [
-            load_config("default", *kind) for kind in ((False, True), (True, True), (True, False))
-        ]
-        return [normalize(describe_value(name, preset)) for preset in presets]
-    options = LiveOptions()
-    for place in (options, options.synthesis):
-        if hasattr(place, name):
-            return [normalize(describe_value(name, getattr(place, name)))]
-    return []
-
-
-def normalize(value: Any) -> Any:
-    """Return values of JSON with lists in place of tuples, so that they can be compared."""
-    if isinstance(value, Mapping):
-        return {name: normalize(inner) for name, inner in value.items()}
-    return [normalize(inner) for inner in value] if isinstance(value, list | tuple) else value
-
-
-def describe_changes(options: LiveOptions, saved: StrokesFile, out: Path | None) -> Iterator[str]:
-    """Describe what is another file than it was; `out` is the folder of a session that goes on."""
-    count = len(saved.frames)
-    yield f"Going on after {count} {'step' if count == 1 else 'steps'}, which are done again."
-    scene = options.scene or options.folder
-    is_known = saved.scene_sha256 is not None and scene is not None and scene.is_file()
-    if scene is not None and is_known and hash_file(scene) != saved.scene_sha256:
-        yield (
-            f"{quote_value(scene)} is another file than the session began with; its steps are "
-            "done on this one."
-        )
-    if out is None:
-        return
-    completed = find_completed(out)
-    if completed.is_file() and not read_edits(completed).is_unchanged:
-        yield f"{quote_value(completed)} was changed by another program; Save replaces it."
+    session: SessionRequest
+    host: str
+    port: int
+    """Port of the page; 0 for a free one."""
+    opens_browser: bool

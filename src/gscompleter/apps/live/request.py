@@ -7,7 +7,8 @@ from binascii import Error as Base64Error
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from gscompleter.apps.inputs.removal import Selection, check_selection
+from gscompleter.apps.inputs.removal import check_selection
+from gscompleter.apps.requests.splat import Selection
 from gscompleter.data.scene import parse_camera
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.typed_json import parse_typed_json

@@ -10,20 +10,19 @@ from PIL import Image
 from rich.console import Console
 
 from gscompleter.apps.command_line.answers import print_json
-from gscompleter.apps.commands.live import LiveOptions
 from gscompleter.apps.completing.preparation import Prepared
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.live.addresses import check_bindable, resolve_host
 from gscompleter.apps.live.difference import PageScene
 from gscompleter.apps.live.journal import Journal
-from gscompleter.apps.live.opening import Opening, find_opening
+from gscompleter.apps.live.opening import LiveRequest
 from gscompleter.apps.live.page import LivePage
 from gscompleter.apps.live.replay import replay_steps
 from gscompleter.apps.live.saving import (
     LIVE_RESULTS,
+    PreparedSession,
     begin_session,
-    describe_began,
-    prepare,
+    prepare_session,
     save_session,
 )
 from gscompleter.apps.live.server import LiveServer
@@ -44,34 +43,35 @@ from gscompleter.system.progress import show_progress
 from gscompleter.types import Camera
 
 
-def serve_live(options: LiveOptions) -> None:
+def serve_live(request: LiveRequest) -> None:
     """Serve the page until Ctrl-C."""
     # A port in use and a lack of the page's libraries are reported now, not after the scene is
     # reconstructed.
-    check_bindable(resolve_host(options.host), options.host, options.port)
+    check_bindable(resolve_host(request.host), request.host, request.port)
     libraries = packages.load_libraries()
-    opening = find_opening(options)
-    options = opening.options
-    with reserve_output(opening.out, options.overwrite, COMMAND, LIVE_RESULTS) as output:
-        console = make_console(stderr=True, quiet=options.quiet)
-        print_lines(console, *opening.notes, *output.describe_others())
+    asked = request.session
+    results = asked.completion.results
+    with reserve_output(results.out, results.overwrite, COMMAND, LIVE_RESULTS) as output:
+        console = make_console(stderr=True, quiet=results.answer.quiet)
+        print_lines(console, *asked.notes, *output.describe_others())
         with show_progress(console):
-            ready = prepare(options, console)
-            session = open_session(ready, opening, console)
-            journal = open_journal(ready, opening, session)
-            page = build_page(ready, session, libraries, console, journal)
-        serve(options, page)
+            prepared = prepare_session(asked, console)
+            session = open_session(prepared, console)
+            journal = open_journal(prepared, session)
+            page = build_page(prepared, session, libraries, console, journal)
+        serve(request, page)
         print_lines(console, *describe_end(page.session, journal))
 
 
-def open_session(ready: Prepared, opening: Opening, console: Console) -> Session:
+def open_session(prepared: PreparedSession, console: Console) -> Session:
     """Begin a session, and do the steps again that it goes on from."""
-    return replay_steps(begin_session(ready), opening.steps, opening.undone, console)
+    asked = prepared.request
+    return replay_steps(begin_session(prepared), asked.steps, asked.undone, console)
 
 
-def open_journal(ready: Prepared, opening: Opening, session: Session) -> Journal:
+def open_journal(prepared: PreparedSession, session: Session) -> Journal:
     """Open the journal of a session, which has what was done again."""
-    journal = Journal(opening.out, describe_began(ready), opening.saved)
+    journal = Journal(prepared.request.out, prepared.began, prepared.request.saved)
     if list_steps(session):
         journal.write(session)
     return journal
@@ -91,9 +91,14 @@ def describe_end(session: Session, journal: Journal) -> list[str]:
 
 
 def build_page(
-    ready: Prepared, session: Session, libraries: Libraries, console: Console, journal: Journal
+    prepared: PreparedSession,
+    session: Session,
+    libraries: Libraries,
+    console: Console,
+    journal: Journal,
 ) -> LivePage:
     """Build the page of a session."""
+    ready = prepared.scene
     scene = session.latest.context
     kind = "Photograph" if ready.opened.renders_from is None else "View"
     shots = [
@@ -105,8 +110,8 @@ def build_page(
         )
         for view in session.latest.views
     ]
-    title = ready.options.scene or ready.options.folder
-    assert title is not None
+    splat = ready.work.splat
+    title = ready.source.scene.folder if splat is None else splat.path
     content = ViewerContent(title.name, scene, scene, tuple(shots))
     page, notes = make_page(content, libraries, is_live=True)
     print_lines(console, *notes)
@@ -115,20 +120,20 @@ def build_page(
         page,
         PageScene(scene),
         lambda completion: find_next_target(ready, completion),
-        lambda session: save_session(ready, session),
+        lambda session: save_session(prepared, session),
         journal,
     )
 
 
-def serve(options: LiveOptions, page: LivePage) -> None:
+def serve(request: LiveRequest, page: LivePage) -> None:
     """Serve a page until Ctrl-C."""
-    server = LiveServer(resolve_host(options.host), options.host, options.port, page)
+    server = LiveServer(resolve_host(request.host), request.host, request.port, page)
     # Printed once the server listens.
-    if options.json:
+    if request.session.completion.results.answer.json:
         print_json({"url": server.url})
     else:
         print(f"{server.url} (Ctrl-C ends it)", flush=True)
-    if not options.no_open:
+    if request.opens_browser:
         webbrowser.open(server.opening_url)
     with suppress(KeyboardInterrupt):
         page.handle_requests()

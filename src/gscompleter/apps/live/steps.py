@@ -14,7 +14,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.apps.inputs.removal import Selection, find_in_region, widen_regions
+from gscompleter.apps.inputs.removal import find_in_region, widen_regions
+from gscompleter.apps.requests.splat import Selection
 from gscompleter.completer import GSCompleter
 from gscompleter.config import CompleterConfig
 from gscompleter.editing.cutting import Region

@@ -11,9 +11,8 @@ mask for that of its camera.
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from hashlib import sha256
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -22,18 +21,15 @@ import numpy as np
 import torch
 
 from gscompleter import __version__
-from gscompleter.apps.commands.shared_options import (
-    WORDS_OR_PATHS,
-    CompletingOptions,
-    Size,
-)
-from gscompleter.apps.inputs.removal import Selection, check_selection
+from gscompleter.apps.inputs.removal import check_selection
 from gscompleter.apps.live.session import UPRIGHT, Action, Session, Step
+from gscompleter.apps.requests.scene import Size
+from gscompleter.apps.requests.splat import Selection
 from gscompleter.data.scene import describe_camera
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import STROKES_FOLDER
-from gscompleter.system.files.reading import hash_file, read_bytes
+from gscompleter.system.files.reading import read_bytes
 from gscompleter.system.files.result_format import MARK
 from gscompleter.system.files.typed_json import read_typed_json
 from gscompleter.system.files.writing import STROKES_FILE
@@ -44,11 +40,6 @@ STROKES = (STROKES_FILE, f"{STROKES_FOLDER}/stroke*.png")
 ADVICE = "save the session again"
 OF_STROKES = ("resolution", "near", "far", "context")
 """Options that `repair --strokes` reads, too, which are entries of their own."""
-OF_MACHINE = (
-    *("out", "overwrite", "quiet", "json", "threads"),
-    *("device", "renderer_device", "network_device"),
-)
-"""Options that each run chooses anew."""
 
 Row = tuple[float, float, float, float]
 
@@ -106,18 +97,15 @@ class StrokesFile:
 class Began:
     """What a session began with, for its `strokes.json`."""
 
-    options: CompletingOptions
+    options: Mapping[str, Any]
+    """Options that a later session goes on with."""
+    resolution: Size | None
+    near: float | None
+    far: float | None
     context: tuple[int, ...] | None
     """Photographs that it works with; None if its cameras were found, and are found again."""
     scene_sha256: str | None
     """SHA-256 of the splat; None if the scene was reconstructed."""
-
-
-def describe_beginning(options: CompletingOptions, context: Sequence[int] | None) -> Began:
-    """Describe what a session began with; its splat is read to know it again."""
-    scene = options.scene
-    known = None if scene is None or not scene.is_file() else hash_file(scene)
-    return Began(options, None if context is None else tuple(context), known)
 
 
 def write_strokes(folder: Path, session: Session, began: Began) -> None:
@@ -157,16 +145,15 @@ def encode_strokes(
         describe_step(step, None if step.mask is None else name_mask(index))
         for index, step in enumerate(steps)
     ]
-    options = began.options
     content = {
         **MARK,
         "version": __version__,
-        "resolution": options.resolution,
-        "near": options.near,
-        "far": options.far,
+        "resolution": began.resolution,
+        "near": began.near,
+        "far": began.far,
         "context": began.context,
         "saved": saved,
-        "session": describe_options(options),
+        "session": began.options,
         "scene_sha256": began.scene_sha256,
         "camera_model": "PINHOLE",
         "frames": rows[: len(session.steps)],
@@ -193,25 +180,6 @@ def digest_steps(steps: Sequence[Step]) -> str:
         mask = None if step.mask is None else sha256(step.mask).hexdigest()
         digest.update(json.dumps(describe_step(step, mask)).encode())
     return digest.hexdigest()
-
-
-def describe_options(options: CompletingOptions) -> dict[str, Any]:
-    """Describe the options that a session goes on with, without those of a machine."""
-    names = [field.name for field in fields(CompletingOptions)]
-    chosen = [name for name in names if name not in (*OF_STROKES, *OF_MACHINE)]
-    return {name: describe_value(name, getattr(options, name)) for name in chosen}
-
-
-def describe_value(name: str, value: Any) -> Any:
-    """Describe the value of an option as JSON; paths are absolute, as a later run is elsewhere."""
-    if is_dataclass(value):
-        names = [field.name for field in fields(value)]
-        return {inner: describe_value(inner, getattr(value, inner)) for inner in names}
-    if isinstance(value, tuple | list):
-        return [describe_value(name, part) for part in value]
-    is_path = isinstance(value, Path)
-    is_path |= name in WORDS_OR_PATHS and isinstance(value, str) and os.path.exists(value)
-    return os.path.abspath(value) if is_path else value
 
 
 def find_strokes_file(path: Path) -> Path:

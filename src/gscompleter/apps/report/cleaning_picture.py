@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import pad
 
-from gscompleter.apps.report.completion import join_images
+from gscompleter.apps.report.pictures import join_images
 from gscompleter.render.lod import MAX_GAUSSIANS, MAX_PREVIEW_GAUSSIANS, thin_gaussians
 from gscompleter.render.outside import DISTANCE, list_outside_cameras, measure_extent
 from gscompleter.render.protocols import Renderer

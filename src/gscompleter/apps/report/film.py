@@ -17,7 +17,7 @@ import torch
 from jaxtyping import Float, UInt8
 from PIL import Image, ImageDraw, ImageFont
 
-from gscompleter.apps.report.completion import MAX_PHOTOGRAPHS, thin_evenly
+from gscompleter.apps.report.record import MAX_PHOTOGRAPHS, thin_evenly
 from gscompleter.evaluation.verdict.held_out import render_before_after
 from gscompleter.numerics.geometry import (
     embed_cameras,

@@ -18,16 +18,13 @@ import torch
 
 from gscompleter.apps.inputs.splat import locate_splat
 from gscompleter.apps.inputs.task import InputSplatFile, Target
-from gscompleter.apps.report.completion import (
-    GENERATED_FILE,
-    make_score_rows,
-    measure_gaps,
-    write_report,
-)
+from gscompleter.apps.report.completion import write_report
 from gscompleter.apps.report.film import VIDEO_FILE
 from gscompleter.apps.report.page import REPORT_FILE, write_completion_page
 from gscompleter.apps.report.run_record import describe_python_run
+from gscompleter.apps.report.scenes import GENERATED_FILE
 from gscompleter.apps.report.schema import RECORD_FILE
+from gscompleter.apps.report.score_rows import make_score_rows, measure_gaps
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.scene import write_cameras
 from gscompleter.editing.removal import restore_surroundings

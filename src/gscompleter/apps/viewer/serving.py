@@ -11,9 +11,9 @@ from http.server import ThreadingHTTPServer
 from pathlib import Path
 
 from gscompleter.apps.command_line.answers import print_answer, print_json
-from gscompleter.apps.commands.view import ViewOptions
 from gscompleter.apps.inputs.captures import find_cameras_beside
 from gscompleter.apps.report.schema import find_completed
+from gscompleter.apps.requests.viewing import ViewRequest
 from gscompleter.apps.viewer import packages
 from gscompleter.apps.viewer.exhibit import (
     ViewerContent,
@@ -28,7 +28,7 @@ from gscompleter.render.loading import load_renderer
 from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.sog import META
 from gscompleter.splats.upward import Direction
-from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.errors import InputError
 from gscompleter.system.files.output_file import reserve_file
 from gscompleter.system.files.writing import SUMMARY_FILE, replace_file
 from gscompleter.virtual_capture.upward import find_upward, require_direction
@@ -38,67 +38,64 @@ HOST_NAMES = (ADDRESS, "localhost")
 """Accepted host names; any other one may be a DNS rebinding attack by a website."""
 
 
-def show_scenes(options: ViewOptions) -> None:
+def show_scenes(request: ViewRequest) -> None:
     """Make the page, and write it or serve it until Ctrl-C."""
-    if options.save is not None:
-        if options.save.suffix.lower() not in (".html", ".htm"):
-            name = quote_value(options.save)
-            raise InputError(f"{name} is no .html file; name it *.html.", "save")
+    if request.save is not None:
         # Reserved first: a file that may not be replaced ends the command before scenes are read.
-        with reserve_file(options.save, options.overwrite):
-            parts, notes = load_page(options)
-            with replace_file(options.save) as file:
+        with reserve_file(request.save, request.overwrite):
+            parts, notes = load_page(request)
+            with replace_file(request.save) as file:
                 file.writelines(parts)
-        content = {"page": str(options.save), "notes": list(notes)}
-        print_answer(options, content, [*notes, options.save])
+        content = {"page": str(request.save), "notes": list(notes)}
+        print_answer(request.answer, content, [*notes, request.save])
         return
 
-    parts, notes = load_page(options)
-    with make_page_server(b"".join(parts), options.port) as server, suppress(KeyboardInterrupt):
+    parts, notes = load_page(request)
+    with make_page_server(b"".join(parts), request.port) as server, suppress(KeyboardInterrupt):
         address = f"http://{ADDRESS}:{server.server_address[1]}/"
         # Printed once the server listens.
-        if options.json:
+        if request.answer.json:
             print_json({"url": address, "notes": list(notes)})
         else:
             print(
-                *(() if options.quiet else notes),
+                *(() if request.answer.quiet else notes),
                 f"{address} (Ctrl-C ends it)",
                 sep="\n",
                 flush=True,
             )
-        if not options.no_open:
+        if request.opens_browser:
             webbrowser.open(address)
         server.serve_forever()
 
 
-def load_page(options: ViewOptions) -> tuple[Iterator[bytes], Sequence[str]]:
-    """Make the parts of the page of the scenes and cameras of the options, with notes on it."""
+def load_page(request: ViewRequest) -> tuple[Iterator[bytes], Sequence[str]]:
+    """Make the parts of the page of the scenes and cameras of a request, with notes on it."""
     # Libraries first: they may have to be downloaded, and a lack of network is said before large
     # scenes are read.
     libraries = packages.load_libraries()
-    return make_page_parts(load_content(options), libraries)
+    return make_page_parts(load_content(request), libraries)
 
 
-def load_content(options: ViewOptions) -> ViewerContent:
-    """Read the scenes and cameras of the options."""
+def load_content(request: ViewRequest) -> ViewerContent:
+    """Read the scenes and cameras of the request."""
     # A folder is that of a completion, of a trainer's model, or an unpacked .sog.
-    scene = options.scene
+    scene = request.scene
     if not (scene / SUMMARY_FILE).is_file():
         scene = resolve_splat(scene)
 
-    reading = options.drop_nonfinite, options.ignore_properties
-    if options.other is not None:
+    reading = request.drop_nonfinite, request.ignore_properties
+    if request.other is not None:
         # B is the scene after, A the one before.
-        content = load_viewer_files(options.other, scene, *reading)
+        content = load_viewer_files(request.other, scene, *reading)
     elif os.path.isdir(scene) and not os.path.isfile(scene / META):
-        content = load_viewer_completion(scene, options.drop_nonfinite)
+        content = load_viewer_completion(scene, request.drop_nonfinite)
     else:
         content = load_viewer_files(scene, None, *reading)
 
-    if options.cameras is not None:
-        content = add_file_cameras(content, options.cameras, options.resolution)
+    if request.cameras is not None:
+        content = add_file_cameras(content, request.cameras, request.resolution)
     is_completion = (scene / SUMMARY_FILE).is_file()
-    return set_upward(content, options.up, find_completed(scene) if is_completion else scene)
+    return set_upward(content, request.up, find_completed(scene) if is_completion else scene)
 
 
 def set_upward(content: ViewerContent, up: Direction | None, path: Path) -> ViewerContent:

@@ -1,4 +1,4 @@
-"""Rows of a manifest as options of `complete`."""
+"""Rows of a manifest: words of a command line of `complete`, and the request that they make."""
 
 from __future__ import annotations
 
@@ -10,7 +10,13 @@ from typing import Any, get_type_hints
 
 from gscompleter.apps.batch.manifest import FOLDER
 from gscompleter.apps.command_line.words import format_error, parse_words
-from gscompleter.apps.commands.complete import CompleteOptions
+from gscompleter.apps.commands.complete import CompleteOptions, decide_completion
+from gscompleter.apps.requests.completion import (
+    ExportRequest,
+    FillingRequest,
+    PlanRequest,
+    UpdateRequest,
+)
 from gscompleter.config.settings import validate
 from gscompleter.system.errors import InputError, quote_value
 
@@ -21,6 +27,19 @@ TRUE = ("true", "yes", "1")
 """Values of a CSV that set a flag."""
 FALSE = ("false", "no", "0", "")
 """Values of a CSV that leave a flag unset; an empty cell is one of them."""
+
+
+def decide_row(row: Mapping[str, Any], out: Path) -> FillingRequest:
+    """Decide what the row of a manifest asks for, or raise InputError."""
+    options = parse_row(row, out)
+    try:
+        request = decide_completion(options)
+    except InputError as error:
+        # Only the sentence is kept in the row of a failed job, so it names the option itself.
+        raise InputError(format_error(error)) from error
+    # `parse_row` lets neither an export nor a dry run through.
+    assert not isinstance(request, ExportRequest | PlanRequest | UpdateRequest)
+    return request
 
 
 def parse_row(row: Mapping[str, Any], out: Path) -> CompleteOptions:

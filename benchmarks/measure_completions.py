@@ -1,16 +1,28 @@
-"""Measurements of completions on this machine, and of how their time grows."""
+"""Measure how long completions take on this machine, and how the time grows.
+
+    python benchmarks/measure_completions.py [--cases benchmarks/performance.json] [--out OUT]
+    python benchmarks/measure_completions.py --quick
+
+Every completion is a process of its own, start-up included. Times are also given relative to one
+pass of the renderer, forward and backward, with 196,608 Gaussians at 256 x 256. Without cases the
+pair of `gscompleter demo` is measured.
+"""
 
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Annotated, Any, Literal
 
-from gscompleter.apps.bench.cases import (
+import tyro
+from annotated_types import Interval
+
+from completions.cases import (
     BenchCase,
     GrowthValues,
     Manifest,
@@ -19,8 +31,8 @@ from gscompleter.apps.bench.cases import (
     read_manifest,
     write_input_splat,
 )
-from gscompleter.apps.bench.generators import compare_generators, format_generators
-from gscompleter.apps.bench.measure import (
+from completions.generators import compare_generators, format_generators
+from completions.measure import (
     Sample,
     Yardstick,
     make_yardstick,
@@ -28,8 +40,8 @@ from gscompleter.apps.bench.measure import (
     measure_command,
     measure_in_rounds,
 )
-from gscompleter.apps.bench.report import Measured, Report, describe_machine, format_report
-from gscompleter.apps.commands.bench import BenchOptions
+from completions.report import Measured, Report, format_report
+from gscompleter.config.settings import Device, Seed, Settings, validate
 from gscompleter.data.demo_scene import (
     BASELINE_M,
     get_motorcycle_cameras,
@@ -43,7 +55,9 @@ from gscompleter.reconstructors import load_reconstructor
 from gscompleter.render.device import choose_device
 from gscompleter.render.loading import load_renderer
 from gscompleter.system.console import make_console
+from gscompleter.system.errors import InputError, print_error
 from gscompleter.system.files.output_folder import check_output, open_output_folder
+from gscompleter.system.machine import describe_machine
 from gscompleter.system.progress import show_preparation, show_progress, stage
 
 BEYOND = (1.0, 1.25, 1.5, 1.75)
@@ -53,13 +67,59 @@ DEMO_GROWTH = GrowthValues(
     pixels=((128, 128), (256, 256), (512, 512)),
     targets=((2,), (2, 3), (2, 3, 4, 5)),
 )
+WRONG_INPUT = 2
+"""Exit code of wrong input, as that of the commands."""
+
+Axis = Literal["gaussians", "pixels", "views", "targets"]
+
+
+@dataclass(frozen=True, kw_only=True)
+class Options(Settings):
+    """Measure how long completions take on this machine, and how the time grows."""
+
+    cases: Path | None = None
+    """JSON file of scenes with their frames and growth series, as benchmarks/performance.json."""
+    in_process: bool = False
+    """Run all completions in this process, as a program does that uses the library."""
+    generators: tuple[str, ...] = ()
+    """Compare these generators instead, at the first target of each case: seconds, and scores in
+    holes."""
+    growth: tuple[Axis, ...] = ("gaussians", "pixels", "views", "targets")
+    """Quantities to increase in the first case."""
+    repeats: Annotated[int, Interval(ge=1, le=1000)] = 5
+    """Number of repetitions."""
+    quick: bool = False
+    """Run a quick check: the smallest case once, no growth."""
+    device: Device = "auto"
+    """Device to compute on."""
+    seed: Seed = 0
+    """Seed of all random numbers."""
+    out: Path | None = None
+    """Folder to write bench.json and tables.md to."""
+    overwrite: bool = False
+    """Replace the files that an earlier run wrote there."""
+    quiet: bool = False
+    """Show no progress."""
+    json: bool = False
+    """Print the measurements as JSON."""
+
+
+def main(words: Sequence[str] | None = None) -> int:
+    """Measure what the words of the command line ask for, and return the exit code."""
+    options = tyro.cli(Options, args=words, config=(tyro.conf.FlagCreatePairsOff,))
+    try:
+        measure_completions(validate(options))
+    except InputError as error:
+        print_error(str(error))
+        return WRONG_INPUT
+    return 0
 
 
 @dataclass(frozen=True)
 class Bench:
     """Shared input of all measurements."""
 
-    options: BenchOptions
+    options: Options
     device: str
     models: Models
     yardstick: Yardstick
@@ -84,7 +144,7 @@ class Bench:
         return measure_command([str(word) for word in words], out, self.yardstick)
 
 
-def measure_completions(options: BenchOptions) -> None:
+def measure_completions(options: Options) -> None:
     """Measure the cases, and print or write the tables."""
     if options.out is not None:
         check_output(options.out, options.overwrite)
@@ -116,7 +176,7 @@ def list_grown_cases(series: Series) -> list[BenchCase]:
     return [case for grown in series.values() for case in grown.values()]
 
 
-def write_results(values: dict[str, Any], tables: str, options: BenchOptions) -> None:
+def write_results(values: dict[str, Any], tables: str, options: Options) -> None:
     """Print the tables or JSON, and write both to the output folder."""
     text = json.dumps(values, indent=1)
     if options.out is not None:
@@ -126,7 +186,7 @@ def write_results(values: dict[str, Any], tables: str, options: BenchOptions) ->
     print(text if options.json else tables)
 
 
-def load_manifest(options: BenchOptions, folder: Path) -> Manifest:
+def load_manifest(options: Options, folder: Path) -> Manifest:
     """Read the cases of a file, or write the demo's pair to `folder`."""
     if options.cases is not None:
         return read_manifest(options.cases)
@@ -141,7 +201,7 @@ def load_manifest(options: BenchOptions, folder: Path) -> Manifest:
     return Manifest((BenchCase("motorcycle", folder, (0, 1), (2,), (256, 256)),), DEMO_GROWTH)
 
 
-def prepare_bench(options: BenchOptions, folder: Path) -> Bench:
+def prepare_bench(options: Options, folder: Path) -> Bench:
     """Load the models and the yardstick, compiled."""
     device = choose_device(options.device)
     renderer = load_renderer(device)
@@ -175,3 +235,7 @@ def run_measurements(bench: Bench, cases: Sequence[BenchCase], series: Series) -
             for axis, grown in series.items()
         },
     )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

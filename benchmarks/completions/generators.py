@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from statistics import fmean, median
 
-from gscompleter.apps.bench.cases import BenchCase
+from completions.cases import BenchCase
 from gscompleter.evaluation.methods import Models
 from gscompleter.evaluation.metrics.scores import PartQuality, measure_part
 from gscompleter.evaluation.tables import format_markdown

@@ -1,23 +1,16 @@
-"""Statistics of measurements, their tables in Markdown, and the machine they are valid for."""
+"""Statistics of measurements, and their tables in Markdown."""
 
 from __future__ import annotations
 
-import platform
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from statistics import median
 from typing import Any
 
 import numpy as np
-import torch
 
-from gscompleter import __version__
-from gscompleter.apps.bench.measure import PROCESS, REST, Sample
+from completions.measure import PROCESS, REST, Sample
 from gscompleter.evaluation.tables import format_markdown
-from gscompleter.system.memory import read_memory_bytes
-from gscompleter.system.threads import count_available_cores
 from gscompleter.system.timing import STAGES
 
 COLUMNS = (*STAGES, "total", REST, PROCESS)
@@ -137,28 +130,3 @@ def format_cells(measured: Measured, columns: Sequence[str]) -> list[str]:
         f"{measured.ratio:.1f}{spread}",
         f"{measured.peak_bytes / 1e9:.2f}" if measured.peak_bytes else "–",
     ]
-
-
-def describe_machine(device: str) -> dict[str, str | int]:
-    """Describe the versions and the hardware."""
-    memory = read_memory_bytes()
-    return {
-        "gscompleter": __version__,
-        "processor": get_processor_name(),
-        "cores": count_available_cores(),
-        "memory_gb": 0 if memory is None else round(memory / 1e9),
-        "system": f"{platform.system()} {platform.release()}",
-        "python": platform.python_version(),
-        "torch": str(torch.__version__),
-        "device": device,
-        **({"gpu": torch.cuda.get_device_name()} if device == "cuda" else {}),
-    }
-
-
-def get_processor_name() -> str:
-    """Return the model of the processor, or its architecture if Linux does not report it."""
-    try:
-        model = re.search(r"(?m)^model name\s*:\s*(.+)$", Path("/proc/cpuinfo").read_text("utf-8"))
-    except OSError:
-        model = None
-    return model[1] if model else platform.processor() or platform.machine()

@@ -1,0 +1,1 @@
+"""Time and memory of completions: cases, measurements and their tables."""

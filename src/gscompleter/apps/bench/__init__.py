@@ -1,1 +1,0 @@
-"""Time and memory of a completion on this machine, and their growth."""

@@ -1,0 +1,315 @@
+"""What a session of `live` begins with: a scene, or a session that was kept in a folder.
+
+Its options are kept in `strokes.json`, so that `live OUT` needs no others, and `repair --strokes`
+takes some of them.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Mapping
+from dataclasses import asdict, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+from gscompleter.apps.command_line.chosen_config import ChosenConfig
+from gscompleter.apps.commands.shared_decisions import (
+    check_context,
+    check_generator,
+    decide_filling,
+    decide_results,
+    has_splat_alone,
+)
+from gscompleter.apps.commands.shared_options import (
+    WORDS_OR_PATHS,
+    CompletingOptions,
+    list_inputs,
+)
+from gscompleter.apps.live.opening import SessionRequest
+from gscompleter.apps.live.strokes import (
+    ADVICE,
+    OF_STROKES,
+    StrokesFile,
+    find_strokes_file,
+    read_steps,
+    read_strokes,
+)
+from gscompleter.apps.report.schema import find_completed
+from gscompleter.apps.requests.completion import CompletionRequest, TargetRequest
+from gscompleter.config import CompleterConfig, load_config
+from gscompleter.config.generators import GeneratorOptions
+from gscompleter.splats.edits import read_edits
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.output_folder import holds_results, holds_session
+from gscompleter.system.files.overlap import refuse_overlap
+from gscompleter.system.files.reading import hash_file
+from gscompleter.system.files.typed_json import validate_typed
+from gscompleter.system.files.writing import COMPLETED_FILES, STROKES_FILE
+from gscompleter.system.plugins import is_in_file
+
+DEFAULT_OUT = Path("live")
+"""Output folder of a session that begins with a scene."""
+DEFAULT_RESOLUTION = (256, 256)
+"""Working size of such a session."""
+NAMES_SCENE = ("folder", "scene")
+OF_MACHINE = (
+    *("out", "overwrite", "quiet", "json", "threads"),
+    *("device", "renderer_device", "network_device"),
+)
+"""Options that each run chooses anew."""
+
+Known = TypeVar("Known", bound=CompletingOptions)
+
+
+def decide_session(options: Known, strokes: Path | None) -> SessionRequest:
+    """Decide on the scene of a session, and on the steps of `strokes` that it goes on from.
+
+    Raises InputError if its folder is not free.
+    """
+    options, path = find_session(options, strokes)
+    if path is None:
+        out = options.out or DEFAULT_OUT
+        size = options.resolution or DEFAULT_RESOLUTION
+        options = replace(options, out=out, resolution=size)
+        if holds_session(out) and not options.overwrite:
+            raise InputError(
+                f"{quote_value(out)} holds a session; go on with it by `gscompleter live "
+                f"{quote_value(out)}`, name another folder, or begin anew in it.",
+                "overwrite",
+            )
+        # A session saves several times, and reads its splat each time.
+        refuse_overlap(out, list_inputs(options), may_continue=False)
+        return begin_with(options)
+
+    saved = read_strokes(path)
+    is_named = options.folder is not None or options.scene is not None
+    out = options.out or (DEFAULT_OUT if is_named else path.parent)
+    continues = path.name == STROKES_FILE and os.path.realpath(path.parent) == os.path.realpath(out)
+    if is_named:
+        options = add_saved_options(options, saved)
+    else:
+        options = restore_options(options, saved, path)
+    options = replace(options, out=out, overwrite=options.overwrite or continues)
+    inputs = [*list_inputs(options), *(() if continues else (path,))]
+    refuse_overlap(out, inputs, may_continue=False)
+    return replace(
+        begin_with(options),
+        steps=read_steps(saved.frames, path.parent),
+        undone=read_steps(saved.undone, path.parent),
+        saved=saved.saved if continues else None,
+        notes=tuple(describe_changes(options, saved, out if continues else None)),
+    )
+
+
+def decide_replay(options: CompletingOptions, strokes: Path) -> SessionRequest:
+    """Decide on the scene on which the steps of a `strokes.json` are done again."""
+    path = find_strokes_file(strokes)
+    saved = read_strokes(path)
+    if not saved.frames:
+        raise InputError(f"{quote_value(path)} has no steps; {ADVICE}.", "strokes")
+    steps = read_steps(saved.frames, path.parent)
+    return replace(begin_with(add_saved_options(options, saved)), steps=steps)
+
+
+def begin_with(options: CompletingOptions) -> SessionRequest:
+    """Decide on a session without steps, with a record of its options."""
+    check_context(options.context)
+    check_generator(options.synthesis)
+    completion = decide_filling(
+        options,
+        # A session begins wherever the splat looks well, if nothing tells where its cameras were.
+        TargetRequest(),
+        decide_results(options),
+        context=options.context,
+        synthesis=options.synthesis,
+        has_marks=False,
+    )
+    return SessionRequest(completion, describe_session(options, completion), options.resolution)
+
+
+def add_saved_options(options: Known, saved: StrokesFile) -> Known:
+    """Return the options with those of the session where they are not given."""
+    given = {name: getattr(options, name) for name in OF_STROKES}
+    missing = {name: getattr(saved, name) for name, value in given.items() if value is None}
+    return replace(options, **missing)
+
+
+def describe_session(options: CompletingOptions, completion: CompletionRequest) -> dict[str, Any]:
+    """Describe what a session began with, for its `strokes.json`."""
+    splat = completion.work.splat
+    scene = None if splat is None else os.path.abspath(splat.path)
+    folder = None if has_splat_alone(options) else describe_value("folder", options.folder)
+    config = asdict(completion.work.config)
+    return {**describe_options(options), "folder": folder, "scene": scene, "config": config}
+
+
+def describe_options(options: CompletingOptions) -> dict[str, Any]:
+    """Describe the options that a session goes on with, without those of a machine."""
+    names = [field.name for field in fields(CompletingOptions)]
+    chosen = [name for name in names if name not in (*OF_STROKES, *OF_MACHINE)]
+    return {name: describe_value(name, getattr(options, name)) for name in chosen}
+
+
+def describe_value(name: str, value: Any) -> Any:
+    """Describe the value of an option as JSON; paths are absolute, as a later run is elsewhere."""
+    if is_dataclass(value):
+        names = [field.name for field in fields(value)]
+        return {inner: describe_value(inner, getattr(value, inner)) for inner in names}
+    if isinstance(value, tuple | list):
+        return [describe_value(name, part) for part in value]
+    is_path = isinstance(value, Path)
+    is_path |= name in WORDS_OR_PATHS and isinstance(value, str) and os.path.exists(value)
+    return os.path.abspath(value) if is_path else value
+
+
+def find_session(options: Known, strokes: Path | None) -> tuple[Known, Path | None]:
+    """Find the steps to go on with, if any; the options then name a scene only with `strokes`.
+
+    An output folder without steps stands for the completed scene in it.
+    """
+    folder = options.folder
+    path = None if strokes is None else find_strokes_file(strokes)
+    if folder is None or options.scene is not None:
+        return options, path
+    if os.path.isdir(folder):
+        if holds_session(folder):
+            own = folder / STROKES_FILE
+            if path is not None and not os.path.samefile(own, path):
+                raise InputError(
+                    f"{quote_value(folder)} holds steps of its own; name its scene, or leave "
+                    "the others out.",
+                    "strokes",
+                )
+            return replace(options, folder=None), own
+        completed = find_completed(folder)
+        if holds_results(folder) and completed.is_file():
+            return replace(options, folder=completed), path
+    elif is_saved_session(folder):
+        own = folder.with_name(STROKES_FILE)
+        if path is None or os.path.realpath(own) == os.path.realpath(path):
+            return replace(options, folder=None), own
+    return options, path
+
+
+def is_saved_session(path: Path) -> bool:
+    """Return True for the completed scene of a session, as the session saved it."""
+    if path.name not in COMPLETED_FILES or not holds_session(path.parent):
+        return False
+    if read_strokes(path.with_name(STROKES_FILE)).session is None:
+        return False
+    # What another program or command changed is a splat of its own.
+    edits = read_edits(path)
+    return edits.is_unchanged and bool(edits) and edits.edits[-1].command == "live"
+
+
+def restore_options(options: Known, saved: StrokesFile, path: Path) -> Known:
+    """Return the options that a session began with, and those of this machine as they are given."""
+    if saved.session is None:
+        raise InputError(
+            f"{quote_value(path)} does not tell of which scene it is; name the scene, as in "
+            f"`gscompleter live splat.ply --strokes {quote_value(path)}`.",
+        )
+    kind = type(options)
+    given = {**describe_options(options), "config": describe_config(options)}
+    known = {**saved.session, **{name: getattr(saved, name) for name in OF_STROKES}}
+    asked = {**given, **{name: describe_value(name, getattr(options, name)) for name in OF_STROKES}}
+    for name, value in known.items():
+        refuse_other_value(name, asked.get(name), value, kind)
+        refuse_code(name, asked.get(name), value)
+
+    own = {field.name for field in fields(kind)}
+    own -= {field.name for field in fields(CompletingOptions)} - set(OF_MACHINE)
+    shown = quote_value(path)
+    config = validate_typed(CompleterConfig, known.get("config", {}), shown, ADVICE)
+    changed = ChosenConfig(changes=asdict(config))
+    values = {**known, **{name: getattr(options, name) for name in own}, "config": changed}
+    restored = validate_typed(kind, values, shown, ADVICE)
+    for name in NAMES_SCENE:
+        scene = getattr(restored, name)
+        if scene is not None and not scene.exists():
+            raise InputError(
+                f"{quote_value(scene)} is missing, with which the session began; name it where it "
+                f"is now, as in `gscompleter live splat.ply --strokes {quote_value(path)}`.",
+            )
+    return restored
+
+
+def refuse_other_value(name: str, given: Any, known: Any, kind: type[CompletingOptions]) -> None:
+    """Refuse an option that would change what the steps did, unless it has its default."""
+    if isinstance(known, Mapping) and isinstance(given, Mapping) and name != "config":
+        for inner, value in known.items():
+            refuse_other_value(inner, given.get(inner), value, kind)
+    elif normalize(given) not in [normalize(known), *list_defaults(name, kind)]:
+        raise InputError(
+            "A session goes on with the settings that it began with; leave this one out, or begin "
+            "anew with it.",
+            name,
+        )
+
+
+def refuse_code(name: str, given: Any, known: Any) -> None:
+    """Refuse to run a file of Python because a session names it, which may come from elsewhere."""
+    words = [word for word in list_words(known) if is_in_file(word)]
+    if words and not set(words) <= set(list_words(given)):
+        raise InputError(
+            f"The session ran {quote_value(words[0])}, a program; name it again if you trust it.",
+            "config.guards" if name == "config" else "generator" if name == "synthesis" else name,
+        )
+
+
+def list_words(value: Any) -> Iterator[str]:
+    """List all texts in values of JSON."""
+    if isinstance(value, str):
+        yield value
+    elif isinstance(value, Mapping):
+        for inner in value.values():
+            yield from list_words(inner)
+    elif isinstance(value, list | tuple):
+        for inner in value:
+            yield from list_words(inner)
+
+
+def list_defaults(name: str, kind: type[CompletingOptions]) -> list[Any]:
+    """List the values of an option, as JSON, that mean that it was not given."""
+    if name == "config":
+        presets = [
+            load_config("default", *kind) for kind in ((False, True), (True, True), (True, False))
+        ]
+        return [normalize(asdict(preset)) for preset in presets]
+    places = (GeneratorOptions, kind)
+    defaults = {field.name: field.default for place in places for field in fields(place)}
+    return [normalize(describe_value(name, defaults[name]))] if name in defaults else []
+
+
+def normalize(value: Any) -> Any:
+    """Return values of JSON with lists in place of tuples, so that they can be compared."""
+    if isinstance(value, Mapping):
+        return {name: normalize(inner) for name, inner in value.items()}
+    return [normalize(inner) for inner in value] if isinstance(value, list | tuple) else value
+
+
+def describe_config(options: CompletingOptions) -> dict[str, Any]:
+    """Describe the config that the options of a session name, which goes on with its own."""
+    lacks_photographs = has_splat_alone(options)
+    is_splat = options.scene is not None or lacks_photographs
+    return asdict(options.config.decide(is_splat, not lacks_photographs))
+
+
+def describe_changes(
+    options: CompletingOptions, saved: StrokesFile, out: Path | None
+) -> Iterator[str]:
+    """Describe what is another file than it was; `out` is the folder of a session that goes on."""
+    count = len(saved.frames)
+    yield f"Going on after {count} {'step' if count == 1 else 'steps'}, which are done again."
+    scene = options.scene or options.folder
+    is_known = saved.scene_sha256 is not None and scene is not None and scene.is_file()
+    if scene is not None and is_known and hash_file(scene) != saved.scene_sha256:
+        yield (
+            f"{quote_value(scene)} is another file than the session began with; its steps are "
+            "done on this one."
+        )
+    if out is None:
+        return
+    completed = find_completed(out)
+    if completed.is_file() and not read_edits(completed).is_unchanged:
+        yield f"{quote_value(completed)} was changed by another program; Save replaces it."

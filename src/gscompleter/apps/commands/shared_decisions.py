@@ -1,0 +1,245 @@
+"""Decisions that several commands share: from options to the parts of a request.
+
+Options that exclude each other are refused here and in the files of the commands, nowhere below.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+from gscompleter.apps.commands.shared_options import (
+    CompletingOptions,
+    ReconstructorOptions,
+    SceneOptions,
+)
+from gscompleter.apps.requests.completion import (
+    CompletionRequest,
+    ResultsRequest,
+    TargetRequest,
+    WorkRequest,
+)
+from gscompleter.apps.requests.models import ModelRequest
+from gscompleter.apps.requests.scene import (
+    NUM_VIDEO_FRAMES,
+    AloneRequest,
+    Names,
+    PhotographsRequest,
+    PosesRequest,
+    SceneRequest,
+    parse_resolution,
+)
+from gscompleter.apps.requests.splat import SplatRequest
+from gscompleter.config import CompleterConfig
+from gscompleter.config.generators import GeneratorOptions
+from gscompleter.data.mask_reading import MaskReading
+from gscompleter.system.errors import InputError, quote_value
+
+# Functions import what needs torch when they are called, so that no help page waits for it.
+
+PHOTOGRAPH_OPTIONS = {
+    "format": None,
+    "frames": NUM_VIDEO_FRAMES,
+    "no_masks": False,
+    "ignore": None,
+    "forget_edits": False,
+}
+"""Options that only photographs can follow, with their defaults."""
+
+Adapt = Callable[[CompleterConfig], CompleterConfig]
+"""Changes a config for what a command does."""
+
+
+def decide_filling(
+    options: CompletingOptions,
+    targets: TargetRequest,
+    results: ResultsRequest,
+    *,
+    context: Names | None,
+    synthesis: GeneratorOptions,
+    has_marks: bool,
+    adapt: Adapt = lambda config: config,
+) -> CompletionRequest:
+    """Decide which holes of which scene are filled, and by what.
+
+    `context` and `synthesis` are those of the options, or of the painted images. Where `has_marks`,
+    masks say what goes, and `--invert-masks` is for them. `adapt` is for what a command does.
+    """
+    check_presence(options, has_marks)
+    models = decide_models(options, synthesis)
+    lacks_photographs = has_splat_alone(options)
+    path = options.folder if lacks_photographs and options.scene is None else options.scene
+    splat = None if path is None else decide_splat(options, path)
+    config = options.config.decide(splat is not None, not lacks_photographs, adapt)
+    config = stop_recoloring(config) if options.no_recolor else config
+
+    masks = MaskReading(
+        options.invert_masks and not has_marks,
+        options.large_masks,
+        is_turned_by_option=not has_marks,
+        folder=options.ignore,
+    )
+    source: PhotographsRequest | AloneRequest
+    if lacks_photographs:
+        assert splat is not None
+        scene = decide_scene(options, splat.path, masks, has_splat=True)
+        source = AloneRequest(scene, context, options.cameras, options.up, options.holes)
+    else:
+        assert options.folder is not None
+        scene = decide_scene(options, options.folder, masks, splat is not None)
+        named = (*(context or ()), *targets.named)
+        poses = PosesRequest(options.out, options.overwrite, options.frames, named)
+        source = PhotographsRequest(scene, poses, context)
+        # With photographs, a scene is what they show, unless the user says otherwise.
+        config = config if options.holes == "auto" else config.for_holes(options.holes)
+    work = WorkRequest(splat=splat, models=models, config=config)
+    return CompletionRequest(source=source, work=work, targets=targets, results=results)
+
+
+def decide_results(options: SceneOptions) -> ResultsRequest:
+    """Decide where results are written."""
+    return ResultsRequest(out=options.out, overwrite=options.overwrite, answer=options.answer)
+
+
+def decide_scene(
+    options: SceneOptions, folder: Path, masks: MaskReading, has_splat: bool
+) -> SceneRequest:
+    """Decide how the photographs in a folder are read."""
+    return SceneRequest(
+        folder,
+        options.format,
+        parse_resolution(options.resolution),
+        has_splat and options.resolution is None,
+        options.near,
+        options.far,
+        uses_given_depth=not options.no_given_depth,
+        uses_masks=not options.no_masks,
+        masks=masks,
+    )
+
+
+def decide_photographs(options: SceneOptions, folder: Path) -> PhotographsRequest:
+    """Decide how the photographs of a splat are read, of which no target is named."""
+    masks = MaskReading(options.invert_masks, options.large_masks, folder=options.ignore)
+    poses = PosesRequest(options.out, options.overwrite, options.frames, options.context or ())
+    return PhotographsRequest(
+        decide_scene(options, folder, masks, has_splat=True), poses, options.context
+    )
+
+
+def decide_splat(options: SceneOptions, path: Path) -> SplatRequest:
+    """Decide how a splat is read."""
+    from gscompleter.splats.foreign import resolve_splat
+
+    return SplatRequest(
+        resolve_splat(path),
+        options.drop_nonfinite,
+        options.ignore_properties,
+        options.forget_edits,
+    )
+
+
+def decide_models(options: ReconstructorOptions, synthesis: GeneratorOptions) -> ModelRequest:
+    """Decide on models and their devices; refuse what is wrong with their names and settings."""
+    from gscompleter.reconstructors import check_reconstructor
+    from gscompleter.render.device import choose_devices
+
+    check_reconstructor(options.reconstructor)
+    settings = synthesis.make_settings()
+    devices = choose_devices(options.device, options.renderer_device, options.network_device)
+    return ModelRequest(
+        reconstructor=options.reconstructor,
+        weights=options.weights,
+        depth=options.depth,
+        depth_weights=options.depth_weights,
+        generator=synthesis.generator,
+        generator_settings=settings,
+        device=devices.renderer,
+        network_device=devices.networks,
+        seed=options.seed,
+    )
+
+
+def stop_recoloring(config: CompleterConfig) -> CompleterConfig:
+    """Return a config that keeps all colours of the splat."""
+    return replace(config, recolor=replace(config.recolor, iterations=0))
+
+
+def has_splat_alone(options: CompletingOptions) -> bool:
+    """Return True for a splat without photographs: SCENE is left out, or is the splat itself."""
+    return options.folder is None or is_splat(options.folder)
+
+
+def is_splat(path: Path) -> bool:
+    """Check whether a path names an existing file of Gaussians, or a folder of nothing else."""
+    if os.path.isdir(path):
+        from gscompleter.splats.foreign import holds_splat_alone
+
+        return holds_splat_alone(path)
+    if not os.path.isfile(path):
+        return False
+    from gscompleter.splats.formats import has_splat_extension
+
+    return has_splat_extension(path)
+
+
+def check_presence(options: CompletingOptions, has_marks: bool) -> None:
+    """Refuse what does not fit the photographs or their absence."""
+    if not has_splat_alone(options):
+        if options.cameras is not None:
+            raise InputError(
+                "The photographs of SCENE have cameras of their own; leave --cameras out, or name "
+                "the splat alone.",
+                "cameras",
+            )
+        if options.up is not None:
+            raise InputError(
+                "The photographs of SCENE tell what is up; leave --up out.",
+                "up",
+            )
+        return
+    if options.folder is not None and options.scene is not None:
+        raise InputError(
+            f"Two splats are named, {quote_value(options.folder, 80)} and "
+            f"{quote_value(options.scene, 80)}; name one, and as SCENE only its photographs.",
+            "scene",
+        )
+    if options.folder is None and options.scene is None:
+        raise InputError(
+            "Nothing is named that is to be completed; name SCENE, the folder of photographs, or "
+            "a splat."
+        )
+    for name, default in PHOTOGRAPH_OPTIONS.items():
+        if getattr(options, name) != default:
+            raise InputError(
+                "There are no photographs to apply this to; name their folder as SCENE.", name
+            )
+    if options.invert_masks and not has_marks:
+        raise InputError(
+            "There are no photographs whose masks could be read the other way round, and no --mask "
+            "is given; leave it out.",
+            "invert-masks",
+        )
+    if options.large_masks and not has_marks:
+        raise InputError("There are no masks that could be too large; leave it out.", "large-masks")
+
+
+def check_context(context: Names | None) -> None:
+    """Refuse an empty context, and repeated frames."""
+    if context is None:
+        return
+    if len(context) == 0 or len(set(context)) < len(context):
+        raise InputError(
+            "--context names no frame, or one twice; name different ones, as in --context 0 4, or "
+            "leave it out."
+        )
+
+
+def check_generator(synthesis: GeneratorOptions) -> None:
+    """Refuse the generator of painted images where none are named."""
+    if synthesis.generator == "painted":
+        raise InputError(
+            "The generator 'painted' needs painted images; name their folder.", "images"
+        )

@@ -1,0 +1,117 @@
+"""Pictures of a completion: targets and photographs, before and after."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import torch
+from jaxtyping import Float
+from torch import Tensor
+
+from gscompleter.apps.inputs.task import Target
+from gscompleter.config.settings import COVERED
+from gscompleter.evaluation.metrics.coverage import RenderPair
+from gscompleter.evaluation.verdict.held_out import render_before_after
+from gscompleter.numerics.image_ops import dilate, paint_marked
+from gscompleter.numerics.kernels.parallel import map_in_parallel
+from gscompleter.render.protocols import Renderer
+from gscompleter.state import Completion
+from gscompleter.target_result import TargetResult
+from gscompleter.system.files.image import write_image
+from gscompleter.types import View
+
+IMAGES = "images"
+"""Folder of the pictures of a completion."""
+
+
+def write_pictures(
+    folder: Path,
+    completion: Completion,
+    targets: Sequence[Target],
+    at_targets: Sequence[RenderPair],
+    name_view: str = "ignored",
+) -> None:
+    """Write `images/`: targets, and photographs with ignored regions, or all renders of a splat."""
+    folder.mkdir()
+    results = zip(targets, completion.targets, at_targets, strict=True)
+    for number, (target, result, pair) in enumerate(results, start=1):
+        images = name_target_images(target, result, pair, completion.config.holes.dilation)
+        write_images(folder, f"target{number}", images)
+    for number, view in enumerate(completion.views, start=1):
+        if view.ignore_mask is not None or name_view == "render":
+            write_images(folder, f"context{number}", {name_view: paint_ignored(view)})
+
+
+def write_photographs(
+    folder: Path, completion: Completion, views: Sequence[View], renderer: Renderer
+) -> None:
+    """Write photographs and the scene before and after at their cameras, numbered from 1."""
+    for number, view in enumerate(views, start=1):
+        pair = render_before_after(completion, view.camera, renderer)
+        images = {
+            "before": pair.before.image,
+            "after": pair.after.image,
+            "truth": paint_ignored(view),
+        }
+        write_images(folder, f"photograph{number}", images)
+
+
+def paint_ignored(view: View) -> Float[Tensor, "h w 3"]:
+    """Paint the ignored pixels of a photograph in a colour that no scene has."""
+    return paint_marked(view.image, ~view.valid_mask)
+
+
+def paint_unfilled(result: TargetResult, pair: RenderPair) -> Float[Tensor, "h w 3"] | None:
+    """Paint what stays empty of the hole of a target; None if the report has no word on it."""
+    if not result.unfilled.describe():
+        return None
+    is_open = result.hole_mask & (pair.after.alpha < COVERED)
+    return paint_marked(pair.after.image, is_open)
+
+
+def paint_reference(result: TargetResult, dilation: int) -> Float[Tensor, "h w 3"] | None:
+    """Paint what was synthesized for a target where it was used; None if nothing was.
+
+    Elsewhere it is the scene before: there the image of Φ only guides the registration, and it may
+    look worse than the scene.
+    """
+    if result.reference is None:
+        return None
+    is_used = dilate(result.hole_mask, dilation)[..., None]
+    return result.reference.image.where(is_used, result.before.image)
+
+
+def name_target_images(
+    target: Target, result: TargetResult, pair: RenderPair, dilation: int
+) -> dict[str, Tensor | None]:
+    """Name the images of a target: colours [h, w, 3], grey or masks [h, w].
+
+    `dilation` is that of the hole mask, in pixels.
+    """
+    alpha = result.trusted_alpha
+    return {
+        "before": pair.before.image,
+        "after": pair.after.image,
+        "hole_mask": result.hole_mask.float(),
+        "unfilled": paint_unfilled(result, pair),
+        "support": None if torch.equal(alpha, result.before.alpha) else alpha,
+        "reference": paint_reference(result, dilation),
+        "truth": None if target.view is None else paint_ignored(target.view),
+    }
+
+
+def write_images(folder: Path, name: str, images: Mapping[str, Tensor | None]) -> None:
+    """Write the images that there are, in parallel, as `{name}_{ending}.png`."""
+    known = {ending: image for ending, image in images.items() if image is not None}
+    paths = [folder / f"{name}_{ending}.png" for ending in known]
+    map_in_parallel(write_image, paths, known.values())
+
+
+def join_images(
+    pictures: Sequence[Float[Tensor, "h _w 3"]], gap: int = 4
+) -> Float[Tensor, "h wide 3"]:
+    """Join images of one height side by side on white."""
+    white = torch.ones((pictures[0].shape[0], gap, 3))
+    parts = [part for picture in pictures for part in (white, picture.cpu().clamp(0, 1))]
+    return torch.cat(parts[1:], dim=1)

@@ -1,0 +1,237 @@
+"""Rows of `summary.json`: scores of photographs and targets, thin gaps, and counts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from types import MappingProxyType
+from typing import Any
+
+from gscompleter.apps.inputs.task import Target
+from gscompleter.apps.report.schema import (
+    SCORES,
+    AlignmentRow,
+    ContextRow,
+    TargetRow,
+    UnfilledRow,
+)
+from gscompleter.editing.removal import hide_removed
+from gscompleter.evaluation.metrics.coverage import RenderPair
+from gscompleter.evaluation.metrics.image import compute_masked_psnr, ssim
+from gscompleter.evaluation.metrics.thin_gaps import (
+    AT_TARGET,
+    WorstGap,
+    find_worst_gap,
+    measure_flight,
+    measure_thin_gaps,
+    render_flight,
+)
+from gscompleter.evaluation.verdict.held_out import HeldOut, render_before_after, score_held_out
+from gscompleter.evaluation.verdict.outcome import judge_completion
+from gscompleter.evaluation.verdict.rows import ScoreRow
+from gscompleter.numerics.image_ops import compute_mask_fraction
+from gscompleter.numerics.kernels.parallel import map_in_parallel
+from gscompleter.reconstructors.features.consistency import measure_pose_errors
+from gscompleter.render.protocols import Renderer
+from gscompleter.render.view_map import get_view_map
+from gscompleter.state import Completion
+from gscompleter.target_result import TargetResult
+from gscompleter.types import View, merge
+
+MIN_POSED = 3
+"""Fewest photographs whose poses are compared."""
+
+Scores = dict[str, Any]
+"""PSNR and SSIM before and after by name, or None without a photograph."""
+
+
+@dataclass(frozen=True)
+class TargetGaps:
+    """Thin gaps after the completion of a target."""
+
+    share: float
+    """Share of the image at the target."""
+    flight_share: float
+    """The same on average on the way from the nearest photograph to the target."""
+    worst: WorstGap | None
+    """The worst place of both; None without thin gaps."""
+
+
+def make_score_rows(
+    completion: Completion,
+    targets: Sequence[Target],
+    at_targets: Sequence[RenderPair],
+    gaps: Sequence[TargetGaps],
+    renderer: Renderer,
+    held_out: Sequence[HeldOut] = (),
+    files: Mapping[int | None, str] = MappingProxyType({}),
+    has_searched: bool = True,
+) -> dict[str, Any]:
+    """Return the verdict and the rows of all photographs and targets, as in `summary.json`.
+
+    `at_targets` are the renders at the targets, and `gaps` their thin gaps; the rest is as in
+    `write_report`.
+    """
+    held_out_rows = score_held_out(completion, held_out, renderer)
+    gains = completion.exposure_gains
+    gain_rows = [None] * len(completion.views) if gains is None else gains.tolist()
+    rows: dict[str, Sequence[ScoreRow]] = {
+        "held_out": held_out_rows,
+        "context": add_pose_errors(
+            score_photographs(completion, completion.views, gain_rows, renderer), completion.views
+        ),
+        "targets": [
+            replace(
+                row,
+                derived_file=files.get(row.derived_from),
+                anchor_file=files.get(row.anchor),
+            )
+            for row in score_targets(completion, targets, at_targets, gaps, renderer)
+        ],
+    }
+    if not completion.targets:
+        checks = [photo.view for photo in completion.photos[completion.num_context :]]
+        rows["checks"] = score_photographs(completion, checks, [None] * len(checks), renderer)
+    scores = {
+        key: [asdict(replace(row, file=files.get(row.frame))) for row in group]
+        for key, group in rows.items()
+    }
+    # The verdict comes from the rows, so that the page and the terminal agree with them.
+    outcome = judge_completion(completion, held_out_rows, has_searched, rows["context"])
+    return {"outcome": asdict(outcome), **scores}
+
+
+def compute_scores(pair: RenderPair, photograph: View | None) -> Scores:
+    """Compute PSNR (dB) and SSIM over the valid pixels, or None without a photograph."""
+    scores: Scores = dict.fromkeys(SCORES)
+    if photograph is not None:
+        truth = photograph.image
+        valid = photograph.valid_mask
+        for when, render in (("before", pair.before), ("after", pair.after)):
+            scores[f"psnr_{when}"] = compute_masked_psnr(render.image, truth, valid)
+            scores[f"ssim_{when}"] = ssim(photograph.fill_ignored(render.image), truth)
+    return scores
+
+
+def score_views(completion: Completion, views: Sequence[View], renderer: Renderer) -> list[Scores]:
+    """Score the scene before and after at photographs, except where they show what was removed."""
+
+    def score(view: View) -> Scores:
+        shown = hide_removed(view, completion.source, renderer)
+        return compute_scores(render_before_after(completion, view.camera, renderer), shown)
+
+    map_views = get_view_map(completion.context.means, len(completion.context))
+    return list(map_views(score, views))
+
+
+def score_photographs(
+    completion: Completion,
+    views: Sequence[View],
+    exposure_gains: Sequence[Any],
+    renderer: Renderer,
+) -> list[ContextRow]:
+    """Make the rows of photographs of the context, or of those that checked a splat."""
+    scores = score_views(completion, views, renderer)
+    return [
+        ContextRow(
+            view.frame,
+            **view_scores,
+            exposure_gain=None if gain is None else tuple(gain),
+            dynamic_fraction=compute_mask_fraction(view.dynamic_mask),
+            given_depth=compute_mask_fraction(view.given_depth),
+            ignored=compute_mask_fraction(view.ignore_mask),
+        )
+        for view, view_scores, gain in zip(views, scores, exposure_gains, strict=True)
+    ]
+
+
+def add_pose_errors(rows: Sequence[ContextRow], views: Sequence[View]) -> list[ContextRow]:
+    """Add the pose errors to the rows of three photographs or more, which blur the scene by them.
+
+    Two photographs agree with any pose but across their epipolar lines.
+    """
+    if len(views) < MIN_POSED:
+        return list(rows)
+    errors = measure_pose_errors(views)
+    return [replace(row, pose_error=error) for row, error in zip(rows, errors, strict=True)]
+
+
+def score_targets(
+    completion: Completion,
+    targets: Sequence[Target],
+    pairs: Sequence[RenderPair],
+    gaps: Sequence[TargetGaps],
+    renderer: Renderer,
+) -> list[TargetRow]:
+    """Make the rows of the targets."""
+    # Photographs of targets are read for their scores alone, and so stayed on the CPU.
+    device = completion.context.means.device
+    views = [
+        t.view and hide_removed(t.view.to(device), completion.source, renderer) for t in targets
+    ]
+    scores = map_in_parallel(compute_scores, pairs, views)
+    rows = zip(targets, completion.targets, scores, gaps, strict=True)
+    return [make_target_row(completion, *row) for row in rows]
+
+
+def measure_gaps(completion: Completion, renderer: Renderer) -> list[TargetGaps]:
+    """Measure the thin gaps at each target, and on the way there from a photograph."""
+    if not completion.targets:
+        return []
+    # As stages see it: of a large scene its proxy, which shows the same gaps.
+    scene = merge(completion.parts)
+    photographs = [view.camera for view in completion.views]
+    gaps = []
+    for result in completion.targets:
+        flight = render_flight(scene, photographs, result.target, renderer)
+        worst = find_worst_gap({AT_TARGET: result.after, **flight})
+        share = measure_thin_gaps(result.after.alpha)
+        gaps.append(TargetGaps(share, measure_flight(flight), worst))
+    return gaps
+
+
+def make_target_row(
+    completion: Completion, target: Target, result: TargetResult, scores: Scores, gaps: TargetGaps
+) -> TargetRow:
+    """Make the row of a target."""
+    fit = result.affine
+    added = result.added
+    empty = result.unfilled
+    return TargetRow(
+        target.frame,
+        **scores,
+        anchor=completion.views[result.anchor].frame,
+        anchor_fallback=result.anchor_fallback,
+        hole_fraction=result.hole_fraction,
+        affine=AlignmentRow(fit.scale, fit.shift, fit.inliers, fit.method, fit.agreement),
+        added=len(added),
+        derived_from=target.derived_from,
+        recolored=result.num_recolored,
+        target_id=result.target_id if len(added) or result.num_recolored else None,
+        unfilled=UnfilledRow(empty.share, empty.lost_by, empty.regions),
+        notes=result.notes,
+        warnings=result.warnings,
+        refused=result.refusal,
+        offset=target.offset,
+        reason=target.reason or None,
+        thin_gaps=gaps.share,
+        flight_thin_gaps=gaps.flight_share,
+        painter=result.painter or None,
+    )
+
+
+def count_changes(completion: Completion) -> dict[str, Any]:
+    """Count the Gaussians and, of a splat, the photographs that it was not trained on."""
+    counts = {"context": len(completion.context), "added": len(completion.added)}
+    if completion.is_given:
+        counts["from_photographs"] = completion.num_observed
+    num_pieces = completion.count_added("piece")
+    if num_pieces:
+        counts["pieces"] = num_pieces
+    num_removed = int(completion.source.gone_mask.sum())
+    if num_removed:
+        counts["removed"] = num_removed
+    if completion.config.trust == "full":
+        return {"gaussians": counts}
+    counts["recolored"] = int(completion.recolored_mask.sum())
+    return {"gaussians": counts, "new_photographs": completion.num_new_photos}

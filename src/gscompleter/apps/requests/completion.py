@@ -1,0 +1,136 @@
+"""Requests to complete, repair and update one scene, and to remove something from it.
+
+`complete`, `remove` and `repair` fill holes at targets; what `remove` and `repair` take out before
+is theirs alone. `update` adds what photographs show, and has no targets.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import ClassVar, Literal
+
+from gscompleter.apps.requests.answer import AnswerRequest
+from gscompleter.apps.requests.models import ModelRequest
+from gscompleter.apps.requests.scene import AloneRequest, PhotographsRequest
+from gscompleter.apps.requests.splat import Selection, SplatRequest
+from gscompleter.config import CompleterConfig
+from gscompleter.data.mask_reading import MaskReading
+
+NUM_TARGETS = 4
+"""Most targets that are searched for, unless a number is given."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class WorkRequest:
+    """A splat to work on, the models that do it, and their settings."""
+
+    splat: SplatRequest | None = None
+    """The splat to complete; None to reconstruct the scene from its photographs."""
+    models: ModelRequest = ModelRequest()
+    config: CompleterConfig = CompleterConfig()
+    """Of a splat alone, without what is still to be found of its holes."""
+
+
+@dataclass(frozen=True)
+class TargetRequest:
+    """Cameras at which holes are filled."""
+
+    named: tuple[str, ...] = ()
+    """Files of cameras, and numbers and names of photographs, in order."""
+    max_found: int = NUM_TARGETS
+    """Most cameras to search for if none is named."""
+    images: Path | None = None
+    """Folder of images that were painted for them, in place of a generator."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResultsRequest:
+    """The folder of the results, and what is written there beside the usual."""
+
+    out: Path
+    overwrite: bool = False
+    """True to replace what an earlier run wrote there."""
+    suffix: Literal[".ply", ".spz", ".sog"] | None = None
+    """Format in which results are kept small; None to write all files as .ply."""
+    has_video: bool = False
+    """True to write a flight through the holes."""
+    answer: AnswerRequest = AnswerRequest()
+
+
+@dataclass(frozen=True, kw_only=True)
+class CompletionRequest:
+    """Fill holes at targets."""
+
+    command: ClassVar[str] = "complete"
+    source: PhotographsRequest | AloneRequest
+    work: WorkRequest
+    targets: TargetRequest = TargetRequest()
+    results: ResultsRequest
+
+
+@dataclass(frozen=True)
+class RepairRequest:
+    """Take what masks mark at the targets out of a splat, and fill its place."""
+
+    command: ClassVar[str] = "repair"
+    completion: CompletionRequest
+    masks: tuple[Path, ...]
+    """An image for each target camera, in their order."""
+    reading: MaskReading = MaskReading()
+    """How these masks are read."""
+
+
+@dataclass(frozen=True)
+class RemovalRequest:
+    """Take a selection out of a splat, and fill its place."""
+
+    command: ClassVar[str] = "remove"
+    completion: CompletionRequest
+    selection: Selection
+
+
+FillingRequest = CompletionRequest | RepairRequest | RemovalRequest
+"""A request that fills holes at targets, whatever it takes out before."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class UpdateRequest:
+    """Add to a splat what its photographs show and it lacks; nothing is invented."""
+
+    command: ClassVar[str] = "update"
+    source: PhotographsRequest
+    work: WorkRequest
+    photos: Path | None = None
+    """Folder of new photographs to place among those of the scene; None for none."""
+    hold_out: int = 0
+    """Number of photographs that are kept back to compare the splat with."""
+    results: ResultsRequest
+
+
+@dataclass(frozen=True)
+class ExportRequest:
+    """Write the holes of a completion for whoever paints them, in place of completing it."""
+
+    filling: FillingRequest
+    folder: Path
+    has_path: bool = False
+    """True to write a video along the targets, too."""
+    names_number: bool = False
+    """True if `--auto` was given, which the command with the painted images does not take."""
+
+
+@dataclass(frozen=True)
+class PlanRequest:
+    """Write the targets of a completion and what they see, and complete nothing."""
+
+    filling: FillingRequest
+
+
+Request = FillingRequest | UpdateRequest | ExportRequest | PlanRequest
+"""All that can be asked of `apps/completing`."""
+
+
+def get_completion(request: FillingRequest) -> CompletionRequest:
+    """Return the completion that a request is, or that follows what it takes out."""
+    return request if isinstance(request, CompletionRequest) else request.completion
