@@ -17,8 +17,8 @@ from gscompleter.numerics.image_ops import dilate, paint_marked
 from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.render.protocols import Renderer
 from gscompleter.state import Completion
-from gscompleter.target_result import TargetResult
 from gscompleter.system.files.image import write_image
+from gscompleter.target_result import TargetResult
 from gscompleter.types import View
 
 IMAGES = "images"
