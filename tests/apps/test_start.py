@@ -76,7 +76,7 @@ def test_help_waits_for_nothing_that_computes(words):
 def test_a_command_line_imports_the_options_of_its_command_alone():
     modules = list_imported("complete", "SCENE", "--out", "OUT")
     files = {name.rpartition(".")[2] for name in modules if "apps.commands." in name}
-    assert files == {"complete", "shared_options"}
+    assert files == {"complete", "shared_options", "shared_decisions"}
 
 
 ENDING = """
