@@ -27,12 +27,17 @@ from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import hash_file
 from gscompleter.system.files.result_format import MARK
 from gscompleter.system.files.typed_json import read_typed_json
-from gscompleter.system.files.writing import COMPLETED_FILE, EDITS_FILE, REMOVED_FILE
+from gscompleter.system.files.writing import (
+    COMPLETED_FILE,
+    EDITS_FILE,
+    REFINED_POSES_FILE,
+    REMOVED_FILE,
+)
 from gscompleter.types import Gaussians
 
 EDITS_FOLDER = "edits"
-EDITS = (EDITS_FILE, f"{EDITS_FOLDER}/*.ply")
-"""Globs of the files that are written."""
+EDITS = (EDITS_FILE, f"{EDITS_FOLDER}/*.ply", REFINED_POSES_FILE)
+"""Globs of the files that are written, with the poses that the splat was made with."""
 ADVICE = "take all files of its folder again, or move it away to do without the record"
 _NAME = re.compile(r"removed\.ply|edits/\d{1,5}_(originals|taken_out)\.ply")
 
@@ -214,6 +219,10 @@ def record_edit(
         can_be_undone=can_be_undone,
     )
     write_edits(folder, folder / COMPLETED_FILE, earlier, edit)
+    # The poses of the photographs that a splat was made with stay beside it.
+    poses = None if given is None else given.parent / REFINED_POSES_FILE
+    if poses is not None and poses.is_file():
+        shutil.copyfile(poses, folder / REFINED_POSES_FILE)
 
 
 def hash_given(path: Path | None) -> str | None:

@@ -23,6 +23,7 @@ from gscompleter.system.process import import_without_collection
 
 PHOTOGRAPH_OPTIONS = (
     *("context", "format", "frames", "resolution", "near", "far", "no_given_depth"),
+    "no_refine_poses",
     *("no_masks", "invert_masks", "large_masks", "ignore", "forget_edits"),
 )
 """Options that only photographs can follow."""

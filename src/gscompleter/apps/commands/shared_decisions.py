@@ -42,6 +42,7 @@ from gscompleter.system.errors import InputError, quote_value
 PHOTOGRAPH_OPTIONS = {
     "format": None,
     "frames": NUM_VIDEO_FRAMES,
+    "no_refine_poses": False,
     "no_masks": False,
     "ignore": None,
     "forget_edits": False,
@@ -115,6 +116,7 @@ def decide_scene(
         options.near,
         options.far,
         uses_given_depth=not options.no_given_depth,
+        refines_poses=not options.no_refine_poses,
         uses_masks=not options.no_masks,
         masks=masks,
     )

@@ -163,6 +163,9 @@ class SceneOptions(ComputeOptions, WritingOptions, MaskOptions):
     """Largest depth in the scene, in the unit of its cameras. Else as for near."""
     no_given_depth: bool = False
     """Ignore the depth that SCENE holds: depth maps, laser sweeps, COLMAP's points."""
+    no_refine_poses: bool = False
+    """Keep the given poses of photographs. Otherwise, poses that matches contradict are refined
+    together where a scene is made of the photographs alone, and taken again beside its splat."""
     no_masks: bool = False
     """Use what masks and alpha channels of photographs hide instead of ignoring it."""
     ignore: Path | None = None

@@ -29,7 +29,7 @@ from gscompleter.apps.completing.remove import prepare_removal
 from gscompleter.apps.completing.run_info import describe_run, read_held_out, refuse_results
 from gscompleter.apps.completing.update import prepare_update
 from gscompleter.apps.inputs.describing import describe_task, print_lines
-from gscompleter.apps.inputs.task import CompletionTask
+from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.apps.report.completion import write_report
 from gscompleter.apps.report.film import write_comparison_video
 from gscompleter.apps.report.page import write_completion_page
@@ -50,6 +50,7 @@ from gscompleter.apps.requests.completion import (
 from gscompleter.completer import check_target_ids
 from gscompleter.config.generators import PaintedSettings
 from gscompleter.data.scene import describe_camera, write_cameras
+from gscompleter.data.sfm.refined_file import write_refined
 from gscompleter.editing.removal import restore_surroundings
 from gscompleter.evaluation.metrics.coverage import render_pairs, sample_held_out_cameras
 from gscompleter.numerics.kernels.parallel import run_in_background
@@ -60,7 +61,7 @@ from gscompleter.system.console import make_console
 from gscompleter.system.errors import print_error, quote_value
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.files.video import find_ffmpeg
-from gscompleter.system.files.writing import RENDERS_FILE, TARGETS_FILE
+from gscompleter.system.files.writing import REFINED_POSES_FILE, RENDERS_FILE, TARGETS_FILE
 from gscompleter.system.process import release_free_memory
 from gscompleter.system.progress import show_progress, stage
 from gscompleter.system.timing import add_seconds
@@ -185,7 +186,7 @@ def plan_targets(request: PlanRequest) -> int:
                 ready = ready.with_choices(choices)
                 holes = [choice.hole_fraction for choice in choices]
             write_targets(folder, ready.task)
-            write_render_cameras(folder, ready)
+            write_chosen_cameras(folder, ready.opened, ready.task)
             if ready.task.targets:
                 write_plan_pictures(folder / IMAGES, ready, begun)
     answer_plan(results, ready.opened, ready.task.targets, holes)
@@ -303,7 +304,7 @@ def write_done(
             testing=[completion.with_depth_range(camera) for camera in task.witnesses.testing],
             edit=EditDraft(command or ready.command, describe_edit(ready)),
         )
-    write_render_cameras(folder, ready)
+    write_chosen_cameras(folder, ready.opened, ready.task)
     write_completion_page(folder)
     return summary
 
@@ -365,11 +366,13 @@ def write_targets(folder: Path, task: CompletionTask) -> None:
         write_in_first_frame(folder / TARGETS_FILE, task, [t.camera for t in task.targets])
 
 
-def write_render_cameras(folder: Path, ready: Prepared) -> None:
-    """Write the cameras of renders that took the place of photographs, as `--cameras` reads."""
-    if ready.opened.renders_from is not None:
-        cameras = [view.camera for view in ready.task.views]
-        write_in_first_frame(folder / RENDERS_FILE, ready.task, cameras)
+def write_chosen_cameras(folder: Path, opened: Opened, task: CompletionTask) -> None:
+    """Write cameras that were not given: those of renders, and refined ones of photographs."""
+    if opened.renders_from is not None:
+        cameras = [view.camera for view in task.views]
+        write_in_first_frame(folder / RENDERS_FILE, task, cameras)
+    if opened.refinement is not None and opened.given is not None:
+        write_refined(folder / REFINED_POSES_FILE, opened.given, opened.photographs)
 
 
 def write_in_first_frame(path: Path, task: CompletionTask, cameras: Sequence[Camera]) -> None:

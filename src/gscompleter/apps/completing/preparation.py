@@ -45,6 +45,8 @@ from gscompleter.config import CompleterConfig
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photograph_names import describe_offset
+from gscompleter.data.sfm.refined_file import take_refined
+from gscompleter.data.sfm.refining import MIN_REFINED, PIXELS_OF, has_pycolmap, refine_poses
 from gscompleter.editing.cutting import Region
 from gscompleter.editing.removal import remove_gaussians
 from gscompleter.generators import load_generator
@@ -52,6 +54,7 @@ from gscompleter.generators.painted import Painting
 from gscompleter.planning.planner import Choice, ViewPlanner
 from gscompleter.reconstructors import DepthAware, load_reconstructor
 from gscompleter.reconstructors.depth_predictors import StoredDepth
+from gscompleter.reconstructors.features.epipolar import measure_pose_fit
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.alignment.similarity import transform_camera
@@ -60,6 +63,7 @@ from gscompleter.splats.morton import sort_nearby
 from gscompleter.stages.context import prepare_single
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.writing import REFINED_POSES_FILE
 from gscompleter.system.progress import show_preparation, stage
 from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.types import Camera, Gaussians, View
@@ -181,6 +185,11 @@ def prepare_completion(
         config = work.config
         opened = open_for_completion(work, source, targets, console)
         task = read_inputs(work, source, targets, opened)
+        if work.splat is None and source.scene.refines_poses:
+            refined = refine_opened(opened, task, console)
+            if refined.refinement is not None:
+                opened = refined
+                task = read_inputs(work, source, targets, opened)
     loaded = load_models(work, config, targets, opened, task, console)
     return Prepared(
         request.command,
@@ -223,6 +232,40 @@ def open_for_completion(
     if not work.config.ego_mask:
         opened = replace(opened, photographs=opened.photographs.keep_ego_vehicle())
     return opened
+
+
+def refine_opened(opened: Opened, task: CompletionTask, console: Console) -> Opened:
+    """Refine the poses of all photographs together if matches of the context contradict them."""
+    fit = measure_pose_fit(task.views)
+    if fit is None or not fit.is_contradicted or len(opened.photographs.posed) < MIN_REFINED:
+        return opened
+    if not has_pycolmap():
+        print_lines(
+            console,
+            f"Matches contradict the given poses by {fit.given:.2f} px (of {PIXELS_OF}); "
+            "pip install 'gscompleter[poses]' refines them.",
+        )
+        return opened
+    photographs, refinement = refine_poses(opened.photographs)
+    if refinement is None:
+        return opened
+    print_lines(console, refinement.describe())
+    if not refinement.is_accepted:
+        return opened
+    return replace(opened, photographs=photographs, given=opened.photographs, refinement=refinement)
+
+
+def take_over_poses(opened: Opened, splat: Path, console: Console) -> Opened:
+    """Take the refined poses that a splat was made with, which lie beside its file."""
+    path = splat.parent / REFINED_POSES_FILE
+    if not path.is_file():
+        return opened
+    photographs = take_refined(opened.photographs, path)
+    if photographs is None:
+        print_lines(console, f"{quote_value(path)} is of other photographs, and is not used.")
+        return opened
+    print_lines(console, f"Refined poses of {quote_value(path)} are used.")
+    return replace(opened, photographs=photographs, given=opened.photographs)
 
 
 def read_inputs(
@@ -343,6 +386,8 @@ def open_input(
     opened = open_scene(photographs.scene, photographs.poses, console, check)
     if splat is None:
         return opened
+    if photographs.scene.refines_poses:
+        opened = take_over_poses(opened, splat.path, console)
     # Photographs in the map of a splat are relative to its origin from here on.
     origin = find_origin(splat.path)
     if origin is not None:

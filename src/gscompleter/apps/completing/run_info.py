@@ -67,6 +67,7 @@ def describe_run(
             "near": reading.near,
             "far": reading.far,
             "no_given_depth": not reading.uses_given_depth,
+            "no_refine_poses": not reading.refines_poses,
             "masks": reading.uses_masks,
             "invert_masks": inverts_masks,
             "large_masks": reading.masks.may_be_large,
@@ -79,6 +80,7 @@ def describe_run(
             "used": len(task.views),
             "splat": splat,
             "renders_from": opened.renders_from,
+            "refined_poses": opened.refinement and asdict(opened.refinement),
             "notes": [
                 *opened.photographs.notes,
                 *describe_missing(opened.photographs),

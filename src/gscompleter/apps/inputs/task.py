@@ -15,6 +15,7 @@ from torch import Tensor
 from gscompleter.apps.requests.scene import SceneRequest
 from gscompleter.data.photograph_names import name_target
 from gscompleter.data.photographs import Photographs
+from gscompleter.data.sfm.refining import PoseRefinement
 from gscompleter.editing.taken_out import TakenOut
 from gscompleter.generators.painted import Painting
 from gscompleter.splats.edits import Edits, read_edits
@@ -86,6 +87,10 @@ class Opened:
     """Number of photographs, with those whose camera was not found."""
     held_out: tuple[int, ...] = ()
     """Frames that are kept back: they only score the result."""
+    given: Photographs | None = None
+    """The photographs with the poses that were given; None if these are used."""
+    refinement: PoseRefinement | None = None
+    """What this command did to the given poses; None if it did nothing."""
     renders_from: str | None = None
     """Source of the cameras of renders that take the place of photographs: `cameras` of a
     file, around the `targets` or the `place` of a removal, the `pixels` of the splat, or

@@ -151,6 +151,16 @@ class ResultFrame:
 
 
 @dataclass(frozen=True)
+class PosesRow:
+    """A refinement of poses; errors are median distances of kept-back matches, in pixels of 256."""
+
+    photographs: int
+    given_error: float
+    refined_error: float
+    moved: float
+
+
+@dataclass(frozen=True)
 class SceneRow:
     """The opened scene."""
 
@@ -164,6 +174,8 @@ class SceneRow:
     """Source of the cameras of renders that took the place of photographs: `cameras` of a
     file, around the `targets` or the `place` of a removal, the `pixels` of the splat, or
     `standpoints`; None if there are photographs."""
+    refined_poses: PosesRow | None = None
+    """What a refinement of the given poses did; None without one."""
     notes: tuple[str, ...] = ()
     """Sentences about the opening: photographs and cameras that are left out, for example."""
 

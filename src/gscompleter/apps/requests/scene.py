@@ -37,6 +37,8 @@ class SceneRequest:
     """Largest depth in the unit of the cameras; None for that of the data."""
     uses_given_depth: bool = True
     """True to read the depth that the scene holds."""
+    refines_poses: bool = True
+    """True to refine poses that matches contradict, and to take refined ones beside a splat."""
     uses_masks: bool = True
     """True to ignore what masks of the scene hide."""
     masks: MaskReading = MaskReading()

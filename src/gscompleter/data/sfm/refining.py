@@ -11,6 +11,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -121,6 +122,11 @@ def refine_poses(photographs: Photographs) -> tuple[Photographs, PoseRefinement 
         pose[:3, 3] += photographs.origin
         frames[number] = replace(frames[number], c2w=pose)
     return replace(photographs, frames=tuple(frames)), done
+
+
+def has_pycolmap() -> bool:
+    """Return True if COLMAP is installed."""
+    return find_spec("pycolmap") is not None
 
 
 def pair_near(cameras: Sequence[Camera]) -> list[tuple[int, int]]:

@@ -1,0 +1,96 @@
+"""Refined poses in a file of a result, which later commands and other programs read.
+
+The file has the keys of nerfstudio's `transforms.json`: OpenGL axes, the frame of the given
+photographs. Intrinsics are those of photographs without distortion. The photographs that it is of
+are known by their names and by a hash of the poses that were given.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from gscompleter.data.cameras import find_pose_defect
+from gscompleter.data.photographs import Photographs
+from gscompleter.data.transforms import OPENCV_FROM_OPENGL
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.result_format import MARK
+from gscompleter.system.files.typed_json import read_typed_json
+from gscompleter.system.files.writing import replace_file
+
+ADVICE = "take it from its folder again, or move it away to use the given poses"
+
+
+@dataclass(frozen=True)
+class RefinedFrame:
+    """A photograph with its refined camera; other keys of a frame are for other programs."""
+
+    file_path: str
+    transform_matrix: list[list[float]]
+
+
+@dataclass(frozen=True)
+class RefinedFile:
+    """What a later command reads of the file."""
+
+    given: str
+    """Hash of the given poses."""
+    frames: list[RefinedFrame]
+
+
+def write_refined(path: Path, given: Photographs, refined: Photographs) -> None:
+    """Write the poses of photographs that differ from the given ones."""
+    frames: list[dict[str, Any]] = []
+    # Photographs that were placed among the given ones come after these, in a file of their own.
+    for number, (before, frame) in enumerate(zip(given.frames, refined.frames, strict=False)):
+        if frame.c2w is before.c2w:
+            continue
+        camera = refined.camera(number)
+        (fl_x, _, cx), (_, fl_y, cy), _ = camera.K.double().tolist()
+        matrix = (frame.c2w @ OPENCV_FROM_OPENGL).tolist()
+        row = RefinedFrame(frame.file_name, matrix)
+        size = {"w": camera.width, "h": camera.height}
+        frames.append({**asdict(row), **size, "fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy})
+    content = {
+        **MARK,
+        "camera_model": "PINHOLE",
+        "given": hash_poses(given),
+        "frames": frames,
+    }
+    with replace_file(path) as file:
+        file.write((json.dumps(content, indent=1) + "\n").encode())
+
+
+def take_refined(photographs: Photographs, path: Path) -> Photographs | None:
+    """Return photographs with the poses of a file; None if it is of others, or of other poses."""
+    content = read_typed_json(RefinedFile, path, ADVICE)
+    if content.given != hash_poses(photographs):
+        return None
+    poses = {}
+    for row in content.frames:
+        c2w = np.array(row.transform_matrix, dtype=np.float64)
+        if c2w.shape != (4, 4) or find_pose_defect(c2w) is not None:
+            raise InputError(
+                f"{quote_value(path)} is damaged: it has no pose of {quote_value(row.file_path)}; "
+                f"{ADVICE}."
+            )
+        poses[row.file_path] = c2w @ OPENCV_FROM_OPENGL
+    frames = [
+        replace(frame, c2w=poses[frame.file_name]) if frame.file_name in poses else frame
+        for frame in photographs.frames
+    ]
+    return replace(photographs, frames=tuple(frames))
+
+
+def hash_poses(photographs: Photographs) -> str:
+    """Hash the names and the poses of photographs."""
+    digest = hashlib.sha256()
+    for frame in photographs.frames:
+        digest.update(frame.file_name.encode(errors="surrogateescape"))
+        digest.update(frame.c2w.tobytes())
+    return digest.hexdigest()
