@@ -16,6 +16,7 @@ from types import NoneType
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import tyro
+from typing_extensions import Doc
 
 from gscompleter.apps.command_line.old_spellings import OLD_SPELLINGS
 from gscompleter.cli import COMMANDS, OptionClasses
@@ -77,7 +78,9 @@ def walk_fields(options: type) -> Iterator[tuple[str, Any, str]]:
         if is_dataclass(field.default):
             yield from walk_fields(type(field.default))
         else:
-            yield field.name, kind, find_help(options, field.name)
+            # As for tyro, a `Doc` of the type comes before the text below the field.
+            docs = [part.documentation for part in get_args(kind)[1:] if isinstance(part, Doc)]
+            yield field.name, kind, docs[0] if docs else find_help(options, field.name)
 
 
 def find_help(options: type, name: str) -> str:

@@ -21,6 +21,7 @@ WORDS = {
     "near": ("0.5",),
     "far": ("9",),
     "no_given_depth": (),
+    "no_refine_poses": (),
     "no_masks": (),
     "invert_masks": (),
     "large_masks": (),

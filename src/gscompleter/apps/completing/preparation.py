@@ -185,7 +185,9 @@ def prepare_completion(
         config = work.config
         opened = open_for_completion(work, source, targets, console)
         task = read_inputs(work, source, targets, opened)
-        if work.splat is None and source.scene.refines_poses:
+        # The paper takes poses as they are.
+        follows_paper = config.registration_method == "paper"
+        if work.splat is None and source.scene.refines_poses and not follows_paper:
             refined = refine_opened(opened, task, console)
             if refined.refinement is not None:
                 opened = refined
