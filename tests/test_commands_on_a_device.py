@@ -249,6 +249,7 @@ def test_a_session_in_the_browser_is_saved(room, tmp_path, actions):
     check_result(tmp_path / "out", 10)
 
 
+@pytest.mark.slow
 def test_photographs_are_completed_in_a_batch_and_unused_ones_score_it(room, tmp_path, monkeypatch):
     row = {"folder": str(room), "context": [0, 1], "target": [3], "near": 0.5, "far": 20}
     manifest = tmp_path / "manifest.jsonl"
@@ -264,6 +265,7 @@ def test_photographs_are_completed_in_a_batch_and_unused_ones_score_it(room, tmp
     assert all(row["psnr_after"] > 10 for row in held_out)
 
 
+@pytest.mark.slow
 def test_methods_are_evaluated(room, tmp_path, monkeypatch):
     case = {"scene": "room", "context": [0, 2], "target": 3, "neighbours": [1]}
     case |= {"near": 0.5, "far": 20.0}

@@ -66,6 +66,7 @@ def test_the_generator_invents_only_what_no_photograph_shows(
     assert back.read_bytes() == cut.read_bytes()
 
 
+@pytest.mark.slow
 def test_without_the_generator_there_are_no_targets(room, cut, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     assert run(monkeypatch, "update", room, "--scene", cut, *SMALL, "--out", out) == 0

@@ -137,6 +137,7 @@ def fox_splat(shared) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_a_hole_that_is_flown_to_closes_opens_again_and_is_saved(tmp_path, monkeypatch):
     cameras = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in PLACES]
     room, out = photographed(tmp_path / "room", cameras), tmp_path / "out"

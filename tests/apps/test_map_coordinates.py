@@ -125,6 +125,7 @@ def test_a_page_counts_in_the_coordinates_of_the_file(folders, tmp_path, monkeyp
     assert np.abs(np.array(centre) - middle).max() < 0.1
 
 
+@pytest.mark.slow
 def test_boxes_are_in_the_coordinates_of_the_file(folders, tmp_path, monkeypatch):
     counts = []
     for name, folder, place in zip("ab", folders, (np.zeros(3), MAP), strict=True):
@@ -227,6 +228,7 @@ def test_photographs_in_coordinates_of_their_own_stay_as_they_are(folders):
         gsc.load_views(folders[0] / "room", frames=[0], origin=(1.0, 2.0))
 
 
+@pytest.mark.slow
 def test_marks_of_a_camera_in_the_map_remove_the_same(folders, completed, tmp_path, monkeypatch):
     mask = torch.zeros(SIZE, SIZE)
     mask[16:32, 16:32] = 1

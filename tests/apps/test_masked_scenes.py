@@ -82,6 +82,7 @@ def compute_lower_psnr(out: Path) -> float:
     return -10 * np.log10(np.square(error).mean())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["masks", "alpha"])
 def test_what_is_masked_changes_nothing_beside_it(completed, kind):
     """The rest is completed as well as without anything in the way, and only it is scored."""

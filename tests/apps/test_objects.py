@@ -36,6 +36,7 @@ def make_z_up_room() -> Gaussians:
     return replace(scene, means=scene.means @ Z_UP.T)
 
 
+@pytest.mark.slow
 def test_nothing_is_added_to_an_object_whose_cameras_are_found(
     folder, tmp_path, monkeypatch, capsys
 ):

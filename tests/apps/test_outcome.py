@@ -113,6 +113,7 @@ def test_python_gets_the_verdict_of_the_command(scene, tmp_path, monkeypatch):
         gsc.judge(completion, views)
 
 
+@pytest.mark.slow
 def test_a_job_of_a_batch_that_did_not_reconstruct_has_failed(scene, tmp_path):
     broken = permute_poses(scene, tmp_path / "broken")
     options = {"folder": str(broken), "context": list(CONTEXT), "target": [TARGET]}
@@ -122,6 +123,7 @@ def test_a_job_of_a_batch_that_did_not_reconstruct_has_failed(scene, tmp_path):
     assert (tmp_path / "jobs" / "broken" / "report.html").is_file()
 
 
+@pytest.mark.slow
 def test_without_unused_photographs_shared_features_decide(scene, tmp_path, monkeypatch):
     broken = permute_poses(scene, tmp_path / "broken")
     folders = {scene: ("completed", 0), broken: ("not-reconstructed", 1)}

@@ -303,6 +303,7 @@ def test_a_batch_exports_no_holes(tmp_path):
         parse_row({"folder": "SCENE", "export_holes": "HOLES"}, tmp_path)
 
 
+@pytest.mark.slow
 def test_targets_of_an_export_are_found(scene, tmp_path, monkeypatch, capsys):
     """Without --target the planner chooses cameras, of which the second command knows where."""
     named = ("--context", 0, 1, "--auto", 1, "--export-holes", tmp_path / "holes")

@@ -76,6 +76,7 @@ def test_of_many_simultaneous_claims_none_is_refused(tmp_path):
     assert read_run_file(out / "run.json") == {"version": VERSION, "seed": 0}
 
 
+@pytest.mark.slow
 @pytest.mark.linux
 def test_of_simultaneous_claims_with_other_settings_one_kind_wins(tmp_path):
     codes, refused = claimed(tmp_path / "out", 40, kinds=2)
@@ -209,6 +210,7 @@ def test_rows_that_come_while_tables_are_written_get_into_them(finished, tmp_pat
     same_tables(out, finished)
 
 
+@pytest.mark.slow
 def test_a_shard_leaves_the_last_tables_to_the_others(finished, tmp_path, monkeypatch):
     """While rows are missing, another shard will write the tables after this one."""
     out = tmp_path / "out"

@@ -217,6 +217,7 @@ def test_the_next_run_keeps_the_poses_unless_it_wants_other_frames(video, tmp_pa
         find_poses(video, out, overwrite=True, num_frames=9)
 
 
+@pytest.mark.slow
 def test_a_video_is_completed_by_one_command(video, tmp_path, monkeypatch, capsys):
     pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     out = tmp_path / "out"

@@ -220,6 +220,7 @@ def test_photographs_that_were_completed_become_anchors(begun, tmp_path):
     assert [step.anchor for step in nearest.steps] == [1, 2, 3]
 
 
+@pytest.mark.slow
 def test_the_baseline_may_choose_them_too(begun, finished):
     turned = tuple(turned_away(view) for view in begun.views)
     state = begun.models.make_completer().begin((*turned, begun.targets[0]), begun.context)

@@ -162,6 +162,7 @@ def test_images_made_together_are_those_made_alone(kontext_folder):
     assert (together[0] - together[1]).abs().max() > 1e-4
 
 
+@pytest.mark.slow
 def test_pe_field_takes_the_depth_that_the_completer_names(kontext_folder, tmp_path, monkeypatch):
     """`paper()` names a monocular network, the default the scene."""
     network = load_monocular(str(tiny_model(tmp_path)))

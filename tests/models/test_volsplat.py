@@ -91,6 +91,7 @@ def test_weights_can_be_assigned_to_a_network_that_was_built_without_any():
     assert torch.equal(predict(empty.eval()).means, predict(given).means)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lower_precision", [False, True])
 def test_a_gaussian_lies_within_reach_of_its_voxel(lower_precision):
     with torch.autocast("cpu", torch.bfloat16, enabled=lower_precision):
