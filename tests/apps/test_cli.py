@@ -373,7 +373,7 @@ def test_a_splat_in_place_of_the_photographs_is_sent_to_its_option(tmp_path, mon
 def config_of(scene, tmp_path, monkeypatch, *more) -> CompleterConfig:
     """Return the settings of a command."""
     words = [str(word) for word in complete(scene, tmp_path / "out", *more)]
-    return parse_command(words).config
+    return parse_command(words).config.decide(is_splat=False, has_photographs=True)
 
 
 def test_single_settings_are_applied_over_those_that_are_named(scene, tmp_path, monkeypatch):
@@ -431,7 +431,7 @@ def test_help_has_every_option_and_one_for_the_settings(monkeypatch, capsys, com
     monkeypatch.setenv("COLUMNS", "100")
     assert run(monkeypatch, command, "--help") == 0
     said = capsys.readouterr().out
-    assert said.count("\n") < 160
+    assert said.count("\n") < 165
     assert "None" not in said
     shown = set(re.findall(r"^(?:  |│ )(?:-h, )?(--[a-z-]+)", said, re.MULTILINE))
     kind = OptionClasses()[command]

@@ -78,6 +78,10 @@ def translate_errors(settings: object, where: str = "", prefix: str = "") -> Ite
         # A sentence names one setting: that of the first error. Parts of its place that are no
         # text are indices, and those with a bracket kinds of a value that may be of several.
         wrong = error.errors(include_url=False)[0]
+        # A group of settings refuses what contradicts itself by a sentence of its own.
+        refusal = wrong.get("ctx", {}).get("error")
+        if isinstance(refusal, InputError):
+            raise refusal from None
         name = ".".join(p for p in wrong["loc"] if isinstance(p, str) and "[" not in p)
         raise InputError(where + describe_invalid(wrong, name, settings), prefix + name) from None
 

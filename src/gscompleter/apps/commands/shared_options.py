@@ -164,8 +164,7 @@ class SceneOptions(ComputeOptions, WritingOptions, MaskOptions):
     no_given_depth: bool = False
     """Ignore the depth that SCENE holds: depth maps, laser sweeps, COLMAP's points."""
     no_refine_poses: bool = False
-    """Keep the given poses of photographs. Otherwise, poses that matches contradict are refined
-    together where a scene is made of the photographs alone, and taken again beside its splat."""
+    """Keep the given poses of photographs; else those that matches contradict are refined."""
     no_masks: bool = False
     """Use what masks and alpha channels of photographs hide instead of ignoring it."""
     ignore: Path | None = None
