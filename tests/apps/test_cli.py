@@ -337,7 +337,7 @@ def test_what_is_no_command_gets_a_sentence_too(monkeypatch, capsys, words):
     [
         (
             ("evaluate", "a", "--out", "b", "--overwrite"),
-            "evaluate has no option --overwrite, which belongs to complete, live, update and 10 "
+            "evaluate has no option --overwrite, which belongs to complete, live, update and 9 "
             "more; evaluate continues the run in its folder (see gscompleter evaluate --help).",
         ),
         (
