@@ -25,6 +25,7 @@ from gscompleter.apps.report.film import (
     write_comparison_video,
 )
 from gscompleter.numerics.geometry import measure_baseline, measure_rotation, resize_camera
+from gscompleter.parts import PartOrigin, make_part
 from gscompleter.render.loading import load_renderer
 from gscompleter.state import Completion, Photo
 from gscompleter.system.errors import InputError
@@ -66,7 +67,9 @@ def completion() -> Completion:
     drawn = load_renderer("reference").render(context, target)
     mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
     made = TargetResult(target, drawn, drawn, mask, drawn.alpha, 0, False, right)
-    return begin_with(context, [view]).extended(made, {"total": 0.0}, (right,))
+    return begin_with(context, [view]).extended(
+        made, {"total": 0.0}, (make_part(PartOrigin("target", 1), right),)
+    )
 
 
 def decoded(path: Path) -> tuple[dict, np.ndarray]:

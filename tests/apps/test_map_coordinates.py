@@ -88,11 +88,11 @@ def test_the_given_file_comes_back_byte_for_byte(completed, folders, tmp_path, m
     assert out.read_bytes() == (folders[1] / "splat.ply").read_bytes()
 
 
-def test_the_frame_of_the_result_is_the_map(completed):
+def test_the_frame_of_the_result_is_the_map(completed, folders):
     frame = summary_of(completed[1])["frame"]
     assert frame["method"] == "given"
     assert np.array_equal(frame["transform"], np.eye(4))
-    assert frame["origin"] == list(load_splat(completed[1] / "completed.ply").origin)
+    assert frame["origin"] == list(load_splat(folders[1] / "splat.ply").origin)
     (camera,) = json.loads((completed[1] / "targets.json").read_text())["frames"]
     centre = np.array(camera["transform_matrix"])[:3, 3]
     assert np.abs(centre - MAP - CAMERAS[2].center.numpy()).max() < 1e-6

@@ -18,9 +18,9 @@ from gscompleter.splats.conversion import (
     measure_rounding,
     write_converted,
 )
-from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import (
     describe_oddities,
+    detect_splat_format,
     find_origin,
     load_splat,
     read_provenance,
@@ -33,6 +33,7 @@ from gscompleter.splats.transform import merge_placed
 from gscompleter.splats.upward import USUAL, read_upward
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import REMOVED_FILE
+from gscompleter.system.progress import stage
 from gscompleter.types import Gaussians
 
 MAX_SHIFT = 1000.0
@@ -45,7 +46,7 @@ UP_TOLERANCE = 1e-3
 
 def convert(request: ConversionRequest) -> Conversion:
     """Convert one splat or several, and say what the result does not keep."""
-    sources = [resolve_splat(path) for path in request.sources]
+    sources = request.sources
     operations = make_operations(request)
     for source in sources:
         if request.level is None and is_streamed(source):
@@ -54,8 +55,12 @@ def convert(request: ConversionRequest) -> Conversion:
                 "one, of which 0 is the finest.",
                 "level",
             )
+        # What is no splat is refused before anything is said to be done.
+        if not is_streamed(source):
+            detect_splat_format(source)
     try:
-        return convert_sources(sources, request, operations)
+        with stage("converting"):
+            return convert_sources(sources, request, operations)
     except DegreeError as error:
         raise InputError(
             "A splat has harmonics of SH degree 4, and degrees 0 to 3 are read; say that the "

@@ -86,8 +86,10 @@ class ConvertOptions(WritingOptions):
 
 def decide_conversion(options: ConvertOptions) -> ConversionRequest:
     """Decide what is converted, and what is changed on the way."""
+    from gscompleter.splats.foreign import resolve_splat  # no help page waits for torch
+
     return ConversionRequest(
-        sources=(options.source, *options.merge),
+        sources=tuple(resolve_splat(path) for path in (options.source, *options.merge)),
         out=options.out,
         level=options.level,
         bands=options.bands,
@@ -131,13 +133,12 @@ def run_convert(options: ConvertOptions) -> None:
         from gscompleter.apps.converting import convert
         from gscompleter.splats.formats import reserve_splat
         from gscompleter.system.console import make_console
-        from gscompleter.system.progress import show_progress, stage
+        from gscompleter.system.progress import show_progress
 
     request = decide_conversion(options)
     with (
         reserve_splat(options.out, options.overwrite),
         show_progress(make_console(stderr=True, quiet=options.quiet)),
-        stage("converting"),
     ):
         done = convert(request)
     lines = list(done.notes)

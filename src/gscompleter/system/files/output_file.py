@@ -47,7 +47,11 @@ def reserve_file(path: Path, overwrite: bool) -> Iterator[None]:
 
 def check_free(path: Path, overwrite: bool) -> None:
     """Refuse to replace a file unless `overwrite` is set."""
-    if os.path.lexists(os.path.realpath(path)) and not overwrite:
+    try:
+        os.lstat(os.path.realpath(path))
+    except (FileNotFoundError, NotADirectoryError):
+        return  # any other error, as of a name that is too long, is one of writing there
+    if not overwrite:
         raise InputError(
             f"{quote_value(path)} exists; name another file, or overwrite it.", "overwrite"
         )
