@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 from jaxtyping import Float
-from scipy.optimize import least_squares
 
 from gscompleter.numerics.geometry import measure_baseline
 from gscompleter.reconstructors.features.consistency import MAX_POSE_ERROR, MIN_POSE_MATCHES
@@ -42,7 +41,8 @@ class PoseFit:
     given: float
     """Under the given poses."""
     fitted: float
-    """Under the relative pose of each pair that fits its matches best."""
+    """Under the relative pose of each pair that fits its matches best; as `given` where that is
+    at most `MIN_CONTRADICTION`."""
 
     @property
     def is_contradicted(self) -> bool:
@@ -60,7 +60,7 @@ def measure_pose_fit(views: Sequence[View]) -> PoseFit | None:
     images, _ = make_stereo_images(views)
     scale = PIXELS_OF / min(min(image.size) for image in images)
     given = []
-    fitted = []
+    pairs = []
     for (i, j), (in_i, in_j) in find_neighbours(images).matches.items():
         reference, source = images[i], images[j]
         errors, is_ahead = measure_match_errors(reference, source, in_i, in_j)
@@ -72,12 +72,18 @@ def measure_pose_fit(views: Sequence[View]) -> PoseFit | None:
         focals = (float(reference.K[0, 0]), float(source.K[0, 0]))
         pose = compute_relative_pose(reference, source)
         given.append(np.abs(compute_sampson_distances(pose, rays, focals)))
-        best = fit_relative_pose(pose, rays, focals)
-        fitted.append(np.abs(compute_sampson_distances(best, rays, focals)))
+        pairs.append((pose, rays, focals))
     if not given:
         return None
-    medians = [float(np.median(np.concatenate(one))) for one in (given, fitted)]
-    return PoseFit(medians[0] * scale, medians[1] * scale)
+    before = float(np.median(np.concatenate(given))) * scale
+    # Poses that agree as well as features can be located need no fit.
+    if before <= MIN_CONTRADICTION:
+        return PoseFit(before, before)
+    fitted = []
+    for pose, rays, focals in pairs:
+        best = fit_relative_pose(pose, rays, focals)
+        fitted.append(np.abs(compute_sampson_distances(best, rays, focals)))
+    return PoseFit(before, float(np.median(np.concatenate(fitted))) * scale)
 
 
 def make_rays(image: StereoImage, pixels: Pixels) -> Float[np.ndarray, "m 3"]:
@@ -122,6 +128,9 @@ def fit_relative_pose(
     focals: tuple[float, float],
 ) -> RelativePose:
     """Fit the relative pose with the smallest distances; those above a pixel count less."""
+    # Imported here, as most poses need no fit.
+    from scipy.optimize import least_squares
+
     # Two directions across the shift, whose length matches do not tell.
     across = np.linalg.svd(start[1][None])[2][1:]
 
