@@ -19,10 +19,10 @@ STARTING = {"sys.executable", "subprocess.run", "subprocess.Popen", "get_context
 STARTS = {
     # A process that libraries start, in a block of `hide_working_folder`.
     "system/jobs/engines.py": {"get_context"},
-    "system/children.py": {"sys.executable", "subprocess.run"},
+    "system/children.py": {"sys.executable", "subprocess.run", "subprocess.Popen"},
     # Programs that are no Python: ffmpeg and git.
     "system/files/video.py": {"subprocess.Popen"},
-    "apps/evaluating/reproduction.py": {"subprocess.run"},
+    "evaluation/measured_code.py": {"subprocess.run"},
 }
 """Files that start processes."""
 
