@@ -204,11 +204,15 @@ def test_a_plain_ply_of_another_name_is_named(tmp_path, monkeypatch, capsys):
     assert "It is named .compressed.ply, and holds a plain .ply." in capsys.readouterr().out
 
 
-def test_a_log_says_that_it_converts(tmp_path, monkeypatch, capsys):
+def test_a_log_says_that_it_converts_a_large_file(tmp_path, monkeypatch, capsys):
     """The line is repeated while a large file takes long; without a stage there would be none."""
     save_ply(tmp_path / "a.ply", random_gaussians(20, seed=0))
     words = ("convert", tmp_path / "a.ply", tmp_path / "b.splat")
     assert run(monkeypatch, *words) == 0
+    assert capsys.readouterr().err == ""
+    monkeypatch.setattr(converting, "MIN_SHOWN", 1)
+    words = (*words, "--overwrite")
+    assert run(monkeypatch, *words) == 0
     assert capsys.readouterr().err == "converting\n"
-    assert run(monkeypatch, *words, "--overwrite", "--quiet") == 0
+    assert run(monkeypatch, *words, "--quiet") == 0
     assert capsys.readouterr().err == ""

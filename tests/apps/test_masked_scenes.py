@@ -96,6 +96,7 @@ def test_what_is_masked_changes_nothing_beside_it(completed, kind):
     assert [row["ignored"] for row in read_summary(completed["whole"])["context"]] == [0, 0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["masks", "alpha"])
 def test_no_gaussian_is_made_of_what_is_masked(completed, kind):
     """Each pixel of a context photograph makes one Gaussian, unless it is masked."""

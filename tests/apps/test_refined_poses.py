@@ -108,6 +108,7 @@ def test_without_colmap_a_line_says_what_would_help(scene, tmp_path, monkeypatch
     assert "pip install 'gscompleter[poses]' refines them" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_refined_poses_that_agree_no_better_are_not_taken(scene, tmp_path, monkeypatch, capsys):
     worse = replace(DONE, refined_error=0.39)
     monkeypatch.setattr(preparation, "refine_poses", lambda given: (given, worse))

@@ -153,6 +153,7 @@ def test_the_crate_goes_its_place_is_filled_and_strip_brings_it_back(
     assert again.read_bytes() == (scene / "splat.ply").read_bytes()
 
 
+@pytest.mark.slow
 def test_half_of_an_object_that_is_left_is_reported(scene, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     half = (*CRATE[:4], 0.9, CRATE[5])

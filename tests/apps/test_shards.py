@@ -67,6 +67,7 @@ def claimed(out: Path, count: int, kinds: int = 1) -> tuple[list[int], str]:
     return json.loads(done.stdout), done.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.linux
 def test_of_many_simultaneous_claims_none_is_refused(tmp_path):
     out = tmp_path / "out" / "deep"

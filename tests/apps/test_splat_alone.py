@@ -253,6 +253,7 @@ def test_whether_a_splat_is_trained_is_decided_once(folder, tmp_path, monkeypatc
     assert len(searches) == 1
 
 
+@pytest.mark.slow
 def test_around_an_object_no_target_is_found(folder, tmp_path, monkeypatch, capsys):
     write_refused(folder)
     write_cameras(tmp_path / "cameras.json", [make_camera(-0.3), make_camera(0.3)])

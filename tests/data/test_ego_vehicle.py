@@ -188,6 +188,7 @@ def test_what_is_fitted_takes_nothing_from_it(clip):
     assert ((torch.minimum(red, blue) - green) > 0.6).float().mean() < 0.003
 
 
+@pytest.mark.slow
 def test_it_is_told_and_shown(clip, tmp_path, monkeypatch):
     folder, out = clip.frames[0].image.parent, tmp_path / "out"
     given = ("--context", 2, 4, "--target", 5, "--near", 1, "--far", 60, "--resolution", 64)

@@ -283,6 +283,7 @@ def test_a_real_road_is_evaluated(shared, tmp_path, monkeypatch, capsys):
     assert scores["context"]["target_after"]["psnr"] == before
 
 
+@pytest.mark.slow
 def test_what_moves_on_a_real_road_does_not_count(shared, tmp_path, monkeypatch, capsys):
     ahead = Seen((14.0, 0.0, 1.0), (4.0, 2.0, 2.0), 0.0, 1, (5.0, 0.0, 0.0))
     root = kitti_city_segment(shared, tmp_path / "waymo", count=5, boxes=(ahead,))

@@ -241,6 +241,7 @@ def test_a_run_killed_five_times_ends_as_one_that_was_not(scenes, finished, tmp_
     same_tables(out, finished)
 
 
+@pytest.mark.slow
 def test_failures_and_scores_can_be_done_again(tasks, tmp_path, monkeypatch):
     out, original = tmp_path / "out", METHODS["no-rc"]
 

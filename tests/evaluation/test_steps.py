@@ -238,6 +238,7 @@ def test_the_baseline_may_choose_them_too(begun, finished):
     assert [step["anchor_fallback"] for step in steps] == [False, False]
 
 
+@pytest.mark.slow
 def test_the_baseline_adds_all_that_it_lifts_and_the_context_adds_nothing(finished):
     folder = finished / "tasks" / FOLDER
     reggs, context = (read_run_file(folder / f"{name}.json") for name in ("reggs", "context"))

@@ -79,6 +79,7 @@ def move(render: Render) -> Render:
     return Render(*(part.to("cuda") for part in (render.image, render.depth, render.alpha)))
 
 
+@pytest.mark.slow
 def test_pe_field_paints_on_the_device(device, tmp_path):
     pytest.importorskip("diffusers")
     from gscompleter.models.diffusion.loading import load_kontext

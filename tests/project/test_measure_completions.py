@@ -115,6 +115,7 @@ def test_generators_are_compared_in_the_same_holes(scene, tmp_path, monkeypatch,
     assert "There is no generator 'nothing'" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_the_rest_of_a_process_is_what_its_completion_does_not_count(quick):
     (case,) = json.loads((quick / "bench.json").read_text())["cases"]
     seconds = case["samples"][0]["seconds"]

@@ -39,6 +39,7 @@ def counted(*arguments: str, **told: str) -> list[int]:
     return [int(word) for word in life.stdout.split()]
 
 
+@pytest.mark.slow
 def test_every_library_takes_as_many_as_it_is_told():
     assert counted("1") == [1, 1, 1]
     assert counted("3")[1:] == [3, 3]  # torch takes no more than there are cores

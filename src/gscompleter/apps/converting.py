@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from pathlib import Path
 
@@ -38,6 +39,8 @@ from gscompleter.types import Gaussians
 
 MAX_SHIFT = 1000.0
 """Longest shift, in scene units, after which coordinates certainly fit float32."""
+MIN_SHOWN = 50_000_000
+"""Size of the files, in bytes, from which on a log says that they are converted."""
 CAMERAS_FILE = "cameras.json"
 """File of a trainer with the cameras of its splat, which lies beside it."""
 UP_TOLERANCE = 1e-3
@@ -59,7 +62,7 @@ def convert(request: ConversionRequest) -> Conversion:
         if not is_streamed(source):
             detect_splat_format(source)
     try:
-        with stage("converting"):
+        with show_conversion(sources):
             return convert_sources(sources, request, operations)
     except DegreeError as error:
         raise InputError(
@@ -67,6 +70,12 @@ def convert(request: ConversionRequest) -> Conversion:
             "fourth band is to be left out: 3.",
             "bands",
         ) from error
+
+
+def show_conversion(sources: Sequence[Path]) -> AbstractContextManager[object]:
+    """Show the conversion of large files, which takes seconds; a small one is done at once."""
+    size = sum(source.stat().st_size for source in sources if source.is_file())
+    return stage("converting") if size >= MIN_SHOWN else nullcontext()
 
 
 def convert_sources(

@@ -70,6 +70,7 @@ def test_splats_in_the_order_of_their_use_are_the_same():
         assert np.array_equal(after, before[order])
 
 
+@pytest.mark.slow
 def test_an_image_too_wide_for_small_boxes_is_drawn_like_its_part():
     gaussians, camera = random_gaussians(40, sh_degree=0), camera_at(size=32)
     gaussians = replace(gaussians, opacities=torch.full((40,), 0.9))

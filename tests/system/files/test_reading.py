@@ -76,7 +76,8 @@ def test_values_are_plain_up_to_a_depth_and_a_number(tmp_path):
 @pytest.mark.parametrize("part", ["meta.json", "means_l.webp"])
 @pytest.mark.parametrize("kind", ["pipe", "device", "socket", "folder"])
 def test_a_folder_of_sog_opens_files_alone(tmp_path, others, part, kind):
-    folder = made(tmp_path, "folder", plausible(40, 1))
+    (tmp_path / "splats").mkdir()
+    folder = made(tmp_path / "splats", "folder", plausible(40, 1))
     (folder / part).unlink()
     (folder / part).symlink_to(others[kind])
     with pytest.raises(InputError, match="no regular file|is a folder without a splat"):
