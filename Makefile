@@ -22,7 +22,7 @@ GPU_WHEELS := $(VENV)/wheels/fetched
 # Tests start hundreds of processes, which would compile all modules again. (Empty is not set.)
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo set-up kernels test test-slow golden check-golden lint format types docs dist release-check fuzz evaluate reproduce held-out results-pages bench gpu clean
+.PHONY: demo set-up kernels test test-core test-slow golden check-golden lint format types docs dist release-check fuzz evaluate reproduce held-out results-pages bench gpu clean
 
 demo: $(VENV)/installed
 ifneq ($(NVIDIA),)
@@ -43,6 +43,11 @@ kernels: $(VENV)/installed-test
 # Longest files come first, as tests/conftest.py says; pytest-xdist would begin with the most tests.
 test: $(VENV)/installed-test $(GPU_WHEELS) kernels
 	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder
+
+# What a contributor to the method needs, in about a minute on two cores.
+test-core: $(VENV)/installed-test kernels
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 tests/stages tests/guards tests/trust \
+		tests/generators tests/config tests/test_parts.py tests/test_types.py
 
 test-slow: $(VENV)/installed-test $(GPU_WHEELS)
 	$(BIN)/python -m pytest -m slow

@@ -15,10 +15,10 @@ from torch import Tensor
 
 from command import run
 from gscompleter import load_camera, load_ply, save_ply
+from gscompleter.apps.commands.live import decide_live
 from gscompleter.apps.inputs.taken_out import describe_taken_out
 from gscompleter.apps.inputs.task import InputSplatFile
 from gscompleter.apps.live import saving
-from gscompleter.apps.live.opening import find_opening
 from gscompleter.apps.live.session import Step, apply_step
 from gscompleter.cli import parse_command
 from gscompleter.render.loading import load_renderer
@@ -72,7 +72,7 @@ def run_live(words: tuple[object, ...], out: Path, *steps: Step) -> Path:
     """Do steps in a session of `live`, save it, and return its result."""
     quiet = Console(quiet=True)
     options = parse_command(["live", *map(str, words), "--out", str(out), "--quiet"])
-    ready = saving.prepare(find_opening(options).options, quiet)
+    ready = saving.prepare_session(decide_live(options).session, quiet)
     session = saving.begin_session(ready)
     for step in steps:
         session, _ = apply_step(session, step)
