@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 import torch
 
+from gscompleter.numerics.two_views import compute_sampson_distances
 from gscompleter.reconstructors.features.epipolar import (
-    compute_sampson_distances,
     fit_relative_pose,
     measure_pose_fit,
 )
 from gscompleter.types import View
 from scenes import Room, camera_at, view_of
 
-FOCALS = (300.0, 300.0)
+FOCALS = (np.array([300.0, 300.0]), np.array([300.0, 300.0]))
 
 
 def turn_view(view: View, degrees: float) -> View:
@@ -53,9 +53,9 @@ def test_the_distance_is_that_of_both_features_from_their_lines():
     # A camera moves along x, so that epipolar lines are rows of the image.
     pose = np.eye(3), np.array([1.0, 0.0, 0.0])
     a = np.array([[0.1, 0.2, 1.0]])
-    b = np.array([[0.4, 0.2 + 3 / FOCALS[1], 1.0]])
+    b = np.array([[0.4, 0.2 + 3 / FOCALS[1][1], 1.0]])
     # Three pixels between rows: both features move half of it, each by 1.5, so √2 · 1.5 together.
-    distance = compute_sampson_distances(pose, (a, b), FOCALS)
+    distance = compute_sampson_distances(*pose, (a, b), FOCALS)
     assert np.abs(distance[0]) == pytest.approx(3 / np.sqrt(2))
 
 

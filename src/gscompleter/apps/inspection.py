@@ -57,7 +57,7 @@ ORIGINS = {
     "target": "invented for targets",
     "gap": "invented in thin gaps",
 }
-"""What a person is told of each kind of rows."""
+"""Words for a person about each kind of rows."""
 
 Bounds = tuple[tuple[float, float], ...]
 """Smallest and largest x, y and z."""

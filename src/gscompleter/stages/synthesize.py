@@ -44,7 +44,8 @@ class GeneratedView(View):
 def make_generator_input(view: TargetView) -> GeneratorInput:
     """Collect the input of Φ, whose holes are those of a target."""
     config = view.state.config.holes
-    opened, forced = view.masks.edits.opened, view.masks.edits.forced
+    opened = view.masks.edits.opened
+    forced = view.masks.edits.forced
     render = view.render
     alpha = view.alpha
     # Φ takes as holes what has too little alpha, which is more than the holes of an object, or

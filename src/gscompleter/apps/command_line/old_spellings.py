@@ -9,7 +9,7 @@ from gscompleter.system.errors import InputError
 OLD_COMMANDS = {
     "bench": "`python benchmarks/measure_completions.py` in a checkout measures completions",
 }
-"""What takes the place of a command, by its name."""
+"""Successor of each command that is gone, by its name."""
 
 UPDATE = "`gscompleter update` adds what photographs show and a splat lacks, and invents nothing"
 

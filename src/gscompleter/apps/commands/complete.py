@@ -131,7 +131,9 @@ def decide_holes(
     check_ending(options)
     if options.images is None:
         check_generator(options.synthesis)
-        named, context, synthesis = options.target, options.context, options.synthesis
+        named = options.target
+        context = options.context
+        synthesis = options.synthesis
     else:
         check_painted(options)
         named, context = decide_painted(options, options.images)
@@ -159,7 +161,8 @@ def decide_painted(options: CompleteOptions, folder: Path) -> tuple[tuple[str, .
     from gscompleter.apps.inputs.paintings import check_paintings
 
     check_paintings(folder, len(options.target))
-    named, context = options.target, options.context
+    named = options.target
+    context = options.context
     if has_holes(folder):
         named = named or (str(folder / HOLES_FILE),)
         # None is listed where renders take the place of photographs, at cameras that are found.

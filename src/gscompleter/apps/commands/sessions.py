@@ -1,4 +1,4 @@
-"""What a session of `live` begins with: a scene, or a session that was kept in a folder.
+"""Decide what a session of `live` begins with: a scene, or a session that was kept in a folder.
 
 Its options are kept in `strokes.json`, so that `live OUT` needs no others, and `repair --strokes`
 takes some of them.

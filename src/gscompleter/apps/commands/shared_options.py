@@ -39,7 +39,7 @@ class Options(Settings):
 
     @property
     def answer(self) -> AnswerRequest:
-        """What the command prints."""
+        """Return what the command prints."""
         return AnswerRequest(self.quiet, self.json)
 
     def check_overlap(self) -> None:

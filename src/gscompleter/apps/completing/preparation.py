@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, is_dataclass, replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ from gscompleter.apps.requests.completion import (
     CompletionRequest,
     ResultsRequest,
     TargetRequest,
+    UpdateRequest,
     WorkRequest,
 )
 from gscompleter.apps.requests.models import ModelRequest
@@ -46,11 +48,12 @@ from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photograph_names import describe_offset
 from gscompleter.data.sfm.refined_file import take_refined
-from gscompleter.data.sfm.refining import MIN_REFINED, PIXELS_OF, has_pycolmap, refine_poses
+from gscompleter.data.sfm.refining import MIN_REFINED, has_pycolmap, refine_poses
 from gscompleter.editing.cutting import Region
 from gscompleter.editing.removal import remove_gaussians
 from gscompleter.generators import load_generator
 from gscompleter.generators.painted import Painting
+from gscompleter.numerics.two_views import ERROR_SIDE
 from gscompleter.planning.planner import Choice, ViewPlanner
 from gscompleter.reconstructors import DepthAware, load_reconstructor
 from gscompleter.reconstructors.depth_predictors import StoredDepth
@@ -71,7 +74,7 @@ from gscompleter.types import Camera, Gaussians, View
 
 @dataclass(frozen=True)
 class Gone:
-    """What a command takes out of the splat before anything is completed."""
+    """Gaussians that a command takes out of the splat before anything is completed."""
 
     chosen: Bool[Tensor, "n"]
     contains: Region
@@ -87,7 +90,7 @@ class Prepared:
     source: PhotographsRequest | AloneRequest
     work: WorkRequest
     targets: TargetRequest | None
-    """None where nothing is invented, as in an update."""
+    """Cameras at which holes are filled; None where nothing is invented, as in an update."""
     results: ResultsRequest
     opened: Opened
     task: CompletionTask
@@ -193,10 +196,24 @@ def prepare_completion(
                 opened = refined
                 task = read_inputs(work, source, targets, opened)
     loaded = load_models(work, config, targets, opened, task, console)
+    return make_prepared(request, targets, loaded)
+
+
+def make_prepared(
+    request: CompletionRequest | UpdateRequest,
+    targets: TargetRequest | None,
+    loaded: Loaded,
+    settings: Mapping[str, Any] = MappingProxyType({}),
+) -> Prepared:
+    """Make what a request begins with, from the scene that was loaded for it.
+
+    `targets` and `settings` are those of `Prepared`.
+    """
+    source = request.source
     return Prepared(
         request.command,
         source,
-        work,
+        request.work,
         targets,
         request.results,
         loaded.opened,
@@ -205,6 +222,7 @@ def prepare_completion(
         loaded.cameras,
         loaded.seconds,
         source.scene.masks.is_inverted,
+        settings=settings,
     )
 
 
@@ -244,7 +262,7 @@ def refine_opened(opened: Opened, task: CompletionTask, console: Console) -> Ope
     if not has_pycolmap():
         print_lines(
             console,
-            f"Matches contradict the given poses by {fit.given:.2f} px (of {PIXELS_OF}); "
+            f"Matches contradict the given poses by {fit.given:.2f} px (of {ERROR_SIDE}); "
             "pip install 'gscompleter[poses]' refines them.",
         )
         return opened

@@ -15,6 +15,7 @@ from gscompleter.apps.completing.preparation import (
     collect_cameras,
     compute_view_transform,
     load_models,
+    make_prepared,
     open_for_completion,
     read_inputs,
     use_predicted_depth,
@@ -37,7 +38,6 @@ from gscompleter.apps.requests.scene import Names
 from gscompleter.config import CompleterConfig
 from gscompleter.data.formats import find_format
 from gscompleter.data.sfm.placing import place_photographs
-from gscompleter.planning.planner import ViewPlanner
 from gscompleter.splats.alignment.similarity import transform_view
 from gscompleter.stages.add_observed import MIN_SHARE, find_lacks
 from gscompleter.system.errors import InputError
@@ -77,23 +77,11 @@ def prepare_update(request: UpdateRequest, console: Console) -> Prepared:
     task = read_inputs(work, source, NO_TARGETS, opened)
     loaded = load_models(work, work.config, NO_TARGETS, opened, task, console)
     loaded = choose_evidence(work.models, source.context, loaded, new)
-    return Prepared(
-        request.command,
-        source,
-        work,
-        None,
-        request.results,
-        loaded.opened,
-        loaded.task,
-        ViewPlanner(loaded.completer),
-        loaded.cameras,
-        loaded.seconds,
-        source.scene.masks.is_inverted,
-        settings={
-            "photos": None if request.photos is None else str(request.photos),
-            "hold_out": request.hold_out,
-        },
-    )
+    settings = {
+        "photos": None if request.photos is None else str(request.photos),
+        "hold_out": request.hold_out,
+    }
+    return make_prepared(request, None, loaded, settings)
 
 
 def add_new_photographs(

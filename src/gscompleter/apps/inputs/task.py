@@ -72,7 +72,7 @@ class InputSplatFile:
 
     @cached_property
     def edits(self) -> Edits:
-        """What earlier commands did to it; the whole file is read to know that it is the same."""
+        """Read what earlier commands did to it, and the whole file, to know that it is the same."""
         return read_edits(self.path)
 
 
@@ -90,7 +90,7 @@ class Opened:
     given: Photographs | None = None
     """The photographs with the poses that were given; None if these are used."""
     refinement: PoseRefinement | None = None
-    """What this command did to the given poses; None if it did nothing."""
+    """Change of the given poses by this command; None if it changed none."""
     renders_from: str | None = None
     """Source of the cameras of renders that take the place of photographs: `cameras` of a
     file, around the `targets` or the `place` of a removal, the `pixels` of the splat, or

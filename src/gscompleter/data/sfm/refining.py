@@ -22,6 +22,7 @@ from gscompleter.data.photographs import Photographs
 from gscompleter.data.sfm.placing import write_known
 from gscompleter.data.sfm.poses import require_pycolmap, run_colmap
 from gscompleter.numerics.geometry import compute_spacing
+from gscompleter.numerics.two_views import ERROR_SIDE, find_near_pairs
 from gscompleter.types import Camera
 
 PROCESS = "gscompleter.data.sfm.refining_process"
@@ -29,14 +30,10 @@ MIN_REFINED = 3
 """Fewest photographs that are refined: two cannot hold the frame of the scene."""
 NUM_MATCHED = 8
 """Photographs near each one, of similar direction, that it is matched with."""
-TURN_PER_TWO_STEPS = 15.0
-"""Rotation in degrees that counts as much as two steps between cameras."""
 POSITION_SIGMA = 0.1
 """Standard deviation of a given camera centre, in steps between cameras."""
 MAX_ERROR_SHARE = 0.8
 """Largest error of the matches that were kept back, of that of the given poses, to accept."""
-PIXELS_OF = 256
-"""Shorter side of an image in whose pixels errors are told."""
 
 Poses = Float[np.ndarray, "n 4 4"]
 """Camera-to-world matrices."""
@@ -47,7 +44,7 @@ class PoseRefinement:
     """What a refinement of poses did.
 
     Errors are median distances of matches that were kept back from their epipolar lines, in pixels
-    of an image of `PIXELS_OF` pixels.
+    of an image of `ERROR_SIDE` pixels.
     """
 
     photographs: int
@@ -69,7 +66,7 @@ class PoseRefinement:
             return f"Given poses are kept: they miss matches by {pixels}."
         return (
             f"The poses of {self.photographs} photographs are refined: given ones miss matches "
-            f"that were kept back by {pixels} (of {PIXELS_OF}); --no-refine-poses leaves them."
+            f"that were kept back by {pixels} (of {ERROR_SIDE}); --no-refine-poses leaves them."
         )
 
 
@@ -107,7 +104,7 @@ def refine_poses(photographs: Photographs) -> tuple[Photographs, PoseRefinement 
         np.stack([invert_viewmat(row) for row in result["viewmats"] if row is not None]),
         given[found],
     )
-    scale = PIXELS_OF / min(copies[0].width, copies[0].height)
+    scale = ERROR_SIDE / min(copies[0].width, copies[0].height)
     shift = np.linalg.norm(refined[found][:, :3, 3] - given[found][:, :3, 3], axis=1)
     done = PoseRefinement(
         sum(found),
@@ -131,17 +128,9 @@ def has_pycolmap() -> bool:
 
 def pair_near(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     """Pair each camera with those that are nearest in place and direction."""
-    centers = torch.stack([camera.center for camera in cameras]).double()
-    forward = torch.stack([camera.forward for camera in cameras]).double()
-    apart = (centers[:, None] - centers).norm(dim=-1)
-    turned = torch.rad2deg((forward @ forward.T).clamp(-1, 1).arccos())
-    # Cameras in one place form no pair: there is no parallax.
-    apart[apart == 0] = torch.inf
-    unlike = apart / compute_spacing(cameras) + 2 * turned / TURN_PER_TWO_STEPS
-    nearest = unlike.argsort(dim=1, stable=True)[:, :NUM_MATCHED].tolist()
-    is_apart = apart.isfinite().tolist()
-    pairs = {(i, j) for i, row in enumerate(nearest) for j in row if is_apart[i][j]}
-    return sorted({(min(pair), max(pair)) for pair in pairs})
+    centers = torch.stack([camera.center for camera in cameras]).double().numpy()
+    forward = torch.stack([camera.forward for camera in cameras]).double().numpy()
+    return find_near_pairs(centers, forward, NUM_MATCHED)
 
 
 def invert_viewmat(viewmat: Sequence[Sequence[float]]) -> Float[np.ndarray, "4 4"]:

@@ -23,6 +23,7 @@ from scipy.sparse.csgraph import connected_components
 from gscompleter.data.sfm.matching import ColmapJob, extract_features, match, prepare_colmap
 from gscompleter.data.sfm.placing import KnownCopy, Pinhole
 from gscompleter.data.sfm.placing_process import make_known_camera, read_image_number
+from gscompleter.numerics.two_views import compute_sampson_distances
 
 ROUNDS = 3
 """Rounds of triangulation and adjustment; better cameras find more points."""
@@ -198,10 +199,7 @@ def measure_epipolar_distances(
     poses: dict[int, pycolmap.Rigid3d],
     intrinsics: dict[int, Pinhole],
 ) -> Float[np.ndarray, "n"]:
-    """Measure the distances of all matches from their epipolar lines, in pixels.
-
-    It is Sampson's distance: to first order, how far both features together have to move.
-    """
+    """Measure the distances of all matches from their epipolar lines, in pixels."""
     rays = {}
     for number, pixels in keypoints.items():
         fx, fy, cx, cy = intrinsics[number]
@@ -211,21 +209,10 @@ def measure_epipolar_distances(
     distances = [np.zeros(0)]
     for (i, j), rows in matches.items():
         relative = (poses[j] * poses[i].inverse()).matrix()
-        x, y, z = relative[:, 3]
-        # E = [t]x R, and b' E a = 0 for the rays a and b of one point.
-        essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ relative[:, :3]
-        a = rays[i][rows[:, 0]]
-        b = rays[j][rows[:, 1]]
-        line_in_b = a @ essential.T
-        line_in_a = b @ essential
-        fx_i, fy_i, *_ = intrinsics[i]
-        fx_j, fy_j, *_ = intrinsics[j]
-        # Slopes of the residual per pixel, not per unit of the image plane.
-        slopes = np.concatenate(
-            [line_in_b[:, :2] / [fx_j, fy_j], line_in_a[:, :2] / [fx_i, fy_i]], axis=1
-        )
-        residual = (b * line_in_b).sum(axis=1)
-        distances.append(np.abs(residual) / np.maximum(np.linalg.norm(slopes, axis=1), 1e-30))
+        focals = (np.array(intrinsics[i][:2]), np.array(intrinsics[j][:2]))
+        matched = (rays[i][rows[:, 0]], rays[j][rows[:, 1]])
+        signed = compute_sampson_distances(relative[:, :3], relative[:, 3], matched, focals)
+        distances.append(np.abs(signed))
     return np.concatenate(distances)
 
 

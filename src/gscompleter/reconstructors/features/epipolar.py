@@ -15,14 +15,13 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.numerics.geometry import measure_baseline
+from gscompleter.numerics.two_views import ERROR_SIDE, Focals, Rays, compute_sampson_distances
 from gscompleter.reconstructors.features.consistency import MAX_POSE_ERROR, MIN_POSE_MATCHES
 from gscompleter.reconstructors.features.matches import Pixels, measure_match_errors
 from gscompleter.reconstructors.features.neighbours import find_neighbours
 from gscompleter.reconstructors.features.stereo_image import StereoImage, make_stereo_images
 from gscompleter.types import View
 
-PIXELS_OF = 256
-"""Shorter side of an image in whose pixels distances are told."""
 MIN_CONTRADICTION = 0.12
 """Smallest median distance under given poses that matters. Poses from structure from motion have
 0.03 to 0.16 px, before and after they are fitted; those of SLAM and drives 0.15 to 1.2 px."""
@@ -36,7 +35,7 @@ RelativePose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
 
 @dataclass(frozen=True)
 class PoseFit:
-    """Median distances of matches from their epipolar lines, in pixels of `PIXELS_OF`."""
+    """Median distances of matches from their epipolar lines, in pixels of `ERROR_SIDE`."""
 
     given: float
     """Under the given poses."""
@@ -58,7 +57,7 @@ def measure_pose_fit(views: Sequence[View]) -> PoseFit | None:
     if len(views) < 2 or not any(measure_baseline(views[0].camera, v.camera) for v in views):
         return None
     images, _ = make_stereo_images(views)
-    scale = PIXELS_OF / min(min(image.size) for image in images)
+    scale = ERROR_SIDE / min(min(image.size) for image in images)
     given = []
     pairs = []
     for (i, j), (in_i, in_j) in find_neighbours(images).matches.items():
@@ -69,9 +68,9 @@ def measure_pose_fit(views: Sequence[View]) -> PoseFit | None:
         if is_true.sum() < MIN_POSE_MATCHES:
             continue
         rays = (make_rays(reference, in_i[is_true]), make_rays(source, in_j[is_true]))
-        focals = (float(reference.K[0, 0]), float(source.K[0, 0]))
+        focals = (reference.K.diagonal()[:2], source.K.diagonal()[:2])
         pose = compute_relative_pose(reference, source)
-        given.append(np.abs(compute_sampson_distances(pose, rays, focals)))
+        given.append(np.abs(compute_sampson_distances(*pose, rays, focals)))
         pairs.append((pose, rays, focals))
     if not given:
         return None
@@ -82,11 +81,11 @@ def measure_pose_fit(views: Sequence[View]) -> PoseFit | None:
     fitted = []
     for pose, rays, focals in pairs:
         best = fit_relative_pose(pose, rays, focals)
-        fitted.append(np.abs(compute_sampson_distances(best, rays, focals)))
+        fitted.append(np.abs(compute_sampson_distances(*best, rays, focals)))
     return PoseFit(before, float(np.median(np.concatenate(fitted))) * scale)
 
 
-def make_rays(image: StereoImage, pixels: Pixels) -> Float[np.ndarray, "m 3"]:
+def make_rays(image: StereoImage, pixels: Pixels) -> Rays:
     """Make the rays of pixels, in camera axes at z = 1."""
     whole = np.concatenate([pixels, np.ones((len(pixels), 1))], axis=1)
     return whole @ np.linalg.inv(image.K).T
@@ -98,34 +97,10 @@ def compute_relative_pose(reference: StereoImage, source: StereoImage) -> Relati
     return source.rotation.T @ reference.rotation, shift / np.linalg.norm(shift)
 
 
-def compute_sampson_distances(
-    pose: RelativePose,
-    rays: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]],
-    focals: tuple[float, float],
-) -> Float[np.ndarray, "m"]:
-    """Compute Sampson's distances in pixels, with a sign.
-
-    To first order, it is how far both features of a match together have to move to meet.
-    """
-    rotation, shift = pose
-    x, y, z = shift
-    # E = [t]x R, and b' E a = 0 for the rays a and b of one point.
-    essential = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]]) @ rotation
-    a, b = rays
-    line_in_b = a @ essential.T
-    line_in_a = b @ essential
-    slopes = np.concatenate(
-        [line_in_b[:, :2] / focals[1], line_in_a[:, :2] / focals[0]],
-        axis=1,
-    )
-    residuals: Float[np.ndarray, "m"] = (b * line_in_b).sum(axis=1)
-    return residuals / np.maximum(np.linalg.norm(slopes, axis=1), 1e-30)
-
-
 def fit_relative_pose(
     start: RelativePose,
-    rays: tuple[Float[np.ndarray, "m 3"], Float[np.ndarray, "m 3"]],
-    focals: tuple[float, float],
+    rays: tuple[Rays, Rays],
+    focals: tuple[Focals, Focals],
 ) -> RelativePose:
     """Fit the relative pose with the smallest distances; those above a pixel count less."""
     # Imported here, as most poses need no fit.
@@ -140,7 +115,7 @@ def fit_relative_pose(
         return turn @ start[0], shift / np.linalg.norm(shift)
 
     solution = least_squares(
-        lambda step: compute_sampson_distances(change(step), rays, focals),
+        lambda step: compute_sampson_distances(*change(step), rays, focals),
         np.zeros(5),
         loss="soft_l1",
         x_scale=[1e-3, 1e-3, 1e-3, 1e-2, 1e-2],

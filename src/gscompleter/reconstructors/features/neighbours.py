@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from gscompleter.numerics.kernels.parallel import map_in_parallel
+from gscompleter.numerics.two_views import find_near_pairs
 from gscompleter.reconstructors.features.matches import (
     Pixels,
     detect_features,
@@ -35,8 +36,6 @@ MIN_COVERING_MATCHES = 20
 """Fewest matches that fit the poses, of a neighbour that is taken for what it covers."""
 NUM_COMPARED = 6
 """Number of photographs per photograph whose features are compared."""
-TURN_PER_TWO_STEPS = 15.0
-"""Rotation in degrees that counts as much as two steps between cameras."""
 BEST_ANGLE = 5.0
 """Best triangulation angle, in degrees."""
 NARROWER_SIGMA = 2.0
@@ -128,16 +127,7 @@ def find_close_pairs(images: Sequence[StereoImage]) -> list[Pair]:
     """List pairs i < j with a baseline and a similar position and direction."""
     centers = np.stack([image.center for image in images])
     forward = np.stack([image.rotation[:, 2] for image in images])
-    distance = np.linalg.norm(centers[:, None] - centers[None], axis=-1)
-    turned = np.degrees(np.arccos((forward @ forward.T).clip(-1, 1)))
-    # Cameras in one place, the same one among them, form no pair: there is no parallax.
-    distance[distance == 0] = np.inf
-    # The usual distance between neighbouring cameras is the unit of the dissimilarity.
-    step = np.median(distance.min(axis=1))
-    unlike = distance / step + 2 * turned / TURN_PER_TWO_STEPS
-    nearest = unlike.argsort(axis=1, kind="stable")[:, :NUM_COMPARED]
-    pairs = {(i, int(j)) for i, row in enumerate(nearest) for j in row if np.isfinite(unlike[i, j])}
-    return sort_pairs(pairs)
+    return find_near_pairs(centers, forward, NUM_COMPARED)
 
 
 def sort_pairs(pairs: Iterable[Pair]) -> list[Pair]:
