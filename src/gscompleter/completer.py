@@ -47,11 +47,7 @@ from gscompleter.stages.result import make_unchanged_result
 from gscompleter.stages.select_anchor import choose_anchor
 from gscompleter.stages.synthesize import GeneratedView, make_generator_input, synthesize
 from gscompleter.stages.target_view import TargetView, render_target
-from gscompleter.state import (
-    Completion,
-    Photo,
-    check_state,
-)
+from gscompleter.state import Completion, Photo
 from gscompleter.system.errors import InputError
 from gscompleter.system.progress import show_in_notebook, track
 from gscompleter.system.tensor_checks import describe, is_whole
@@ -353,7 +349,8 @@ class GSCompleter:
         # `begin` has chosen the margin.
         margin = state.config.margin or 0.0
         can_pad = as_generator(self.generator).supports_padding
-        return pad_camera(state.with_depth_range(target), margin if can_pad else 0.0)
+        ranged = state.with_depth_range(target)
+        return pad_camera(ranged, margin if can_pad else 0.0)
 
     @timed_stage("generate")
     def synthesize(self, views: Sequence[TargetView]) -> list[GeneratedView]:
@@ -373,6 +370,15 @@ def name_model(model: object) -> str:
     """Name a model by its own `name`, or that of its function or class."""
     own = getattr(model, "name", None) or getattr(model, "__name__", None)
     return own if isinstance(own, str) else type(model).__name__
+
+
+def check_state(state: object) -> None:
+    """Raise InputError for a value in place of a completion."""
+    if not isinstance(state, Completion):
+        raise InputError(
+            "The state has to be a Completion, such as GSCompleter.begin returns, and is "
+            f"{describe(state)}."
+        )
 
 
 def check_target_list(targets: object) -> None:

@@ -14,10 +14,8 @@ from torch import Tensor
 
 from gscompleter.config import CompleterConfig
 from gscompleter.parts import Part, PartKind, find_last_target_id
-from gscompleter.system.errors import InputError
 from gscompleter.system.files.display import Displayed
 from gscompleter.system.plugins import load_function
-from gscompleter.system.tensor_checks import describe
 from gscompleter.system.timing import add_seconds
 from gscompleter.target_result import TargetResult
 from gscompleter.trust import Trust
@@ -264,12 +262,3 @@ class Completion(Displayed):
     def plus_seconds(self, seconds: Mapping[str, float]) -> Completion:
         """Add wall times stage by stage."""
         return replace(self, seconds=add_seconds(self.seconds, seconds))
-
-
-def check_state(state: object) -> None:
-    """Raise InputError for a value in place of a completion."""
-    if not isinstance(state, Completion):
-        raise InputError(
-            "The state has to be a Completion, such as GSCompleter.begin returns, and is "
-            f"{describe(state)}."
-        )

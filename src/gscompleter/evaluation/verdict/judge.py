@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from gscompleter.completer import check_state
 from gscompleter.evaluation.verdict.held_out import HeldOut, score_context, score_held_out
 from gscompleter.evaluation.verdict.outcome import judge_completion
 from gscompleter.evaluation.verdict.rows import OutcomeRow
 from gscompleter.numerics.value_checks import check_views
 from gscompleter.render.loading import load_renderer
-from gscompleter.state import Completion, check_state
+from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
 from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import View
