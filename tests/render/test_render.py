@@ -516,8 +516,8 @@ def test_gsplat_is_called_so_that_frozen_views_draw_what_the_reference_does(name
     assert_close(ours.depth, truth.depth, "depth", 1e-5)
     assert_close(ours.image, truth.image, "image", 1e-5)
     view = cuda.freeze(context, CAMERA)
-    assert 0 < len(view.visible_scene) < len(context)
-    assert view.visible_scene.sh.shape[1] == 1
+    assert 0 < len(view.scene) < len(context)
+    assert view.scene.sh.shape[1] == 1
     plain = REFERENCE.freeze(context, CAMERA)
     check_frozen(view, plain, new, 1e-4)
     check_sums(view, plain, new, 1e-4)
@@ -537,7 +537,7 @@ def test_gsplat_is_not_called_where_there_is_nothing(cuda):
     new = SCENES["random"][:20]
     nothing = cuda.freeze(new[:0], CAMERA)
     assert not cuda.render(new[:0], CAMERA).image.any()
-    assert len(nothing.visible_scene) == 0
+    assert len(nothing.scene) == 0
     assert_close(nothing.composite(new).image, REFERENCE.render(new, CAMERA).image, "image", 1e-5)
     layers = torch.ones(CAMERA.height, CAMERA.width, 3)
     assert nothing.backproject(layers).shape == (0, 3)
@@ -592,7 +592,7 @@ def test_a_frozen_view_on_a_gpu_draws_what_drawing_everything_anew_does(name):
     new = random_gaussians(200, seed=5, sh_degree=1).to("cuda")
     new = replace(new, is_antialiased=context.is_antialiased)
     view = cuda.freeze(context, camera)
-    assert 0 < len(view.visible_scene) < len(context) / 2 + 1
+    assert 0 < len(view.scene) < len(context) / 2 + 1
     plain = RedrawnScene(cuda, context, camera)
     check_frozen(view, plain, new, 1e-3)
     check_sums(view, plain, new, 1e-3)

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import sys
 import threading
+import weakref
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -101,6 +102,57 @@ class Counts:
             self.stages.pop()
 
 
+@dataclass
+class Memory:
+    """Bytes of the device that tensors hold, each storage counted once."""
+
+    counts: Counts
+    alive: int = 0
+    peaks: Counter[str] = field(default_factory=Counter)
+    """Most bytes at once, by stage."""
+    largest: dict[str, Counter[str]] = field(default_factory=dict)
+    """Bytes at the peak of each stage, by the line that made them."""
+    _held: dict[int, tuple[int, str]] = field(default_factory=dict)
+    """Bytes of a storage, and the line that made it, by its address."""
+    _users: Counter[int] = field(default_factory=Counter)
+    """Tensors that hold a storage."""
+    _is_at_peak: bool = False
+    """Whether nothing was released since the last peak of the stage."""
+    _lock: threading.RLock = field(default_factory=threading.RLock)
+
+    def hold(self, tensor: FakeCudaTensor) -> None:
+        """Count the storage of a tensor until the last tensor on it is gone."""
+        storage = tensor.values.untyped_storage()
+        place = storage.data_ptr()
+        with self._lock:
+            if self._users[place] == 0:
+                self._held[place] = storage.nbytes(), find_caller()
+                self.alive += storage.nbytes()
+                stage = self.counts.stages[-1]
+                if self.alive > self.peaks[stage]:
+                    self.peaks[stage] = self.alive
+                    self._is_at_peak = True
+            self._users[place] += 1
+        weakref.finalize(tensor, self._release, place, self.counts.stages[-1]).atexit = False
+
+    def _release(self, place: int, stage: str) -> None:
+        """Forget a tensor, and its storage with the last one."""
+        with self._lock:
+            self._users[place] -= 1
+            if self._users[place]:
+                return
+            if self._is_at_peak:
+                # The sums of all lines are made once for a peak, when it ends.
+                self._is_at_peak = False
+                lines: Counter[str] = Counter()
+                for size, line in self._held.values():
+                    lines[line] += size
+                self.largest[self.counts.stages[-1]] = lines
+            del self._users[place]
+            size, _ = self._held.pop(place)
+            self.alive -= size
+
+
 def find_caller() -> str:
     """Find the innermost line of the package, else of gsplat, that is being run."""
     frame = sys._getframe(1)
@@ -133,6 +185,7 @@ class FakeCudaTensor(Tensor):
                 dtype=values.dtype,
             )
         wrapper.values = values
+        get_device().memory.hold(wrapper)
         return wrapper
 
     __torch_function__ = torch._C._disabled_torch_function_impl
@@ -252,6 +305,7 @@ class FakeDevice:
 
     def __init__(self) -> None:
         self.counts = Counts()
+        self.memory = Memory(self.counts)
         self.thread = Thread()
 
     def run(self, func: Any, args: tuple[Any, ...], kwargs: dict[str, Any]) -> Any:

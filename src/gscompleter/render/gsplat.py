@@ -57,8 +57,21 @@ class CudaRenderer:
 
     def freeze(self, context: Gaussians, camera: Camera) -> CudaFrozenScene:
         """Prepare `context` for many renders from `camera`."""
-        rows = torch.arange(len(context), device=context.means.device)
-        return CudaFrozenScene(self, context, camera, rows, len(context))
+        rows, seen = self.show_from(context, camera)
+        return CudaFrozenScene(self, seen, camera, rows, len(context))
+
+    def show_from(
+        self, gaussians: Gaussians, camera: Camera
+    ) -> tuple[Int64[Tensor, "seen"], Gaussians]:
+        """Return the Gaussians that a camera sees, in the colours that it sees, and their rows.
+
+        Colours of one camera are fixed, so that harmonics need not be kept and evaluated again.
+        """
+        rows = self.find_visible(gaussians, camera).nonzero()[:, 0]
+        # What a writer needs stays behind: a frozen scene is the most that a completion holds.
+        seen = replace(gaussians, encoded=None)[rows]
+        center = camera.center.to(seen.means.device)
+        return rows, set_colors(seen, evaluate_colors(seen.sh, seen.means, center))
 
     @torch.no_grad()
     def find_visible(self, gaussians: Gaussians, camera: Camera) -> Bool[Tensor, "n"]:
@@ -130,7 +143,7 @@ def project_gaussians(
         opacities=gaussians.opacities.float(),
     )
     if antialiasing is None:
-        antialiasing = torch.ones_like(depths)
+        antialiasing = depths.new_ones(()).expand_as(depths)
     return radii, means2d, depths, conics, antialiasing
 
 
@@ -283,92 +296,73 @@ class BinnedGaussians:
 
 @dataclass(frozen=True)
 class CudaFrozenScene(RedrawnScene):
-    """A frozen scene that keeps only Gaussians visible to its camera.
+    """A frozen scene that holds only Gaussians visible to its camera, in the colours it sees.
 
     Each composite still projects and sorts all of them, since new ones may lie anywhere in between.
     """
 
     renderer: CudaRenderer
-    rows: Int64[Tensor, "m"]
-    """Index in the context of each Gaussian of `scene`."""
+    rows: Int64[Tensor, "seen"]
+    """Row of each Gaussian of `scene` in the context and what was added to it since."""
     count: int
-    """Number of Gaussians of the context."""
+    """Number of Gaussians of the context and of what was added, visible or not."""
 
     @cached_property
-    def visible_rows(self) -> Int64[Tensor, "seen"]:
-        """Indices in `scene` of the Gaussians that reach the image."""
-        return self.renderer.find_visible(self.scene, self.camera).nonzero()[:, 0]
-
-    @cached_property
-    def visible_scene(self) -> Gaussians:
-        """The visible Gaussians, with their colours as this camera sees them."""
-        # Colours of one camera are fixed, so that harmonics need not be evaluated in each render.
-        kept = self.scene[self.visible_rows]
-        center = self.camera.center.to(kept.means.device)
-        colors = evaluate_colors(kept.sh, kept.means, center)
-        return set_colors(kept, colors)
-
-    @cached_property
-    def visible_bins(self) -> BinnedGaussians:
-        """The visible Gaussians, binned for images in other colours."""
-        return self.renderer.bin_gaussians(self.visible_scene, self.camera)
+    def bins(self) -> BinnedGaussians:
+        """The Gaussians, binned for images in other colours."""
+        return self.renderer.bin_gaussians(self.scene, self.camera)
 
     def extend(self, new: Gaussians) -> CudaFrozenScene:
-        """Add `new` to the visible Gaussians."""
-        # Rows count all Gaussians that were ever added, visible or not, as their owner does.
-        numbers = self.count + torch.arange(len(new), device=self.rows.device)
-        rows = torch.cat([self.rows[self.visible_rows], numbers])
+        """Add those of `new` that are visible."""
+        new_rows, seen = self.renderer.show_from(new, self.camera)
+        rows = torch.cat([self.rows, self.count + new_rows])
         count = self.count + len(new)
-        return replace(self, scene=merge([self.visible_scene, new]), rows=rows, count=count)
+        return replace(self, scene=merge([self.scene, seen]), rows=rows, count=count)
 
     def repaint(self, rows: Int64[Tensor, "m"], painted: Gaussians) -> CudaFrozenScene:
         """Give the visible ones among the Gaussians at `rows` new colours."""
-        # The scene holds colours instead of harmonics where it was extended before, and lacks what
-        # was invisible then.
         place = rows.new_full((self.count,), -1)
         place[rows] = torch.arange(len(rows), device=rows.device)
-        sources = place[self.rows[self.visible_rows]]
+        sources = place[self.rows]
         painted_here = (sources >= 0).nonzero()[:, 0]
         new = painted[sources[painted_here]]
         center = self.camera.center.to(new.means.device)
         colors = sh_from_rgb(evaluate_colors(new.sh, new.means, center))
-        sh = self.visible_scene.sh.index_copy(0, painted_here, colors)
-        scene = replace(self.visible_scene, sh=sh)
-        return replace(self, scene=scene, rows=self.rows[self.visible_rows])
+        sh = self.scene.sh.index_copy(0, painted_here, colors)
+        return replace(self, scene=replace(self.scene, sh=sh))
 
     def backproject(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """Sum `image` over the compositing weights; they are 0 for invisible Gaussians."""
         sums = image.new_zeros((self.count, 3))
-        if len(self.visible_rows) == 0:
+        if len(self.rows) == 0:
             return sums
-        values = torch.zeros_like(self.visible_scene.means)
-        seen = self.visible_bins.backproject(values, image)
-        return sums.index_copy(0, self.rows[self.visible_rows], seen)
+        seen = self.bins.backproject(torch.zeros_like(self.scene.means), image)
+        return sums.index_copy(0, self.rows, seen)
 
     def splat(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
         """Render the visible Gaussians with the values as grey."""
-        seen = values[self.rows[self.visible_rows]]
-        sums, _ = self.visible_bins.composite(seen[None, :, None])
+        seen = values[self.rows]
+        sums, _ = self.bins.composite(seen[None, :, None])
         return sums[0, ..., 0]
 
     def composite_beside(self, new: Gaussians, other: Camera) -> tuple[Render, Render]:
         """Render the visible Gaussians and `new`, and at once `new` alone from another camera."""
-        both = merge([self.visible_scene, new])
+        both = merge([self.scene, new])
         here, there = self.renderer.render_together(
-            both, [self.camera, other], num_only_first=len(self.visible_scene)
+            both, [self.camera, other], num_only_first=len(self.scene)
         )
         return here, there
 
     def vary_opacities(self, new: Gaussians) -> OpacityRender:
         """Fix all of `new` but the opacities, with boxes that hold for every opacity."""
         opaque = replace(new, opacities=torch.ones_like(new.opacities))
-        render = self.renderer.vary_opacities(merge([self.visible_scene, opaque]), self.camera)
-        return lambda opacities: render(torch.cat([self.visible_scene.opacities, opacities]))
+        render = self.renderer.vary_opacities(merge([self.scene, opaque]), self.camera)
+        return lambda opacities: render(torch.cat([self.scene.opacities, opacities]))
 
     def vary_colors(self, new: Gaussians) -> ColorErrors:
         """Fix all of `new` but its colours, in one forward and one backward pass per call."""
-        binned = self.renderer.bin_gaussians(merge([self.visible_scene, new]), self.camera)
-        context = compute_colors(self.visible_scene, self.camera)
+        binned = self.renderer.bin_gaussians(merge([self.scene, new]), self.camera)
+        context = compute_colors(self.scene, self.camera)
 
         def measure_errors(
             colors: Float[Tensor, "n 3"], photograph: Float[Tensor, "h w 3"]

@@ -40,11 +40,6 @@ class RedrawnScene:
         with torch.no_grad():
             return self.renderer.render(self.scene, self.camera)
 
-    @property
-    def visible_scene(self) -> Gaussians:
-        """The Gaussians to render together with new ones."""
-        return self.scene
-
     def extend(self, new: Gaussians) -> RedrawnScene:
         """Add `new` to the scene."""
         return replace(self, scene=merge([self.scene, new]))
@@ -55,19 +50,19 @@ class RedrawnScene:
         return replace(self, scene=replace(self.scene, sh=sh))
 
     def backproject(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
-        """Sum `image` over the compositing weights of each visible Gaussian."""
-        return backproject(self._render_colors, self.visible_scene, image)
+        """Sum `image` over the compositing weights of each Gaussian of the scene."""
+        return backproject(self._render_colors, self.scene, image)
 
     def splat(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
         """Render the visible Gaussians with the values as grey."""
         return self._render_colors(values[:, None].expand(-1, 3))[..., 0]
 
     def _render_colors(self, colors: Float[Tensor, "n 3"]) -> Float[Tensor, "h w 3"]:
-        return self.renderer.render(set_colors(self.visible_scene, colors), self.camera).image
+        return self.renderer.render(set_colors(self.scene, colors), self.camera).image
 
     def composite(self, new: Gaussians) -> Render:
         """Render the visible Gaussians and `new`."""
-        return self.renderer.render(merge([self.visible_scene, new]), self.camera)
+        return self.renderer.render(merge([self.scene, new]), self.camera)
 
     def vary_opacities(self, new: Gaussians) -> OpacityRender:
         """Fix all of `new` but the opacities."""
