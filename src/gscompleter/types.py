@@ -27,7 +27,7 @@ from gscompleter.system.errors import InputError
 from gscompleter.system.files.display import Displayed
 from gscompleter.system.tensor_checks import (
     BOOLS,
-    BYTES,
+    BYTE_DTYPES,
     FLOATS,
     INTEGERS,
     Form,
@@ -37,7 +37,7 @@ from gscompleter.system.tensor_checks import (
     is_whole,
 )
 
-MAX_SIDE = 16_384
+MAX_IMAGE_SIDE = 16_384
 """Largest width or height of an image, in pixels. Files hold float64 and the pipeline uses float32,
 where 1e300 is infinity and 1e-300 is zero: every real camera keeps these bounds, and squares and
 quotients of its numbers are finite."""
@@ -191,8 +191,8 @@ def _find_size_defect(width: object, height: object) -> str | None:
     for name, side in (("width", width), ("height", height)):
         if not is_whole(side):
             return f"its {name} is {describe(side)}, and a whole number of pixels is needed"
-        if not 1 <= side <= MAX_SIDE:  # type: ignore[operator]
-            return f"its {name} is {side} pixels, and 1 to {MAX_SIDE} are possible"
+        if not 1 <= side <= MAX_IMAGE_SIDE:  # type: ignore[operator]
+            return f"its {name} is {side} pixels, and 1 to {MAX_IMAGE_SIDE} are possible"
     return None
 
 
@@ -444,7 +444,7 @@ class Gaussians(Displayed, TensorDataclass):
         "scales": (FLOATS, ("n", 3)),
         "opacities": (FLOATS, ("n",)),
         "sh": (FLOATS, ("n", "k", 3)),
-        "generated": (BYTES, ("n",)),
+        "generated": (BYTE_DTYPES, ("n",)),
         "encoded": (FLOATS, ("n", 4)),
     }
 

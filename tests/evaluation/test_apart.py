@@ -10,7 +10,7 @@ import pytest
 
 from apart import read_used_cases, select_scenes
 from command import run
-from gscompleter.evaluation.apart import HEAD, LEDGER, count_uses, record_uses
+from gscompleter.evaluation.apart import APART_HEAD, LEDGER, count_uses, record_uses
 from gscompleter.evaluation.case_file import read_case_file, read_scene_file
 from gscompleter.evaluation.cases import Place, list_places, read_cases
 from gscompleter.system.errors import InputError, OutputError
@@ -115,7 +115,7 @@ def test_a_use_is_written_down_and_counted_once(tmp_path, rooms, monkeypatch, ca
     # The ledger is the one above the file of cases.
     folder = tmp_path / "cases"
     folder.mkdir()
-    (tmp_path / LEDGER).write_text(HEAD)
+    (tmp_path / LEDGER).write_text(APART_HEAD)
     for name in ("seen", "unseen"):
         (folder / name).symlink_to(rooms / name)
     cases = write_cases(folder / "apart.json", apart=["unseen"])

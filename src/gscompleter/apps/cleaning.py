@@ -25,7 +25,7 @@ from gscompleter.apps.inputs.splat import locate_splat, move_to_splat
 from gscompleter.apps.inputs.taken_out import take_over_edits
 from gscompleter.apps.inputs.task import InputSplatFile
 from gscompleter.apps.report.cleaning_picture import (
-    PICTURE_FILE,
+    REMOVED_PICTURE_FILE,
     RemovalSeen,
     choose_cameras,
     draw_removal_rows,
@@ -55,8 +55,8 @@ from gscompleter.system.progress import show_progress, stage, track
 from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.types import Camera, Gaussians, View
 
-COMMAND = "clean"
-RESULTS = (COMPLETED_FILE, REMOVED_FILE, PICTURE_FILE, SUMMARY_FILE, *EDITS)
+CLEAN_COMMAND = "clean"
+CLEANING_FILES = (COMPLETED_FILE, REMOVED_FILE, REMOVED_PICTURE_FILE, SUMMARY_FILE, *EDITS)
 """Files that it may write."""
 
 
@@ -86,7 +86,7 @@ def clean_splat(request: CleaningRequest) -> None:
     console = make_console(stderr=True, quiet=results.answer.quiet)
     with (
         show_progress(console),
-        reserve_output(results.out, results.overwrite, COMMAND, RESULTS) as output,
+        reserve_output(results.out, results.overwrite, CLEAN_COMMAND, CLEANING_FILES) as output,
     ):
         if request.dry_run:
             refuse_results(results.out)
@@ -113,7 +113,7 @@ def clean_splat(request: CleaningRequest) -> None:
                 )
                 record_edit(
                     folder,
-                    EditDraft(COMMAND),
+                    EditDraft(CLEAN_COMMAND),
                     rows=len(cleaning.given),
                     appended=(),
                     given=cleaning.splat_file.path,
@@ -126,7 +126,7 @@ def clean_splat(request: CleaningRequest) -> None:
                 picture = draw_removal_rows(
                     cleaning.given, cleaning.removed, cleaning.cameras, cleaning.renderer
                 )
-                write_image(folder / PICTURE_FILE, picture)
+                write_image(folder / REMOVED_PICTURE_FILE, picture)
             (folder / SUMMARY_FILE).write_bytes(json.dumps(summary, indent=2).encode() + b"\n")
     lines = describe_result(summary, request)
     print_answer(results.answer, json.loads((results.out / SUMMARY_FILE).read_bytes()), lines)
@@ -265,7 +265,9 @@ def describe_result(summary: Mapping[str, Any], request: CleaningRequest) -> lis
         lines = [describe_cleaning(summary)]
     if counts["removed"] > 0:
         goes = "would go" if request.dry_run else "went"
-        lines.append(f"What {goes}: {out / REMOVED_FILE}; {out / PICTURE_FILE} shows it in red.")
+        lines.append(
+            f"What {goes}: {out / REMOVED_FILE}; {out / REMOVED_PICTURE_FILE} shows it in red."
+        )
     if request.dry_run:
         lines.append(f"Nothing was cleaned; leave out --dry-run to write {COMPLETED_FILE}.")
     else:

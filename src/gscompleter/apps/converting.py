@@ -39,7 +39,7 @@ from gscompleter.types import Gaussians
 
 MAX_SHIFT = 1000.0
 """Longest shift, in scene units, after which coordinates certainly fit float32."""
-MIN_SHOWN = 50_000_000
+MIN_LOGGED_BYTES = 50_000_000
 """Size of the files, in bytes, from which on a log says that they are converted."""
 CAMERAS_FILE = "cameras.json"
 """File of a trainer with the cameras of its splat, which lies beside it."""
@@ -75,7 +75,7 @@ def convert(request: ConversionRequest) -> Conversion:
 def show_conversion(sources: Sequence[Path]) -> AbstractContextManager[object]:
     """Show the conversion of large files, which takes seconds; a small one is done at once."""
     size = sum(source.stat().st_size for source in sources if source.is_file())
-    return stage("converting") if size >= MIN_SHOWN else nullcontext()
+    return stage("converting") if size >= MIN_LOGGED_BYTES else nullcontext()
 
 
 def convert_sources(

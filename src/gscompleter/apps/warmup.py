@@ -56,7 +56,7 @@ COSTS = {RENDERER_PART: 58, RECONSTRUCTOR_PART: 41, GENERATOR_PART: 18, SPLAT_PA
 """Time to compile each part that has kernels, in that of `time_compilation` (decision 098)."""
 PARTS = tuple(COSTS)
 """Renderer, models and part that have kernels."""
-MODELS = (RECONSTRUCTOR_PART, GENERATOR_PART)
+COMPILED_PARTS = (RECONSTRUCTOR_PART, GENERATOR_PART)
 """Parts that are compiled in a process of their own, beside the others."""
 CHILD = "import sys; from gscompleter.apps.warmup import rehearse; rehearse(sys.argv[1:])"
 """Program of that process."""
@@ -120,8 +120,8 @@ def compile_beside(names: Collection[str]) -> Iterator[None]:
 
 def split_work(missing: Sequence[str], threads: int) -> tuple[list[str], list[str]]:
     """Split missing parts into those for a process of their own, and the others."""
-    models = [name for name in missing if name in MODELS]
-    others = [name for name in missing if name not in MODELS]
+    models = [name for name in missing if name in COMPILED_PARTS]
+    others = [name for name in missing if name not in COMPILED_PARTS]
     # Models call the renderer at the end. By then this process has compiled its kernels, and if it
     # need not, one process is enough.
     if threads == 1 or RENDERER_PART not in others:

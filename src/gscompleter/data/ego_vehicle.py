@@ -26,7 +26,7 @@ FEWEST = 6
 """Fewest photographs of a camera that are searched; with fewer, nothing is found."""
 MOST = 12
 """Most photographs of a camera that are searched."""
-SIDE = 256
+COPY_SIDE = 256
 """Longer side of the small copies, in pixels."""
 MAX_TURN = 25.0
 """Largest deviation of the travel direction and the down axis from their means, in degrees."""
@@ -48,7 +48,7 @@ MAX_ROW_STEP = 4
 """Largest change of the outline from one column to the next, in rows."""
 BEND_COST = 0.1
 """Cost of each such row, relative to an edge that is static in every photograph."""
-MIN_WIDTH = 0.25
+MIN_EDGE_SHARE = 0.25
 """Smallest share of the columns with a static edge that moving ground would have moved."""
 MIN_SUPPORT = 0.6
 """Smallest static share of the length of an outline."""
@@ -62,7 +62,7 @@ CLEARANCE = 4
 """Rows between two outlines, and between an outline and other edges, in small copies."""
 MAX_DIP_WIDTH = 0.12
 """Largest width of a dip of the outline that is filled, as a share of the columns."""
-MARGIN = 1
+OUTLINE_MARGIN = 1
 """Rows added above the outline, in pixels of the small copies."""
 
 
@@ -111,7 +111,7 @@ def read_small(frames: Sequence[Frame]) -> dict[Frame, Float[np.ndarray, "h w"]]
             photograph = frame.require_photograph()
             # No vehicle carries the camera of a render.
             if isinstance(photograph, StoredPhotograph):
-                small = read_brightness(photograph.stored, SIDE)
+                small = read_brightness(photograph.stored, COPY_SIDE)
                 copies[frame] = turn_upright(small, frame.find_turn())
     shape = next((image.shape for image in copies.values()), None)
     return {frame: image for frame, image in copies.items() if image.shape == shape}
@@ -215,7 +215,7 @@ def find_static_region(
     rows = np.pad(highest, width // 2, mode="edge").astype(np.float32)[None]
     opened = cv2.morphologyEx(rows, cv2.MORPH_OPEN, dips)[0]
     filled = opened[width // 2 :][:width].astype(np.int64)
-    return fill_below(np.where(filled < height, filled - MARGIN, height), height)
+    return fill_below(np.where(filled < height, filled - OUTLINE_MARGIN, height), height)
 
 
 def find_edges(images: Float[np.ndarray, "n h w"], flow: Float[np.ndarray, "h w 2"]) -> Edges:
@@ -284,7 +284,7 @@ def is_vehicle(edges: Edges, outline: Int[np.ndarray, "w"]) -> bool:
     near = np.ones((3, 1), np.uint8)  # a row above and one below
     staying = cv2.dilate(kept.astype(np.uint8), near)[rows, columns] > 0
     staying_across = cv2.dilate(across.astype(np.uint8), near)[rows, columns] > 0
-    if staying.mean() < MIN_SUPPORT or staying_across.sum() < MIN_WIDTH * width:
+    if staying.mean() < MIN_SUPPORT or staying_across.sum() < MIN_EDGE_SHARE * width:
         return False
 
     # If most other edges are static too, the camera hardly moved, and the outline says nothing.

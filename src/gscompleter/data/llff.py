@@ -24,14 +24,16 @@ from gscompleter.data.points import FAR_FACTOR, NEAR_FACTOR
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import check_file
 
-NAME = "poses_bounds.npy"
-IMAGES = (".jpg", ".jpeg", ".png")
-ADVICE = "run LLFF's imgs2poses again"
+POSES_BOUNDS_FILE = "poses_bounds.npy"
+LLFF_ENDINGS = (".jpg", ".jpeg", ".png")
+LLFF_ADVICE = "run LLFF's imgs2poses again"
 
 
 def has_llff(path: Path) -> bool:
     """Check whether `path` is a `poses_bounds.npy`, or a folder with one."""
-    return os.path.isfile(path / NAME) or (path.name.endswith(NAME) and os.path.isfile(path))
+    return os.path.isfile(path / POSES_BOUNDS_FILE) or (
+        path.name.endswith(POSES_BOUNDS_FILE) and os.path.isfile(path)
+    )
 
 
 def open_llff(path: Path) -> Iterator[Photographs]:
@@ -40,7 +42,7 @@ def open_llff(path: Path) -> Iterator[Photographs]:
     Rows belong to the sorted photographs beside it, in `images` or another usual folder. The near
     and far planes enclose all bounds.
     """
-    file = path / NAME if os.path.isdir(path) else path
+    file = path / POSES_BOUNDS_FILE if os.path.isdir(path) else path
     rows = _read_rows(file)
     images = _find_photographs(file, len(rows))
     frames = [
@@ -69,23 +71,27 @@ def _read_rows(path: Path) -> Float[np.ndarray, "n 17"]:
         # Mapping refuses an array that claims more than the file holds.
         rows = np.load(path, mmap_mode="r").astype(np.float64, casting="same_kind")
     except Exception as error:  # damaged headers raise anything
-        raise InputError(f"{quote_value(path)} is no array of real numbers; {ADVICE}.") from error
+        raise InputError(
+            f"{quote_value(path)} is no array of real numbers; {LLFF_ADVICE}."
+        ) from error
     require(
         rows.ndim == 2 and rows.shape[1] == 17 and len(rows) > 0,
-        f"{quote_value(path)} has the shape {list(rows.shape)}, not 17 columns; {ADVICE}.",
+        f"{quote_value(path)} has the shape {list(rows.shape)}, not 17 columns; {LLFF_ADVICE}.",
     )
     low, high = DEPTH_RANGE
     near = rows[:, 15]
     far = rows[:, 16]
     bounded = ((near >= low) & (near < far) & (far <= high)).all()
-    require(bounded, f"The bounds in {quote_value(path)} are no z-depths, nearest first; {ADVICE}.")
+    require(
+        bounded, f"The bounds in {quote_value(path)} are no z-depths, nearest first; {LLFF_ADVICE}."
+    )
     return rows
 
 
 def _find_photographs(file: Path, count: int) -> list[Path]:
     """List the photographs of the first folder with one for each row."""
     for folder in list_image_folders([file.parent]):
-        images = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGES)
+        images = sorted(path for path in folder.iterdir() if path.suffix.lower() in LLFF_ENDINGS)
         if len(images) == count:
             return images
     raise InputError(

@@ -10,7 +10,7 @@ from gscompleter.types import Camera
 
 NEAREST = 0.1
 """Smallest z-depth of the corners of a box, in metres."""
-MAX_PIXELS = 1e5
+MAX_CORNER_COORDINATE = 1e5
 """Largest pixel coordinate of a projected corner; rasterisers use integers."""
 
 
@@ -33,6 +33,6 @@ def mask_moving(
             local[:, 2] = np.maximum(local[:, 2], NEAREST)
             # OpenCV puts the centre of the first pixel at (0, 0).
             pixels = (local @ K.T)[:, :2] / local[:, 2:] - 0.5
-            pixels = np.rint(np.clip(pixels, -MAX_PIXELS, MAX_PIXELS))
+            pixels = np.rint(np.clip(pixels, -MAX_CORNER_COORDINATE, MAX_CORNER_COORDINATE))
             cv2.fillConvexPoly(mask, cv2.convexHull(pixels.astype(np.int32)), 1)
     return mask > 0

@@ -18,7 +18,7 @@ from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL, parse_camera_frame
 from gscompleter.system.errors import quote_value, require_path
-from gscompleter.system.files.result_format import MARK
+from gscompleter.system.files.result_format import RESULT_MARK
 from gscompleter.system.files.writing import replace_file
 from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import Camera, View
@@ -153,7 +153,7 @@ def write_cameras(
     if file_paths is not None:
         pairs = zip(file_paths, frames, strict=True)
         frames = [{"file_path": file_path, **frame} for file_path, frame in pairs]
-    content = {**MARK, "camera_model": "PINHOLE", "frames": frames}
+    content = {**RESULT_MARK, "camera_model": "PINHOLE", "frames": frames}
     with replace_file(path) as file:
         file.write((json.dumps(content, indent=1) + "\n").encode())
 

@@ -24,7 +24,7 @@ Image8 = UInt8[np.ndarray, "h w"]
 Corners = Float[np.ndarray, "n 1 2"]
 Values = Float[np.ndarray, "n"]
 
-ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm")
+SOURCE_VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm")
 """Endings of videos, in any case."""
 NUM_FRAMES = 40
 """Default number of frames to choose."""
@@ -45,7 +45,7 @@ QUALITY = 95
 
 def is_video(path: Path) -> bool:
     """Check whether `path` is a file with the name of a video."""
-    return path.suffix.lower() in ENDINGS and path.is_file()
+    return path.suffix.lower() in SOURCE_VIDEO_ENDINGS and path.is_file()
 
 
 def extract_frames(video: Path, folder: Path, count: int) -> None:

@@ -33,9 +33,9 @@ MIN_OPACITY = 0.05
 """Least opacity of a Gaussian along which another one may lie."""
 SUSPECT_SHARE = 0.3
 """Share of `max_free` from which on renders decide."""
-SIDE = 128
+STREAK_RENDER_SIDE = 128
 """Width and height of these renders, in pixels."""
-BLOCK = 5_000
+STREAK_BLOCK = 5_000
 """Long Gaussians that are compared with their neighbours at a time, to save memory."""
 
 
@@ -101,10 +101,10 @@ def measure_free_length(
     steps = torch.tensor(STEPS).to(scene.means)
     weights = (-(steps**2) / 2).softmax(dim=0)
     shares = [torch.zeros(0).to(weights)]
-    for start in track(range(0, len(long.rows), BLOCK), "Comparing streaks"):
-        block = slice(start, start + BLOCK)
+    for start in track(range(0, len(long.rows), STREAK_BLOCK), "Comparing streaks"):
+        block = slice(start, start + STREAK_BLOCK)
         own = long.rows[block, None, None]
-        numbers = nearest.rows[start * len(STEPS) : (start + BLOCK) * len(STEPS)]
+        numbers = nearest.rows[start * len(STEPS) : (start + STREAK_BLOCK) * len(STEPS)]
         others = torch.from_numpy(numbers).long().to(own.device).unflatten(0, (-1, len(STEPS)))
         # Offsets along the axes of the other one, in standard deviations of both together: across,
         # a long one is as wide as it is.
@@ -124,7 +124,7 @@ def measure_uncovered(
     """Measure the share of what suspects cover, seen from outside, where no others are."""
     beside = torch.zeros_like(suspects.opacities)
     total = torch.zeros_like(suspects.opacities)
-    views = look_from_outside(others, renderer, SIDE, extent)
+    views = look_from_outside(others, renderer, STREAK_RENDER_SIDE, extent)
     for view in track(views, "Comparing renders"):
         empty = (~view.silhouette).to(beside)
         counted = torch.stack([empty, torch.ones_like(empty), torch.zeros_like(empty)], dim=-1)

@@ -21,7 +21,7 @@ from typing import Any
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_json
 from gscompleter.system.tensor_checks import is_number
-from gscompleter.types import MAX_SIDE
+from gscompleter.types import MAX_IMAGE_SIDE
 
 FILE_KEYS = ("resolution", "cases", "about", "apart")
 """Keys of the file; `about` is a remark for people."""
@@ -73,7 +73,7 @@ def read_case_file(path: Path) -> CaseFile:
 
     size = content.get("resolution")
     sides = size if isinstance(size, list) else []
-    if len(sides) != 2 or not all(type(s) is int and 1 <= s <= MAX_SIDE for s in sides):
+    if len(sides) != 2 or not all(type(s) is int and 1 <= s <= MAX_IMAGE_SIDE for s in sides):
         raise InputError(
             f"{name}: resolution has to be height and width in pixels, as in [256, 256], and is "
             f"{show(size)}."

@@ -11,8 +11,8 @@ from torch import Tensor
 
 from gscompleter.config import SynthesisConfig
 from gscompleter.config.generators import (
+    GENERATOR_PLUGINS,
     GENERATORS,
-    PLUGINS,
     GeneratorSettings,
     get_settings_class,
 )
@@ -141,5 +141,5 @@ def load_generator(
     if name in GENERATORS:
         load = load_function(*GENERATORS[name].load.split(":"))
     else:
-        load = load_plugins(PLUGINS)[name]
+        load = load_plugins(GENERATOR_PLUGINS)[name]
     return as_generator(load(settings, seed, photographs, device))

@@ -26,7 +26,7 @@ MIN_LIMIT = 0.03
 MAX_GAIN = 1.6
 """Largest gain of a colour shift; its inverse is the smallest."""
 MAX_OFFSET = 0.25
-MIN_PIXELS = 200
+MIN_OBSERVED_PIXELS = 200
 """Fewest observed pixels for a comparison."""
 
 
@@ -97,7 +97,7 @@ def compare_with_observed(
     zeros = torch.zeros(3).to(image)
     if not image.isfinite().all():
         return Agreement(ones, zeros, float("inf"), MIN_LIMIT, False, image)
-    if int(known.sum()) < MIN_PIXELS:
+    if int(known.sum()) < MIN_OBSERVED_PIXELS:
         return Agreement(ones, zeros, 0.0, MIN_LIMIT, True, image)
 
     painted = smooth_masked(image, known, BLUR_RADIUS)[known]

@@ -8,7 +8,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-MIN_PIXELS = 100
+MIN_EXPOSURE_PIXELS = 100
 """Fewest shared pixels to compare two photographs."""
 DARKEST = 0.05
 """Smallest usable value; darker ones are noise."""
@@ -37,7 +37,7 @@ def match_exposures(
         best, known, num_shared = max(pairs, key=lambda pair: pair[2])
         waiting.remove(best)
         gains[best] = ones
-        if num_shared >= MIN_PIXELS:
+        if num_shared >= MIN_EXPOSURE_PIXELS:
             overlap = visible[best] & visible[known]
             ratio = compute_median_ratio(colors[best][overlap], colors[known][overlap])
             gains[best] = gains[known] * ratio
@@ -54,6 +54,6 @@ def compute_median_ratio(
         other_values = other[:, channel]
         is_exposed = torch.minimum(own_values, other_values) > DARKEST
         is_exposed &= torch.maximum(own_values, other_values) < BRIGHTEST
-        if int(is_exposed.sum()) >= MIN_PIXELS:
+        if int(is_exposed.sum()) >= MIN_EXPOSURE_PIXELS:
             ratios[channel] = (other_values[is_exposed] / own_values[is_exposed]).median()
     return ratios

@@ -30,7 +30,7 @@ from gscompleter.generators.warp import (
 )
 from gscompleter.numerics.image_ops import dilate, smooth_masked
 from gscompleter.numerics.kernels import patchmatch
-from gscompleter.numerics.kernels.patchmatch import RADIUS, SIDE
+from gscompleter.numerics.kernels.patchmatch import PATCHMATCH_SIDE, RADIUS
 from gscompleter.types import Camera, GeneratorInput, View
 
 STRUCTURE_REACH = 0.15
@@ -265,7 +265,11 @@ def search_and_vote(
     channel_weight = patchmatch.pad_border(np.repeat(weight[..., None], 3, axis=-1))
     # Beyond the image a patch has no weight.
     total_weight = cv2.boxFilter(
-        weight, -1, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_CONSTANT
+        weight,
+        -1,
+        (PATCHMATCH_SIDE, PATCHMATCH_SIDE),
+        normalize=False,
+        borderType=cv2.BORDER_CONSTANT,
     )
     costs = patchmatch.Costs(
         max_bias=np.float32(MAX_BIAS),

@@ -51,7 +51,7 @@ MAX_MEDIAN_RATIO = 6.0
 """Multiple of a pair's median difference that reflections and exposure may cause."""
 HIDDEN_TOLERANCE = 0.05
 """Tolerated distance of a visible surface behind the other depth map, relative to depth."""
-BORDER = 3
+IGNORED_BORDER = 3
 """Width of the image border that is not compared, in pixels."""
 GAP_RADIUS = 3
 """Radius of gaps that are closed in a region, in pixels: moving objects may match by chance."""
@@ -196,8 +196,8 @@ def compare_photographs(photo: SmallPhoto, other: SmallPhoto, min_difference: fl
     Masks of the result have the size of `photo`.
     """
     pixels, z = project(unproject(photo.depth, photo.camera), other.camera)
-    in_frame = is_inside(pixels - BORDER, z, other.camera)
-    in_frame &= is_inside(pixels + BORDER, z, other.camera)
+    in_frame = is_inside(pixels - IGNORED_BORDER, z, other.camera)
+    in_frame &= is_inside(pixels + IGNORED_BORDER, z, other.camera)
     # Bilinear samples are 1 only if all pixels around are valid.
     is_valid_there = sample(other.valid_mask[..., None].float(), pixels)[..., 0] == 1
     known = in_frame & photo.valid_mask & is_valid_there

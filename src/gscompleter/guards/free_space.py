@@ -33,7 +33,7 @@ CLEARANCE = 0.01
 A Gaussian there is invisible to the camera and still closes the hole."""
 STEPS_AT_ONCE = 8
 """Steps that a GPU tests together, without an answer in between for which the host would wait."""
-BORDER = 3
+OUTER_BORDER = 3
 """Pixels beyond the border of an image up to which a Gaussian there still shows inside."""
 FOOTPRINT_RADIUS = 3.0
 """Distance from its mean up to which a Gaussian is visible, in pixels of the target. Additions
@@ -207,8 +207,8 @@ def is_before_surface(points: Float[Tensor, "n 3"], observed: Observed) -> Bool[
     camera = observed.camera
     pixels, z = project(points, camera)
     x, y = pixels.unbind(-1)
-    visible = (z > 0) & (pixels > -BORDER).all(-1)
-    visible &= (x < camera.width + BORDER) & (y < camera.height + BORDER)
+    visible = (z > 0) & (pixels > -OUTER_BORDER).all(-1)
+    visible &= (x < camera.width + OUTER_BORDER) & (y < camera.height + OUTER_BORDER)
 
     # A mean just outside of the image reads the pixel at its border, since the Gaussian still
     # covers that. The pixels of invisible means, which may be infinite, are replaced first.

@@ -27,7 +27,7 @@ LARGEST_SH = 1e6
 """Largest spherical harmonic; colours are in [0, 1], and 1e38 would add up to infinity."""
 MIN_QUAT_LENGTH = 1e-12
 """Smallest length of a quaternion: `torch.nn.functional.normalize` divides by no less."""
-MIN_SIDE = 8
+MIN_PHOTOGRAPH_SIDE = 8
 """Smallest width and height of a photograph or target, in pixels; stereo needs as many."""
 COLOR_TOLERANCE = 0.01
 """Largest tolerated excess of a colour beyond [0, 1], as resampling causes it."""
@@ -153,7 +153,7 @@ def check_given_views(views: object) -> None:
 def check_views(views: object, name: str) -> None:
     """Raise InputError unless these are photographs to work on.
 
-    They are a list of `View`, at least `MIN_SIDE` pixels wide and high, with colours
+    They are a list of `View`, at least `MIN_PHOTOGRAPH_SIDE` pixels wide and high, with colours
     in [0, 1], depths of at least 0, and some pixel that is not ignored. `name` is for the
     sentences, such as "context".
     """
@@ -228,10 +228,10 @@ def check_camera(camera: object, name: str) -> None:
             f"{describe(camera)}."
         )
     _check_float32(camera.K, name)
-    if min(camera.width, camera.height) < MIN_SIDE:
+    if min(camera.width, camera.height) < MIN_PHOTOGRAPH_SIDE:
         raise InputError(
             f"{name} has an image of {camera.width} × {camera.height} pixels, and at least "
-            f"{MIN_SIDE} × {MIN_SIDE} are needed; choose a larger resolution."
+            f"{MIN_PHOTOGRAPH_SIDE} × {MIN_PHOTOGRAPH_SIDE} are needed; choose a larger resolution."
         )
     camera.to("cpu")  # whose constructor reads the numbers, which it does not on a GPU
 

@@ -227,13 +227,13 @@ RECONSTRUCTORS: dict[str, Callable[[Path | None, str], Reconstructor]] = {
 }
 """Loader of each built-in reconstructor: (weights path or None for the default, device) -> Ψ."""
 
-PLUGINS = "gscompleter.reconstructors"
+RECONSTRUCTOR_PLUGINS = "gscompleter.reconstructors"
 """Group of entry points that name further tables of this form."""
 
 
 def list_reconstructors() -> dict[str, Callable[[Path | None, str], Reconstructor]]:
     """List the loaders of all reconstructors, by name."""
-    return RECONSTRUCTORS | load_plugins(PLUGINS)
+    return RECONSTRUCTORS | load_plugins(RECONSTRUCTOR_PLUGINS)
 
 
 def find_loader(name: str) -> Callable[[Path | None, str], Reconstructor] | None:

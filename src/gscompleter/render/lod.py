@@ -103,7 +103,7 @@ def merge_nearby(scene: Gaussians, max_gaussians: int) -> Gaussians:
         focal = np.array([FAR_AWAY * radius / distance], np.float32)
         place = to_float32(centre + FAR_AWAY * radius * torch.tensor([0.0, 0.0, 1.0]))[None]
         begins = np.empty(len(scene), np.bool_)
-        num_blocks = -(-len(scene) // kernels.BLOCK)
+        num_blocks = -(-len(scene) // kernels.RUN_BLOCK)
         share(
             kernels.mark_run_starts,
             num_blocks,
@@ -139,7 +139,7 @@ def find_run_starts(
     focals = to_float32(torch.stack([camera.K[0, 0] for camera in cameras]))
     begins = np.empty(len(means), np.bool_)
     max_runs = count_fitting_gaussians(len(cameras))
-    num_blocks = -(-len(means) // kernels.BLOCK)
+    num_blocks = -(-len(means) // kernels.RUN_BLOCK)
     # A coarser proxy is better than one that does not fit in memory.
     growth = 1.0
     while True:

@@ -14,8 +14,8 @@ import torch
 from gscompleter.config import AlignmentConfig
 from gscompleter.numerics.robust import find_affine_inliers
 from gscompleter.stages.align_paper import (
+    MIN_FIT_PIXELS,
     MIN_INLIERS,
-    MIN_PIXELS,
     align_as_paper,
     fit_affine,
     pair_depths,
@@ -65,7 +65,7 @@ def refit_at_target(
     is better, the paper's choice stays.
     """
     x, y = pair_depths(predicted, context)
-    if len(x) < MIN_PIXELS:
+    if len(x) < MIN_FIT_PIXELS:
         return affine
     agree = find_affine_inliers(x, y, affine.scale, affine.shift).double().mean().item()
     affine = replace(affine, agreement=agree, coverage=len(x) / context.depth.numel())

@@ -19,7 +19,7 @@ from gscompleter.system.errors import InputError, quote_value
 FLOATS = (torch.float32, torch.float64)
 """Types of numbers that are stored; float64 is for files and comparisons."""
 BOOLS = (torch.bool,)
-BYTES = (torch.uint8,)
+BYTE_DTYPES = (torch.uint8,)
 INTEGERS = (torch.int32, torch.int64)
 
 Form = tuple[tuple[torch.dtype, ...], tuple[int | str, ...]]

@@ -37,7 +37,7 @@ from gscompleter.types import Camera, Gaussians, Render
 
 NUM_CAMERAS = 3
 """Most cameras that are chosen around a target."""
-SIDE = 72
+COMPARED_SIDE = 72
 """Longer side, in pixels, of the images in which cameras are compared."""
 STEPS = (0.12, 0.3)
 """Lengths of moves, relative to the depth of the hole's border."""
@@ -131,7 +131,7 @@ def find_border(
     """Find the surfaces around the hole of a target; None without a hole or a surface."""
     if holes is None:
         holes = renderer.render(scene, add_near_plane(target, scene.means)).alpha < COVERED
-    small = shrink_camera(add_near_plane(target, scene.means), SIDE)
+    small = shrink_camera(add_near_plane(target, scene.means), COMPARED_SIDE)
     # A pixel of the small image is a hole if any of its pixels is: a mean would lose thin holes.
     size = (small.height, small.width)
     small_holes = adaptive_max_pool2d(holes[None, None].float(), size)[0, 0] > 0
@@ -184,7 +184,7 @@ def rate_camera(
     it sees, times its baseline up to what is enough, times one half to one by the share of the
     target's surfaces that it sees. It is 0 if something is too close.
     """
-    small = shrink_camera(replace(camera, near=0.1 * border.nearest), SIDE)
+    small = shrink_camera(replace(camera, near=0.1 * border.nearest), COMPARED_SIDE)
     render = renderer.render(scene, small)
     covered = render.alpha >= COVERED
     close = covered & (render.depth < CLEARANCE * border.nearest)

@@ -28,7 +28,7 @@ from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
 from gscompleter.types import Camera, Gaussians
 
-SIDE = 64
+OUTSIDE_SIDE = 64
 """Width and height of the images from outside, in pixels."""
 MAX_SURROUNDED = 0.1
 """Largest share of the border of an image from outside that an object covers. It was 0.00 to 0.02
@@ -62,7 +62,7 @@ def is_object(scene: Gaussians, renderer: Renderer, given: Sequence[Camera] = ()
     that is closed on all sides, are scenes. `given` are cameras of the user, none that was found:
     if they stand between walls, it is a scene, too.
     """
-    views = look_from_outside(scene, renderer, SIDE)
+    views = look_from_outside(scene, renderer, OUTSIDE_SIDE)
     if max(view.border_share for view in views) > MAX_SURROUNDED:
         return False
     extent = measure_extent(scene)
@@ -144,13 +144,13 @@ def is_ground(scene: Gaussians, extent: Extent, renderer: Renderer) -> bool:
         extent.center - distance * axis,
         axis,
         (1.5 * longest / distance).item(),
-        2 * SIDE,
+        2 * OUTSIDE_SIDE,
         distance - 2 * extent.radius,
     )
     covered = renderer.render(small, camera).alpha >= COVERED
     # Points all over the extent, as the camera sees them.
-    steps = torch.linspace(-1, 1, SIDE).to(extent.half)
-    level = torch.zeros((SIDE, SIDE, 3)).to(extent.half)
+    steps = torch.linspace(-1, 1, OUTSIDE_SIDE).to(extent.half)
+    level = torch.zeros((OUTSIDE_SIDE, OUTSIDE_SIDE, 3)).to(extent.half)
     level[..., 1] = middle * steps
     level[..., 2] = longest * steps[:, None]
     pixels, _ = project(extent.center + level.reshape(-1, 3) @ extent.axes, camera)

@@ -21,7 +21,7 @@ from gscompleter.types import Camera, Gaussians
 from gscompleter.virtual_capture.pixel_aligned import make_intrinsics
 from gscompleter.virtual_capture.quality import measure_quality
 
-SIDE = 48
+STANDPOINT_SIDE = 48
 """Width and height of the images in which cameras are compared."""
 FIELD_OF_VIEW = 60.0
 """Field of view of cameras that are found, in degrees."""
@@ -258,5 +258,5 @@ def make_camera(
     """Make a small camera at a place."""
     c2w = torch.eye(4).to(center)
     c2w[:3, 3] = center
-    K = make_intrinsics(SIDE, math.tan(math.radians(FIELD_OF_VIEW) / 2)).to(center)
-    return look_along(Camera(c2w, K, SIDE, SIDE, near=near), forward, up)
+    K = make_intrinsics(STANDPOINT_SIDE, math.tan(math.radians(FIELD_OF_VIEW) / 2)).to(center)
+    return look_along(Camera(c2w, K, STANDPOINT_SIDE, STANDPOINT_SIDE, near=near), forward, up)

@@ -26,7 +26,7 @@ from gscompleter.virtual_capture.kind import is_object
 
 OTHERS: tuple[Direction, ...] = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))
 """Up in other files: that of surveys and nerfstudio, and that of modelling programs."""
-UNUSUAL: tuple[Direction, ...] = ((0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
+UNUSUAL_UP: tuple[Direction, ...] = ((0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
 """Directions that are up in no file. What looks like their floor is a wall or a ceiling."""
 MIN_OPACITY = 0.2
 """Least opacity of a Gaussian that counts."""
@@ -34,7 +34,7 @@ OUTLIERS = 0.002
 """Share of the lowest, and of the highest, that does not count."""
 SLAB = 0.02
 """Thickness of a layer, in radii of the core; two adjacent ones hold a floor."""
-MAX_BELOW = 0.1
+MAX_SHARE_BELOW = 0.1
 """Largest share of the splat below a floor."""
 MIN_SHARE = 0.15
 """Least share of the splat in a floor. Shares are of area times opacity."""
@@ -128,7 +128,7 @@ def find_floor(scene: Gaussians) -> Direction | None:
     solid = scene[scene.opacities > MIN_OPACITY]
     if len(solid) < CELLS**2:
         return None
-    floors = {up: measure_floor(solid, up) for up in (USUAL, *OTHERS, *UNUSUAL)}
+    floors = {up: measure_floor(solid, up) for up in (USUAL, *OTHERS, *UNUSUAL_UP)}
     scores = {up: floors[up].score for up in (USUAL, *OTHERS) if is_whole(floors[up])}
     if scores:
         best = max(scores, key=lambda up: scores[up])
@@ -139,7 +139,7 @@ def find_floor(scene: Gaussians) -> Direction | None:
     rest = max(floor.score for up, floor in floors.items() if up != best)
     is_clear = floors[best].score >= MIN_ADVANTAGE_IN_PART * rest
     is_seen = floors[best].share >= MIN_SHARE_IN_PART and floors[best].filled >= MIN_CELLS_IN_PART
-    return best if best not in UNUSUAL and is_clear and is_seen else None
+    return best if best not in UNUSUAL_UP and is_clear and is_seen else None
 
 
 def is_whole(floor: Floor) -> bool:
@@ -170,7 +170,7 @@ def measure_floor(scene: Gaussians, up: Direction) -> Floor:
 
     # The share of two adjacent layers, of those with nearly nothing below.
     below = shares.cumsum(0) - shares
-    pairs = (shares[:-1] + shares[1:]).where(below[:-1] <= MAX_BELOW, 0.0)
+    pairs = (shares[:-1] + shares[1:]).where(below[:-1] <= MAX_SHARE_BELOW, 0.0)
     lowest = int(pairs.argmax())
     share = pairs[lowest].item()
     is_floor = (layers == lowest) | (layers == lowest + 1)

@@ -5,7 +5,7 @@ import pytest
 
 from gscompleter.generators.warp_inpaint import compute_likelihood
 from gscompleter.numerics.kernels import patchmatch
-from gscompleter.numerics.kernels.patchmatch import RADIUS, SIDE
+from gscompleter.numerics.kernels.patchmatch import PATCHMATCH_SIDE, RADIUS
 
 H, W = 20, 26
 COSTS = patchmatch.Costs(*map(np.float32, (0.1, 0.3, 0.02, 0.002, 30.0)))
@@ -23,7 +23,7 @@ def matched(seed=0):
     query_at[near] = np.arange(len(queries))
     inside = np.pad(np.ones((2, H - 2 * RADIUS, W - 2 * RADIUS), bool), ((0, 0), (3, 3), (3, 3)))
     padded = np.pad(weight, RADIUS)
-    total = [padded[y : y + SIDE, x : x + SIDE].sum() for y, x in queries]
+    total = [padded[y : y + PATCHMATCH_SIDE, x : x + PATCHMATCH_SIDE].sum() for y, x in queries]
     sources = rng.random((2, H, W, 3), np.float32)
     return image, patchmatch.PatchProblem(
         patchmatch.pad_border(image),
@@ -49,7 +49,7 @@ def plain_cost(found, number, match):
     """Compute the cost of a match and its shift, pixel by pixel in float64."""
     y, x = found.queries[number]
     s, sy, sx = match
-    here = np.s_[y : y + SIDE, x : x + SIDE]
+    here = np.s_[y : y + PATCHMATCH_SIDE, x : x + PATCHMATCH_SIDE]
     there = np.s_[s, sy - RADIUS : sy + RADIUS + 1, sx - RADIUS : sx + RADIUS + 1]
     weight = found.weight[here].astype(float)
     error = found.image[here].astype(float) - found.sources[there]

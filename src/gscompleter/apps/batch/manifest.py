@@ -25,9 +25,9 @@ from gscompleter.system.jobs.jobs import Job
 
 FOLDER = "folder"
 """Column of the scene folder."""
-NAME = "name"
+NAME_COLUMN = "name"
 """Column of the job name."""
-PATHS = (FOLDER, "scene", "cameras", "weights", "depth_weights", "images", "ignore")
+PATH_COLUMNS = (FOLDER, "scene", "cameras", "weights", "depth_weights", "images", "ignore")
 """Options that are paths."""
 MARKERS = ("batch.json", "run.json")
 """Files that mark the output folders of `batch` and `evaluate`."""
@@ -63,7 +63,7 @@ def read_manifest(manifest: Path, common: Mapping[str, Any], out: Path | None = 
             f"Two jobs have the name {quote_value(name)}; give each row a name of its own."
         )
     return [
-        Job(name, {key: value for key, value in row.items() if key != NAME})
+        Job(name, {key: value for key, value in row.items() if key != NAME_COLUMN})
         for name, row in zip(names, rows, strict=True)
     ]
 
@@ -74,7 +74,7 @@ def resolve_paths(row: Mapping[str, Any], base: Path) -> Options:
     def join(value: Any) -> Any:
         return os.path.join(base, value) if isinstance(value, str) and value else value
 
-    result = {key: join(value) if key in PATHS else value for key, value in row.items()}
+    result = {key: join(value) if key in PATH_COLUMNS else value for key, value in row.items()}
     target = result.get("target")
     config = result.get("config")
     # A text is the path of a file of cameras, or else numbers and names of photographs.
@@ -158,5 +158,5 @@ def parse_json_lines(text: str) -> Iterator[Options]:
 
 def make_job_name(row: Options) -> str:
     """Turn the name of a row, or that of its scene folder, into a valid file name."""
-    name = str(row[NAME]) if NAME in row else Path(str(row.get(FOLDER, ""))).name
+    name = str(row[NAME_COLUMN]) if NAME_COLUMN in row else Path(str(row.get(FOLDER, ""))).name
     return make_valid_name(name.strip(".")[:LONGEST_NAME]) or "job"

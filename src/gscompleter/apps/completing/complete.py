@@ -33,8 +33,8 @@ from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.apps.report.completion import write_report
 from gscompleter.apps.report.film import write_comparison_video
 from gscompleter.apps.report.page import write_completion_page
-from gscompleter.apps.report.pictures import IMAGES, write_images
-from gscompleter.apps.report.results import COMMAND, RESULTS
+from gscompleter.apps.report.pictures import IMAGES_FOLDER, write_images
+from gscompleter.apps.report.results import COMPLETE_COMMAND, COMPLETION_RESULTS
 from gscompleter.apps.report.schema import read_summary
 from gscompleter.apps.requests.completion import (
     ExportRequest,
@@ -128,7 +128,9 @@ def complete_folder(
     console = make_console(stderr=True, quiet=results.answer.quiet)
     with (
         show_progress(console),
-        reserve_output(results.out, results.overwrite, COMMAND, RESULTS, takes_over) as output,
+        reserve_output(
+            results.out, results.overwrite, COMPLETE_COMMAND, COMPLETION_RESULTS, takes_over
+        ) as output,
     ):
         print_lines(console, *output.describe_others())
         ready = prepare(request, console)
@@ -169,7 +171,9 @@ def plan_targets(request: PlanRequest) -> int:
     console = make_console(stderr=True, quiet=results.answer.quiet)
     with (
         show_progress(console),
-        reserve_output(results.out, results.overwrite, COMMAND, RESULTS) as output,
+        reserve_output(
+            results.out, results.overwrite, COMPLETE_COMMAND, COMPLETION_RESULTS
+        ) as output,
     ):
         refuse_results(results.out)
         print_lines(console, *output.describe_others())
@@ -188,7 +192,7 @@ def plan_targets(request: PlanRequest) -> int:
             write_targets(folder, ready.task)
             write_chosen_cameras(folder, ready.opened, ready.task)
             if ready.task.targets:
-                write_plan_pictures(folder / IMAGES, ready, begun)
+                write_plan_pictures(folder / IMAGES_FOLDER, ready, begun)
     answer_plan(results, ready.opened, ready.task.targets, holes)
     return DONE
 
@@ -202,7 +206,7 @@ def export_holes(request: ExportRequest) -> int:
     console = make_console(stderr=True, quiet=results.answer.quiet)
     with (
         show_progress(console),
-        reserve_output(request.folder, results.overwrite, COMMAND, EXPORTED) as output,
+        reserve_output(request.folder, results.overwrite, COMPLETE_COMMAND, EXPORTED) as output,
     ):
         print_lines(console, *output.describe_others())
         ready = prepare(request.filling, console)

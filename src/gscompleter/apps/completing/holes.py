@@ -28,7 +28,7 @@ from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import write_depth, write_image
 from gscompleter.system.files.reading import hash_file
-from gscompleter.system.files.result_format import MARK
+from gscompleter.system.files.result_format import RESULT_MARK
 from gscompleter.system.progress import track
 from gscompleter.types import Camera
 
@@ -110,7 +110,7 @@ def write_holes(folder: Path, ready: Prepared, begun: Completion, has_path: bool
     # Cameras that were found around the targets are found again.
     frames = ready.task.context_frames if ready.opened.has_numbered_frames else ()
     content = {
-        **MARK,
+        **RESULT_MARK,
         "version": __version__,
         "camera_model": "PINHOLE",
         "depth_unit_scale_factor": unit,

@@ -41,7 +41,7 @@ from gscompleter.data.sfm.placing import place_photographs
 from gscompleter.splats.alignment.similarity import transform_view
 from gscompleter.stages.add_observed import MIN_SHARE, find_lacks
 from gscompleter.system.errors import InputError
-from gscompleter.system.files.output_folder import POSES, refuse_link
+from gscompleter.system.files.output_folder import FOUND_POSES_FOLDER, refuse_link
 from gscompleter.system.progress import show_preparation, track
 
 MAX_LACKING = 16
@@ -88,7 +88,7 @@ def add_new_photographs(
     photos: Path, results: ResultsRequest, opened: Opened, console: Console
 ) -> Opened:
     """Place new photographs among those of the scene, and add them."""
-    kept = results.out / POSES
+    kept = results.out / FOUND_POSES_FOLDER
     refuse_link(kept)
     photographs, placed = place_photographs(
         photos, opened.photographs, kept, results.overwrite, opened.request.masks

@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.console import Console
 
 from gscompleter.apps.requests.evaluation import CasesRequest
-from gscompleter.apps.requests.scene import LONG_SIDE, parse_resolution
+from gscompleter.apps.requests.scene import DEFAULT_LONG_SIDE, parse_resolution
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.limits import check_planes
 from gscompleter.data.mask_checks import read_masks_as_asked
@@ -118,7 +118,7 @@ def iterate_tasks(
 
     # With a preset, images are cropped and scenes left out as by its authors' code (decision 047).
     loader = find_loader(request)
-    resolution = LONG_SIDE if request.resolution is None else request.resolution
+    resolution = DEFAULT_LONG_SIDE if request.resolution is None else request.resolution
     size: Resolution
     if loader is not None and isinstance(resolution, tuple):
         height, width = resolution

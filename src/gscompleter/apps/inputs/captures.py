@@ -13,10 +13,10 @@ from torch import Tensor
 
 from gscompleter.apps.inputs.named_photographs import PhotographNames
 from gscompleter.apps.inputs.removal import select_gaussians
-from gscompleter.apps.requests.scene import LONG_SIDE, SceneRequest
+from gscompleter.apps.requests.scene import DEFAULT_LONG_SIDE, SceneRequest
 from gscompleter.apps.requests.splat import Selection
 from gscompleter.config import HoleConfig
-from gscompleter.data.camera_files import NAME, has_camera_list
+from gscompleter.data.camera_files import INRIA_CAMERAS_FILE, has_camera_list
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photograph_names import name_render
 from gscompleter.data.photographs import (
@@ -106,7 +106,11 @@ def find_cameras_beside(splat: Path) -> Path | None:
     folders = [folder]
     if folder.parent.name == "point_cloud":
         folders.append(folder.parents[TRAINER_LEVELS - 1])
-    found = [place / NAME for place in folders if has_camera_list(place / NAME)]
+    found = [
+        place / INRIA_CAMERAS_FILE
+        for place in folders
+        if has_camera_list(place / INRIA_CAMERAS_FILE)
+    ]
     return found[0] if found else None
 
 
@@ -200,7 +204,7 @@ def choose_side(resolution: Resolution) -> int:
     """Choose the width and height of cameras that are found by the splat alone."""
     if isinstance(resolution, (tuple, list)):
         return max(resolution)
-    return resolution if isinstance(resolution, int) else LONG_SIDE
+    return resolution if isinstance(resolution, int) else DEFAULT_LONG_SIDE
 
 
 def search_around(

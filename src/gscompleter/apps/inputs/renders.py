@@ -60,7 +60,7 @@ from gscompleter.virtual_capture.rendered_photograph import RenderedPhotograph
 from gscompleter.virtual_capture.upward import estimate_axis_up, require_direction
 from gscompleter.virtual_capture.witnesses import choose_witnesses
 
-FORMAT = "renders"
+RENDERS_FORMAT = "renders"
 """Format of photographs that are renders of the splat."""
 MAX_POINTS = 10_000
 """Gaussians that stand for the surfaces of the scene where cameras are compared."""
@@ -112,7 +112,7 @@ def open_renders(
     photographs = replace(
         known,
         frames=tuple(make_frames(capture, scene, renderer, origin)),
-        format=FORMAT,
+        format=RENDERS_FORMAT,
         sparse=partial(sample_surface_points, scene, origin),
     )
     chosen = find_context(photographs, request.context)
@@ -139,7 +139,7 @@ def open_renders(
     opened = Opened(
         reading,
         replace(photographs, notes=tuple(notes)),
-        FORMAT,
+        RENDERS_FORMAT,
         len(photographs),
         renders_from=capture.source,
     )

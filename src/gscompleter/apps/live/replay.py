@@ -17,7 +17,7 @@ from gscompleter.apps.live.saving import (
     write_session,
 )
 from gscompleter.apps.live.session import Session, Step, apply_step, undo_step
-from gscompleter.apps.report.results import COMMAND
+from gscompleter.apps.report.results import COMPLETE_COMMAND
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.output_folder import reserve_output
@@ -30,7 +30,7 @@ def replay_session(request: SessionRequest) -> int:
     console = make_console(stderr=True, quiet=results.answer.quiet)
     with (
         show_progress(console),
-        reserve_output(results.out, results.overwrite, COMMAND, LIVE_RESULTS) as output,
+        reserve_output(results.out, results.overwrite, COMPLETE_COMMAND, LIVE_RESULTS) as output,
     ):
         print_lines(console, *output.describe_others())
         prepared = prepare_session(request, console)

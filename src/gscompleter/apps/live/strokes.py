@@ -30,14 +30,14 @@ from gscompleter.data.transforms import OPENCV_FROM_OPENGL
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import STROKES_FOLDER
 from gscompleter.system.files.reading import read_bytes
-from gscompleter.system.files.result_format import MARK
+from gscompleter.system.files.result_format import RESULT_MARK
 from gscompleter.system.files.typed_json import read_typed_json
 from gscompleter.system.files.writing import STROKES_FILE
 from gscompleter.types import Camera
 
 STROKES = (STROKES_FILE, f"{STROKES_FOLDER}/stroke*.png")
 """Globs of the files that are written."""
-ADVICE = "save the session again"
+STROKES_ADVICE = "save the session again"
 OF_STROKES = ("resolution", "near", "far", "context")
 """Options that `repair --strokes` reads, too, which are entries of their own."""
 
@@ -146,7 +146,7 @@ def encode_strokes(
         for index, step in enumerate(steps)
     ]
     content = {
-        **MARK,
+        **RESULT_MARK,
         "version": __version__,
         "resolution": began.resolution,
         "near": began.near,
@@ -189,13 +189,13 @@ def find_strokes_file(path: Path) -> Path:
 
 def read_strokes(path: Path) -> StrokesFile:
     """Read and validate a `strokes.json`, without its masks."""
-    strokes = read_typed_json(StrokesFile, path, ADVICE)
+    strokes = read_typed_json(StrokesFile, path, STROKES_ADVICE)
     for row in (*strokes.frames, *strokes.undone):
         # What is read lies beside the file, whatever it says.
         if row.mask_path is not None and not is_beside(row.mask_path):
             raise InputError(
                 f"{quote_value(path)} names the mask '{quote_value(row.mask_path)}', and only "
-                f"files beside it are read; {ADVICE}."
+                f"files beside it are read; {STROKES_ADVICE}."
             )
         if row.box is not None:
             check_selection(Selection(row.box, row.box_rotation))

@@ -17,10 +17,10 @@ from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
 from gscompleter.types import Camera, Gaussians, merge
 
-PICTURE_FILE = "removed.png"
+REMOVED_PICTURE_FILE = "removed.png"
 NUM_ROWS = 2
 """Cameras that the picture shows, those that see most of what goes."""
-SIDE = 384
+PICTURE_SIDE = 384
 """Width and height of an image from outside, in pixels."""
 ZOOM = 1.5
 """Factor on the focal length of these images: they show 1.3 times the extent of what stays."""
@@ -100,10 +100,12 @@ def choose_cameras(seen: Sequence[RemovalSeen]) -> list[Camera]:
 
 
 def enlarge(camera: Camera) -> Camera:
-    """Enlarge the images of a camera from outside to `SIDE`, with less of what is around."""
-    K = camera.K * camera.K.new_tensor([[SIDE / PREVIEW_SIDE], [SIDE / PREVIEW_SIDE], [1.0]])
+    """Enlarge the images of an outside camera to `PICTURE_SIDE`, with less of what is around."""
+    K = camera.K * camera.K.new_tensor(
+        [[PICTURE_SIDE / PREVIEW_SIDE], [PICTURE_SIDE / PREVIEW_SIDE], [1.0]]
+    )
     K = K * K.new_tensor([[ZOOM, 1.0, 1.0], [1.0, ZOOM, 1.0], [1.0, 1.0, 1.0]])
-    return replace(camera, K=K, width=SIDE, height=SIDE)
+    return replace(camera, K=K, width=PICTURE_SIDE, height=PICTURE_SIDE)
 
 
 def draw_removal_rows(

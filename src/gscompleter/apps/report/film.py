@@ -37,10 +37,10 @@ FRAMES_PER_SECOND = 24
 ONE_WAY_SECONDS = 3.0
 MIN_LEG_SECONDS = 0.75
 MAX_TARGETS = 6
-MAX_SIDE = 640
-"""Longer side of one half in pixels, unless `MIN_WIDTH` needs more."""
+MAX_FILM_SIDE = 640
+"""Longer side of one half in pixels, unless `MIN_FILM_WIDTH` needs more."""
 GAP_PIXELS = 4
-MIN_WIDTH = 720
+MIN_FILM_WIDTH = 720
 
 
 def write_comparison_video(
@@ -73,8 +73,8 @@ def choose_stops(completion: Completion) -> list[Camera]:
 
 def fit_to_video(camera: Camera) -> Camera:
     """Resize the image to one half of the video, with an even width and height."""
-    small = shrink_camera(camera, MAX_SIDE)
-    factor = max((MIN_WIDTH - GAP_PIXELS) / 2 / small.width, 1.0)
+    small = shrink_camera(camera, MAX_FILM_SIDE)
+    factor = max((MIN_FILM_WIDTH - GAP_PIXELS) / 2 / small.width, 1.0)
     lens = resize_camera(small, math.ceil(factor * small.width), math.ceil(factor * small.height))
     return replace(lens, width=lens.width // 2 * 2, height=lens.height // 2 * 2)
 

@@ -14,7 +14,7 @@ from gscompleter.apps.report.schema import (
     TargetRow,
     UnfilledRow,
 )
-from gscompleter.data.depth_beside_colmap import KINDS
+from gscompleter.data.depth_beside_colmap import DEPTH_KINDS
 from gscompleter.evaluation.verdict.kept import KeptRow
 from gscompleter.evaluation.verdict.numbers import format_number, format_percent
 
@@ -237,7 +237,7 @@ def list_photograph_notes(summary: CompletionSummary) -> Iterator[Note]:
 
 def describe_given_depth(share: float, summary: CompletionSummary) -> str:
     """Describe the largest share of a photograph whose depth is known without stereo."""
-    has_maps = any(kind in note for kind in KINDS for note in summary.scene.notes)
+    has_maps = any(kind in note for kind in DEPTH_KINDS for note in summary.scene.notes)
     has_only_points = summary.scene.format in POINT_FORMATS and not has_maps
     is_predicted = len(summary.context) == 1 and summary.settings.get("depth") != "none"
     if has_only_points and not is_predicted:

@@ -56,8 +56,8 @@ from gscompleter.system.progress import show_in_notebook, stage
 from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import Camera, View
 
-COMMAND = "complete"
-RESULTS = (
+COMPLETE_COMMAND = "complete"
+COMPLETION_RESULTS = (
     *(*COMPLETED_FILES, *(f"{name}.generated.json" for name in COMPLETED_FILES[1:])),
     *(CONTEXT_FILE, GENERATED_FILE, REMOVED_FILE, TARGETS_FILE),
     RENDERS_FILE,
@@ -66,7 +66,7 @@ RESULTS = (
     *EDITS,
 )
 """Globs of the files that a completion may write."""
-FORMAT = "python"
+VALUES_FORMAT = "python"
 """Format of a scene whose photographs were given as values."""
 
 
@@ -138,7 +138,7 @@ def save_result(
     out = require_path(out)
     splat_file = None if splat is None else find_splat_file(require_path(splat), completion)
     judged = prepare_judged(completion, unused_views)
-    with stage("report"), open_output_folder(out, overwrite, COMMAND) as folder:
+    with stage("report"), open_output_folder(out, overwrite, COMPLETE_COMMAND) as folder:
         write_result(folder, judged, splat_file)
     return out
 
@@ -200,7 +200,7 @@ def describe_values(judged: Judged, splat_file: InputSplatFile | None) -> Mappin
         },
         "device": completion.context.means.device.type,
         "scene": {
-            "format": FORMAT,
+            "format": VALUES_FORMAT,
             "photographs": len(judged.cameras),
             "used": len(completion.views),
             "splat": splat,

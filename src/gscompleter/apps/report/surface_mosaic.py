@@ -29,7 +29,7 @@ THICKNESS = 0.05
 """Distance in depth from the plane up to which something belongs to it, relative to its depth."""
 MIN_SHARE = 0.5
 """Share of the surroundings that has to lie on one plane."""
-MIN_PIXELS = 100
+MIN_SURROUNDING_PIXELS = 100
 """Fewest pixels of surroundings."""
 SIZE = 1.5
 """Side of the mosaic, relative to the longer side of the target's image."""
@@ -65,7 +65,7 @@ def fit_surroundings(view: TargetView) -> Float[Tensor, "3"] | None:
     longer = max(view.holes.shape)
     around = dilate(view.holes, round(REACH * longer)) & surface.valid
     around &= ~dilate(view.holes, max(round(RIM * longer), 1))
-    if around.sum() < MIN_PIXELS:
+    if around.sum() < MIN_SURROUNDING_PIXELS:
         return None
     target = view.camera.target
     rays = (target.z_rays() @ target.c2w[:3, :3])[around]

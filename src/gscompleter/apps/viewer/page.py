@@ -25,14 +25,14 @@ from torch.nn.functional import normalize
 from gscompleter.apps.viewer.exhibit import ViewerCamera, ViewerContent
 from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.numerics.geometry import embed_cameras, is_inside, look_along, project
-from gscompleter.splats.spz import BLOCK, encode_spz_blocks
+from gscompleter.splats.spz import ENCODED_BLOCK, encode_spz_blocks
 from gscompleter.splats.upward import USUAL, Direction
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import encode_text
 from gscompleter.types import Camera, Gaussians
 
 ASSETS = Path(__file__).with_name("assets")
-PROGRAM = (
+PAGE_PARTS = (
     *("state", "libraries", "pictures", "camera", "path", "marks", "saving", "box", "connection"),
     *("controls", "texts", "start"),
 )
@@ -93,8 +93,8 @@ def is_within_page(gaussians: Gaussians, frame: PageFrame) -> Bool[Tensor, "n"]:
     # .spz has fixed-point positions: what lies beyond their range cannot be written. In float64
     # positions take much memory, and so are moved some at a time.
     is_within = torch.empty_like(gaussians.opacities, dtype=torch.bool)
-    for start in range(0, len(gaussians), BLOCK):
-        block = slice(start, start + BLOCK)
+    for start in range(0, len(gaussians), ENCODED_BLOCK):
+        block = slice(start, start + ENCODED_BLOCK)
         is_within[block] = frame.normalize(gaussians[block]).means.norm(dim=1) <= MAX_DISTANCE
     return is_within
 
@@ -177,7 +177,7 @@ def encode_layer(name: str, scene: Gaussians, rows: Int64[Tensor, "m"], frame: P
     """Encode rows of a scene as a .spz in the frame of the page, some at a time."""
 
     def make_blocks() -> Iterator[Gaussians]:
-        for block in rows.split(BLOCK):
+        for block in rows.split(ENCODED_BLOCK):
             yield frame.normalize(scene[block.to(scene.means.device)]).to("cpu")
 
     return encode_spz_blocks(Path(name), make_blocks)
@@ -278,7 +278,7 @@ def fill_template(content: Mapping[str, Any], scripts: str) -> str:
 
 def read_program() -> str:
     """Read the page's program: its files, one after the other, share their names."""
-    return "".join(read_asset(f"{name}.js") for name in PROGRAM)
+    return "".join(read_asset(f"{name}.js") for name in PAGE_PARTS)
 
 
 def read_asset(name: str) -> str:

@@ -26,7 +26,7 @@ from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_head, read_json
 
-ADVICE = "download the scene again"
+DGP_ADVICE = "download the scene again"
 MAX_SNIFFED = 1 << 26
 """Bytes read from a file to detect a scene."""
 
@@ -38,7 +38,7 @@ def open_dgp(path: Path) -> Iterator[Photographs]:
     first camera by name, in DDAD CAMERA_01, is the front camera.
     """
     file = list_scene_files(path)[0]
-    content = read_json(file, ADVICE)
+    content = read_json(file, DGP_ADVICE)
     cameras = _read_calibrations(file, content)
     sweeps = _map_sweeps(content)
     # A datum is a reading of one sensor: an image, or a point cloud.
@@ -58,11 +58,11 @@ def _parse_frame(
     camera = "" if sensor is None else str(sensor)
     name = get_text(image, "filename", str(file)) or ""
     title = f"image {quote_value(name)} of {quote_value(file)}"
-    require(name, f"The {title} has no `filename`; {ADVICE}.")
-    require(camera, f"The {title} does not say which camera took it (`id.name`); {ADVICE}.")
+    require(name, f"The {title} has no `filename`; {DGP_ADVICE}.")
+    require(camera, f"The {title} does not say which camera took it (`id.name`); {DGP_ADVICE}.")
     require(
         camera in cameras,
-        f"The camera {quote_value(camera)} of {title} is not in the calibration; {ADVICE}.",
+        f"The camera {quote_value(camera)} of {title} is not in the calibration; {DGP_ADVICE}.",
     )
     intrinsics = replace(cameras[camera], size=get_size(image, title))
 
@@ -104,7 +104,7 @@ def _read_points(
         points = np.load(path)["data"][:, :3].astype(np.float64, casting="same_kind")
         return transform_points(points, world_from_laser)
     except Exception as error:  # damaged archives and arrays raise anything
-        raise InputError(f"{quote_value(path)} is no point cloud of DGP; {ADVICE}.") from error
+        raise InputError(f"{quote_value(path)} is no point cloud of DGP; {DGP_ADVICE}.") from error
 
 
 def _read_calibrations(scene: Path, content: Any) -> dict[str, Intrinsics]:
@@ -118,13 +118,13 @@ def _read_calibrations(scene: Path, content: Any) -> dict[str, Intrinsics]:
     if file is None and key is None:
         raise InputError(
             f"{quote_value(scene)} does not name its calibration (`calibration_key` of its first "
-            f"sample); {ADVICE}."
+            f"sample); {DGP_ADVICE}."
         )
     if file is None:
         raise InputError(
             f"The calibration of {quote_value(scene)} is missing; put it at {quote_value(keyed)}."
         )
-    calibration = read_json(file, ADVICE)
+    calibration = read_json(file, DGP_ADVICE)
     names = get_part(calibration, "names", list)
     entries = get_part(calibration, "intrinsics", list)
     # Entries of other sensors are zeros.

@@ -26,9 +26,16 @@ from gscompleter.data.photographs import Photographs, build_drive, build_photogr
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.reading import MAX_LINE, read_head, read_lines
 
-POSES = "poses.txt"
+KITTI_POSES_FILE = "poses.txt"
 CALIBRATION = "calib.txt"
-CAMERAS = {"image_2": 2, "image_0": 0, "image_3": 3, "image_1": 1, "image_l": 0, "image_r": 1}
+CAMERA_NUMBERS = {
+    "image_2": 2,
+    "image_0": 0,
+    "image_3": 3,
+    "image_1": 1,
+    "image_l": 0,
+    "image_r": 1,
+}
 """Folders of photographs of a sequence in search order, and their camera numbers."""
 RAW_CAMERAS = ("02", "03", "00", "01")
 """Cameras of a drive in order of preference: colour left, colour right, then grey."""
@@ -66,8 +73,8 @@ def open_kitti(path: Path) -> Iterator[Photographs]:
 
     # calib.txt labels the projections P0 to P3; some copies omit the labels, one camera a line.
     entries = _read_entries(calibration)
-    images = next((name for name in CAMERAS if os.path.isdir(folder / name)), "image_2")
-    camera = CAMERAS[images]
+    images = next((name for name in CAMERA_NUMBERS if os.path.isdir(folder / name)), "image_2")
+    camera = CAMERA_NUMBERS[images]
     label = f"P{camera}" if f"P{camera}" in entries else str(camera)
     projection = _get_matrix(entries, label, calibration)
     intrinsics, first_from_camera = _split_projection(projection, calibration)
@@ -219,7 +226,10 @@ def _list_poses(path: Path) -> list[Path]:
     if not os.path.isdir(path):
         return [path]
     sequence = path.resolve()
-    candidates = (path / POSES, sequence.parent.parent / "poses" / f"{sequence.name}.txt")
+    candidates = (
+        path / KITTI_POSES_FILE,
+        sequence.parent.parent / "poses" / f"{sequence.name}.txt",
+    )
     return [file for file in candidates if os.path.isfile(file)]
 
 

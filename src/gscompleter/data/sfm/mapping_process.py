@@ -28,7 +28,7 @@ from gscompleter.data.sfm.matching import (
 )
 from gscompleter.data.sfm.poses import MIN_PHOTOGRAPHS, UprightCopy
 
-LENS = "SIMPLE_RADIAL"
+LENS_MODEL = "SIMPLE_RADIAL"
 """COLMAP's camera model: one focal length, one distortion coefficient."""
 GUESSED_FOCAL = 1.2
 """Focal length in longer image sides, if EXIF lacks it."""
@@ -81,7 +81,9 @@ def find_features(job: MappingJob) -> None:
     with pycolmap.Database.open(job.database) as database:
         for key, one in cameras.items():
             focal = one.focal or GUESSED_FOCAL * max(one.width, one.height)
-            camera = pycolmap.Camera.create_from_model_name(1, LENS, focal, one.width, one.height)
+            camera = pycolmap.Camera.create_from_model_name(
+                1, LENS_MODEL, focal, one.width, one.height
+            )
             camera.has_prior_focal_length = one.focal is not None
             numbers[key] = int(database.write_camera(camera))
 
@@ -181,7 +183,7 @@ def _fix_focals(job: MappingJob, focals: dict[int, float], fov: float) -> None:
             number = camera.camera_id
             focal = max(width, height) / 2 / math.tan(math.radians(fov / 2))
             known = pycolmap.Camera.create_from_model_name(
-                number, LENS, focals.get(number, focal), width, height
+                number, LENS_MODEL, focals.get(number, focal), width, height
             )
             known.has_prior_focal_length = True
             database.update_camera(known)

@@ -17,7 +17,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float
 
-from gscompleter.data.sfm.mapping_process import GUESSED_FOCAL, LENS, is_plausible
+from gscompleter.data.sfm.mapping_process import GUESSED_FOCAL, LENS_MODEL, is_plausible
 from gscompleter.data.sfm.matching import (
     SEED,
     ColmapJob,
@@ -98,7 +98,7 @@ def make_new_camera(copy: NewCopy) -> pycolmap.Camera:
     if copy.pinhole is not None:
         return make_known_camera(copy.pinhole, copy)
     focal = copy.focal or GUESSED_FOCAL * max(copy.width, copy.height)
-    camera = pycolmap.Camera.create_from_model_name(1, LENS, focal, copy.width, copy.height)
+    camera = pycolmap.Camera.create_from_model_name(1, LENS_MODEL, focal, copy.width, copy.height)
     camera.has_prior_focal_length = copy.focal is not None
     return camera
 

@@ -25,7 +25,7 @@ from gscompleter.numerics.geometry import compute_spacing
 from gscompleter.numerics.two_views import ERROR_SIDE, find_near_pairs
 from gscompleter.types import Camera
 
-PROCESS = "gscompleter.data.sfm.refining_process"
+REFINING_PROCESS = "gscompleter.data.sfm.refining_process"
 MIN_REFINED = 3
 """Fewest photographs that are refined: two cannot hold the frame of the scene."""
 NUM_MATCHED = 8
@@ -93,7 +93,7 @@ def refine_poses(photographs: Photographs) -> tuple[Photographs, PoseRefinement 
             "pairs": pair_near(cameras),
             "position_sigma": POSITION_SIGMA * step,
         }
-        result = run_colmap(PROCESS, job, home, "Refining poses")
+        result = run_colmap(REFINING_PROCESS, job, home, "Refining poses")
 
     given = np.stack([invert_viewmat(copy.viewmat) for copy in copies])
     found = [row is not None for row in result["viewmats"]]

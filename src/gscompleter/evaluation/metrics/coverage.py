@@ -30,7 +30,7 @@ from gscompleter.trust.photometric import PhotometricTrust
 from gscompleter.types import Camera, Render, merge
 
 NUM_CAMERAS = 32
-SIDE = 96
+COVERAGE_SIDE = 96
 """Longer side of the rendered images, in pixels."""
 TURN_DEGREES = 5.0
 """Standard deviation of yaw and pitch, in degrees."""
@@ -85,7 +85,9 @@ def render_pairs(
         )
 
     return list(
-        get_view_map(new.means)(render_pair, [shrink_camera(camera, SIDE) for camera in cameras])
+        get_view_map(new.means)(
+            render_pair, [shrink_camera(camera, COVERAGE_SIDE) for camera in cameras]
+        )
     )
 
 

@@ -41,9 +41,9 @@ SHARES = (1.0, 0.5, 0.25)
 """Shares of a step that are tried until one helps."""
 ROBUST = 0.03
 """Error of a colour from which on it pulls no more than linearly."""
-MARGIN = 2
+HOLE_MARGIN = 2
 """Pixels around holes that do not count, since holes move with the camera."""
-MIN_PIXELS = 500
+MIN_POSE_PIXELS = 500
 """Fewest pixels that determine a pose."""
 
 Pixels = Float[np.ndarray, "h w 3"]
@@ -70,11 +70,11 @@ def measure_fitted(
 ) -> FittedQuality | None:
     """Fit the camera and the exposure of a target to its photograph, and score the scene there.
 
-    `holes` is where the scene was empty before it was completed. None if fewer than `MIN_PIXELS`
-    lie outside.
+    `holes` is where the scene was empty before it was completed. None if fewer than
+    `MIN_POSE_PIXELS` lie outside.
     """
-    observed = ~dilate(holes, MARGIN) & target.valid_mask
-    if observed.sum() < MIN_PIXELS:
+    observed = ~dilate(holes, HOLE_MARGIN) & target.valid_mask
+    if observed.sum() < MIN_POSE_PIXELS:
         return None
     truth = target.image.cpu().numpy()
     counted = observed.cpu().numpy()

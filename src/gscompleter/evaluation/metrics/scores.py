@@ -38,7 +38,7 @@ from gscompleter.types import Camera, DepthMap, Gaussians, Render, View
 
 Image = Float[Tensor, "h w 3"]
 
-MIN_PIXELS = 50
+MIN_DEPTH_PIXELS = 50
 """Minimum number of pixels for a median of depths."""
 
 
@@ -275,8 +275,8 @@ def compute_depth_scale(
 
 
 def compute_median(values: Float[Tensor, "h w"], where: Bool[Tensor, "h w"]) -> float | None:
-    """Compute the median over the pixels of `where`; None for fewer than `MIN_PIXELS`."""
-    return None if where.sum() < MIN_PIXELS else values[where].median().item()
+    """Compute the median over the pixels of `where`; None for fewer than `MIN_DEPTH_PIXELS`."""
+    return None if where.sum() < MIN_DEPTH_PIXELS else values[where].median().item()
 
 
 def compare_views(

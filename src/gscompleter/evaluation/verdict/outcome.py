@@ -51,7 +51,7 @@ MIN_GAIN = 0.5
 MIN_LOSS = 0.05
 """Loss of PSNR in dB from which the headline mentions it; smaller ones cannot be seen."""
 
-ADVICE = (
+WORSE_ADVICE = (
     "Usual reasons: wrong poses or focal lengths of the cameras, things that moved, or photographs "
     "with too little in common."
 )
@@ -113,7 +113,7 @@ def explain_unreconstructed(completion: Completion, held_out: Sequence[HeldOutRo
         return None
     return (
         f"The scene did not reconstruct: of {matches.total} details that two photographs share, "
-        f"only {format_percent(matches.share, 0)} lie where the cameras see them. {ADVICE}"
+        f"only {format_percent(matches.share, 0)} lie where the cameras see them. {WORSE_ADVICE}"
     )
 
 
@@ -133,7 +133,7 @@ def describe_mismatch(compared: Sequence[HeldOutRow]) -> str:
     return (
         f"The scene did not reconstruct: seen from {name_unused(compared)}, it shows something "
         f"else ({psnr} dB{measured}; holding up one of its own photographs would be as good). "
-        f"{ADVICE}"
+        f"{WORSE_ADVICE}"
     )
 
 

@@ -8,7 +8,7 @@ from gscompleter.numerics.kernels.cache import njit
 from gscompleter.numerics.kernels.project import normalize_quat, rotate_by_quat
 from gscompleter.numerics.kernels.splat_rows import copy_row
 
-BLOCK = 4096
+RUN_BLOCK = 4096
 """Consecutive Gaussians that are cut into runs independently of the others."""
 MAX_OPACITY = np.float32(0.9999)
 """Largest opacity, which keeps the logarithm of the transmittance finite."""
@@ -29,8 +29,8 @@ def mark_run_starts(begin, end, means, scales, generated, centers, focals, reach
         x = np.float32(0)
         y = np.float32(0)
         z = np.float32(0)
-        origin = generated[block * BLOCK]
-        for i in range(block * BLOCK, min((block + 1) * BLOCK, len(means))):
+        origin = generated[block * RUN_BLOCK]
+        for i in range(block * RUN_BLOCK, min((block + 1) * RUN_BLOCK, len(means))):
             dx = means[i, 0] - x
             dy = means[i, 1] - y
             dz = means[i, 2] - z

@@ -12,7 +12,7 @@ from gscompleter.numerics.kernels.parallel import share
 
 RADIUS = 3
 """Radius of a patch of 2 * radius + 1 pixels; a compile-time constant for vectorised rows."""
-SIDE = 2 * RADIUS + 1
+PATCHMATCH_SIDE = 2 * RADIUS + 1
 """Side of a patch, in pixels."""
 LANES = 24
 """Values per row of a patch: 3 per pixel, with one pixel of padding to fill whole registers."""
@@ -81,7 +81,7 @@ def _copy(image, y, x, patch):
     stride = np.uintp(3 * image.shape[1])
     start = np.uintp(y) * stride + np.uintp(3 * x)
     for lane in range(LANES):
-        for row in range(SIDE):
+        for row in range(PATCHMATCH_SIDE):
             patch[row, lane] = numbers[start + np.uintp(row) * stride + np.uintp(lane)]
 
 
@@ -98,14 +98,14 @@ def _compute_patch_cost(costs, patch, weight, total, sources, s, sy, sx, sums, b
     # Each lane sums its column of the patch over all rows, so that lanes are vectorised.
     for lane in range(LANES):
         square = difference = np.float32(0)
-        for row in range(SIDE):
+        for row in range(PATCHMATCH_SIDE):
             e = patch[row, lane] - numbers[start + np.uintp(row) * stride + np.uintp(lane)]
             weighted = weight[row, lane] * e
             difference += weighted
             square += weighted * e
         sums[0, lane], sums[1, lane] = square, difference
     square = d0 = d1 = d2 = np.float32(0)
-    for column in range(SIDE):
+    for column in range(PATCHMATCH_SIDE):
         square += sums[0, 3 * column] + sums[0, 3 * column + 1] + sums[0, 3 * column + 2]
         d0 += sums[1, 3 * column]
         d1 += sums[1, 3 * column + 1]
@@ -160,8 +160,8 @@ def _improve(begin, end, problem, costs, max_reach, seed, before, field, cost, s
     query_at = problem.query_at
     num_sources, H, W = usable.shape
     h, w = query_at.shape
-    patch = np.empty((SIDE, LANES), np.float32)
-    weight = np.empty((SIDE, LANES), np.float32)
+    patch = np.empty((PATCHMATCH_SIDE, LANES), np.float32)
+    weight = np.empty((PATCHMATCH_SIDE, LANES), np.float32)
     sums = np.empty((2, LANES), np.float32)
     bias = np.empty(3, np.float32)
     for i in range(begin, end):
@@ -253,7 +253,7 @@ def _vote(begin, end, query_at, vote_weight, sources, field, shift, colors, tota
             for dy in range(max(-RADIUS, begin - y), min(RADIUS, end - 1 - y) + 1):
                 source_row = sources[s, sy + dy]
                 sums = colors[y + dy]
-                for column in range(SIDE):
+                for column in range(PATCHMATCH_SIDE):
                     for c in range(3):
                         color = source_row[sx - RADIUS + column, c] + shift[q, c]
                         sums[x + column, c] += a * color

@@ -18,7 +18,7 @@ TILE_COLUMNS = 64
 """Size of a tile, which is matched at once, within the cache."""
 INFEASIBLE = np.int16(16000)
 """Infeasible cost, half of the largest int16."""
-PATHS = 8
+AGGREGATION_PATHS = 8
 """Number of paths of semi-global aggregation."""
 
 
@@ -404,7 +404,7 @@ def _choose(begin, end, totals, bands, index, margin):
             for k in range(planes):
                 if abs(k - best) > 2:
                     second = min(second, total[k])
-            margin[y, x] = np.float32(second - total[best]) / np.float32(PATHS)
+            margin[y, x] = np.float32(second - total[best]) / np.float32(AGGREGATION_PATHS)
             at = np.float32(bands.low[row, column] + best)
             if 0 < best < planes - 1:
                 # Two lines of opposite gradient: less biased towards whole planes than a parabola.

@@ -7,7 +7,7 @@ import numpy as np
 
 from gscompleter.numerics.kernels.cache import njit
 
-BLOCK = 256
+SUPPORT_BLOCK = 256
 """Gaussians per block."""
 MIN_ANGLE_WEIGHT = np.float32(1e-6)
 """Smallest angular weight: opposite photographs count if there are no others."""
@@ -112,11 +112,11 @@ def accumulate_trust(
     """
     one = np.float32(1)
     turn = np.float32(1) / max_turn
-    known = np.empty((6, BLOCK), np.float32)
+    known = np.empty((6, SUPPORT_BLOCK), np.float32)
     x, y, z, ray_x, ray_y, ray_z = known
-    agreeing, weights, largest = totals = np.empty((3, BLOCK), np.float32)
-    for start in range(begin, end, BLOCK):
-        count = min(BLOCK, end - start)
+    agreeing, weights, largest = totals = np.empty((3, SUPPORT_BLOCK), np.float32)
+    for start in range(begin, end, SUPPORT_BLOCK):
+        count = min(SUPPORT_BLOCK, end - start)
         totals[:] = 0
         for j in range(count):
             x[j], y[j], z[j] = means[start + j, 0], means[start + j, 1], means[start + j, 2]

@@ -28,12 +28,12 @@ from gscompleter.reconstructors.plane_sweep.sweep import (
 
 MIN_CONFIDENCE = 0.5
 """Confidence from which a measured pixel anchors depth and tests it."""
-MIN_PIXELS = 200
+MIN_HIDDEN_PIXELS = 200
 """Fewest such pixels, for an anchor and for a test."""
 MIN_SURE_SHARE = 0.25
 """Smallest share of such pixels for a test. With less, as in a room of blank walls, a third of what
 stereo is sure of is wrong, and true depth would contradict it."""
-MAX_PIXELS = 8192
+MAX_AFFINE_PIXELS = 8192
 """Most pixels of the affine fit, evenly spaced among all."""
 WEIGHT = np.float32(0.1)
 """Weight of an anchored pixel in the surface fit; a confident measurement has 1."""
@@ -71,7 +71,7 @@ def anchor_depth(guess: Map, measured: Measurement, anchors: Mask) -> Map | None
     positive scale fits: far things would be near, or nothing would be nearer than anything else.
     """
     places = np.flatnonzero(anchors)
-    sample = places[:: -(-len(places) // MAX_PIXELS)]
+    sample = places[:: -(-len(places) // MAX_AFFINE_PIXELS)]
     inverse = compute_inverse_depth(measured.planes, measured.index)
     x = torch.from_numpy(guess.ravel()[sample]).double()
     y = torch.from_numpy(inverse.ravel()[sample]).double()
@@ -130,7 +130,7 @@ def compare_in_hidden_blocks(
         hidden = parts == part
         tested = sure & hidden
         anchors = sure & ~hidden
-        if not tested.any() or anchors.sum() < MIN_PIXELS:
+        if not tested.any() or anchors.sum() < MIN_HIDDEN_PIXELS:
             continue
         anchored = anchor_depth(guess, measured, anchors)
         if anchored is None:
@@ -143,7 +143,7 @@ def compare_in_hidden_blocks(
             index = fit_surfaces(observed.index, observed.weight, image, iterations)
             found = compute_inverse_depth(measured.planes, index)
             errors.append(np.minimum(np.abs(np.log(found / truth))[tested], MAX_ERROR))
-    if sum(len(errors) for errors in supported) < MIN_PIXELS:
+    if sum(len(errors) for errors in supported) < MIN_HIDDEN_PIXELS:
         return None
     return BlockErrors(
         float(np.concatenate(supported).mean(dtype=np.float64)),

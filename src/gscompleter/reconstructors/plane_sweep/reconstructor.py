@@ -58,7 +58,7 @@ MIN_HALVED_LIFT = 320.0
 which takes an eighth of the time. Photographs never are: of five it would cost 0.4 dB."""
 MAX_LOSS = 0.05
 """Largest loss of a photograph, in dB, that predicted depth may cause."""
-MAX_NAMED = 8
+MAX_LINE_PHOTOGRAPHS = 8
 """Most photographs that a line names."""
 
 
@@ -252,7 +252,7 @@ def name_photographs(views: Sequence[View], numbers: Sequence[int]) -> str:
     named = [
         number if frame is None else frame for number, frame in zip(numbers, frames, strict=True)
     ]
-    return f"photograph{'s' if len(named) > 1 else ''} {join_names(named, MAX_NAMED)}"
+    return f"photograph{'s' if len(named) > 1 else ''} {join_names(named, MAX_LINE_PHOTOGRAPHS)}"
 
 
 def match_views(

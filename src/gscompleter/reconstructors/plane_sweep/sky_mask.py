@@ -30,7 +30,7 @@ EDGE_RADIUS = 3
 """Distance in pixels at which an edge still raises the gradient of the sky."""
 OUTLINE_WIDTH = 3
 """Width of the outline of a sky, in pixels."""
-MIN_WIDTH = 0.4
+MIN_SKY_WIDTH = 0.4
 """Smallest fraction of the top image row that a sky covers."""
 MIN_HEIGHT = 0.1
 """Smallest mean height of a sky over its columns, as a fraction of the image height."""
@@ -118,7 +118,7 @@ def is_overhead(region: Mask) -> bool:
     """Test if `region` covers a large part of the top of the image."""
     width = region[0].mean()
     area = region.mean()
-    if width < MIN_WIDTH or area < MIN_HEIGHT * width:
+    if width < MIN_SKY_WIDTH or area < MIN_HEIGHT * width:
         return False
     # Unbroken pixels have only pixels of the region above them in their column.
     unbroken = np.logical_and.accumulate(region, axis=0).sum() / region.sum()

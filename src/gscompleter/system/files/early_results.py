@@ -35,7 +35,7 @@ COMPLETION_FILES = re.compile(
 MODEL_FILES = re.compile(r"sparse/0/(cameras|frames|images|points3D|rigs)\.bin")
 FRAME_FILES = re.compile(r"images/frame_\d{6}\.jpg")
 """Frames of a film, which become its photographs."""
-HOMES = ("", "images", "sparse/0")
+EARLY_FOLDERS = ("", "images", "sparse/0")
 """Folders that such a version wrote to."""
 
 
@@ -77,7 +77,7 @@ def describe_early(folder: Path, content: Mapping[str, Any]) -> EarlyResults | N
 
 def _list_files(folder: Path) -> Iterator[str]:
     """List the files of the folders that an early version wrote to."""
-    for home in HOMES:
+    for home in EARLY_FOLDERS:
         names = []
         with suppress(OSError):
             names = sorted(os.listdir(folder / home))

@@ -26,7 +26,7 @@ AVIF_BRANDS = (b"avif", b"avis")
 """Brands in the first box of a file, by which HEIC of phones and AVIF are known. `mif1` and `msf1`
 are the general container, which either may name first."""
 
-MAX_PIXELS = 178_956_970
+MAX_IMAGE_PIXELS = 178_956_970
 """Largest number of pixels of an image, as in Pillow."""
 
 PNG_COMPRESSION = 3
@@ -265,7 +265,7 @@ def _read_array(path: Path) -> np.ndarray:
     try:
         # A memory map cannot exceed the file, whatever size its header claims.
         values = np.lib.format.open_memmap(path, mode="r")
-        if not 0 < values.size <= MAX_PIXELS:
+        if not 0 < values.size <= MAX_IMAGE_PIXELS:
             raise DamagedError(f"it claims {values.size:,} values")
     except Exception as error:  # damaged files raise any kind
         raise InputError(

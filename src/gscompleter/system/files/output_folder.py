@@ -31,7 +31,7 @@ from typing import Any
 from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.early_results import describe_early
 from gscompleter.system.files.renaming import rename
-from gscompleter.system.files.result_format import MARK, is_marked, refuse_later
+from gscompleter.system.files.result_format import RESULT_MARK, is_marked, refuse_later
 from gscompleter.system.files.unfinished import (
     REPLACED_SUFFIX,
     UNFINISHED_PREFIX,
@@ -52,12 +52,12 @@ from gscompleter.system.files.writing import (
 
 FILES = "files"
 """Entry of `summary.json`: the files of the run."""
-COMMAND = "command"
+COMMAND_KEY = "command"
 """Entry of `summary.json`: the command that wrote them."""
-COMMANDS = frozenset({"bench", "clean", "complete", "demo", "poses"})
+WRITING_COMMANDS = frozenset({"bench", "clean", "complete", "demo", "poses"})
 """Commands that write an output folder. One of them is named by the summaries of versions before
 formats had numbers, which do not name the program."""
-POSES = "colmap"
+FOUND_POSES_FOLDER = "colmap"
 """Folder of the cameras that a completion found for its photographs; it has its own summary."""
 
 STROKES_FOLDER = "images"
@@ -65,8 +65,8 @@ STROKE_MASK = re.compile(r"stroke\d{1,6}\.png")
 """Name of a mask of a session, in `STROKES_FOLDER`."""
 
 MAX_SUMMARY_BYTES = 10**9
-MAX_NAME_LENGTH = 60
-MAX_NAMED = 5
+MAX_FOREIGN_NAME_LENGTH = 60
+MAX_FOREIGN_FILES = 5
 """Most foreign files that a sentence names."""
 ATTEMPTS = 4
 """Attempts of two runs that reserve a folder at the same moment."""
@@ -117,7 +117,7 @@ class OutputFolder:
         """Write the line on what stays in the folder; none if there is nothing else."""
         if not self.others:
             return []
-        names = join_names(self.others, MAX_NAMED)
+        names = join_names(self.others, MAX_FOREIGN_FILES)
         return [f"Kept: {names} in {quote_value(self.path)}, which no run wrote."]
 
 
@@ -211,7 +211,7 @@ def read_command(folder: Path) -> str | None:
     content = _read_own_summary(folder)
     if content is None or not holds_results(folder):
         return None
-    command = content.get(COMMAND)
+    command = content.get(COMMAND_KEY)
     return command if isinstance(command, str) else None
 
 
@@ -259,11 +259,11 @@ def _read_own_summary(folder: Path) -> dict[str, Any] | None:
     That of an early version, which listed no files, gets the entries of later ones.
     """
     content = _read_summary(folder)
-    command = content.get(COMMAND)
-    if is_marked(content) or (isinstance(command, str) and command in COMMANDS):
+    command = content.get(COMMAND_KEY)
+    if is_marked(content) or (isinstance(command, str) and command in WRITING_COMMANDS):
         return content
     early = describe_early(folder, content)
-    return None if early is None else {**content, COMMAND: early.command, FILES: early.files}
+    return None if early is None else {**content, COMMAND_KEY: early.command, FILES: early.files}
 
 
 @contextmanager
@@ -311,12 +311,12 @@ def _check_free(given: Path, target: Path, overwrite: bool) -> None:
     names = list[str]()
     with suppress(FileNotFoundError):
         names = sorted(name for name in os.listdir(target) if not is_unfinished(name))
-    if names == [POSES] and os.path.isfile(target / POSES / SUMMARY_FILE):
+    if names == [FOUND_POSES_FOLDER] and os.path.isfile(target / FOUND_POSES_FOLDER / SUMMARY_FILE):
         return  # only the cameras that an earlier run found
     if names and not overwrite:
         # What `ls` does not show is named.
         is_hidden = all(name.startswith(".") for name in names)
-        held = f" (it holds {join_names(names, MAX_NAMED)})" if is_hidden else ""
+        held = f" (it holds {join_names(names, MAX_FOREIGN_FILES)})" if is_hidden else ""
         raise InputError(
             f"The output folder {quote_value(given)} is not empty{held}; name another one, or "
             "overwrite the results in it.",
@@ -416,9 +416,9 @@ def _list_in_summary(draft: Path, command: str) -> None:
     """Add the mark and the names of all files to the summary of a draft, or make one of them."""
     path = draft / SUMMARY_FILE
     content = json.loads(path.read_bytes()) if path.is_file() else {}
-    origin = {COMMAND: command} if command else {}
+    origin = {COMMAND_KEY: command} if command else {}
     files = sorted({SUMMARY_FILE, *_list_files(draft)})
-    whole = json.dumps({**MARK, **origin, **content, FILES: files}, indent=2)
+    whole = json.dumps({**RESULT_MARK, **origin, **content, FILES: files}, indent=2)
     path.write_bytes(whole.encode() + b"\n")
 
 
@@ -588,7 +588,8 @@ def _refuse_impossible(given: Path, target: Path, draft: Path, replaced: Path) -
     if unlisted or blocked:
         raise InputError(
             f"{quote_value([*unlisted, *blocked][0])} is nothing that a killed run leaves; delete "
-            f"it, or name another output folder than {quote_value(given, MAX_NAME_LENGTH)}.",
+            "it, or name another output folder than "
+            f"{quote_value(given, MAX_FOREIGN_NAME_LENGTH)}.",
             "out",
         )
     _refuse_unlisted(given, target, new, left)

@@ -28,7 +28,7 @@ from gscompleter.system.threads import count_available_cores, limit_threads
 
 PIXELS = 640 * 480
 """Pixels per image of a typical completion; its memory limits the default number of workers."""
-IMAGES = 8
+TYPICAL_IMAGES = 8
 """Images of a typical completion."""
 STOP_SECONDS = 10.0
 """Time, in seconds, that stopped workers have to remove what they have not finished."""
@@ -48,7 +48,7 @@ def choose_num_workers() -> int:
     cores = count_available_cores()
     if memory is None:
         return cores
-    return max(1, min(cores, memory // estimate_bytes(PIXELS, IMAGES)))
+    return max(1, min(cores, memory // estimate_bytes(PIXELS, TYPICAL_IMAGES)))
 
 
 def check_processes() -> None:
