@@ -54,7 +54,7 @@ SH_C0 = 0.28209479177387814
 MAX_RIGID_ERROR = 1e-3
 """Largest entry of RᵀR - I that counts as rounding error of a rotation R."""
 
-MAX_SKEW = 1e-6
+MAX_ROUNDED_SKEW = 1e-6
 """Largest entry of K, relative to the focal length, that counts as rounding error of 0."""
 NUM_SH = (1, 4, 9, 16)
 """Spherical harmonics per channel, by degree."""
@@ -63,7 +63,7 @@ Origin = tuple[float, float, float]
 """Place in the coordinates of a file, in float64."""
 
 M = TypeVar("M", bound="TensorDataclass")
-V = TypeVar("V", bound="View")
+AnyView = TypeVar("AnyView", bound="View")
 
 
 @dataclass(frozen=True)
@@ -258,7 +258,7 @@ def _find_intrinsics_defect(K: Float[Tensor, "3 3"], width: int, height: int) ->
     if not (fx > 0 and fy > 0 and math.isfinite(fx + fy + cx + cy)):
         return f"its focal lengths are {fx:g} and {fy:g}, its centre is ({cx:g}, {cy:g})"
     # Renderers read the focal lengths and the centre only; rays take the inverse of the whole K.
-    if last != [0, 0, 1] or not max(abs(skew), abs(below)) <= MAX_SKEW * min(fx, fy):
+    if last != [0, 0, 1] or not max(abs(skew), abs(below)) <= MAX_ROUNDED_SKEW * min(fx, fy):
         return "its K has a skew or another last row than 0 0 1; pixels must be right-angled"
     low, high = FOCAL_RANGE
     if not (low <= fx / width <= high and low <= fy / height <= high):
@@ -400,7 +400,7 @@ class View(Displayed, TensorDataclass):
             return image
         return torch.where(self.ignore_mask[..., None], self.image, image)
 
-    def paint_ignored(self: V, image: Float[Tensor, "h w 3"]) -> V:
+    def paint_ignored(self: AnyView, image: Float[Tensor, "h w 3"]) -> AnyView:
         """Replace ignored pixels of the photograph by those of a render."""
         if self.ignore_mask is None:
             return self

@@ -37,7 +37,7 @@ from gscompleter.system.files.writing import REMOVED_FILE
 from gscompleter.system.progress import stage
 from gscompleter.types import Gaussians
 
-MAX_SHIFT = 1000.0
+MAX_EXACT_SHIFT = 1000.0
 """Longest shift, in scene units, after which coordinates certainly fit float32."""
 MIN_LOGGED_BYTES = 50_000_000
 """Size of the files, in bytes, from which on a log says that they are converted."""
@@ -140,7 +140,7 @@ def can_be_streamed(
         return False
     # The origin of a moved splat is chosen by all of its Gaussians.
     if operations.similarity is not None and (
-        max(map(abs, operations.translate)) > MAX_SHIFT or find_origin(sources[0]) is not None
+        max(map(abs, operations.translate)) > MAX_EXACT_SHIFT or find_origin(sources[0]) is not None
     ):
         return False
     return is_ply_to_ply(sources[0], request.out)

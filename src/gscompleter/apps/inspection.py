@@ -39,15 +39,13 @@ from gscompleter.splats.formats import (
     read_provenance,
 )
 from gscompleter.splats.origin import count_digits
+from gscompleter.splats.ply import MIDDLE_QUANTILES
 from gscompleter.splats.provenance import ModelRecord, RunRecord
 from gscompleter.splats.row_kinds import count_row_kinds
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import COMPLETED_FILE, SUMMARY_FILE
 from gscompleter.types import Camera, Gaussians, Origin, sh_from_rgb
-
-MIDDLE = (0.01, 0.99)
-"""Quantiles of the coordinates that floaters leave alone."""
 
 ORIGINS = {
     "given": "as they were",
@@ -183,9 +181,9 @@ def make_bounds(
 
 
 def compute_middle(means: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Compute the quantiles `MIDDLE` of the coordinates, those of Gaussians that exist."""
+    """Compute the `MIDDLE_QUANTILES` of the coordinates of the Gaussians that exist."""
     # numpy sorts any number of them, and torch no more than 16 million.
-    low, high = np.quantile(means.numpy(), MIDDLE, axis=0, method="nearest")
+    low, high = np.quantile(means.numpy(), MIDDLE_QUANTILES, axis=0, method="nearest")
     return torch.from_numpy(low), torch.from_numpy(high)
 
 

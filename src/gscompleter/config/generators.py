@@ -70,7 +70,7 @@ CHOICE = (
     "function of yours as file.py:function."
 )
 """Help of the option `--generator`."""
-C = TypeVar("C")
+SettingsClass = TypeVar("SettingsClass")
 
 GENERATOR_PLUGINS = "gscompleter.generators"
 """Group of entry points that name tables of further generators, from name to loader.
@@ -98,7 +98,7 @@ def get_settings_class(name: str) -> type[GeneratorSettings]:
     )
 
 
-def add_options(kind: type[C]) -> type[C]:
+def add_options(kind: type[SettingsClass]) -> type[SettingsClass]:
     """Add to a class of options a field for each setting that a row of the table explains.
 
     None, their default, leaves the setting to the generator.

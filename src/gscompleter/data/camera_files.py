@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.camera_paths import find_world, is_camera_path, parse_camera_path
+from gscompleter.data.camera_paths import FOV_RANGE, find_world, is_camera_path, parse_camera_path
 from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.colmap import has_colmap, is_image_file, read_image_file, read_scene_cameras
 from gscompleter.data.frame import Frame, keep_existing, locate_images
@@ -46,8 +46,6 @@ INRIA_CAMERAS_FILE = "cameras.json"
 CAMERAS_ADVICE = "export the cameras again"
 DEFAULT_FOV = 60.0
 """SuperSplat's default field of view, in degrees."""
-FOV_RANGE = (1.0, 179.0)
-"""Range of the field of view, in degrees."""
 SPLAT_FROM_WORLD = np.array([-1.0, -1.0, 1.0])
 """Axis factors from SuperSplat's world to the splat: 180° about z."""
 

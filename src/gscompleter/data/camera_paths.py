@@ -30,7 +30,7 @@ DATAPARSER_FILE = "dataparser_transforms.json"
 """File of a nerfstudio run with the transform that it applied to the scene."""
 CAMERA_PATH_ADVICE = "export the camera path again"
 FOV_RANGE = (1.0, 179.0)
-"""Range of the vertical field of view, in degrees."""
+"""Range of a field of view, in degrees."""
 
 
 def is_camera_path(content: Any) -> bool:

@@ -52,13 +52,13 @@ MIN_EDGE_SHARE = 0.25
 """Smallest share of the columns with a static edge that moving ground would have moved."""
 MIN_SUPPORT = 0.6
 """Smallest static share of the length of an outline."""
-MIN_AREA = 0.01
+MIN_VEHICLE_AREA = 0.01
 """Smallest share of the image that a vehicle covers."""
 MAX_AREA = 0.5
 """Largest share of the image that a vehicle covers."""
 MAX_STATIC_ELSEWHERE = 0.3
 """Largest static share of the edges elsewhere; above it the camera hardly moves."""
-CLEARANCE = 4
+OUTLINE_CLEARANCE = 4
 """Rows between two outlines, and between an outline and other edges, in small copies."""
 MAX_DIP_WIDTH = 0.12
 """Largest width of a dip of the outline that is filled, as a share of the columns."""
@@ -201,11 +201,11 @@ def find_static_region(
         if not is_vehicle(edges, outline):
             break
         # Once a vehicle is certain, its outline may be followed where it is faint.
-        top = max(first, int(outline.min()) - CLEARANCE)
+        top = max(first, int(outline.min()) - OUTLINE_CLEARANCE)
         fainter = trace_outline(edges, top, limit, LENIENT)
         highest = np.minimum(highest, np.minimum(outline, fainter))
         # The next outline has to lie above this one.
-        limit = np.where(highest < height, highest - CLEARANCE, height)
+        limit = np.where(highest < height, highest - OUTLINE_CLEARANCE, height)
     if (highest == height).all():
         return None
 
@@ -272,7 +272,7 @@ def is_vehicle(edges: Edges, outline: Int[np.ndarray, "w"]) -> bool:
     """Decide whether the region below an outline moves with the camera."""
     height, width = edges.static_share.shape
     inside = fill_below(outline, height)
-    if not MIN_AREA <= inside.mean() <= MAX_AREA:
+    if not MIN_VEHICLE_AREA <= inside.mean() <= MAX_AREA:
         return False
 
     # Most of the outline has to be static, and enough of it where moving ground would have moved
@@ -288,7 +288,7 @@ def is_vehicle(edges: Edges, outline: Int[np.ndarray, "w"]) -> bool:
         return False
 
     # If most other edges are static too, the camera hardly moved, and the outline says nothing.
-    elsewhere = ~fill_below(outline - CLEARANCE, height)
+    elsewhere = ~fill_below(outline - OUTLINE_CLEARANCE, height)
     occurring = np.where(elsewhere, edges.edge_share, 0)
     return bool(occurring[kept].sum() <= MAX_STATIC_ELSEWHERE * occurring.sum())
 

@@ -45,7 +45,7 @@ MAX_MATRICES = 1 << 26
 """Largest file of matrices, in bytes."""
 MAX_MATRIX = 1 << 12
 """Largest matrix with its header, in bytes."""
-MAX_SKEW = 1e-3
+MAX_LENS_SKEW = 1e-3
 """Largest skew of a lens relative to its focal length."""
 
 
@@ -100,7 +100,7 @@ def read_cam(path: Path) -> tuple[Float[np.ndarray, "4 4"], Intrinsics]:
 def build_lens(matrix: Float[np.ndarray, "3 3"], title: str) -> Intrinsics:
     """Build intrinsics of the photograph's size from the matrix of a lens."""
     (fx, skew, cx), (_, fy, cy), _ = matrix.tolist()
-    is_lens = fx > 0 and fy > 0 and abs(skew) <= MAX_SKEW * fx and max(fx, fy) <= MAX_NUMBER
+    is_lens = fx > 0 and fy > 0 and abs(skew) <= MAX_LENS_SKEW * fx and max(fx, fy) <= MAX_NUMBER
     require(is_lens, f"The lens of {title} has skew, or no focal length; {MVS_ADVICE}.")
     return Intrinsics(None, (fx, fy), (cx, cy))
 

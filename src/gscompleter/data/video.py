@@ -31,15 +31,15 @@ NUM_FRAMES = 40
 MIN_FRAMES = 3
 SMALL_SIDE = 640
 """Longer side in pixels at which frames are measured."""
-STEP = 0.02
+REFERENCE_MOTION = 0.02
 """Motion from one reference frame to the next, in longer sides."""
-QUANTILE = 0.75
+MOTION_QUANTILE = 0.75
 """Quantile of the motions of corners; around a thing at the centre most move little."""
 NUM_CORNERS = 200
 """Most corners that are tracked."""
 MIN_TRACKED = 0.5
 """Share of corners below which the reference frame is out of sight."""
-QUALITY = 95
+FRAME_JPEG_QUALITY = 95
 """JPEG quality of the chosen frames."""
 
 
@@ -63,13 +63,13 @@ def extract_frames(video: Path, folder: Path, count: int) -> None:
         images = read_video(video, f"select='{_write_choice(chosen)}'", is_grey=False)
         for number, pixels in zip(chosen, images, strict=True):
             path = folder / f"frame_{number:06d}.jpg"
-            Image.fromarray(pixels).save(path, quality=QUALITY, subsampling=0)
+            Image.fromarray(pixels).save(path, quality=FRAME_JPEG_QUALITY, subsampling=0)
 
 
 def measure_frames(frames: Iterable[Image8]) -> tuple[Values, Values]:
     """Measure the variance of the Laplacian of each frame, and its motion since the first one.
 
-    Motion is in steps of `STEP`; the fraction is the way from the last reference frame.
+    Motion is in steps of `REFERENCE_MOTION`; the fraction is the way from the last reference frame.
     """
     sharpness = list[float]()
     motion = list[float]()
@@ -96,7 +96,9 @@ def _measure_motion(reference: Image8, corners: Corners, frame: Image8) -> float
     if status.mean() < MIN_TRACKED:
         return 1.0
     moved = np.linalg.norm((corners_now - corners)[status == 1], axis=-1)
-    return min(float(np.quantile(moved, QUANTILE)) / (STEP * max(frame.shape)), 1.0)
+    return min(
+        float(np.quantile(moved, MOTION_QUANTILE)) / (REFERENCE_MOTION * max(frame.shape)), 1.0
+    )
 
 
 def select_frames(sharpness: Values, motion: Values, count: int) -> list[int]:

@@ -8,13 +8,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gscompleter.numerics.image_ops import BRIGHTEST, DARKEST
+
 MIN_EXPOSURE_PIXELS = 100
 """Fewest shared pixels to compare two photographs."""
-DARKEST = 0.05
-"""Smallest usable value; darker ones are noise."""
-BRIGHTEST = 0.95
-"""Largest usable value; brighter ones may be clipped."""
-MAX_GAIN = 2.0
+MAX_EXPOSURE_GAIN = 2.0
 """Largest plausible gain; its inverse is the smallest."""
 
 
@@ -41,7 +39,7 @@ def match_exposures(
             overlap = visible[best] & visible[known]
             ratio = compute_median_ratio(colors[best][overlap], colors[known][overlap])
             gains[best] = gains[known] * ratio
-    return [gains[i].clamp(1 / MAX_GAIN, MAX_GAIN) for i in range(len(colors))]
+    return [gains[i].clamp(1 / MAX_EXPOSURE_GAIN, MAX_EXPOSURE_GAIN) for i in range(len(colors))]
 
 
 def compute_median_ratio(

@@ -30,7 +30,7 @@ from gscompleter.generators.warp import (
 )
 from gscompleter.numerics.image_ops import dilate, smooth_masked
 from gscompleter.numerics.kernels import patchmatch
-from gscompleter.numerics.kernels.patchmatch import PATCHMATCH_SIDE, RADIUS
+from gscompleter.numerics.kernels.patchmatch import PATCHMATCH_RADIUS, PATCHMATCH_SIDE
 from gscompleter.types import Camera, GeneratorInput, View
 
 STRUCTURE_REACH = 0.15
@@ -227,7 +227,9 @@ def fill_by_patches(
         # second one on each diagonal, as scores do not change (decision 045).
         spacing = FINEST_SPACING if number == 0 else 1
         rows, columns = np.indices(level.known.shape)
-        centres = dilate(~level.known, RADIUS).numpy() & ((rows + columns) % spacing == 0)
+        centres = dilate(~level.known, PATCHMATCH_RADIUS).numpy() & (
+            (rows + columns) % spacing == 0
+        )
         # Each level and round draws other random numbers; the steps between seeds are primes.
         filled, field = search_and_vote(level, field, centres, rounds, seed + 7919 * number)
     return filled
@@ -324,9 +326,9 @@ def compute_likelihood(cost: Float32[ndarray, "q"]) -> Float32[ndarray, "q"]:
 
 def find_usable_centres(valid: Bool[Tensor, "s h w"]) -> Bool[ndarray, "s h w"]:
     """Mark the pixels whose whole patch is valid and inside the image."""
-    is_missing = pad(~valid, (RADIUS,) * 4, value=True)
-    inner = slice(RADIUS, -RADIUS)
-    return np.stack([~dilate(mask, RADIUS)[inner, inner].numpy() for mask in is_missing])
+    is_missing = pad(~valid, (PATCHMATCH_RADIUS,) * 4, value=True)
+    inner = slice(PATCHMATCH_RADIUS, -PATCHMATCH_RADIUS)
+    return np.stack([~dilate(mask, PATCHMATCH_RADIUS)[inner, inner].numpy() for mask in is_missing])
 
 
 def init_matches(

@@ -28,7 +28,7 @@ from gscompleter.types import Camera, Gaussians, Render
 
 SLIDE_STEP = 0.04
 """Step of a Gaussian along its ray, relative to its distance before the step."""
-CLEARANCE = 0.01
+OCCLUSION_CLEARANCE = 0.01
 """Least distance behind an observed surface, relative to its depth, that counts as occluded.
 A Gaussian there is invisible to the camera and still closes the hole."""
 STEPS_AT_ONCE = 8
@@ -217,7 +217,7 @@ def is_before_surface(points: Float[Tensor, "n 3"], observed: Observed) -> Bool[
     depth = observed.depth[row, column]
 
     # Depth is 0 where no surface is seen, so that nothing is in front of it.
-    before = z < (1 + CLEARANCE) * depth
+    before = z < (1 + OCCLUSION_CLEARANCE) * depth
     # Half-way between an object and the wall, a mean is hidden by the object, but its footprint
     # shows beside the edge, before the wall (decision 049). It has to slide on to the wall. Where
     # its own pixel shows no surface, nothing hides it: it is in a hole of this camera and may stay.

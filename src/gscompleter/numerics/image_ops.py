@@ -11,6 +11,12 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 
+DARKEST = 0.05
+"""Smallest colour that tells how bright a surface is; darker ones are noise."""
+BRIGHTEST = 0.95
+"""Largest one; brighter ones may be clipped."""
+MIN_CONTRAST = 0.02
+"""Range of brightness in 5 x 5 smoothed pixels that counts as texture; colours are in [0, 1]."""
 SSIM_RADIUS = 5
 """Radius of the Gaussian window of SSIM, in pixels."""
 SSIM_SIGMA = 1.5

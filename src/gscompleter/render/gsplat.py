@@ -24,7 +24,7 @@ from gscompleter.types import Camera, Gaussians, Render, merge, sh_from_rgb
 
 EPS_2D = 0.3
 """Low-pass of 3DGS: pixels² that are added to the variances of each footprint."""
-MIN_ALPHA = 1e-10
+MIN_DIVIDING_ALPHA = 1e-10
 """Smallest alpha that gsplat divides a depth by."""
 TILE_SIZE = 16
 """Side of a tile in pixels, gsplat's default."""
@@ -231,7 +231,7 @@ class BinnedGaussians:
         """Render in these colours, and opacities at most those of the Gaussians."""
         # The depth is composited as a fourth colour, and divided by alpha as in "RGB+ED".
         sums, alpha = self.composite(torch.cat([colors, self.depths[..., None]], dim=-1), opacities)
-        depth = sums[..., 3] / alpha.clamp_min(MIN_ALPHA)
+        depth = sums[..., 3] / alpha.clamp_min(MIN_DIVIDING_ALPHA)
         return [
             Render(
                 sums[i, :height, :width, :3], depth[i, :height, :width], alpha[i, :height, :width]

@@ -39,7 +39,7 @@ EDITS_FOLDER = "edits"
 EDITS = (EDITS_FILE, f"{EDITS_FOLDER}/*.ply", REFINED_POSES_FILE)
 """Globs of the files that are written, with the poses that the splat was made with."""
 EDITS_ADVICE = "take all files of its folder again, or move it away to do without the record"
-_NAME = re.compile(r"removed\.ply|edits/\d{1,5}_(originals|taken_out)\.ply")
+_EDITS_FILE = re.compile(r"removed\.ply|edits/\d{1,5}_(originals|taken_out)\.ply")
 
 
 RowKind = Literal["recolored", PartKind]
@@ -144,7 +144,7 @@ def read_edits(splat: Path) -> Edits:
     # Names of a file that may come from elsewhere lead to nothing outside of its folder.
     for edit in content.edits:
         for name in edit.files:
-            if not _NAME.fullmatch(name):
+            if not _EDITS_FILE.fullmatch(name):
                 raise InputError(f"{quote_value(path)} names {quote_value(name)}; {EDITS_ADVICE}.")
     is_unchanged = content.sha256 == hash_file(splat)
     if not is_unchanged and splat.name != content.file:

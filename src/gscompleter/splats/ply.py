@@ -74,7 +74,7 @@ SAMPLE_ROWS = 1024
 """Rows of each block of a sample."""
 MIN_TELLING = 100
 """Fewest Gaussians whose numbers tell how they are stored."""
-MIDDLE = (0.01, 0.99)
+MIDDLE_QUANTILES = (0.01, 0.99)
 """Quantiles of positions that floaters leave alone."""
 LARGE_SIZE = 0.1
 """Largest size of the median Gaussian that is plausible, relative to the extent of the scene."""
@@ -251,7 +251,7 @@ def _measure_scales(rows: ndarray) -> tuple[float, float, float]:
 def _measure_extent(rows: ndarray) -> float:
     """Measure the largest side of the box around nearly all Gaussians, in scene units."""
     means = read_columns(sample_rows(rows), MEANS)
-    return float(np.ptp(np.quantile(means, MIDDLE, axis=0), axis=0).max())
+    return float(np.ptp(np.quantile(means, MIDDLE_QUANTILES, axis=0), axis=0).max())
 
 
 def find_plain_opacities(rows: ndarray, has_linear_scales: bool) -> bool:

@@ -20,7 +20,7 @@ names no number."""
 MIN_FIT_PIXELS = 64
 """Fewest comparable pixels that a fit needs. Our reading, as are both limits below: the paper does
 not say what happens where RANSAC finds nothing."""
-MIN_INLIERS = 0.3
+MIN_INLIER_SHARE = 0.3
 """Smallest inlier fraction of a reliable fit."""
 MIN_DEPTH_SPREAD = 0.05
 """Smallest (p95 - p5) / median of depths that separates scale and shift.
@@ -54,7 +54,7 @@ def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> 
         # Our reading: ρ counts pixels whose error, relative to their depth, is small.
         scale, shift = fit_line_ransac(x, y, rng, predicted.depth.device)
         inliers = find_affine_inliers(x, y, scale, shift).double().mean().item()
-        if scale > 0 and inliers >= MIN_INLIERS:
+        if scale > 0 and inliers >= MIN_INLIER_SHARE:
             return DepthAffine(scale, shift, inliers, "ransac")
 
     scale = (y / x).median().item()

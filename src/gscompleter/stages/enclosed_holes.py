@@ -32,7 +32,7 @@ ENCLOSURE_SIDE = 224
 """Longer side, in pixels, of the images from other sides."""
 MIN_PART_PIXELS = 12
 """Pixels of the smallest part that can be judged; smaller ones stay empty."""
-OPAQUE = 0.9
+OBJECT_ALPHA = 0.9
 """Alpha from which a pixel beside a hole counts as the object."""
 HOLE_BORDER = 0.02
 """Width of the border of a hole, relative to the longer side of the image."""
@@ -84,7 +84,7 @@ def is_hole_in_object(
     """Judge one connected part of the empty pixels; the cheap criteria come first."""
     if not is_enclosed(part) or int(part.sum()) < MIN_PART_PIXELS:
         return False
-    opaque = render.alpha >= OPAQUE
+    opaque = render.alpha >= OBJECT_ALPHA
     width = max(3, round(HOLE_BORDER * max(part.shape)))
     beside = dilate(part, 1)
     border = dilate(part, width + 1) & ~beside & opaque

@@ -33,7 +33,7 @@ from gscompleter.system.threads import use_one_torch_thread
 from gscompleter.trust import HeldViews, Trust
 from gscompleter.types import Camera, Gaussians, Render, View
 
-BLUR_RADIUS = 0.01
+BOX_RADIUS = 0.01
 """Radius of box filters, relative to the longer side; it tolerates edges off by a pixel."""
 EXPOSURE_PIXELS = 10_000
 """Pixels that the exposure fit uses."""
@@ -255,5 +255,5 @@ def sum_weights(frozen: FrozenScene) -> Float[Tensor, "n"]:
 
 
 def blur(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Apply the box filter of radius `BLUR_RADIUS`."""
-    return average_box(values, max(round(BLUR_RADIUS * max(values.shape)), 1))
+    """Apply the box filter of radius `BOX_RADIUS`."""
+    return average_box(values, max(round(BOX_RADIUS * max(values.shape)), 1))

@@ -42,7 +42,7 @@ LOOK_SIDE = 16
 MAX_BOUNDED = 0.48
 """Largest mean share of these looks that ends on an object. It was 0.00 to 0.46 for objects, and
 0.50 to 0.87 for rooms and streets (decision 080)."""
-MIN_OPEN = 0.05
+MIN_SEEN_FROM_OUTSIDE = 0.05
 """Least share of the points that has to be seen from outside. Of a closed box nearly none is."""
 MAX_FLATNESS = 0.3
 """Largest ratio of the shortest to the middle side of the extent of open ground."""
@@ -72,7 +72,7 @@ def is_object(scene: Gaussians, renderer: Renderer, given: Sequence[Camera] = ()
     small = thin_gaussians(scene, MAX_PREVIEW_GAUSSIANS)
     points = list_points(extent)
     points = points[find_seen_from_outside(points, views)]
-    if len(points) < MIN_OPEN * GRID**3:
+    if len(points) < MIN_SEEN_FROM_OUTSIDE * GRID**3:
         return False
     if measure_bounded(small, extent, points, renderer) > MAX_BOUNDED:
         return False

@@ -20,7 +20,7 @@ HALF_MIST = 0.1
 """Mist at which the quality is halved."""
 HALF_FOOTPRINT = 0.05
 """Footprint at which the quality is halved."""
-NEAREST = 0.05
+NEAREST_SURFACE_QUANTILE = 0.05
 """Quantile of the depths that counts as the nearest surface."""
 
 
@@ -68,5 +68,5 @@ def measure_quality(scene: Gaussians, camera: Camera, frozen: FrozenScene) -> Qu
         covered.float().mean().item(),
         spread.mean().item(),
         footprint.median().item(),
-        torch.quantile(render.depth[covered], NEAREST).item(),
+        torch.quantile(render.depth[covered], NEAREST_SURFACE_QUANTILE).item(),
     )

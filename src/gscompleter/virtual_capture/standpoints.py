@@ -25,9 +25,9 @@ STANDPOINT_SIDE = 48
 """Width and height of the images in which cameras are compared."""
 FIELD_OF_VIEW = 60.0
 """Field of view of cameras that are found, in degrees."""
-NEAR = 0.02
+STANDPOINT_NEAR = 0.02
 """Near plane of the images that are compared, in radii of the core."""
-SEED = 0
+STANDPOINT_SEED = 0
 
 NUM_RANDOM = 200
 """Random cameras of the search for standpoints; with 300 those found of a trained splat are no
@@ -43,7 +43,7 @@ FREE_NEAREST = 0.12
 """The same, from which on it does not matter."""
 APART = (0.35, 0.6)
 """Distance, in radii of the core, and angle, in radians, of standpoints that count as others."""
-MIN_SHARE = 0.3
+MIN_RELATIVE_SCORE = 0.3
 """Least score of a standpoint, relative to the best."""
 
 DISTANCES = (2.5, 4.0, 6.0)
@@ -51,7 +51,7 @@ DISTANCES = (2.5, 4.0, 6.0)
 AZIMUTH_STEP = 20
 ELEVATIONS = (0, 20, 45)
 """Directions of cameras around a place, in degrees."""
-MIN_SHOWN = 0.35
+MIN_BALL_SHARE = 0.35
 """Least share of a place, against a ball of its size, that a camera around it has to show."""
 AROUND_APART = 35.0
 """Angle, in degrees, from which on cameras around a place show other sides of it."""
@@ -82,7 +82,7 @@ def find_standpoints(
     core = measure_core(scene.means)
     small = thin_gaussians(scene, MAX_PREVIEW_GAUSSIANS)
     up = normalize(up, dim=0)
-    generator = torch.Generator().manual_seed(SEED)
+    generator = torch.Generator().manual_seed(STANDPOINT_SEED)
 
     def rate(camera: Camera) -> Standpoint:
         quality = measure_quality(small, camera, renderer.freeze(small, camera))
@@ -109,7 +109,7 @@ def find_standpoints(
         distances = (centers - other.center).norm(dim=1) / core.radius
         return distances / APART[0] + measure_turns(cameras, other) / APART[1]
 
-    chosen = choose_apart(found, measure_apart, count, MIN_SHARE)
+    chosen = choose_apart(found, measure_apart, count, MIN_RELATIVE_SCORE)
     return [replace(resize_camera(camera, side, side), near=None) for camera in chosen]
 
 
@@ -142,7 +142,7 @@ def choose_cameras_around_place(
         # A ball of that radius covers this share of the image.
         expected = math.pi / distance**2 / (4 * half**2)
         shown = (frozen.splat(values) > 0.5).float().mean().item() / expected
-        if shown < MIN_SHOWN:
+        if shown < MIN_BALL_SHARE:
             return Standpoint(0.0, camera)
         return Standpoint(measure_quality(small, camera, frozen).score * min(shown, 1.0), camera)
 
@@ -217,7 +217,7 @@ def draw_camera(core: Core, up: Float[Tensor, "3"], generator: torch.Generator) 
         forward = core.center + spot * core.radius - center
     else:
         forward = make_direction(up, draw(0.0, 2 * math.pi), -math.asin(draw(-0.15, 0.45)))
-    return make_camera(center, limit_pitch(forward, up), up, NEAR * core.radius)
+    return make_camera(center, limit_pitch(forward, up), up, STANDPOINT_NEAR * core.radius)
 
 
 def shift_camera(
@@ -231,7 +231,7 @@ def shift_camera(
     steps = torch.randn((2, 3), generator=generator).to(up)
     center = camera.center + 0.15 * reach * core.radius * steps[0]
     forward = limit_pitch(camera.forward + 0.25 * reach * steps[1], up)
-    return make_camera(center, forward, up, NEAR * core.radius)
+    return make_camera(center, forward, up, STANDPOINT_NEAR * core.radius)
 
 
 def limit_pitch(forward: Float[Tensor, "3"], up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:

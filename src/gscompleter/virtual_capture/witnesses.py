@@ -29,7 +29,7 @@ from gscompleter.virtual_capture.standpoints import find_standpoints
 MAX_WITNESSES = 64
 """Most witnesses of a splat; of a file with more cameras, those that are spread most are taken. Of
 40, some of a trained splat that tested saw its rim hidden (26.5 dB), of 64 none (45.8 dB)."""
-MIN_KNOWN = 12
+ENOUGH_KNOWN_CAMERAS = 12
 """Cameras of a file besides the context from which on no further witnesses are found."""
 TESTING = 4
 """Every so many-th witness guards nothing, and tests the result."""
@@ -82,7 +82,7 @@ def choose_witnesses(
     """
     if len(others) > MAX_WITNESSES:
         others = [others[index] for index in select_spread_cameras(others, MAX_WITNESSES)]
-    if len(others) < MIN_KNOWN:
+    if len(others) < ENOUGH_KNOWN_CAMERAS:
         # Not where renders are taken: the same splat has the same witnesses, whether its cameras
         # were found or come from the file of an earlier run.
         small = [resize_camera(camera, WITNESS_SIDE, WITNESS_SIDE) for camera in context]

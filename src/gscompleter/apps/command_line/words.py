@@ -28,7 +28,7 @@ from gscompleter.apps.command_line.help_pages import (
     make_program,
 )
 from gscompleter.apps.command_line.old_spellings import refuse_old_spellings
-from gscompleter.apps.requests.completion import NUM_TARGETS
+from gscompleter.apps.requests.completion import DEFAULT_NUM_TARGETS
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.system.errors import InputError, join_names, quote_value
 
@@ -200,7 +200,7 @@ def insert_auto_count(words: Sequence[str]) -> list[str]:
     if "--auto" in counted:
         place = counted.index("--auto") + 1
         if not counted[place:] or not counted[place].isdecimal():
-            counted.insert(place, str(NUM_TARGETS))
+            counted.insert(place, str(DEFAULT_NUM_TARGETS))
     return counted
 
 

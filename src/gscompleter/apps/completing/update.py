@@ -39,7 +39,7 @@ from gscompleter.config import CompleterConfig
 from gscompleter.data.formats import find_format
 from gscompleter.data.sfm.placing import place_photographs
 from gscompleter.splats.alignment.similarity import transform_view
-from gscompleter.stages.add_observed import MIN_SHARE, find_lacks
+from gscompleter.stages.add_observed import MIN_ADDED_SHARE, find_lacks
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.output_folder import FOUND_POSES_FOLDER, refuse_link
 from gscompleter.system.progress import show_preparation, track
@@ -137,7 +137,7 @@ def choose_evidence(
     frames.update(frame for frame in new if frame not in opened.held_out)
     if context is None:
         shares = measure_lacks(loaded)
-        lacking = [frame for frame, share in shares.items() if share >= MIN_SHARE]
+        lacking = [frame for frame, share in shares.items() if share >= MIN_ADDED_SHARE]
         lacking.sort(key=lambda frame: -shares[frame])
         frames.update(lacking[:MAX_LACKING])
     if frames == set(task.context_frames):

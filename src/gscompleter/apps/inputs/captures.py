@@ -28,7 +28,7 @@ from gscompleter.numerics.geometry import add_near_plane, is_same_camera
 from gscompleter.render.protocols import Renderer
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.types import Camera, Gaussians
-from gscompleter.virtual_capture.around_target import NUM_CAMERAS, choose_cameras_around
+from gscompleter.virtual_capture.around_target import MAX_CHOSEN_CAMERAS, choose_cameras_around
 from gscompleter.virtual_capture.pixel_aligned import aim_pixel_camera, move_beside
 from gscompleter.virtual_capture.standpoints import choose_cameras_around_place, find_standpoints
 from gscompleter.virtual_capture.upward import Upward, find_upward
@@ -215,7 +215,7 @@ def search_around(
 ) -> Capture:
     """Search for cameras around the holes of all targets."""
     # Fewer around each of many targets.
-    count = max(1, min(NUM_CAMERAS, MAX_AROUND // max(len(targets), 1)))
+    count = max(1, min(MAX_CHOSEN_CAMERAS, MAX_AROUND // max(len(targets), 1)))
     cameras: list[Camera] = []
     for target, hole in zip(targets, holes, strict=True):
         for camera in choose_cameras_around(scene, target, renderer, hole, count):

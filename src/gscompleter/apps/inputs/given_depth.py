@@ -26,7 +26,7 @@ from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.types import View
 
 WAY_OUT = "--no-given-depth leaves it out"
-MAX_DEVIATION = 0.03
+MAX_DEPTH_DEVIATION = 0.03
 """Largest median deviation of predicted depth from triangulated points that counts as measured.
 Stereo of photographs is about as exact, so that a worse map only helps where stereo measures
 nothing (decision 088)."""
@@ -136,7 +136,7 @@ def sort_predicted(
     agreeing = {
         frame: depth
         for frame, depth in maps.items()
-        if deviations.get(frame, np.inf) <= MAX_DEVIATION
+        if deviations.get(frame, np.inf) <= MAX_DEPTH_DEVIATION
     }
     others = {frame: depth for frame, depth in maps.items() if frame not in agreeing}
     return PredictedDepth(agreeing, others, deviations)

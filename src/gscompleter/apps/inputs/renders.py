@@ -62,7 +62,7 @@ from gscompleter.virtual_capture.witnesses import choose_witnesses
 
 RENDERS_FORMAT = "renders"
 """Format of photographs that are renders of the splat."""
-MAX_POINTS = 10_000
+MAX_SURFACE_POINTS = 10_000
 """Gaussians that stand for the surfaces of the scene where cameras are compared."""
 MIN_POINT_OPACITY = 0.5
 """Least opacity of such a Gaussian."""
@@ -257,7 +257,7 @@ def sample_surface_points(
 ) -> Float[np.ndarray, "n 3"]:
     """Sample the means of opaque Gaussians, in the coordinates of the file."""
     means = scene.means[scene.opacities >= MIN_POINT_OPACITY]
-    step = max(1, len(means) // MAX_POINTS)
+    step = max(1, len(means) // MAX_SURFACE_POINTS)
     return means[::step].double().cpu().numpy() + origin
 
 

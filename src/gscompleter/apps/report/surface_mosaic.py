@@ -21,13 +21,13 @@ from gscompleter.stages.synthesize import make_generator_input
 from gscompleter.stages.target_view import TargetView, render_target
 from gscompleter.types import Camera
 
-REACH = 0.15
+SURROUNDINGS_WIDTH = 0.15
 """Width of the surroundings of a hole that a surface is fitted to, relative to the longer side."""
-RIM = 0.01
+UNSURE_RIM = 0.01
 """Width of the part of them beside the hole that is left out, as depth is unsure there."""
-THICKNESS = 0.05
+PLANE_THICKNESS = 0.05
 """Distance in depth from the plane up to which something belongs to it, relative to its depth."""
-MIN_SHARE = 0.5
+MIN_PLANE_SHARE = 0.5
 """Share of the surroundings that has to lie on one plane."""
 MIN_SURROUNDING_PIXELS = 100
 """Fewest pixels of surroundings."""
@@ -52,7 +52,7 @@ def draw_mosaic(view: TargetView) -> Float[Tensor, "s s 3"] | None:
     # What stands before the plane is no part of it. In the axes of the target, plane · x = 1.
     target = view.camera.target
     points = (unproject(warped.depth, camera) - target.center) @ target.c2w[:3, :3]
-    is_surface = warped.known & ((points @ plane - 1).abs() < THICKNESS)
+    is_surface = warped.known & ((points @ plane - 1).abs() < PLANE_THICKNESS)
     return warped.image.where(is_surface[..., None], 0.0)
 
 
@@ -63,16 +63,16 @@ def fit_surroundings(view: TargetView) -> Float[Tensor, "3"] | None:
     """
     surface = view.render.depth_map()
     longer = max(view.holes.shape)
-    around = dilate(view.holes, round(REACH * longer)) & surface.valid
-    around &= ~dilate(view.holes, max(round(RIM * longer), 1))
+    around = dilate(view.holes, round(SURROUNDINGS_WIDTH * longer)) & surface.valid
+    around &= ~dilate(view.holes, max(round(UNSURE_RIM * longer), 1))
     if around.sum() < MIN_SURROUNDING_PIXELS:
         return None
     target = view.camera.target
     rays = (target.z_rays() @ target.c2w[:3, :3])[around]
     depths = surface.depth[around]
     plane = fit_plane_ransac(rays, depths, torch.Generator().manual_seed(0))
-    is_near = (depths * (rays @ plane) - 1).abs() < THICKNESS
-    return plane if is_near.float().mean() >= MIN_SHARE else None
+    is_near = (depths * (rays @ plane) - 1).abs() < PLANE_THICKNESS
+    return plane if is_near.float().mean() >= MIN_PLANE_SHARE else None
 
 
 def face_plane(plane: Float[Tensor, "3"], holes: Bool[Tensor, "h w"], target: Camera) -> Camera:

@@ -39,7 +39,7 @@ PAGE_PARTS = (
 """Files of the page's program in their order: each uses only names of those before it at once."""
 PAGE_EXTENT = 4.0
 """Median distance of Gaussians from the centre, within a factor of 2, in page units."""
-MAX_DISTANCE = 4096.0
+MAX_PAGE_DISTANCE = 4096.0
 """Largest distance of a Gaussian from the centre, in page units; leaves ten fractional bits."""
 PART = 48_000_000
 """Bytes of Gaussians per script element, below the longest string of any browser."""
@@ -95,7 +95,7 @@ def is_within_page(gaussians: Gaussians, frame: PageFrame) -> Bool[Tensor, "n"]:
     is_within = torch.empty_like(gaussians.opacities, dtype=torch.bool)
     for start in range(0, len(gaussians), ENCODED_BLOCK):
         block = slice(start, start + ENCODED_BLOCK)
-        is_within[block] = frame.normalize(gaussians[block]).means.norm(dim=1) <= MAX_DISTANCE
+        is_within[block] = frame.normalize(gaussians[block]).means.norm(dim=1) <= MAX_PAGE_DISTANCE
     return is_within
 
 

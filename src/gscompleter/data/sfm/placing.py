@@ -52,7 +52,7 @@ from gscompleter.types import View
 
 MAX_KNOWN = 200
 """Most photographs with known cameras that new ones are compared with; of more, those far apart."""
-MIN_MATCHES = 30
+MIN_PLACING_MATCHES = 30
 """Features that COLMAP needs in common with the points of the scene."""
 MAX_UNPLACED_PHOTOGRAPHS = 5
 """Most photographs that a sentence names."""
@@ -244,8 +244,8 @@ def explain_unplaced(row: Mapping[str, Any], sources: Mapping[str, str]) -> str:
     if matches == 0:
         return "it shares no features with a photograph of SCENE"
     like = quote_value(sources[row["like"]])
-    if matches < MIN_MATCHES:
-        return f"{matches} features in common with {like}, and {MIN_MATCHES} are needed"
+    if matches < MIN_PLACING_MATCHES:
+        return f"{matches} features in common with {like}, and {MIN_PLACING_MATCHES} are needed"
     return f"{matches} features in common with {like} fit no single camera"
 
 

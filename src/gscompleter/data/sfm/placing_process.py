@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from gscompleter.data.sfm.mapping_process import GUESSED_FOCAL, LENS_MODEL, is_plausible
 from gscompleter.data.sfm.matching import (
-    SEED,
+    MATCHING_SEED,
     ColmapJob,
     extract_features,
     match,
@@ -125,7 +125,7 @@ def register_new(job: PlacingJob, cameras: dict[str, int]) -> pycolmap.Reconstru
     known.write(triangulated)
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=job.threads,
-        random_seed=SEED,
+        random_seed=MATCHING_SEED,
         multiple_models=False,
         fix_existing_frames=True,
         constant_cameras={cameras[copy.name] for copy in job.known},

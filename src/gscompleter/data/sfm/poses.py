@@ -82,13 +82,13 @@ MAX_FOLDERS = 10_000
 """Most folders below one that are searched for photographs."""
 MIN_PHOTOGRAPHS = 3
 """Fewest photographs; two determine neither a focal length nor a wrong match."""
-MIN_SHARE = 0.25
+MIN_MODEL_SHARE = 0.25
 """Smallest share of the photographs in a usable model."""
-MIN_POINTS = 30
+MIN_MODEL_POINTS = 30
 """Fewest points of a model; COLMAP needs as many in common with one photograph."""
 MAX_COPY_SIDE = 1600
 """Longest side of a copy in pixels; SIFT finds no better features in larger ones."""
-QUALITY = 95
+COPY_JPEG_QUALITY = 95
 """JPEG quality of rotated or shrunk copies."""
 MAX_THREADS = 4
 MAX_LEFT_OUT_PHOTOGRAPHS = 5
@@ -384,8 +384,8 @@ def _run(photographs: Path, folder: Path, given: Path, reading: MaskReading) -> 
     )
 
     # Few photographs, few points or an odd lens: the mapper found a coincidence, not the scene.
-    enough = max(MIN_PHOTOGRAPHS, MIN_SHARE * len(copies))
-    is_large = poses.num_registered >= enough and poses.points >= MIN_POINTS
+    enough = max(MIN_PHOTOGRAPHS, MIN_MODEL_SHARE * len(copies))
+    is_large = poses.num_registered >= enough and poses.points >= MIN_MODEL_POINTS
     if not (is_large and result["is_plausible"]):
         lens = "" if result["is_plausible"] else " and an implausible lens"
         raise InputError(
@@ -426,7 +426,7 @@ def write_copies(
         kind = f"view_{number}"
         name = Path(re.sub(SEPARATORS, "_", given.name)).with_suffix(".jpg")
         target = _prepare_target(folder / COPIES_FOLDER / kind / name, given.path)
-        Image.fromarray(pixels).save(target, quality=QUALITY, subsampling=0)
+        Image.fromarray(pixels).save(target, quality=COPY_JPEG_QUALITY, subsampling=0)
         side = len(pixels)
         place = f"{kind}/{name.as_posix()}"
         is_masked = shade is not None and _write_mask(folder, place, shade, (side, side))
@@ -469,7 +469,7 @@ def write_upright(
     else:
         copy.info.clear()  # removes the orientation, which is applied already
         written = "JPEG" if kind == "JPEG" else "PNG"
-        copy.save(target, format=written, quality=QUALITY, subsampling=0)
+        copy.save(target, format=written, quality=COPY_JPEG_QUALITY, subsampling=0)
 
     hidden = read_hidden(path, mask, has_inverted_mask)
     is_masked = hidden is not None and _write_mask(folder, name, hidden, copy.size)

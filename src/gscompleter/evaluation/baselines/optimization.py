@@ -26,14 +26,14 @@ POSITION_RATE = 1.6e-4
 # Step sizes of the other parameters, in their own units.
 ROTATION_RATE = 1e-3
 SCALE_RATE = 5e-3
-OPACITY_RATE = 0.05
+OPTIMIZED_OPACITY_RATE = 0.05
 COLOR_RATE = 2.5e-3
 
 DSSIM_WEIGHT = 0.2
 """Weight of 1 - SSIM in the loss; the rest is L1."""
 DENSE_SHARE = 0.01
 """Largest size of a cloned Gaussian, in camera extents; larger ones are split."""
-MIN_OPACITY = 0.005
+PRUNED_OPACITY = 0.005
 """Opacity below which Gaussians are pruned."""
 
 
@@ -102,7 +102,13 @@ class Parameters:
         self.scene = scene
         log_scales = scene.scales.clamp_min(1e-12).log()
         values = (scene.means, scene.quats, log_scales, scene.opacities.logit(eps=1e-4), scene.sh)
-        rates = (POSITION_RATE * extent, ROTATION_RATE, SCALE_RATE, OPACITY_RATE, COLOR_RATE)
+        rates = (
+            POSITION_RATE * extent,
+            ROTATION_RATE,
+            SCALE_RATE,
+            OPTIMIZED_OPACITY_RATE,
+            COLOR_RATE,
+        )
         self.leaves = [value.detach().clone().requires_grad_() for value in values]
         both = zip(self.leaves, rates, strict=True)
         groups = [{"params": [leaf], "lr": rate} for leaf, rate in both]
@@ -163,4 +169,4 @@ def control_density(
             moved = parents.means + (quats_to_rotations(parents.quats) @ offset[..., None])[..., 0]
             children.append(replace(parents, means=moved, scales=parents.scales / 1.6))
         dense = merge([kept, clones, *children])
-        return dense[dense.opacities >= MIN_OPACITY]
+        return dense[dense.opacities >= PRUNED_OPACITY]

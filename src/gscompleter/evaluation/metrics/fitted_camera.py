@@ -28,11 +28,11 @@ from gscompleter.types import Camera, Gaussians, Render, View
 
 MAX_MOVE = 4.0
 """Largest rotation and shift along each axis, in pixels: poses are not searched for, but mended."""
-STEP = 0.25
+DERIVATIVE_STEP = 0.25
 """Difference of each number for the derivatives, in pixels."""
 MIN_STEP = 0.05
 """Largest change in pixels at which the fit has converged."""
-ROUNDS = 10
+MAX_NEWTON_STEPS = 10
 """Most steps of Gauss and Newton for each blur."""
 BLURS = (6.0, 1.5)
 """Standard deviations of the blur in pixels, one after the other, so that edges that lie beside
@@ -143,12 +143,12 @@ def fit_blurred(
 
     move = start
     image = draw(move)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_NEWTON_STEPS):
         gains = fit_gains(image, truth, counted)
         residuals = compute_residuals(image, gains)
-        steps = STEP * np.eye(6)
+        steps = DERIVATIVE_STEP * np.eye(6)
         drawn = [compute_residuals(draw(move + step), gains) for step in steps]
-        slopes = np.stack([(one - residuals) / STEP for one in drawn], axis=1)
+        slopes = np.stack([(one - residuals) / DERIVATIVE_STEP for one in drawn], axis=1)
         weighted = slopes / np.maximum(np.abs(residuals), ROBUST)[:, None]
         # A little damping, where two of the numbers act alike, as a turn and a shift do.
         normal = weighted.T @ slopes

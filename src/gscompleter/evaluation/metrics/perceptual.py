@@ -20,7 +20,7 @@ from gscompleter.system.errors import InputError
 
 Image = Float[Tensor, "h w 3"]
 
-C = 30.0
+GMSD_CONSTANT = 30.0
 """Constant of the similarity, in units of 8-bit colours; fitted by the authors."""
 ALPHA = 4.2
 """Steepness of the logistic function; fitted by the authors."""
@@ -73,7 +73,7 @@ def compute_similarities(
 
 def compare_values(a: Float[Tensor, "*n"], b: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Compute (2 a b + c) / (a² + b² + c), which is 1 for equal values."""
-    return (2 * a * b + C) / (a**2 + b**2 + C)
+    return (2 * a * b + GMSD_CONSTANT) / (a**2 + b**2 + GMSD_CONSTANT)
 
 
 def compute_wavelets(luminance: Float[Tensor, "h w"], scale: int) -> Float[Tensor, "2 h w"]:

@@ -44,9 +44,9 @@ MIN_CONSISTENT = 0.3
 On the same scenes it is 0.49 to 1.00 with true poses. With wrong ones it is below 0.3 only where
 the cameras differ much, so that this notices about half of them.
 """
-MIN_MATCHES = 20
+MIN_DECIDING_MATCHES = 20
 """Fewest matched features that decide: by chance, few wrong ones may fit."""
-MIN_GAIN = 0.5
+MIN_BETTER_GAIN = 0.5
 """Gain of PSNR in dB from which a photograph of the context counts as better than before."""
 MIN_LOSS = 0.05
 """Loss of PSNR in dB from which the headline mentions it; smaller ones cannot be seen."""
@@ -109,7 +109,7 @@ def explain_unreconstructed(completion: Completion, held_out: Sequence[HeldOutRo
         return None if is_like(compared) else describe_mismatch(compared)
     # In small images, in which poses that are a little off still fit.
     matches = count_consistent_matches([shrink_view(view) for view in completion.views])
-    if matches.total < MIN_MATCHES or matches.share >= MIN_CONSISTENT:
+    if matches.total < MIN_DECIDING_MATCHES or matches.share >= MIN_CONSISTENT:
         return None
     return (
         f"The scene did not reconstruct: of {matches.total} details that two photographs share, "
@@ -199,7 +199,7 @@ def describe_gain(
     Unused photographs tell it best, then those of the `context` of a given scene that gained.
     """
     scored = [row for row in held_out if row.psnr_after is not None]
-    better = [row for row in context if compute_gain(row) >= MIN_GAIN]
+    better = [row for row in context if compute_gain(row) >= MIN_BETTER_GAIN]
     has_unused = any(not row.is_check for row in scored)
     if not scored or (better and not has_unused):
         if not better:

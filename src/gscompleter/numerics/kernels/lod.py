@@ -10,11 +10,11 @@ from gscompleter.numerics.kernels.splat_rows import copy_row
 
 RUN_BLOCK = 4096
 """Consecutive Gaussians that are cut into runs independently of the others."""
-MAX_OPACITY = np.float32(0.9999)
+MAX_RUN_OPACITY = np.float32(0.9999)
 """Largest opacity, which keeps the logarithm of the transmittance finite."""
 MAX_THICKNESS = np.float32(4.6)
 """Optical thickness (at opacity 0.99) beyond which a Gaussian hardly gets wider."""
-MIN_DIVISOR = np.float32(1e-30)
+MIN_WEIGHT_SUM = np.float32(1e-30)
 
 
 @njit(nogil=True, fastmath={"contract"}, error_model="numpy")
@@ -72,7 +72,7 @@ def _compute_cross_section(scales, i):
 @njit(fastmath={"contract"})
 def _compute_thickness(opacity):
     """Compute the optical thickness t of an opacity: exp(-t) is the transmittance."""
-    return -math.log(np.float32(1) - min(opacity, MAX_OPACITY))
+    return -math.log(np.float32(1) - min(opacity, MAX_RUN_OPACITY))
 
 
 @njit()
@@ -150,11 +150,11 @@ def merge_runs(begin, end, start, gaussians, shares, merged):
             axis = axes[k], axes[3 + k], axes[6 + k]
             seen = (means, quats, scales, to_means[run], axis)
             to_scales[run, k] = math.sqrt(_compute_variance(first, last, shares, *seen))
-        thickness = total / max(_compute_cross_section(to_scales, run), MIN_DIVISOR)
+        thickness = total / max(_compute_cross_section(to_scales, run), MIN_WEIGHT_SUM)
         before = np.float32(0)
         for i in range(first, last):
             before += shares[i] * _compute_thickness(opacities[i])
         wider = math.sqrt(_compute_fullness(thickness) / _compute_fullness(before))
         for k in range(3):
             to_scales[run, k] *= wider
-        to_opacities[run] = min(-math.expm1(-thickness), MAX_OPACITY)
+        to_opacities[run] = min(-math.expm1(-thickness), MAX_RUN_OPACITY)

@@ -11,7 +11,7 @@ SUPPORT_BLOCK = 256
 """Gaussians per block."""
 MIN_ANGLE_WEIGHT = np.float32(1e-6)
 """Smallest angular weight: opposite photographs count if there are no others."""
-MIN_DIVISOR = np.float32(1e-20)
+MIN_CAP_DIVISOR = np.float32(1e-20)
 
 # Abramowitz and Stegun 4.4.46: acos(x) = sqrt(1 - x) p(x) from 0 to 1, to 2e-8.
 _A0, _A1, _A2, _A3 = map(np.float32, (1.5707963050, -0.2145988016, 0.0889789874, -0.0501743046))
@@ -91,7 +91,7 @@ def _add_agreement(x, y, z, rays, center, turn, areas, agreement, totals):
         dx = x[j] - center_x
         dy = y[j] - center_y
         dz = z[j] - center_z
-        inverse = one / math.sqrt(max(dx * dx + dy * dy + dz * dz, MIN_DIVISOR))
+        inverse = one / math.sqrt(max(dx * dx + dy * dy + dz * dz, MIN_CAP_DIVISOR))
         turned = _acos((dx * ray_x[j] + dy * ray_y[j] + dz * ray_z[j]) * inverse) * turn
         weight = areas[j] * (_exp_negative(turned * turned) + MIN_ANGLE_WEIGHT)
         agreeing[j] += weight * agreement[j]
@@ -123,7 +123,7 @@ def accumulate_trust(
             dx = x[j] - place.center[0]
             dy = y[j] - place.center[1]
             dz = z[j] - place.center[2]
-            inverse = one / math.sqrt(max(dx * dx + dy * dy + dz * dz, MIN_DIVISOR))
+            inverse = one / math.sqrt(max(dx * dx + dy * dy + dz * dz, MIN_CAP_DIVISOR))
             ray_x[j], ray_y[j], ray_z[j] = dx * inverse, dy * inverse, dz * inverse
         for k in range(len(centers)):
             center = centers[k, 0], centers[k, 1], centers[k, 2]
@@ -133,7 +133,7 @@ def accumulate_trust(
             )
         for j in range(count):
             i = start + j
-            needed = max(sums[i] * _compute_pixel_area(means, i, place), MIN_DIVISOR)
+            needed = max(sums[i] * _compute_pixel_area(means, i, place), MIN_CAP_DIVISOR)
             share = min(largest[j] / (enough * needed), one)
-            supported = share * agreeing[j] / max(weights[j], MIN_DIVISOR)
+            supported = share * agreeing[j] / max(weights[j], MIN_CAP_DIVISOR)
             values[i] = supported if sums[i] > 0 else one

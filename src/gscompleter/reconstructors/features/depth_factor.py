@@ -24,7 +24,7 @@ MIN_SAMPLES = 24
 """Fewest compared depths from which a factor is estimated."""
 MIN_OWN_SAMPLES = 12
 """Fewest compared depths from which a single photograph is judged."""
-CORE = np.log(1.1)
+RATIO_WINDOW = np.log(1.1)
 """Half the width of the window, in logarithms, that is moved to where most ratios lie."""
 AGREEMENT = np.log(1.25)
 """Largest deviation of a logarithm that agrees with the factor. Stereo is as inexact as the poses:
@@ -35,7 +35,7 @@ MIN_AGREEMENT = 0.5
 same share tells that it has another one, as relative depth has in each."""
 MIN_CORRELATION = -0.3
 """Smallest rank correlation of given and measured depths. Inverted depth comes near -1."""
-NOISE = np.log(1.1)
+POSE_NOISE = np.log(1.1)
 """Largest logarithm that counts as no factor: errors of poses scale all depths of a pair."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
@@ -139,7 +139,7 @@ def fit_depth_factor(samples: DepthSamples) -> DepthFactor | None:
 
     # A factor within the noise of the poses, or of the ratios themselves, counts as 1.
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(ratios - log_factor)))
-    if abs(log_factor) <= max(NOISE, sigma):
+    if abs(log_factor) <= max(POSE_NOISE, sigma):
         log_factor = 0.0
 
     agreement = compute_agreement(ratios, log_factor)
@@ -152,10 +152,10 @@ def fit_depth_factor(samples: DepthSamples) -> DepthFactor | None:
 def find_densest(ratios: Float[np.ndarray, "n"]) -> float:
     """Find the median of the ratios in the window around one of them that holds the most."""
     ordered = np.sort(ratios)
-    first = np.searchsorted(ordered, ordered - CORE)
-    last = np.searchsorted(ordered, ordered + CORE)
+    first = np.searchsorted(ordered, ordered - RATIO_WINDOW)
+    last = np.searchsorted(ordered, ordered + RATIO_WINDOW)
     center = ordered[(last - first).argmax()]
-    return float(np.median(ratios[np.abs(ratios - center) <= CORE]))
+    return float(np.median(ratios[np.abs(ratios - center) <= RATIO_WINDOW]))
 
 
 def compute_agreement(ratios: Float[np.ndarray, "n"], log_factor: float) -> float:
@@ -173,7 +173,7 @@ def contradicts_factor(samples: DepthSamples, log_factor: float) -> bool:
     ratios = np.log(samples.measured) - np.log(samples.given)
     if compute_agreement(ratios, log_factor) >= MIN_AGREEMENT:
         return False
-    in_core = np.abs(ratios - find_densest(ratios)) <= CORE
+    in_core = np.abs(ratios - find_densest(ratios)) <= RATIO_WINDOW
     return bool(in_core.mean() >= MIN_AGREEMENT) or correlate_ranks(samples) < MIN_CORRELATION
 
 

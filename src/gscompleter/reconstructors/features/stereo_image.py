@@ -14,7 +14,7 @@ from gscompleter.types import View
 
 MIN_STEREO_SIDE = 8
 """Smallest side of an image that stereo can match, in pixels."""
-NEAREST = np.float32(1e-6)
+MIN_GIVEN_DEPTH = np.float32(1e-6)
 """Smallest given depth, in units of the images; sensors write any number."""
 
 
@@ -81,7 +81,7 @@ def _make_stereo_image(view: View, center: Float[np.ndarray, "3"], unit: float) 
     given = np.zeros(view.image.shape[:2], np.float32)
     if view.given_depth is not None:
         depth = view.given_depth.detach().cpu().numpy()
-        inverse = unit / np.maximum(depth, NEAREST * unit)
+        inverse = unit / np.maximum(depth, MIN_GIVEN_DEPTH * unit)
         given = np.where(depth > 0, inverse, 0).astype(np.float32)
     return StereoImage(
         np.ascontiguousarray(view.image.detach().cpu().float().numpy()),

@@ -17,7 +17,11 @@ from jaxtyping import Float32, Int
 
 from gscompleter.numerics.image_ops import push_pull
 from gscompleter.numerics.robust import fit_line_ransac
-from gscompleter.reconstructors.plane_sweep.surfaces import ITERATIONS, Image, fit_surfaces
+from gscompleter.reconstructors.plane_sweep.surfaces import (
+    SMOOTHING_ITERATIONS,
+    Image,
+    fit_surfaces,
+)
 from gscompleter.reconstructors.plane_sweep.sweep import (
     Map,
     Mask,
@@ -42,7 +46,7 @@ NUM_PARTS = 3
 """Number of parts that blocks are hidden in, one after the other."""
 MIN_BLOCK, MAX_BLOCK = 1 / 8, 1 / 3
 """Smallest and largest side of a block, relative to the shorter side of the image."""
-MAX_ERROR = 0.5
+MAX_LOG_ERROR = 0.5
 """Largest absolute error of a logarithm of depth that counts; a blunder says no more than that."""
 TEST_SIDE = 256
 """Shorter side, in pixels, that a test needs: it takes every n-th pixel of an image n times as
@@ -99,7 +103,7 @@ def support(measured: Measurement, inverse: Map, known: Mask) -> Measurement:
 
 
 def compare_in_hidden_blocks(
-    guess: Map, measured: Measurement, image: Image, iterations: int = ITERATIONS // 2
+    guess: Map, measured: Measurement, image: Image, iterations: int = SMOOTHING_ITERATIONS // 2
 ) -> BlockErrors | None:
     """Compare what inverse depths, 0 where unknown, tell about hidden blocks of stereo.
 
@@ -142,7 +146,7 @@ def compare_in_hidden_blocks(
         ):
             index = fit_surfaces(observed.index, observed.weight, image, iterations)
             found = compute_inverse_depth(measured.planes, index)
-            errors.append(np.minimum(np.abs(np.log(found / truth))[tested], MAX_ERROR))
+            errors.append(np.minimum(np.abs(np.log(found / truth))[tested], MAX_LOG_ERROR))
     if sum(len(errors) for errors in supported) < MIN_HIDDEN_PIXELS:
         return None
     return BlockErrors(

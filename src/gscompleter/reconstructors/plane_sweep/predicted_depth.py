@@ -21,7 +21,7 @@ from gscompleter.reconstructors.plane_sweep.surfaces import Image
 from gscompleter.reconstructors.plane_sweep.sweep import Mask, Measurement
 from gscompleter.types import DepthMap
 
-MAX_RATIO = 0.95
+MAX_PREDICTED_RATIO = 0.95
 """Largest error in hidden blocks with the prediction, relative to that without it."""
 UNTESTED = "stereo measures too little there to test it"
 CONTRADICTED = "continued surfaces tell hidden blocks of stereo as well as it does, or better"
@@ -59,7 +59,7 @@ def add_prediction(
     errors = compare_in_hidden_blocks(guess, full, image)
     if errors is None:
         return Supported(measured, refusal=UNTESTED)
-    if errors.ratio > MAX_RATIO:
+    if errors.ratio > MAX_PREDICTED_RATIO:
         return Supported(measured, refusal=CONTRADICTED)
     anchored = anchor_depth(guess, full, known & (full.confidence >= MIN_CONFIDENCE))
     if anchored is None:

@@ -25,19 +25,21 @@ STEP_PENALTY = 3.0
 """Cost of a one-plane step in a uniform area; a measurement costs 1 per missed plane."""
 BEND_PENALTY = 12.0
 """Cost of a gradient change by one plane per pixel."""
-EDGE_CONTRAST = 0.1
+STEP_CONTRAST = 0.1
 """Colour difference at which the cost of a step falls to 1/e."""
 MIN_STEP_SHARE = 0.02
 """Relative cost of a step at the strongest edge."""
-TOLERANCE = 0.15
+MEASUREMENT_TOLERANCE = 0.15
 """Measurement error without cost, in planes."""
 LEVELS = 5
 """Number of pyramid levels; coarse ones carry planes over long distances."""
-ITERATIONS = 100
+SMOOTHING_ITERATIONS = 100
 """Iterations on the finest level, doubled on each coarser one."""
 
 
-def fit_surfaces(measured: Map, confidence: Map, image: Image, iterations: int = ITERATIONS) -> Map:
+def fit_surfaces(
+    measured: Map, confidence: Map, image: Image, iterations: int = SMOOTHING_ITERATIONS
+) -> Map:
     """Fit inverse depths to measurements with weights in [0, 1].
 
     Without a positive weight or an iteration they stay as measured.
@@ -72,7 +74,7 @@ def fit_surfaces(measured: Map, confidence: Map, image: Image, iterations: int =
             across=step_right / np.float32(scale),
             down=step_down / np.float32(scale),
             bend=np.float32(BEND_PENALTY / scale**2),
-            tolerance=np.float32(TOLERANCE),
+            tolerance=np.float32(MEASUREMENT_TOLERANCE),
             iterations=iterations * 2**number,
         )
     return heights
@@ -82,7 +84,7 @@ def compute_step_costs(image: Image) -> tuple[Map, Map]:
     """Compute the cost of a step to the right and lower neighbour; low at edges."""
 
     def compute_cost(beside: Image) -> Map:
-        share = np.maximum(np.exp(-compute_contrast(image, beside) / EDGE_CONTRAST), MIN_STEP_SHARE)
+        share = np.maximum(np.exp(-compute_contrast(image, beside) / STEP_CONTRAST), MIN_STEP_SHARE)
         return (STEP_PENALTY * share).astype(np.float32)
 
     right = np.append(image[:, 1:], image[:, -1:], 1)

@@ -26,6 +26,8 @@ AVIF_BRANDS = (b"avif", b"avis")
 """Brands in the first box of a file, by which HEIC of phones and AVIF are known. `mif1` and `msf1`
 are the general container, which either may name first."""
 
+SHOWN_JPEG_QUALITY = 85
+"""JPEG quality of pictures to look at, in a page or a notebook."""
 MAX_IMAGE_PIXELS = 178_956_970
 """Largest number of pixels of an image, as in Pillow."""
 
