@@ -34,7 +34,7 @@ from gscompleter.system.tensor_checks import (
     check_tensors,
     describe,
     is_number,
-    is_whole,
+    is_whole_number,
 )
 
 MAX_IMAGE_SIDE = 16_384
@@ -189,7 +189,7 @@ class Camera(Displayed, TensorDataclass):
 def _find_size_defect(width: object, height: object) -> str | None:
     """Return a sentence part about an impossible size of the image, or None."""
     for name, side in (("width", width), ("height", height)):
-        if not is_whole(side):
+        if not is_whole_number(side):
             return f"its {name} is {describe(side)}, and a whole number of pixels is needed"
         if not 1 <= side <= MAX_IMAGE_SIDE:  # type: ignore[operator]
             return f"its {name} is {side} pixels, and 1 to {MAX_IMAGE_SIDE} are possible"
@@ -201,7 +201,7 @@ def _find_padding_defect(padding: object, width: int, height: int) -> str | None
     if not (
         isinstance(padding, tuple)
         and len(padding) == 2
-        and all(is_whole(pixels) and pixels >= 0 for pixels in padding)
+        and all(is_whole_number(pixels) and pixels >= 0 for pixels in padding)
     ):
         return f"its padding is {describe(padding)}, and two numbers of pixels from 0 are needed"
     if 2 * padding[0] >= width or 2 * padding[1] >= height:
@@ -331,7 +331,7 @@ class View(Displayed, TensorDataclass):
             raise InputError(
                 f"The camera of a view has to be a Camera, and is {describe(self.camera)}."
             )
-        if self.frame is not None and not is_whole(self.frame):
+        if self.frame is not None and not is_whole_number(self.frame):
             raise InputError(
                 f"The frame of a view is {describe(self.frame)}; give the number of a frame or "
                 "None."

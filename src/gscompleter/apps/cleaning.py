@@ -17,7 +17,7 @@ from torch import Tensor
 from gscompleter import __version__
 from gscompleter.apps.command_line.answers import print_answer
 from gscompleter.apps.completing.preparation import open_input, read_splat
-from gscompleter.apps.completing.run_info import describe_run, refuse_results
+from gscompleter.apps.completing.run_info import describe_run_values, refuse_results
 from gscompleter.apps.inputs.depth_range import apply_splat_range
 from gscompleter.apps.inputs.describing import describe_opening, print_lines
 from gscompleter.apps.inputs.reading import read_photographs
@@ -128,7 +128,7 @@ def clean_splat(request: CleaningRequest) -> None:
                 )
                 write_image(folder / REMOVED_PICTURE_FILE, picture)
             (folder / SUMMARY_FILE).write_bytes(json.dumps(summary, indent=2).encode() + b"\n")
-    lines = describe_result(summary, request)
+    lines = describe_cleaned_files(summary, request)
     print_answer(results.answer, json.loads((results.out / SUMMARY_FILE).read_bytes()), lines)
 
 
@@ -166,7 +166,7 @@ def clean_by_photographs(
     config = request.config.strengthen(request.strength)
     with record_seconds(()) as seconds, timed_stage("clean"):
         removed = find_superfluous(given, task.views, renderer, config)
-    run_info = describe_run(
+    run_info = describe_run_values(
         photographs,
         splat,
         opened,
@@ -255,7 +255,7 @@ def score_cleaning(
     return rows, seen
 
 
-def describe_result(summary: Mapping[str, Any], request: CleaningRequest) -> list[str]:
+def describe_cleaned_files(summary: Mapping[str, Any], request: CleaningRequest) -> list[str]:
     """Describe what went, and which file is what; the last line names the cleaned splat."""
     counts = summary["gaussians"]
     out = request.results.out

@@ -68,7 +68,7 @@ WALL_DEPTH = 2.0
 """Depth of the wall, in baselines."""
 
 
-def list_missing(names: Collection[str]) -> list[str]:
+def list_uncompiled(names: Collection[str]) -> list[str]:
     """List those of some parts whose kernels are not compiled."""
     return [name for name in PARTS if name in names and not is_compiled(name)]
 
@@ -76,7 +76,7 @@ def list_missing(names: Collection[str]) -> list[str]:
 def compile_kernels(names: Collection[str]) -> float | None:
     """Compile the missing kernels of these parts; return the seconds, or None if there are none."""
     # Without a cache each kernel is compiled when it is used, and a rehearsal gains nothing.
-    if not list_missing(names) or get_cache_folder() is None:
+    if not list_uncompiled(names) or get_cache_folder() is None:
         return None
     start = time.perf_counter()
     with compile_beside(names):
@@ -90,7 +90,7 @@ def compile_beside(names: Collection[str]) -> Iterator[None]:
 
     Within the block only what needs no kernels should be done, such as reading photographs.
     """
-    missing = list_missing(names)
+    missing = list_uncompiled(names)
     # As in `compile_kernels`.
     if not missing or get_cache_folder() is None:
         yield

@@ -119,10 +119,10 @@ def read_camera_list(path: Path) -> list[Frame]:
         isinstance(content, list) and content,
         f"{quote_value(path)} lists no cameras; a list of cameras is needed, {CAMERAS_ADVICE}.",
     )
-    return [_parse_camera(entry, number, path) for number, entry in enumerate(content)]
+    return [_parse_inria_camera(entry, number, path) for number, entry in enumerate(content)]
 
 
-def _parse_camera(entry: Any, number: int, path: Path) -> Frame:
+def _parse_inria_camera(entry: Any, number: int, path: Path) -> Frame:
     title = f"camera {number} of {quote_value(path)}"
     focal = get_focal(entry, title)
     size = get_size(entry, title)

@@ -51,7 +51,7 @@ def parse_camera_path(content: Any, path: Path) -> list[Frame]:
     size = get_size(content, str(path), "render_width", "render_height")
     to_photographs = find_world(path)
     return [
-        _parse_camera(entry, f"camera {number} of {quote_value(path)}", size, to_photographs)
+        _parse_path_camera(entry, f"camera {number} of {quote_value(path)}", size, to_photographs)
         for number, entry in enumerate(entries)
     ]
 
@@ -78,7 +78,7 @@ def find_world(path: Path) -> Float[np.ndarray, "4 4"] | None:
     return to_original
 
 
-def _parse_camera(
+def _parse_path_camera(
     entry: Any,
     title: str,
     size: tuple[int, int],

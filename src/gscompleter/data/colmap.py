@@ -166,7 +166,7 @@ def build_intrinsics(
 def read_intrinsics(path: Path) -> dict[int, Intrinsics]:
     """Read the cameras of a cameras.bin or cameras.txt by number."""
     if _is_text(path):
-        entries = _parse_lines(path, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS…", _parse_camera)
+        entries = _parse_lines(path, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS…", _parse_camera_line)
     else:
         entries = _read_binary_cameras(path)
     cameras = {}
@@ -217,16 +217,16 @@ def _is_text(path: Path) -> bool:
 def _read_binary_cameras(path: Path) -> Iterator[CameraEntry]:
     with _open_binary(path) as content:
         for _ in range(_read_count(content)):
-            number, model, width, height = _unpack(content, "<IiQQ")
+            number, model, width, height = _unpack_struct(content, "<IiQQ")
             title = f"camera {number} of {quote_value(path)}"
             count = len(find_model(model, title).parameters.split())
-            yield number, model, (width, height), _unpack(content, f"<{count}d")
+            yield number, model, (width, height), _unpack_struct(content, f"<{count}d")
 
 
 def _read_binary_images(path: Path) -> Iterator[PosedImage]:
     with _open_binary(path) as content:
         for _ in range(_read_count(content)):
-            number, *pose, camera = _unpack(content, "<I4d3dI")
+            number, *pose, camera = _unpack_struct(content, "<I4d3dI")
             # A name of any length, which ends with a zero byte.
             start = content.tell()
             end = content.find(b"\0", start, start + MAX_NAME)
@@ -242,7 +242,7 @@ def _read_binary_points(path: Path) -> Iterator[Track]:
     with _open_binary(path) as content:
         for _ in range(_read_count(content)):
             # Between the position and the length of its track, a point has a colour and an error.
-            xyz = _unpack(content, "<Q3d3Bd")[1:4]
+            xyz = _unpack_struct(content, "<Q3d3Bd")[1:4]
             track = content.read(_read_count(content) * SIGHTING_SIZE)
             yield xyz, [image for image, _ in struct.iter_unpack("<II", track)]
 
@@ -265,12 +265,12 @@ def _open_binary(path: Path) -> Iterator[mmap.mmap]:
             ) from error
 
 
-def _unpack(content: mmap.mmap, form: str) -> tuple[Any, ...]:
+def _unpack_struct(content: mmap.mmap, form: str) -> tuple[Any, ...]:
     return struct.unpack(form, content.read(struct.calcsize(form)))
 
 
 def _read_count(content: mmap.mmap) -> int:
-    return int(_unpack(content, "<Q")[0])
+    return int(_unpack_struct(content, "<Q")[0])
 
 
 def _parse_lines(path: Path, form: str, parse: Callable[[str], Entry]) -> Iterator[Entry]:
@@ -291,7 +291,7 @@ def _parse_lines(path: Path, form: str, parse: Callable[[str], Entry]) -> Iterat
         yield entry
 
 
-def _parse_camera(line: str) -> CameraEntry:
+def _parse_camera_line(line: str) -> CameraEntry:
     number, model, width, height, *words = line.split()
     return int(number), model, (int(width), int(height)), [float(word) for word in words]
 
@@ -332,7 +332,7 @@ def open_colmap(path: Path) -> Iterator[Photographs]:
     notes += (*missing, *depth_notes)
     notes += _describe_orientation(there[0])
     photographs = build_photographs(roots[-1].name, str(model), there)
-    yield replace(photographs, notes=notes, sparse=_make_point_reader(model))
+    yield replace(photographs, notes=notes, sparse=_make_model_point_reader(model))
 
 
 def _describe_orientation(frame: Frame) -> tuple[str, ...]:
@@ -458,7 +458,7 @@ def _list_roots(scene: Path, model: Path) -> list[Path]:
         roots.append(folder.parent)
 
 
-def _make_point_reader(model: Path) -> partial[Float[np.ndarray, "n 3"]] | None:
+def _make_model_point_reader(model: Path) -> partial[Float[np.ndarray, "n 3"]] | None:
     """Return a reader of the model's points; None if it has no file of points."""
     path = _find_model_file(model, "points3D")
     if path is not None:

@@ -197,12 +197,12 @@ def find_static_region(
     highest = np.full(width, height)
     limit = np.full(width, height)
     while True:
-        outline = trace_outline(edges, first, limit, STRICT)
+        outline = trace_vehicle_outline(edges, first, limit, STRICT)
         if not is_vehicle(edges, outline):
             break
         # Once a vehicle is certain, its outline may be followed where it is faint.
         top = max(first, int(outline.min()) - OUTLINE_CLEARANCE)
-        fainter = trace_outline(edges, top, limit, LENIENT)
+        fainter = trace_vehicle_outline(edges, top, limit, LENIENT)
         highest = np.minimum(highest, np.minimum(outline, fainter))
         # The next outline has to lie above this one.
         limit = np.where(highest < height, highest - OUTLINE_CLEARANCE, height)
@@ -235,7 +235,7 @@ def find_edges(images: Float[np.ndarray, "n h w"], flow: Float[np.ndarray, "h w 
     )
 
 
-def trace_outline(
+def trace_vehicle_outline(
     edges: Edges, first: int, limit: Int[np.ndarray, "w"], cost: float
 ) -> Int[np.ndarray, "w"]:
     """Trace the outline along the most static edges by dynamic programming over columns.

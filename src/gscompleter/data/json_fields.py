@@ -17,10 +17,10 @@ from gscompleter.system.errors import quote_value
 from gscompleter.types import MAX_COORDINATE, MAX_IMAGE_SIDE
 
 NUMBER_TYPES = (int, float, np.integer, np.floating)
-Part = TypeVar("Part")
+JsonPart = TypeVar("JsonPart")
 
 
-def get_part(entry: Any, key: str, kind: type[Part]) -> Part:
+def get_part(entry: Any, key: str, kind: type[JsonPart]) -> JsonPart:
     """Return the list or object at `key`; an empty one if there is none."""
     value = _get(entry, key)
     return value if isinstance(value, kind) else kind()

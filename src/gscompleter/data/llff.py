@@ -43,10 +43,10 @@ def open_llff(path: Path) -> Iterator[Photographs]:
     and far planes enclose all bounds.
     """
     file = path / POSES_BOUNDS_FILE if os.path.isdir(path) else path
-    rows = _read_rows(file)
+    rows = _read_pose_rows(file)
     images = _find_photographs(file, len(rows))
     frames = [
-        _parse_frame(image, row, f"row {number} of {quote_value(file)}")
+        _parse_llff_frame(image, row, f"row {number} of {quote_value(file)}")
         for number, (image, row) in enumerate(zip(images, rows, strict=True))
     ]
     near = NEAR_FACTOR * rows[:, 15].min().item()
@@ -55,7 +55,7 @@ def open_llff(path: Path) -> Iterator[Photographs]:
     yield replace(scene, near=near, far=far)
 
 
-def _parse_frame(image: Path, row: Float[np.ndarray, "17"], title: str) -> Frame:
+def _parse_llff_frame(image: Path, row: Float[np.ndarray, "17"], title: str) -> Frame:
     down, right, back, center, (height, width, focal) = row[:15].reshape(3, 5).T
     size = get_size({"width": width, "height": height}, title)
     c2w = np.eye(4)
@@ -65,7 +65,7 @@ def _parse_frame(image: Path, row: Float[np.ndarray, "17"], title: str) -> Frame
     return Frame(image.name, title, c2w, intrinsics, image)
 
 
-def _read_rows(path: Path) -> Float[np.ndarray, "n 17"]:
+def _read_pose_rows(path: Path) -> Float[np.ndarray, "n 17"]:
     check_file(path)
     try:
         # Mapping refuses an array that claims more than the file holds.

@@ -158,7 +158,7 @@ class Photographs:
             return None
         chosen = [self.frame(number) for number in frames]
         named = [frame.mask for frame in chosen if frame.mask is not None]
-        num_transparent = sum(_has_alpha(frame) for frame in chosen)
+        num_transparent = sum(_has_alpha_channel(frame) for frame in chosen)
         kinds = []
         if named:
             places = list(dict.fromkeys(path.parent for path in named))
@@ -189,7 +189,7 @@ class Photographs:
     def is_hidden(self, frame: int) -> bool:
         """Check whether a mask or the alpha channel hides all of a photograph."""
         chosen = self.frame(frame)
-        if not self.is_masked or (chosen.mask is None and not _has_alpha(chosen)):
+        if not self.is_masked or (chosen.mask is None and not _has_alpha_channel(chosen)):
             return False
         hidden = self._load_colors(chosen)[1]
         return hidden is not None and bool(hidden.all())
@@ -435,7 +435,7 @@ def _ends_alike(one: Sequence[str], other: Sequence[str]) -> bool:
     return shorter > 0 and one[-shorter:] == other[-shorter:]
 
 
-def _has_alpha(frame: Frame) -> bool:
+def _has_alpha_channel(frame: Frame) -> bool:
     return frame.file is not None and frame.file.has_alpha
 
 

@@ -47,7 +47,7 @@ ANGLE_RANGE = (1e-5, 3.14159)
 """Range of fields of view in radians, below π."""
 DEPTH_UNITS = ("depth_unit_scale_factor", "integer_depth_scale")
 
-Pair = tuple[float | None, float | None]
+NumberPair = tuple[float | None, float | None]
 
 
 def has_transforms(path: Path) -> bool:
@@ -73,7 +73,7 @@ def open_transforms(path: Path) -> Iterator[Photographs]:
     if len(files) == 1 and files[0].name not in (TRANSFORMS_FILE, *SPLITS):
         name = files[0].stem
     scene = build_photographs(name, str(files[0] if len(files) == 1 else path), frames)
-    yield replace(scene, sparse=_make_point_reader(files))
+    yield replace(scene, sparse=_make_cloud_reader(files))
 
 
 def _find_files(scene: Path) -> list[Path]:
@@ -91,7 +91,7 @@ def _find_files(scene: Path) -> list[Path]:
     return []
 
 
-def _make_point_reader(files: Sequence[Path]) -> partial[Float[np.ndarray, "n 3"]] | None:
+def _make_cloud_reader(files: Sequence[Path]) -> partial[Float[np.ndarray, "n 3"]] | None:
     """Return a reader of the points that a file names; None if there are none."""
     for file in files:
         name = get_text(read_json(file, TRANSFORMS_ADVICE), "ply_file_path", str(file))
@@ -118,11 +118,12 @@ def read_frames(path: Path) -> list[Frame]:
     unit = next((unit for unit in units if unit is not None), 1e-3)
     listings = FolderListings()
     return [
-        _parse_frame(entry, i, content, unit, path, listings) for i, entry in enumerate(entries)
+        _parse_transforms_frame(entry, i, content, unit, path, listings)
+        for i, entry in enumerate(entries)
     ]
 
 
-def _parse_frame(
+def _parse_transforms_frame(
     entry: Any,
     position: int,
     content: Mapping[str, Any],
@@ -175,7 +176,7 @@ def parse_camera_frame(entry: Any, title: str, content: Mapping[str, Any] | None
 
 
 def _parse_intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
-    def read_pair(*keys: str, low: float = -MAX_NUMBER, high: float = MAX_NUMBER) -> Pair:
+    def read_pair(*keys: str, low: float = -MAX_NUMBER, high: float = MAX_NUMBER) -> NumberPair:
         x_key, y_key = keys
         x = get_optional_number(entry, x_key, title, low, high)
         y = get_optional_number(entry, y_key, title, low, high)

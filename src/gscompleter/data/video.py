@@ -21,7 +21,7 @@ from gscompleter.system.files.video import read_video
 from gscompleter.system.progress import stage
 
 Image8 = UInt8[np.ndarray, "h w"]
-Corners = Float[np.ndarray, "n 1 2"]
+MotionCorners = Float[np.ndarray, "n 1 2"]
 Values = Float[np.ndarray, "n"]
 
 SOURCE_VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm")
@@ -90,7 +90,7 @@ def measure_frames(frames: Iterable[Image8]) -> tuple[Values, Values]:
     return np.array(sharpness), np.array(motion)
 
 
-def _measure_motion(reference: Image8, corners: Corners, frame: Image8) -> float:
+def _measure_motion(reference: Image8, corners: MotionCorners, frame: Image8) -> float:
     """Measure the motion of most corners in steps, at most 1; 1 if too many are lost."""
     corners_now, status, _ = cv2.calcOpticalFlowPyrLK(reference, frame, corners, corners.copy())
     if status.mean() < MIN_TRACKED:

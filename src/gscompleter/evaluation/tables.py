@@ -151,13 +151,13 @@ def read_run_rows(out: Path) -> list[RunRow]:
     return list(rows.values())
 
 
-def rank(order: Iterable[str], name: str) -> tuple[int, str]:
+def rank_name(order: Iterable[str], name: str) -> tuple[int, str]:
     """Return the sort key of a name in tables: its place in `order`, unknown ones last."""
     return ([*order, name].index(name), name)
 
 
-rank_method = partial(rank, METHODS)
-rank_stage = partial(rank, ORDER)
+rank_method = partial(rank_name, METHODS)
+rank_stage = partial(rank_name, ORDER)
 
 
 def summarize_run(rows: Sequence[RunRow]) -> RunSummary:

@@ -187,7 +187,7 @@ class Sources:
 
 
 @dataclass(frozen=True)
-class Level:
+class InpaintLevel:
     """One pyramid level: image, known pixels, expected log-depth and sources."""
 
     image: Float[Tensor, "h w 3"]
@@ -214,7 +214,7 @@ def fill_by_patches(
     """
     # Coarse to fine (Wexler et al. 2007): the coarsest level decides what goes where, and each
     # finer one starts from its matches.
-    levels = [Level(image, known, expected, sources)]
+    levels = [InpaintLevel(image, known, expected, sources)]
     while min(levels[-1].known.shape) // 2 >= MIN_SIZE:
         levels.append(downsample_level(levels[-1]))
 
@@ -236,7 +236,7 @@ def fill_by_patches(
 
 
 def search_and_vote(
-    level: Level,
+    level: InpaintLevel,
     coarse_field: Field | None,
     centres: Bool[ndarray, "h w"],
     rounds: int,
@@ -379,7 +379,7 @@ def find_nearest(mask: Bool[ndarray, "h w"]) -> Int64[ndarray, "h w 2"]:
     return places[labels]
 
 
-def downsample_level(level: Level) -> Level:
+def downsample_level(level: InpaintLevel) -> InpaintLevel:
     """Halve a level and its sources; averages leave out unknown and invalid pixels."""
     # Means of the known and of the guessed pixels of a block, each divided by its share.
     known = level.known.float()[..., None]
@@ -403,7 +403,7 @@ def downsample_level(level: Level) -> Level:
         valid.append(usable_share[..., 0] > 0.75)
         log_depths.append(means[..., 3])
     halved = Sources(torch.stack(images), torch.stack(valid), torch.stack(log_depths))
-    return Level(image, known_share[..., 0] > 0.5, expected, halved)
+    return InpaintLevel(image, known_share[..., 0] > 0.5, expected, halved)
 
 
 def pool_pixels(values: Float[Tensor, "*s h w c"]) -> Float[Tensor, "*s h2 w2 c"]:

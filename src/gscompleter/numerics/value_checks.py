@@ -17,7 +17,7 @@ from torch import Tensor
 from gscompleter.numerics.kernels.parallel import share
 from gscompleter.numerics.kernels.splat_rows import mark_usable
 from gscompleter.system.errors import InputError
-from gscompleter.system.memory import check_images
+from gscompleter.system.memory import check_image_memory
 from gscompleter.system.tensor_checks import describe, name_dtype
 from gscompleter.types import Camera, DepthMap, Gaussians, View
 
@@ -113,7 +113,7 @@ def check_inputs(
         check_camera(target, f"Target {number}")
     # Before anything of this size is allocated.
     cameras = [*(view.camera for view in (*views, *check_photos)), *targets]
-    check_images(sum(camera.width * camera.height for camera in cameras), len(cameras))
+    check_image_memory(sum(camera.width * camera.height for camera in cameras), len(cameras))
     tensors = {f"context view {number}": view.image for number, view in enumerate(views)}
     tensors |= {f"check view {number}": view.image for number, view in enumerate(check_photos)}
     tensors |= {f"target {number}": target.K for number, target in enumerate(targets)}

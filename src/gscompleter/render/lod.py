@@ -71,7 +71,7 @@ def merge_runs(scene: Gaussians, start: Int64[ndarray, "bounds"]) -> Gaussians:
         *[np.empty((num_runs, *array.shape[1:]), np.float32) for array in arrays]
     )
     shares = np.empty(len(scene), np.float32)
-    share(kernels.merge_runs, num_runs, start, arrays, shares, merged_arrays)
+    share(kernels.merge_run_range, num_runs, start, arrays, shares, merged_arrays)
 
     first = torch.from_numpy(start[:-1])
     return Gaussians(

@@ -167,7 +167,7 @@ def list_outside_cameras(extent: Extent, side: int) -> list[Camera]:
     directions = list_directions().to(extent.center) @ extent.axes
     half = FIELD / DISTANCE
     return [
-        place_camera(
+        place_outside_camera(
             extent.center + DISTANCE * extent.radius * direction,
             -direction,
             half,
@@ -178,7 +178,7 @@ def list_outside_cameras(extent: Extent, side: int) -> list[Camera]:
     ]
 
 
-def place_camera(
+def place_outside_camera(
     center: Float[Tensor, "3"], forward: Float[Tensor, "3"], half: float, side: int, near: float
 ) -> Camera:
     """Place a camera with a square image, whose border is `half` aside at a depth of 1."""

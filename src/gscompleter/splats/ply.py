@@ -178,11 +178,11 @@ def read_scene(path: Path, leaves_out_band_4: bool = False) -> SceneFile:
         **vars(scene),
         has_linear_scales=has_linear_scales,
         has_plain_opacities=find_plain_opacities(scene.rows, has_linear_scales),
-        origin=find_origin(scene.rows, has_linear_scales),
+        origin=find_rows_origin(scene.rows, has_linear_scales),
     )
 
 
-def find_origin(rows: ndarray, has_linear_scales: bool) -> Origin | None:
+def find_rows_origin(rows: ndarray, has_linear_scales: bool) -> Origin | None:
     """Find the place to which positions are read that float32 would round; None for zero."""
     if not has_doubles(rows):
         return None

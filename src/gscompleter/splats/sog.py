@@ -88,7 +88,7 @@ def read_sog(path: Path) -> Gaussians:
     if not data.startswith(ZIP_MAGIC):
         return _read_folder(path.parent, path.name)
     with zipfile.ZipFile(io.BytesIO(data)) as bundle:
-        return _read_files(partial(_read_entry, bundle), META, len(data))
+        return _read_files(partial(_read_bundle_entry, bundle), META, len(data))
 
 
 def _read_folder(folder: Path, meta: str) -> Gaussians:
@@ -117,12 +117,12 @@ def _read_meta(path: Path) -> dict[str, Any]:
         data = read_bytes(path)
         if data.startswith(ZIP_MAGIC):
             with zipfile.ZipFile(io.BytesIO(data)) as bundle:
-                data = _read_entry(bundle, META, MAX_META)
+                data = _read_bundle_entry(bundle, META, MAX_META)
     table: dict[str, Any] = json.loads(data)
     return table
 
 
-def _read_entry(bundle: zipfile.ZipFile, name: str, most: int) -> bytes:
+def _read_bundle_entry(bundle: zipfile.ZipFile, name: str, most: int) -> bytes:
     if name not in bundle.NameToInfo:
         raise DamagedError(f"it lacks its file {quote_value(name)}")
     if bundle.getinfo(name).flag_bits & 1:

@@ -222,7 +222,7 @@ def _read_prim(prim: Usd.Prim, has_z_up: bool) -> Gaussians:
     space = _find_color_space(prim)
     if space.startswith(LINEAR):
         raise UnsupportedError(f"has colours in the linear space {quote_value(space)}")
-    positions = _read_array(prim, "positions", 3)
+    positions = _read_prim_array(prim, "positions", 3)
     count = len(positions)
     degree = int(prim.GetAttribute(f"{SH_NAME}Degree").Get(Usd.TimeCode.EarliestTime()))
     if not 0 <= degree < len(NUM_SH_REST):
@@ -230,10 +230,10 @@ def _read_prim(prim: Usd.Prim, has_z_up: bool) -> Gaussians:
     width = 1 + NUM_SH_REST[degree]
     gaussians = build_gaussians(
         positions,
-        np.roll(_read_array(prim, "orientations", 4), 1, axis=1),
-        _read_array(prim, "scales", 3),
-        _read_array(prim, "opacities", 1)[:, 0],
-        _read_array(prim, f"{SH_NAME}Coefficients", 3).reshape(count, width, 3),
+        np.roll(_read_prim_array(prim, "orientations", 4), 1, axis=1),
+        _read_prim_array(prim, "scales", 3),
+        _read_prim_array(prim, "opacities", 1)[:, 0],
+        _read_prim_array(prim, f"{SH_NAME}Coefficients", 3).reshape(count, width, 3),
     )
     labels = prim.GetAttribute(LABELS_PRIMVAR)
     if labels and labels.HasAuthoredValue():
@@ -261,7 +261,7 @@ def _find_color_space(prim: Usd.Prim) -> str:
     return ""
 
 
-def _read_array(prim: Usd.Prim, name: str, width: int) -> Float[ndarray, "n w"]:
+def _read_prim_array(prim: Usd.Prim, name: str, width: int) -> Float[ndarray, "n w"]:
     """Read an array of a prim, that of single precision if there are both."""
     from pxr import Usd
 

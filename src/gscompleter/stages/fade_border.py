@@ -46,7 +46,7 @@ def fade_border(added: Gaussians, view: TargetView) -> Gaussians:
     return faded[faded.opacities >= MIN_DRAWN_OPACITY]
 
 
-def find_border(view: TargetView) -> Bool[Tensor, "h w"]:
+def find_fading_border(view: TargetView) -> Bool[Tensor, "h w"]:
     """Find the pixels of the padded target in which additions may fade."""
     camera = view.camera.padded
     width = math.ceil(compute_width(view))

@@ -121,7 +121,7 @@ def name_dtype(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
 
 
-def is_whole(value: object) -> bool:
+def is_whole_number(value: object) -> bool:
     """Return True for a whole number, NumPy's too; booleans are none."""
     return isinstance(value, Integral) and not isinstance(value, bool)
 

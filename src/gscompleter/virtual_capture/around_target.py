@@ -112,7 +112,7 @@ def choose_cameras_around(
     """
     target = replace(target, near=None, far=None)
     small_scene = thin_gaussians(scene, MAX_PREVIEW_GAUSSIANS)
-    border = find_border(scene, small_scene, target, renderer, holes)
+    border = find_hole_border(scene, small_scene, target, renderer, holes)
     if border is None:
         return []
     rate = partial(rate_camera, small_scene, border, target, renderer)
@@ -121,7 +121,7 @@ def choose_cameras_around(
     return choose_greedily(rated, border, count)
 
 
-def find_border(
+def find_hole_border(
     scene: Gaussians,
     small_scene: Gaussians,
     target: Camera,

@@ -22,7 +22,7 @@ from gscompleter.render.outside import (
     OutsideView,
     look_from_outside,
     measure_extent,
-    place_camera,
+    place_outside_camera,
 )
 from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
@@ -115,7 +115,7 @@ def measure_bounded(
     def look(point: Float[Tensor, "3"]) -> Float[Tensor, ""]:
         offset = extent.axes @ (point - extent.center)
         forward = normalize(offset / extent.half.clamp_min(1e-12) ** 2, dim=0) @ extent.axes
-        camera = place_camera(point, forward, math.tan(half_angle), LOOK_SIDE, near)
+        camera = place_outside_camera(point, forward, math.tan(half_angle), LOOK_SIDE, near)
         covered = renderer.render(scene, camera).alpha >= COVERED
         weights = weigh_directions(camera, math.cos(half_angle))
         return (weights * covered).sum() / weights.sum()
@@ -140,7 +140,7 @@ def is_ground(scene: Gaussians, extent: Extent, renderer: Renderer) -> bool:
     axis = extent.axes[0]
     # From so far that lines of sight are nearly parallel.
     distance = 20 * extent.radius
-    camera = place_camera(
+    camera = place_outside_camera(
         extent.center - distance * axis,
         axis,
         (1.5 * longest / distance).item(),
@@ -163,7 +163,7 @@ def measure_around(scene: Gaussians, camera: Camera, extent: Extent, renderer: R
     center = camera.center.to(scene.means)
     for axis in torch.eye(3).to(scene.means):
         for forward in (axis, -axis):
-            face = place_camera(center, forward, 1.0, LOOK_SIDE, 0.01 * extent.radius)
+            face = place_outside_camera(center, forward, 1.0, LOOK_SIDE, 0.01 * extent.radius)
             covered = renderer.render(scene, face).alpha >= COVERED
             weights = weigh_directions(face, 0.0)
             shares.append((weights * covered).sum() / weights.sum())

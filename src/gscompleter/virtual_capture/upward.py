@@ -129,7 +129,7 @@ def find_floor(scene: Gaussians) -> Direction | None:
     if len(solid) < FLOOR_CELLS**2:
         return None
     floors = {up: measure_floor(solid, up) for up in (USUAL, *OTHERS, *UNUSUAL_UP)}
-    scores = {up: floors[up].score for up in (USUAL, *OTHERS) if is_whole(floors[up])}
+    scores = {up: floors[up].score for up in (USUAL, *OTHERS) if is_whole_floor(floors[up])}
     if scores:
         best = max(scores, key=lambda up: scores[up])
         is_better = scores[best] >= MIN_ADVANTAGE * scores.get(USUAL, 0.0)
@@ -142,7 +142,7 @@ def find_floor(scene: Gaussians) -> Direction | None:
     return best if best not in UNUSUAL_UP and is_clear and is_seen else None
 
 
-def is_whole(floor: Floor) -> bool:
+def is_whole_floor(floor: Floor) -> bool:
     """Tell a floor that was seen as a whole."""
     return floor.share >= MIN_FLOOR_SHARE and floor.filled >= MIN_CELLS
 

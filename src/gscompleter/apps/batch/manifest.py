@@ -38,7 +38,7 @@ LONGEST_FILE = 2 * 10**9
 LONGEST_NAME = 120
 """Maximum number of characters of a job name."""
 
-Options = dict[str, Any]
+OptionValues = dict[str, Any]
 """Options of `complete` by name."""
 
 
@@ -68,7 +68,7 @@ def read_manifest(manifest: Path, common: Mapping[str, Any], out: Path | None = 
     ]
 
 
-def resolve_paths(row: Mapping[str, Any], base: Path) -> Options:
+def resolve_paths(row: Mapping[str, Any], base: Path) -> OptionValues:
     """Make the paths of a row absolute; invalid values stay."""
 
     def join(value: Any) -> Any:
@@ -89,7 +89,7 @@ def resolve_paths(row: Mapping[str, Any], base: Path) -> Options:
     return result
 
 
-def read_manifest_rows(manifest: Path, out: Path | None = None) -> list[Options]:
+def read_manifest_rows(manifest: Path, out: Path | None = None) -> list[OptionValues]:
     """Read the rows of a manifest as they are."""
     if os.path.isdir(manifest):
         results = list_results(manifest, out)
@@ -132,7 +132,7 @@ def is_result(folder: Path, out: Path | None) -> bool:
     return has_marker or read_command(folder) in COMPLETING
 
 
-def parse_csv(text: str) -> Iterator[Options]:
+def parse_csv(text: str) -> Iterator[OptionValues]:
     """Parse the rows of a CSV file with a header."""
     for row in csv.DictReader(io.StringIO(text, newline=""), strict=True):
         options = {k: v.strip() for k, v in row.items() if isinstance(v, str) and v.strip()}
@@ -143,7 +143,7 @@ def parse_csv(text: str) -> Iterator[Options]:
         yield options
 
 
-def parse_json_lines(text: str) -> Iterator[Options]:
+def parse_json_lines(text: str) -> Iterator[OptionValues]:
     """Parse JSON lines."""
     for number, line in enumerate(text.splitlines(), start=1):
         if line.strip():
@@ -156,7 +156,7 @@ def parse_json_lines(text: str) -> Iterator[Options]:
             yield row
 
 
-def make_job_name(row: Options) -> str:
+def make_job_name(row: OptionValues) -> str:
     """Turn the name of a row, or that of its scene folder, into a valid file name."""
     name = str(row[NAME_COLUMN]) if NAME_COLUMN in row else Path(str(row.get(FOLDER, ""))).name
     return make_valid_name(name.strip(".")[:LONGEST_NAME]) or "job"

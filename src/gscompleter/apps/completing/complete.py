@@ -26,7 +26,7 @@ from gscompleter.apps.completing.printing import (
     answer_plan,
 )
 from gscompleter.apps.completing.remove import prepare_removal
-from gscompleter.apps.completing.run_info import describe_run, read_held_out, refuse_results
+from gscompleter.apps.completing.run_info import describe_run_values, read_held_out, refuse_results
 from gscompleter.apps.completing.update import prepare_update
 from gscompleter.apps.inputs.describing import describe_task, print_lines
 from gscompleter.apps.inputs.task import CompletionTask, Opened
@@ -134,7 +134,7 @@ def complete_folder(
     ):
         print_lines(console, *output.describe_others())
         ready = prepare(request, console)
-        print_lines(console, *describe_work(ready))
+        print_lines(console, *describe_completion_plan(ready))
         with output.write() as folder:
             return write_completion(folder, ready)
 
@@ -178,7 +178,7 @@ def plan_targets(request: PlanRequest) -> int:
         refuse_results(results.out)
         print_lines(console, *output.describe_others())
         ready = prepare(request.filling, console)
-        print_lines(console, *describe_work(ready))
+        print_lines(console, *describe_completion_plan(ready))
         with output.write() as folder:
             begun = ready.begin()
             targets = ready.task.target_cameras
@@ -238,7 +238,7 @@ def write_plan_pictures(folder: Path, ready: Prepared, begun: Completion) -> Non
             write_images(folder, f"target{number}", {"beside": beside.image})
 
 
-def describe_work(ready: Prepared) -> list[str]:
+def describe_completion_plan(ready: Prepared) -> list[str]:
     """Write the lines before a completion."""
     models = ready.work.models
     settings = models.generator_settings
@@ -282,7 +282,7 @@ def write_done(
     # They are rendered while the files are written.
     cameras = tuple(ready.cameras.values())
     aside = sample_held_out_cameras(cameras, seed)
-    facts = describe_run(
+    facts = describe_run_values(
         ready.source,
         ready.work.splat,
         ready.opened,

@@ -53,7 +53,7 @@ def print_completion(results: ResultsRequest) -> None:
             if len(numbers) == 1:
                 name = summary.targets[numbers[0] - 1].name
                 sentences.append(f"{name}: {' '.join(warnings)}")
-    sentences += describe_result(summary, results)
+    sentences += describe_completion(summary, results)
     for sentence in sentences:
         console.print(sentence, soft_wrap=True)
 
@@ -80,7 +80,7 @@ def make_score_table(summary: CompletionSummary) -> Table:
     return table
 
 
-def describe_result(summary: CompletionSummary, results: ResultsRequest) -> Iterator[str]:
+def describe_completion(summary: CompletionSummary, results: ResultsRequest) -> Iterator[str]:
     """Write the sentences below the table."""
     counts = summary.gaussians
     seconds = summary.seconds["total"]

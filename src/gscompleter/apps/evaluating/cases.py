@@ -117,7 +117,7 @@ def iterate_tasks(
     rules = [protocols.parse_protocol(text) for text in request.protocol]
 
     # With a preset, images are cropped and scenes left out as by its authors' code (decision 047).
-    loader = find_loader(request)
+    loader = find_authors_loader(request)
     resolution = DEFAULT_LONG_SIDE if request.resolution is None else request.resolution
     size: Resolution
     if loader is not None and isinstance(resolution, tuple):
@@ -165,7 +165,7 @@ def iterate_tasks(
                 yield from tasks[:1] if request.one_per_scene else tasks
 
 
-def find_loader(request: CasesRequest) -> AuthorsLoader | None:
+def find_authors_loader(request: CasesRequest) -> AuthorsLoader | None:
     """Find the loader to follow; none without a preset, or at another size than the preset's."""
     preset = get_data_set(request.preset)
     return preset.loader if request.resolution == preset.resolution else None

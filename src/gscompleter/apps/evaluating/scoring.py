@@ -12,7 +12,7 @@ from gscompleter.apps.batch.engine import make_engine
 from gscompleter.apps.batch.running import print_failures
 from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.command_line.exit_codes import choose_exit_code
-from gscompleter.apps.evaluating.cases import collect_tasks, find_loader, print_skipped
+from gscompleter.apps.evaluating.cases import collect_tasks, find_authors_loader, print_skipped
 from gscompleter.apps.evaluating.tables import write_and_print_tables
 from gscompleter.apps.requests.evaluation import CasesRequest, EvaluationRequest
 from gscompleter.apps.requests.scene import DEFAULT_LONG_SIDE, parse_resolution
@@ -139,7 +139,7 @@ def describe_source(cases: CasesRequest, tasks: Sequence[Task]) -> dict[str, Any
     num_apart = sum(task.apart_by is not None for task in tasks)
     # A cases.json has the resolution of each case; scenes of a protocol have none.
     size = DEFAULT_LONG_SIDE if cases.resolution is None and cases.protocol else cases.resolution
-    loader = find_loader(cases)
+    loader = find_authors_loader(cases)
     return {
         "paths": [path.resolve().name for path in cases.paths],
         "protocols": list(cases.protocol),

@@ -67,7 +67,7 @@ def describe_opening(opened: Opened, task: CompletionTask) -> list[str]:
     scene = task.scene
     camera = task.views[0].camera
     photographs = opened.photographs
-    used = len(photographs.posed) - len(list_missing(photographs))
+    used = len(photographs.posed) - len(list_missing_photographs(photographs))
     splat = ""
     if scene is not None:
         mode = "antialiased " if scene.is_antialiased else ""
@@ -86,23 +86,23 @@ def describe_opening(opened: Opened, task: CompletionTask) -> list[str]:
         f"Opened: {source}.",
         f"Found: {task.frame_description.rstrip('.')}; depths from {camera.near:.3g} to "
         f"{camera.far:.3g}; worked at {camera.width} x {camera.height} (--resolution changes it).",
-        *describe_missing(photographs),
+        *describe_missing_photographs(photographs),
         *describe_masks(photographs, task),
         *([] if task.splat_file is None else describe_oddities(task.splat_file.path)),
         *task.depth_notes,
     ]
 
 
-def list_missing(photographs: Photographs) -> list[str]:
+def list_missing_photographs(photographs: Photographs) -> list[str]:
     """List the names of photographs that cameras name and that are not there."""
     posed = [photographs.frame(number) for number in photographs.posed]
     named = [frame for frame in posed if frame.image is not None]
     return [frame.name for frame in named if not frame.has_photograph()]
 
 
-def describe_missing(photographs: Photographs) -> list[str]:
+def describe_missing_photographs(photographs: Photographs) -> list[str]:
     """Say which cameras have no photograph; such a camera stays, because it can be a target."""
-    missing = list_missing(photographs)
+    missing = list_missing_photographs(photographs)
     if not missing:
         return []
     return [

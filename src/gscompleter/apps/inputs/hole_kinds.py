@@ -30,7 +30,7 @@ HoleKind = Literal["all", "enclosed"]
 
 
 @dataclass(frozen=True)
-class SplatKind:
+class SplatAloneKind:
     """What a splat without photographs is, which is decided once from its Gaussians."""
 
     is_lifted: bool

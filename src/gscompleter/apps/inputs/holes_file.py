@@ -77,7 +77,7 @@ def read_holes(folder: Path) -> HolesFile:
     if not holes.frames:
         raise InputError(f"{quote_value(path)} lists no frames; {HOLES_ADVICE}.")
     # What is read lies in the folder itself, whatever the file says.
-    for name in list_names(holes):
+    for name in list_hole_files(holes):
         if name != os.path.basename(name) or name in ("", ".", ".."):
             raise InputError(
                 f"{quote_value(path)} names the file '{quote_value(name)}', and only files beside "
@@ -93,7 +93,7 @@ def read_holes(folder: Path) -> HolesFile:
     return holes
 
 
-def list_names(holes: HolesFile) -> Iterator[str]:
+def list_hole_files(holes: HolesFile) -> Iterator[str]:
     """List the files that are read."""
     for row in holes.frames:
         yield from (row.image_path, row.hole_mask_path)

@@ -97,7 +97,7 @@ def read_paintings(
     stills = read_video_frames(sources, rows, holes.path)
     return [
         replace(
-            name_target(target, row, photographs, resolution),
+            add_exported_photograph(target, row, photographs, resolution),
             painting=read_painting(source, target.camera, row, still),
         )
         for target, row, source, still in zip(targets, rows, sources, stills, strict=True)
@@ -141,7 +141,7 @@ def find_row(camera: Camera, rows: Sequence[HoleRow], cameras: Sequence[Camera])
     return next(same, None)
 
 
-def name_target(
+def add_exported_photograph(
     target: Target, row: HoleRow, photographs: Photographs, resolution: Resolution
 ) -> Target:
     """Add the photograph that a target is, or was derived from, as the export knew it."""

@@ -25,7 +25,7 @@ from gscompleter.apps.inputs.captures import (
 from gscompleter.apps.inputs.hole_kinds import (
     OBJECT_NOTE,
     HoleKind,
-    SplatKind,
+    SplatAloneKind,
     choose_kind,
     find_target_holes,
     pair_masks,
@@ -74,7 +74,7 @@ def open_renders(
     scene: Gaussians,
     renderer: Renderer,
     device: str,
-) -> tuple[Opened, CompletionTask, SplatKind]:
+) -> tuple[Opened, CompletionTask, SplatAloneKind]:
     """Choose cameras, and render the splat there in place of photographs.
 
     Also returns what kind of splat it is.
@@ -135,7 +135,7 @@ def open_renders(
     else:
         up = capture.upward.direction
     witnesses = choose_witnesses(scene, pixel_center, list(cameras.values()), others, up, renderer)
-    check_images([*cameras.values(), *(target.camera for target in targets)])
+    check_capture_images([*cameras.values(), *(target.camera for target in targets)])
     opened = Opened(
         reading,
         replace(photographs, notes=tuple(notes)),
@@ -148,13 +148,13 @@ def open_renders(
         targets,
         compute_frame_from_photographs(origin),
         origin,
-        find_depth_sources(reading),
+        find_capture_depth_sources(reading),
         scene=scene,
         splat_file=replace(splat_file, origin=origin),
         frame_description="the frame of the splat",
         witnesses=witnesses,
     )
-    return opened, task, SplatKind(pixel_center is not None, kind)
+    return opened, task, SplatAloneKind(pixel_center is not None, kind)
 
 
 def choose_capture(
@@ -195,7 +195,7 @@ def choose_capture(
     return capture, kind, find_target_holes(target_cameras, scene, renderer, config)
 
 
-def check_images(cameras: Sequence[Camera]) -> None:
+def check_capture_images(cameras: Sequence[Camera]) -> None:
     """Refuse images that are too small, or too many for the memory."""
     check_sizes(cameras)
     check_memory(max(camera.width * camera.height for camera in cameras), len(cameras))
@@ -276,7 +276,7 @@ def make_frames(
     return frames
 
 
-def find_depth_sources(reading: SceneRequest) -> dict[str, str]:
+def find_capture_depth_sources(reading: SceneRequest) -> dict[str, str]:
     """Find the sources of `near` and `far`: the user, or renders of the splat."""
     planes = {"near": reading.near, "far": reading.far}
     return {name: "splat" if plane is None else "given" for name, plane in planes.items()}

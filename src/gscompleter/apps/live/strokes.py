@@ -22,7 +22,7 @@ import torch
 
 from gscompleter import __version__
 from gscompleter.apps.inputs.removal import check_selection
-from gscompleter.apps.live.session import UPRIGHT, Action, Session, Step
+from gscompleter.apps.live.session import UPRIGHT, Action, Session, SessionStep
 from gscompleter.apps.requests.scene import Size
 from gscompleter.apps.requests.splat import Selection
 from gscompleter.data.scene import describe_camera
@@ -41,7 +41,7 @@ STROKES_ADVICE = "save the session again"
 OF_STROKES = ("resolution", "near", "far", "context")
 """Options that `repair --strokes` reads, too, which are entries of their own."""
 
-Row = tuple[float, float, float, float]
+FourNumbers = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,12 @@ class StrokeRow:
     fl_y: float
     cx: float
     cy: float
-    transform_matrix: tuple[Row, Row, Row, Row]
+    transform_matrix: tuple[FourNumbers, FourNumbers, FourNumbers, FourNumbers]
     mask_path: str | None = None
     """Image beside the file, white where something is marked; None without marks."""
     box: tuple[float, float, float, float, float, float] | None = None
     """Box of a removal, as `remove --box` takes it; None without one."""
-    box_rotation: Row = UPRIGHT
+    box_rotation: FourNumbers = UPRIGHT
 
     def make_camera(self) -> Camera:
         """Make the camera in float64, as it was written; InputError if there is no such camera."""
@@ -115,12 +115,12 @@ def write_strokes(folder: Path, session: Session, began: Began) -> None:
     (folder / STROKES_FILE).write_bytes(content)
 
 
-def list_steps(session: Session) -> tuple[Step, ...]:
+def list_steps(session: Session) -> tuple[SessionStep, ...]:
     """List the steps of a session, then those that were undone, the next to be done again first."""
     return (*session.steps, *(step for _, step in reversed(session.undone)))
 
 
-def write_masks(folder: Path, steps: Sequence[Step], first: int = 0) -> None:
+def write_masks(folder: Path, steps: Sequence[SessionStep], first: int = 0) -> None:
     """Write the masks of steps, from the step at the index `first` on."""
     for index, step in enumerate(steps):
         if index >= first and step.mask is not None:
@@ -162,7 +162,7 @@ def encode_strokes(
     return (json.dumps(content, indent=1) + "\n").encode()
 
 
-def describe_step(step: Step, mask_path: str | None) -> dict[str, Any]:
+def describe_step(step: SessionStep, mask_path: str | None) -> dict[str, Any]:
     """Describe a step as a row of `strokes.json`."""
     return {
         "action": step.action,
@@ -173,7 +173,7 @@ def describe_step(step: Step, mask_path: str | None) -> dict[str, Any]:
     }
 
 
-def digest_steps(steps: Sequence[Step]) -> str:
+def digest_steps(steps: Sequence[SessionStep]) -> str:
     """Return a digest of steps, by which those of a saved scene are known again."""
     digest = sha256()
     for step in steps:
@@ -202,10 +202,10 @@ def read_strokes(path: Path) -> StrokesFile:
     return strokes
 
 
-def read_steps(rows: Sequence[StrokeRow], folder: Path) -> tuple[Step, ...]:
+def read_steps(rows: Sequence[StrokeRow], folder: Path) -> tuple[SessionStep, ...]:
     """Make the steps of rows, with cameras in the frame of the file; read masks from `folder`."""
     return tuple(
-        Step(
+        SessionStep(
             row.action,
             row.make_camera(),
             None if row.mask_path is None else read_bytes(folder / row.mask_path),

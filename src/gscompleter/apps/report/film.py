@@ -160,10 +160,10 @@ def follow_path(way: Sequence[Camera], count: int) -> list[Camera]:
     smooth = BSpline(knots, poses, degree)
     shares = np.linspace(0, 1, count + 1)
     eased = shares**2 * (3 - 2 * shares)  # zero speed at both ends
-    return [make_camera(way[0], *pose.T) for pose in smooth(eased)]
+    return [make_path_camera(way[0], *pose.T) for pose in smooth(eased)]
 
 
-def make_camera(
+def make_path_camera(
     lens: Camera,
     right: Float[np.ndarray, "3"],
     forward: Float[np.ndarray, "3"],

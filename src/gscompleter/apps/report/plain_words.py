@@ -93,12 +93,12 @@ def list_facts(summary: CompletionSummary) -> list[tuple[str, str]]:
     if summary.outcome.status != "nothing-gained":
         for number, row in enumerate(summary.targets, start=1):
             own = [text for text in row.notes if text not in row.warnings]
-            own += describe_losses(row.unfilled)
+            own += describe_empty_part(row.unfilled)
             facts += [(f"target {number}", text) for text in own]
     return facts
 
 
-def describe_losses(unfilled: UnfilledRow) -> list[str]:
+def describe_empty_part(unfilled: UnfilledRow) -> list[str]:
     """Describe what stays empty of the hole of a target, and the steps that left it so."""
     if not unfilled.lost_by:
         return []

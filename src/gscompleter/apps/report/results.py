@@ -34,7 +34,7 @@ from gscompleter.evaluation.metrics.coverage import (
     sample_held_out_cameras,
 )
 from gscompleter.evaluation.verdict.held_out import HeldOut, render_before_after
-from gscompleter.evaluation.verdict.judge import hold_out
+from gscompleter.evaluation.verdict.judge import prepare_held_out
 from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
@@ -88,7 +88,7 @@ class Judged:
 
 def prepare_judged(completion: Completion, unused_views: Sequence[View]) -> Judged:
     """Finish a removal, and tell photographs of targets from others; raises as `judge`."""
-    held_out = hold_out(completion, unused_views)
+    held_out = prepare_held_out(completion, unused_views)
     renderer = load_renderer(completion.context.means.device.type)
     # After a removal, photographs must look as before where they do not show what was removed.
     # Without one this returns the completion as it is.
@@ -169,7 +169,7 @@ def write_result(folder: Path, judged: Judged, splat_file: InputSplatFile | None
         completion,
         judged.targets,
         judged.renderer,
-        describe_values(judged, splat_file),
+        describe_judged(judged, splat_file),
         splat_file,
         judged.cameras,
         partial(render_pairs, completion, aside, judged.renderer),
@@ -182,8 +182,8 @@ def write_result(folder: Path, judged: Judged, splat_file: InputSplatFile | None
     write_completion_page(folder)
 
 
-def describe_values(judged: Judged, splat_file: InputSplatFile | None) -> Mapping[str, Any]:
-    """Describe the input and the settings for `summary.json`, as `describe_run` does."""
+def describe_judged(judged: Judged, splat_file: InputSplatFile | None) -> Mapping[str, Any]:
+    """Describe the input and the settings for `summary.json`, as `describe_run_values` does."""
     completion = judged.completion
     camera = completion.views[0].camera
     origin = np.array(completion.context.origin or (0.0, 0.0, 0.0))

@@ -39,7 +39,7 @@ SCORES = ("psnr_before", "psnr_after", "ssim_before", "ssim_after")
 
 T = TypeVar("T")
 Vector = tuple[float, float, float]
-Row = tuple[float, float, float, float]
+MatrixRow = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ class ResultFrame:
     """Transform from the photographs to the .ply."""
 
     method: str
-    transform: tuple[Row, Row, Row, Row]
+    transform: tuple[MatrixRow, MatrixRow, MatrixRow, MatrixRow]
     origin: Vector
 
 
@@ -161,7 +161,7 @@ class PosesRow:
 
 
 @dataclass(frozen=True)
-class SceneRow:
+class OpenedSceneRow:
     """The opened scene."""
 
     format: str
@@ -193,7 +193,7 @@ class CompletionSummary:
     settings: Mapping[str, Any]
     seed: int
     device: str
-    scene: SceneRow
+    scene: OpenedSceneRow
     outcome: OutcomeRow
     frame: ResultFrame
     depth_range: Mapping[str, Any]

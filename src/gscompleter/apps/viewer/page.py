@@ -150,10 +150,10 @@ def make_page_parts(
         "counts": {name: len(part) for name, part in shown.items()},
         "layers": layer_sources,
         "antialiased": {name: scene.is_antialiased for name, scene in scenes.items()},
-        "path": plan_path([camera.camera for camera in cameras]),
+        "path": plan_tour([camera.camera for camera in cameras]),
         "live": is_live,
         "up": None if up is None else turn_to_page(up),
-        "shots": [describe_camera(camera, frame, landmarks) for camera in cameras],
+        "shots": [describe_page_camera(camera, frame, landmarks) for camera in cameras],
         **vars(libraries),
     }
     omitted = sum(len(layers[name]) - len(shown[name]) for name in ("observed", "generated"))
@@ -220,7 +220,7 @@ def turn_to_page(direction: Direction) -> list[float]:
     return [x, -y, -z]
 
 
-def describe_camera(
+def describe_page_camera(
     view_camera: ViewerCamera, frame: PageFrame, landmarks: Float[Tensor, "n 3"]
 ) -> dict[str, Any]:
     """Describe a camera as the page reads it, focused on landmarks in page unit and scene axes."""
@@ -243,7 +243,7 @@ def describe_camera(
     }
 
 
-def plan_path(cameras: Sequence[Camera]) -> list[tuple[int, float]]:
+def plan_tour(cameras: Sequence[Camera]) -> list[tuple[int, float]]:
     """Plan a path from the first camera, each time to the nearest one left: indices and seconds."""
     where = embed_cameras([camera.to("cpu") for camera in cameras]).double()
     apart = torch.cdist(where, where)

@@ -43,14 +43,14 @@ def open_dgp(path: Path) -> Iterator[Photographs]:
     sweeps = _map_sweeps(content)
     # A datum is a reading of one sensor: an image, or a point cloud.
     images = [d for d in get_part(content, "data", list) if "image" in get_part(d, "datum", dict)]
-    frames = [_parse_frame(datum, cameras, sweeps, file) for datum in images]
+    frames = [_parse_datum(datum, cameras, sweeps, file) for datum in images]
     frames.sort(key=lambda frame: frame.name)
     require(frames, f"{quote_value(file)} lists no images; name a scene with cameras.")
     front = min(frame.sensor or "" for frame in frames)
     yield build_photographs(file.resolve().parent.name, str(file), frames, front=front)
 
 
-def _parse_frame(
+def _parse_datum(
     datum: Any, cameras: Mapping[str, Intrinsics], sweeps: Mapping[str, Any], file: Path
 ) -> Frame:
     image = datum["datum"]["image"]
@@ -71,7 +71,7 @@ def _parse_frame(
     read_points = None
     points = get_text(sweep, "filename", str(file))
     if points is not None and os.path.isfile(file.parent / points):
-        read_points = partial(_read_points, file.parent / points, _get_pose(sweep, str(file)))
+        read_points = partial(_read_sweep_points, file.parent / points, _get_pose(sweep, str(file)))
     c2w = _get_pose(image, title)
     place = file.parent / name
     return Frame(name, title, c2w, intrinsics, place, sensor=camera, laser_points=read_points)
@@ -96,7 +96,7 @@ def _map_sweeps(content: Any) -> dict[str, Any]:
     return sweeps
 
 
-def _read_points(
+def _read_sweep_points(
     path: Path, world_from_laser: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "n 3"]:
     """Read the points of a sweep in the world frame: the first three columns of `data`."""

@@ -90,13 +90,15 @@ def _parse_sample(sample: Any, path: Path) -> list[Shot]:
     world_from_laser = world_from_vehicle @ get_array(lidar, "lidar2ego", title, (4, 4))
     things = get_part(sample, "instances", list)
     things = [t for t in things if isinstance(t, dict) and "velocity" in t]  # none in Waymo's infos
-    boxes = partial(_read_boxes, things, world_from_laser, path) if things else None
+    boxes = partial(_read_infos_boxes, things, world_from_laser, path) if things else None
 
     # nuScenes begins its file names with the drive, "n015-2018-07-24-11-22-45+0800__CAM_FRONT__…".
     first = images.get(FRONT_CAMERA_KEY, next(iter(images.values())))
     file = os.path.basename(get_text(first, "img_path", title) or "")
     drive = get_text(sample, "context_name", title) or file.split("__")[0]
-    frames = (_make_frame(path, n, time, image, world_from_laser) for n, image in images.items())
+    frames = (
+        _make_infos_frame(path, n, time, image, world_from_laser) for n, image in images.items()
+    )
     return [(drive, time, replace(frame, boxes=boxes)) for frame in frames]
 
 
@@ -118,7 +120,9 @@ def _build_scene(path: Path, shots: list[Shot]) -> Photographs:
     return build_drive(f"{drive}_{time:.3f}", str(path), frames, front=frames[0].sensor)
 
 
-def _make_frame(path: Path, camera: str, time: float, image: Any, world_from_laser: Pose) -> Frame:
+def _make_infos_frame(
+    path: Path, camera: str, time: float, image: Any, world_from_laser: Pose
+) -> Frame:
     title = f"the photograph of {camera} at {time:.3f} in {quote_value(path)}"
     file = get_text(image, "img_path", title) or ""
     camera_from_laser = get_array(image, "lidar2cam", title, (4, 4))
@@ -144,7 +148,7 @@ def _find_image(folder: Path, file: str, camera: str) -> Path:
     return next((place for place in places if os.path.isfile(place)), places[0])
 
 
-def _read_boxes(
+def _read_infos_boxes(
     things: list[Any], world_from_laser: Pose, path: Path
 ) -> Float[np.ndarray, "n 8 3"]:
     """Read the boxes of moving objects; in the infos they are in the laser frame."""

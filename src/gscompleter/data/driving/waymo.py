@@ -59,16 +59,16 @@ def list_segments(path: Path) -> list[Path]:
     return [f for f in files if f.match(f"{IMAGE_COMPONENT}/*.parquet") and os.path.isfile(f)]
 
 
-def _locate(segment: Path, component: str) -> Path:
+def _locate_component(segment: Path, component: str) -> Path:
     """Return the file of a component; `segment` is that of the photographs."""
     return segment.parent.parent / component / segment.name
 
 
 def _has_components(segment: Path, *components: str) -> bool:
-    return all(os.path.isfile(_locate(segment, component)) for component in components)
+    return all(os.path.isfile(_locate_component(segment, component)) for component in components)
 
 
-def _read_rows(
+def _read_table_rows(
     path: Path, columns: Sequence[str], where: Mapping[str, int] | None = None
 ) -> list[tuple[Any, ...]]:
     """Read columns of a file, named without their prefix, as rows of plain values.
@@ -98,21 +98,21 @@ def _read_rows(
 
 def _read_value(path: Path, column: str, where: Mapping[str, int]) -> Any:
     """Read the value of a column in the only row where other columns have these values."""
-    values = [value for (value,) in _read_rows(path, (column,), where) if value]
+    values = [value for (value,) in _read_table_rows(path, (column,), where) if value]
     require(len(values) == 1, f"{quote_value(path)} lacks a {column} of a frame; {WAYMO_ADVICE}.")
     return values[0]
 
 
 def _open_segment(segment: Path) -> Photographs:
-    cameras = _read_cameras(_locate(segment, "camera_calibration"))
-    rows = _read_rows(segment, (CAMERA, TIME, "pose.transform"))
+    cameras = _read_cameras(_locate_component(segment, "camera_calibration"))
+    rows = _read_table_rows(segment, (CAMERA, TIME, "pose.transform"))
     shown = sorted((row for row in rows if row[0] in CAMERA_NAMES), key=lambda row: row[:2])
     require(shown, f"{quote_value(segment)} holds no photographs; {WAYMO_ADVICE}.")
-    frames = [_make_frame(segment, cameras, *row) for row in shown]
+    frames = [_make_waymo_frame(segment, cameras, *row) for row in shown]
     return build_drive(segment.stem, str(segment), frames, front=CAMERA_NAMES[1])
 
 
-def _make_frame(
+def _make_waymo_frame(
     segment: Path, cameras: dict[int, PosedLens], camera: int, time: int, pose: Any
 ) -> Frame:
     name = CAMERA_NAMES[camera]
@@ -123,10 +123,10 @@ def _make_frame(
     # Components are downloaded one by one, and only the first two are needed.
     laser_points = None
     if _has_components(segment, "lidar", "lidar_calibration", "vehicle_pose"):
-        laser_points = partial(_read_points, segment, time)
+        laser_points = partial(_read_segment_points, segment, time)
     boxes = None
     if _has_components(segment, "lidar_box", "vehicle_pose"):
-        boxes = partial(_read_boxes, segment, time)
+        boxes = partial(_read_segment_boxes, segment, time)
     return Frame(
         f"{name}/{time}",
         title,
@@ -144,7 +144,9 @@ def _make_frame(
 def _read_cameras(path: Path) -> dict[int, PosedLens]:
     title = quote_value(path)
     cameras = {}
-    for camera, pose, *numbers in _read_rows(path, (CAMERA, "extrinsic.transform", *LENS_COLUMNS)):
+    for camera, pose, *numbers in _read_table_rows(
+        path, (CAMERA, "extrinsic.transform", *LENS_COLUMNS)
+    ):
         lens = np.array(numbers, dtype=np.float64)  # null becomes NaN
         require(
             np.isfinite(lens).all() and (lens[:2] >= 1).all(),
@@ -159,23 +161,23 @@ def _read_cameras(path: Path) -> dict[int, PosedLens]:
 
 
 @lru_cache(maxsize=2)
-def _read_points(segment: Path, time: int) -> Float[np.ndarray, "n 3"]:
+def _read_segment_points(segment: Path, time: int) -> Float[np.ndarray, "n 3"]:
     """Read the first laser returns in the world frame, in metres.
 
     The roof laser rotates while the vehicle drives; `lidar_pose` has the vehicle pose per pixel.
     """
     vehicle = _read_vehicle_pose(segment, time)
     # Of each laser its pose on the vehicle, its beams, and their lower and upper end.
-    calibration = _locate(segment, "lidar_calibration")
+    calibration = _locate_component(segment, "lidar_calibration")
     beams = (f"beam_inclination.{name}" for name in ("values", "min", "max"))
-    rows = _read_rows(calibration, (LASER, "extrinsic.transform", *beams))
+    rows = _read_table_rows(calibration, (LASER, "extrinsic.transform", *beams))
     lasers = {
         laser: (_parse_matrix(pose, quote_value(calibration)), *inclinations)
         for laser, pose, *inclinations in rows
     }
 
-    measured = _locate(segment, "lidar")
-    turning = _locate(segment, "lidar_pose")
+    measured = _locate_component(segment, "lidar")
+    turning = _locate_component(segment, "lidar_pose")
     poses = _read_range_images(turning, time) if os.path.isfile(turning) else {}
     points = [np.zeros((0, 3))]
     for laser, image in _read_range_images(measured, time).items():
@@ -224,7 +226,7 @@ def _compute_points(
 
 
 def _read_vehicle_pose(segment: Path, time: int) -> Float[np.ndarray, "4 4"]:
-    path = _locate(segment, "vehicle_pose")
+    path = _locate_component(segment, "vehicle_pose")
     values = _read_value(path, "world_from_vehicle.transform", {TIME: time})
     return _parse_matrix(values, quote_value(path))
 
@@ -233,7 +235,7 @@ def _read_range_images(path: Path, time: int) -> dict[int, Float[np.ndarray, "h 
     """Read the range image of the first returns, or the poses of its pixels, by laser."""
     columns = (LASER, "range_image_return1.values", "range_image_return1.shape")
     images = {}
-    for laser, values, shape in _read_rows(path, columns, {TIME: time}):
+    for laser, values, shape in _read_table_rows(path, columns, {TIME: time}):
         if values is not None and shape is not None:
             fits = len(shape) == 3 and min(shape) > 0 and len(values) == np.prod(shape)
             require(fits, f"A range image in {quote_value(path)} is damaged; {WAYMO_ADVICE}.")
@@ -241,14 +243,14 @@ def _read_range_images(path: Path, time: int) -> dict[int, Float[np.ndarray, "h 
     return images
 
 
-def _read_boxes(segment: Path, time: int) -> Float[np.ndarray, "n 8 3"]:
+def _read_segment_boxes(segment: Path, time: int) -> Float[np.ndarray, "n 8 3"]:
     """Read the boxes of moving objects around the vehicle, except signs."""
     vehicle = _read_vehicle_pose(segment, time)
     center = [f"box.center.{axis}" for axis in "xyz"]
     size = [f"box.size.{axis}" for axis in "xyz"]
     speed = [f"speed.{axis}" for axis in "xyz"]
     columns = ["type", *center, *size, "box.heading", *speed]
-    rows = _read_rows(_locate(segment, "lidar_box"), columns, {TIME: time})
+    rows = _read_table_rows(_locate_component(segment, "lidar_box"), columns, {TIME: time})
     objects = [numbers for kind, *numbers in rows if kind != SIGN]
     return compute_moving_boxes(vehicle, np.array(objects, dtype=np.float64).reshape(-1, 10))
 

@@ -118,7 +118,7 @@ def open_recording(path: Path) -> Iterator[Photographs]:
     confidences = find_files(path, "rgbd/*.conf")
     notes = (NOTE,) if depths and find_spec("liblzfse") is None else ()
     files = find_recording(path), {} if notes else depths, confidences
-    decoders = partial(_unpack, "<f4", size), partial(_unpack, "u1", size)
+    decoders = partial(_unpack_map, "<f4", size), partial(_unpack_map, "u1", size)
     scene = build_recording(path, _parse_recorded(content, size, title), files, decoders)
     yield replace(scene, notes=notes)
 
@@ -140,7 +140,9 @@ def _parse_recorded(content: Any, size: tuple[int, int], title: str) -> dict[str
     return cameras
 
 
-def _unpack(kind: str, size: tuple[int, int], data: bytes, title: str) -> Shaped[np.ndarray, "h w"]:
+def _unpack_map(
+    kind: str, size: tuple[int, int], data: bytes, title: str
+) -> Shaped[np.ndarray, "h w"]:
     """Unpack a map with the aspect ratio of the photographs, and at most as many pixels."""
     from liblzfse import decompress
 

@@ -53,7 +53,7 @@ def find_files(export: Path, pattern: str) -> Files:
             entries = [PurePosixPath(name) for name in archive.namelist()]
             # `match` compares from the right, so that a folder around the export does not matter.
             paths = [entry for entry in entries if entry.match(pattern)]
-        read = partial(_read_entry, export)
+        read = partial(_read_archive_entry, export)
     # macOS adds "._x.jpg" for each "x.jpg" to an archive.
     paths = sorted(path for path in paths if not path.name.startswith("."))
     require(
@@ -63,7 +63,7 @@ def find_files(export: Path, pattern: str) -> Files:
     return {path.stem.rpartition("_")[2]: partial(read, path) for path in paths}
 
 
-def _read_entry(export: Path, path: PurePosixPath) -> bytes:
+def _read_archive_entry(export: Path, path: PurePosixPath) -> bytes:
     with _open_archive(export) as archive:
         return read_zip_entry(archive, str(path), MAX_ENTRY)
 

@@ -63,7 +63,7 @@ PLACING_PROCESS = "gscompleter.data.sfm.placing_process"
 
 LensKey = tuple[int, int, str]
 """Width and height of upright photographs, and the key of camera, lens and zoom from EXIF."""
-Pinhole = tuple[float, float, float, float]
+PinholeNumbers = tuple[float, float, float, float]
 """Focal lengths and principal point in pixels: fx, fy, cx, cy."""
 
 
@@ -75,7 +75,7 @@ class KnownCopy:
     """File, relative to the folder that COLMAP reads."""
     width: int
     height: int
-    pinhole: Pinhole
+    pinhole: PinholeNumbers
     viewmat: list[list[float]]
     """World to camera, as the rows of a 3 × 4 matrix."""
     is_masked: bool
@@ -93,7 +93,7 @@ class NewCopy:
     """Key of camera, lens and zoom from EXIF."""
     focal: float | None
     """Focal length in pixels from EXIF, or None."""
-    pinhole: Pinhole | None
+    pinhole: PinholeNumbers | None
     """Intrinsics of the undistorted copy, if a known photograph was taken by the same lens."""
     is_masked: bool
 
@@ -298,7 +298,7 @@ def save_pixels(path: Path, pixels: np.ndarray) -> None:
     Image.fromarray(pixels).save(path, compress_level=1)
 
 
-def read_pinhole(view: View) -> Pinhole:
+def read_pinhole(view: View) -> PinholeNumbers:
     """Return the intrinsics of a view."""
     K = view.camera.K.tolist()
     return K[0][0], K[1][1], K[0][2], K[1][2]

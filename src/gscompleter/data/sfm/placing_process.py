@@ -26,7 +26,7 @@ from gscompleter.data.sfm.matching import (
     prepare_colmap,
     select_pairs,
 )
-from gscompleter.data.sfm.placing import KnownCopy, NewCopy, Pinhole
+from gscompleter.data.sfm.placing import KnownCopy, NewCopy, PinholeNumbers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ def main() -> None:
     new = [NewCopy(**one) for one in task.pop("new")]
     job = PlacingJob(known=known, new=new, **task)
     prepare_colmap()
-    cameras = extract_all_features(job)
+    cameras = extract_placing_features(job)
     match(job, job.names, select_pairs(job, job.names))
     model = register_new(job, cameras)
     placed = find_placed(job, model)
@@ -64,7 +64,7 @@ def main() -> None:
     print(json.dumps(describe_placed(job, model, placed)))
 
 
-def extract_all_features(job: PlacingJob) -> dict[str, int]:
+def extract_placing_features(job: PlacingJob) -> dict[str, int]:
     """Extract the features of all copies, and return the number of the camera of each."""
     cameras: dict[str, int] = {}
     with pycolmap.Database.open(job.database) as database:
@@ -84,7 +84,7 @@ def extract_all_features(job: PlacingJob) -> dict[str, int]:
     return cameras
 
 
-def make_known_camera(pinhole: Pinhole, copy: KnownCopy | NewCopy) -> pycolmap.Camera:
+def make_known_camera(pinhole: PinholeNumbers, copy: KnownCopy | NewCopy) -> pycolmap.Camera:
     """Make the camera of an undistorted copy with known intrinsics."""
     camera = pycolmap.Camera(
         model="PINHOLE", width=copy.width, height=copy.height, params=list(pinhole)

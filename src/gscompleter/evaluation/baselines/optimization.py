@@ -58,7 +58,7 @@ def optimize(
     """Fit all attributes of `scene` to `views`; `seed` sets their order and the splitting."""
     random = torch.Generator().manual_seed(seed)
     extent = compute_extent([view.camera for view in views])
-    state = Parameters(scene, extent)
+    state = SceneParameters(scene, extent)
     # Sum of the image gradients of each Gaussian since the last round, and of its views.
     gradients = torch.zeros_like(scene.opacities)
     counts = torch.zeros_like(scene.opacities)
@@ -85,14 +85,14 @@ def optimize(
         if number in rounds:
             crowded = gradients / counts.clamp_min(1) >= config.gradient_threshold
             dense = control_density(state.make_gaussians(), crowded, extent, random)
-            state = Parameters(dense, extent)
+            state = SceneParameters(dense, extent)
             gradients = torch.zeros_like(dense.opacities)
             counts = torch.zeros_like(dense.opacities)
     with torch.no_grad():  # so that the result is detached from the parameters
         return state.make_gaussians()[:]
 
 
-class Parameters:
+class SceneParameters:
     """Optimized parameters of 3DGS: means, quats, log-scales, opacity logits and SH.
 
     Adam restarts with each round of density control.

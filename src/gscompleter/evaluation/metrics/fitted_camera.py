@@ -46,7 +46,7 @@ HOLE_MARGIN = 2
 MIN_POSE_PIXELS = 500
 """Fewest pixels that determine a pose."""
 
-Pixels = Float[np.ndarray, "h w 3"]
+PixelValues = Float[np.ndarray, "h w 3"]
 Move = Float[np.ndarray, "6"]
 """Rotation about x, y, z and shift along them, in camera axes and pixels."""
 
@@ -81,7 +81,7 @@ def measure_fitted(
     start = renderer.render(scene, target.camera)
     unit = measure_depth(start, observed) / float(target.camera.K[0, 0])
 
-    def draw(move: Move) -> Pixels:
+    def draw(move: Move) -> PixelValues:
         camera = move_camera_by(target.camera, move, unit)
         image = renderer.render(scene, camera).image
         return np.asarray(image.clamp(0, 1).cpu().numpy(), np.float64)
@@ -117,7 +117,7 @@ def move_camera_by(camera: Camera, move: Move, unit: float) -> Camera:
 
 
 def fit_move(
-    draw: Callable[[Move], Pixels], truth: Pixels, counted: Bool[np.ndarray, "h w"]
+    draw: Callable[[Move], PixelValues], truth: PixelValues, counted: Bool[np.ndarray, "h w"]
 ) -> Move:
     """Fit the move, from wide to narrow blur; zero if the picture is no nearer to the truth."""
     still = np.zeros(6)
@@ -129,16 +129,18 @@ def fit_move(
 
 
 def fit_blurred(
-    draw: Callable[[Move], Pixels],
+    draw: Callable[[Move], PixelValues],
     start: Move,
-    truth: Pixels,
+    truth: PixelValues,
     counted: Bool[np.ndarray, "h w"],
     sigma: float,
 ) -> Move:
     """Fit the move to blurred images, by steps of Gauss and Newton with robust weights."""
     wanted = blur(truth, sigma)
 
-    def compute_residuals(image: Pixels, gains: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n"]:
+    def compute_residuals(
+        image: PixelValues, gains: Float[np.ndarray, "3"]
+    ) -> Float[np.ndarray, "n"]:
         return (blur(image, sigma) * gains - wanted)[counted].ravel()
 
     move = start
@@ -171,14 +173,14 @@ def fit_blurred(
     return move
 
 
-def measure_loss(image: Pixels, truth: Pixels, counted: Bool[np.ndarray, "h w"]) -> float:
+def measure_loss(image: PixelValues, truth: PixelValues, counted: Bool[np.ndarray, "h w"]) -> float:
     """Measure the squared error outside of holes after the best gains."""
     gains = fit_gains(image, truth, counted)
     return float(np.square(image * gains - truth)[counted].mean())
 
 
 def fit_gains(
-    image: Pixels, truth: Pixels, counted: Bool[np.ndarray, "h w"]
+    image: PixelValues, truth: PixelValues, counted: Bool[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "3"]:
     """Fit the gain of each channel by least squares; 1 for a black one."""
     seen = image[counted]
@@ -187,6 +189,6 @@ def fit_gains(
     return np.where(energy > 0, products / np.maximum(energy, 1e-12), 1.0)
 
 
-def blur(image: Pixels, sigma: float) -> Pixels:
+def blur(image: PixelValues, sigma: float) -> PixelValues:
     """Blur an image."""
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.float64)

@@ -22,7 +22,12 @@ from gscompleter.evaluation.metrics.image import (
     compute_masked_psnr,
     ssim,
 )
-from gscompleter.evaluation.metrics.perceptual import compute_flip_map, compute_lpips, haarpsi
+from gscompleter.evaluation.metrics.perceptual import (
+    Image,
+    compute_flip_map,
+    compute_lpips,
+    haarpsi,
+)
 from gscompleter.evaluation.metrics.st_lpips import compute_st_lpips
 from gscompleter.evaluation.metrics.thin_gaps import (
     AT_TARGET,
@@ -35,8 +40,6 @@ from gscompleter.evaluation.metrics.thin_gaps import (
 from gscompleter.render.protocols import Renderer
 from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.types import Camera, DepthMap, Gaussians, Render, View
-
-Image = Float[Tensor, "h w 3"]
 
 MIN_DEPTH_PIXELS = 50
 """Minimum number of pixels for a median of depths."""

@@ -199,12 +199,12 @@ def describe_gain(
     Unused photographs tell it best, then those of the `context` of a given scene that gained.
     """
     scored = [row for row in held_out if row.psnr_after is not None]
-    better = [row for row in context if compute_gain(row) >= MIN_BETTER_GAIN]
+    better = [row for row in context if compute_psnr_gain(row) >= MIN_BETTER_GAIN]
     has_unused = any(not row.is_check for row in scored)
     if not scored or (better and not has_unused):
         if not better:
             return f"{work}; no unused photograph could test it"
-        gains = format_number(average(compute_gain(row) for row in better), 1)
+        gains = format_number(average(compute_psnr_gain(row) for row in better), 1)
         gain = "1 photograph gains" if len(better) == 1 else f"{len(better)} photographs gain"
         return f"{work}: {gain} {gains} dB"
 
@@ -223,7 +223,7 @@ def describe_gain(
     return f"{work}: {name_unused(rows)} {gain} {place} ({scores})"
 
 
-def compute_gain(row: ScoreRow) -> float:
+def compute_psnr_gain(row: ScoreRow) -> float:
     """Return the gain of PSNR of a photograph in dB; none without a score or of an equal image."""
     if row.psnr_before is None or row.psnr_after is None or isinf(row.psnr_before):
         return 0.0

@@ -98,7 +98,7 @@ def _compute_shares(first, last, scales, opacities, shares):
 
 
 @njit(fastmath={"contract"})
-def _compute_mean(first, last, shares, values, mean):
+def _compute_run_mean(first, last, shares, values, mean):
     for column in range(len(mean)):
         begun = values[first, column]
         away = np.float32(0)
@@ -126,7 +126,7 @@ def _compute_variance(first, last, shares, means, quats, scales, mean, axis):
 
 
 @njit(nogil=True, fastmath={"contract"}, error_model="numpy")
-def merge_runs(begin, end, start, gaussians, shares, merged):
+def merge_run_range(begin, end, start, gaussians, shares, merged):
     """Merge each of the runs begin..end into one Gaussian.
 
     It has their joint transmittance, mean position and colour, and variances along the axes of the
@@ -138,8 +138,8 @@ def merge_runs(begin, end, start, gaussians, shares, merged):
         first = start[run]
         last = start[run + 1]
         most, total = _compute_shares(first, last, scales, opacities, shares)
-        _compute_mean(first, last, shares, means, to_means[run])
-        _compute_mean(first, last, shares, sh, to_sh[run])
+        _compute_run_mean(first, last, shares, means, to_means[run])
+        _compute_run_mean(first, last, shares, sh, to_sh[run])
         copy_row(quats, most, to_quats, run)
         if last - first == 1:
             copy_row(scales, first, to_scales, run)

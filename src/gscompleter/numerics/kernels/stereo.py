@@ -476,12 +476,12 @@ def fill_background(values, known):
     Low inverse depths are far away, and one ray may miss a thin object in front.
     """
     filled = values.copy()
-    share(_fill, len(values), values, known, filled)
+    share(_fill_unknown, len(values), values, known, filled)
     return filled
 
 
 @njit(nogil=True)
-def _fill(begin, end, values, known, filled):
+def _fill_unknown(begin, end, values, known, filled):
     h, w = values.shape
     for y in range(begin, end):
         for x in range(w):

@@ -19,7 +19,7 @@ _A4, _A5, _A6, _A7 = map(np.float32, (0.0308918810, -0.0170881256, 0.0066700901,
 # Least squares polynomial of 2**x on [-1, 0]: relative error 2e-7.
 _E0, _E1, _E2 = map(np.float32, (0.999999923, 0.693142171, 0.240171588))
 _E3, _E4, _E5 = map(np.float32, (0.055278135, 0.00918687438, 0.000938116473))
-_LOG2_E = np.float32(1.4426950408889634)
+_LOG2_E32 = np.float32(1.4426950408889634)
 _PI = np.float32(math.pi)
 
 
@@ -48,7 +48,7 @@ def _acos(x):
 @njit(fastmath={"contract"})
 def _exp_negative(x):
     """Compute exp(-x) for x >= 0; beyond 80 it is practically 0."""
-    power = max(-_LOG2_E * x, np.float32(-120))
+    power = max(-_LOG2_E32 * x, np.float32(-120))
     # 2^power by its whole part, which goes into the exponent of a float32, and a polynomial for the
     # rest, in (-1, 0].
     whole = np.int32(power)

@@ -179,14 +179,14 @@ def contradicts_factor(samples: DepthSamples, log_factor: float) -> bool:
 
 def correlate_ranks(samples: DepthSamples) -> float:
     """Compute Spearman's rank correlation of given and measured depths; 0 if one is constant."""
-    given = rank(samples.given)
-    measured = rank(samples.measured)
+    given = rank_values(samples.given)
+    measured = rank_values(samples.measured)
     if np.ptp(given) == 0 or np.ptp(measured) == 0:
         return 0.0
     return float(np.corrcoef(given, measured)[0, 1])
 
 
-def rank(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def rank_values(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """Rank values; equal ones share their mean rank.
 
     `scipy.stats.rankdata` gives the same, and its import takes longer than a tenth of a completion.

@@ -90,7 +90,7 @@ def find_depth_range(
     else:
         found = DepthRange(*get_depth_range(views, lambda _: trained))
         if None in known:
-            return replace(found, notes=describe_mismatch(views, found))
+            return replace(found, notes=describe_untrained_range(views, found))
     if known in ((None, None), trained):
         return found
     if not keeps:
@@ -131,7 +131,7 @@ def widen_range(views: Sequence[View], given: DepthRange, outcome: str = "") -> 
     return DepthRange(near, far, notes)
 
 
-def describe_mismatch(views: Sequence[View], trained: DepthRange) -> tuple[str, ...]:
+def describe_untrained_range(views: Sequence[View], trained: DepthRange) -> tuple[str, ...]:
     """Say that the scene's features lie outside of the depths that Ψ was trained on.
 
     Published networks sweep planes between depths that their authors chose. A scene in another

@@ -19,7 +19,7 @@ from gscompleter.numerics.image_ops import push_pull
 from gscompleter.numerics.robust import fit_line_ransac
 from gscompleter.reconstructors.plane_sweep.surfaces import (
     SMOOTHING_ITERATIONS,
-    Image,
+    ColorImage,
     fit_surfaces,
 )
 from gscompleter.reconstructors.plane_sweep.sweep import (
@@ -103,7 +103,10 @@ def support(measured: Measurement, inverse: Map, known: Mask) -> Measurement:
 
 
 def compare_in_hidden_blocks(
-    guess: Map, measured: Measurement, image: Image, iterations: int = SMOOTHING_ITERATIONS // 2
+    guess: Map,
+    measured: Measurement,
+    image: ColorImage,
+    iterations: int = SMOOTHING_ITERATIONS // 2,
 ) -> BlockErrors | None:
     """Compare what inverse depths, 0 where unknown, tell about hidden blocks of stereo.
 

@@ -188,7 +188,7 @@ class ColorEquations:
         damping = LINEAR_PENALTY * total[..., None] * (spread + smallest)
         square = moments.second + damping
         complement = square - multiply_outer(moments.first, moments.first / total)
-        return ColorEquations(total, moments.first, damping, invert_symmetric(complement))
+        return ColorEquations(total, moments.first, damping, invert_3x3(complement))
 
     def solve(
         self,
@@ -234,7 +234,7 @@ def multiply_outer(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Te
     return a[:, :, None] * b[:, None, :]
 
 
-def invert_symmetric(matrices: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
+def invert_3x3(matrices: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
     """Invert positive definite matrices by their cofactors, faster than a solver of any size."""
     # The rows of the cofactors are cross products of the rows, and the matrix is symmetric.
     a, b, c = matrices.unbind(dim=1)

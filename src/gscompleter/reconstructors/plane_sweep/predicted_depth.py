@@ -17,7 +17,7 @@ from gscompleter.reconstructors.plane_sweep.hidden_blocks import (
     compare_in_hidden_blocks,
     support,
 )
-from gscompleter.reconstructors.plane_sweep.surfaces import Image
+from gscompleter.reconstructors.plane_sweep.surfaces import ColorImage
 from gscompleter.reconstructors.plane_sweep.sweep import Mask, Measurement
 from gscompleter.types import DepthMap
 
@@ -43,7 +43,7 @@ class Supported:
 
 
 def add_prediction(
-    measured: Measurement, predicted: DepthMap, image: Image, sky: Mask
+    measured: Measurement, predicted: DepthMap, image: ColorImage, sky: Mask
 ) -> Supported:
     """Use predicted depth where stereo measured nothing, if stereo confirms it elsewhere.
 

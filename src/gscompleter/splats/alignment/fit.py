@@ -37,7 +37,7 @@ MAX_ROUND_TRIP_ERROR = 1.0
 """Largest error of a corner tracked forward and back, in pixels."""
 
 GreyBytes = UInt8[np.ndarray, "h w"]
-Corners = Float[np.ndarray, "n 1 2"]
+FlowCorners = Float[np.ndarray, "n 1 2"]
 
 
 class ImageFit(NamedTuple):
@@ -172,8 +172,8 @@ def measure_drift(
 
 
 def track_corners(
-    before: GreyBytes, after: GreyBytes, corners: Corners
-) -> tuple[Corners, Bool[np.ndarray, "n"]]:
+    before: GreyBytes, after: GreyBytes, corners: FlowCorners
+) -> tuple[FlowCorners, Bool[np.ndarray, "n"]]:
     """Track corners by up to about 50 px to another image, and mark those that were found."""
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
         before, after, corners, np.zeros_like(corners), winSize=(15, 15), maxLevel=3

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from gscompleter.data.camera_files import has_camera_list, read_camera_list
 from gscompleter.data.camera_paths import DATAPARSER_FILE
-from gscompleter.data.cameras import find_pose_defect
+from gscompleter.data.cameras import Poses, find_pose_defect
 from gscompleter.data.local_origin import compute_frame_from_photographs, read_dataparser_transforms
 from gscompleter.data.photographs import Photographs
 from gscompleter.splats.alignment.similarity import (
@@ -37,7 +37,6 @@ ITERATION_PREFIX = "iteration_"
 MAX_COMPARED_PHOTOGRAPHS = 200
 """Photographs by which two camera lists are compared."""
 
-Poses = Float[np.ndarray, "n 4 4"]
 Points = Float[np.ndarray, "p 3"]
 
 NERFSTUDIO_WORLDS = (

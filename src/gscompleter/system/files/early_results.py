@@ -57,17 +57,17 @@ def describe_early(folder: Path, content: Mapping[str, Any]) -> EarlyResults | N
         return None
     if counts and entries >= COMPLETION_ENTRIES:
         command = "complete"
-        files = [name for name in _list_files(folder) if COMPLETION_FILES.fullmatch(name)]
+        files = [name for name in _list_early_files(folder) if COMPLETION_FILES.fullmatch(name)]
     elif counts == CLEANING_COUNTS and entries >= CLEANING_ENTRIES:
         command = "clean"
         known = {COMPLETED_FILE, REMOVED_FILE, SUMMARY_FILE}
-        files = [name for name in _list_files(folder) if name in known]
+        files = [name for name in _list_early_files(folder) if name in known]
     elif entries == POSES_ENTRIES and isinstance(content["photographs"], dict):
         command = "poses"
         known = {SUMMARY_FILE, *_name_copies(content["photographs"])}
         files = [
             name
-            for name in _list_files(folder)
+            for name in _list_early_files(folder)
             if name in known or MODEL_FILES.fullmatch(name) or FRAME_FILES.fullmatch(name)
         ]
     else:
@@ -75,7 +75,7 @@ def describe_early(folder: Path, content: Mapping[str, Any]) -> EarlyResults | N
     return EarlyResults(command, files)
 
 
-def _list_files(folder: Path) -> Iterator[str]:
+def _list_early_files(folder: Path) -> Iterator[str]:
     """List the files of the folders that an early version wrote to."""
     for home in EARLY_FOLDERS:
         names = []

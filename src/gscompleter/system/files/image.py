@@ -247,7 +247,7 @@ def read_brightness(stored: Path | bytes, side: int) -> Float[np.ndarray, "h w"]
 def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
     """Read z-depth from a 16-bit PNG or a `.npy` file, times `unit`; 0 where unknown."""
     if path.suffix == ".npy":
-        values = _read_array(path)
+        values = _read_npy(path)
     else:
         with open_image(path) as image:
             values = np.array(image)
@@ -262,7 +262,7 @@ def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
-def _read_array(path: Path) -> np.ndarray:
+def _read_npy(path: Path) -> np.ndarray:
     check_file(path)
     try:
         # A memory map cannot exceed the file, whatever size its header claims.

@@ -403,7 +403,7 @@ def _list_others(folder: Path, listed: frozenset[str]) -> Iterator[str]:
                     yield relative
 
 
-def _list_files(folder: Path) -> list[str]:
+def _list_files_below(folder: Path) -> list[str]:
     """List the files below a folder as relative paths."""
     return sorted(
         Path(home, name).relative_to(folder).as_posix()
@@ -417,7 +417,7 @@ def _list_in_summary(draft: Path, command: str) -> None:
     path = draft / SUMMARY_FILE
     content = json.loads(path.read_bytes()) if path.is_file() else {}
     origin = {COMMAND_KEY: command} if command else {}
-    files = sorted({SUMMARY_FILE, *_list_files(draft)})
+    files = sorted({SUMMARY_FILE, *_list_files_below(draft)})
     whole = json.dumps({**RESULT_MARK, **origin, **content, FILES: files}, indent=2)
     path.write_bytes(whole.encode() + b"\n")
 
@@ -429,7 +429,7 @@ def _publish(draft: Path, target: Path) -> None:
         return
     replaced = target / f"{draft.name}{REPLACED_SUFFIX}"
     listed = read_listing(target)
-    new = _list_files(draft)
+    new = _list_files_below(draft)
     _refuse_unlisted(target, target, new, listed)
     for name in listed.intersection(new):
         keep_permissions(target / name, draft / name)
@@ -472,7 +472,7 @@ def _list_old_moves(target: Path, replaced: Path, listed: Iterable[str]) -> list
 
 def _list_new_moves(draft: Path, target: Path) -> list[tuple[Path, Path]]:
     """List the moves of the new files, the summary last."""
-    ordered = sorted(_list_files(draft), key=lambda name: (name == SUMMARY_FILE, name))
+    ordered = sorted(_list_files_below(draft), key=lambda name: (name == SUMMARY_FILE, name))
     return [(draft / name, target / name) for name in ordered]
 
 
@@ -524,7 +524,7 @@ def _finish_interrupted(given: Path, target: Path) -> bool:
                 _refuse_impossible(given, target, draft, entry.path)
                 _finish_moves(draft, target, entry.path)
             is_changed = True
-        elif not os.path.lexists(target / SUMMARY_FILE) and _list_files(entry.path):
+        elif not os.path.lexists(target / SUMMARY_FILE) and _list_files_below(entry.path):
             # A disk failed, and its run could not put these files back.
             raise InputError(
                 f"{quote_value(entry.path)} holds results that a run could not put back; move them "
@@ -563,7 +563,7 @@ def _list_replaced(target: Path, replaced: Path) -> frozenset[str]:
 def _list_left(draft: Path, target: Path, replaced: Path) -> frozenset[str]:
     """List what a killed run was to replace, and what is still in its place."""
     # New files that left the draft have their final name already, and must not be moved away.
-    published = read_listing(draft).difference(_list_files(draft))
+    published = read_listing(draft).difference(_list_files_below(draft))
     waiting = _list_replaced(target, replaced) - published
     # What was replaced by then is a file below real folders.
     moved = {
@@ -580,7 +580,7 @@ def _refuse_impossible(given: Path, target: Path, draft: Path, replaced: Path) -
         _refuse_foreign(folder)
     _refuse_links(draft)
     refuse_later_results(draft)
-    new = _list_files(draft)
+    new = _list_files_below(draft)
     written = read_listing(draft)
     left = _list_left(draft, target, replaced)
     unlisted = [draft / name for name in new if name not in written]
