@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 import torch
 
+from gscompleter.data.cameras import Poses
 from gscompleter.data.photographs import Photographs
 from gscompleter.reconstructors.features.depth_range import estimate_depth_range
 from gscompleter.render.lod import build_proxy, thin_gaussians
@@ -26,7 +27,6 @@ from gscompleter.splats.alignment.similarity import Matrix, transform_camera, tr
 from gscompleter.splats.alignment.trainer_frames import (
     InputSplat,
     Points,
-    Poses,
     collect_poses,
     compute_trainer_frames,
     read_trainer_frames,
