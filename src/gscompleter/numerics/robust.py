@@ -67,30 +67,6 @@ def fit_line_ransac(
     return scale, shift
 
 
-def fit_plane_ransac(
-    rays: Float[Tensor, "n 3"], depths: Float[Tensor, "n"], rng: torch.Generator
-) -> Float[Tensor, "3"]:
-    """Fit the plane `plane · x = 1` to the most inliers among points `depths * rays`, then refit.
-
-    Rays have z = 1, so that residuals are relative errors of inverse depth. There are three points
-    or more.
-    """
-    # Three points each: rays @ plane = 1 / depth. Those on one line have no solution, and a plane
-    # of zeros has no inliers.
-    index = torch.randint(len(rays), (MAX_HYPOTHESES, 3), generator=rng).to(rays.device)
-    solved = torch.linalg.solve_ex(rays[index].double(), (1 / depths[index]).double()[..., None])
-    planes = solved.result[..., 0].nan_to_num(0.0, 0.0, 0.0).to(rays)
-    counts = [
-        ((depths * (batch @ rays.T) - 1).abs() < RESIDUAL_THRESHOLD).sum(dim=1)
-        for batch in planes.split(HYPOTHESES_PER_BATCH)
-    ]
-    plane = planes[torch.cat(counts).argmax()]
-
-    agree = (depths * (rays @ plane) - 1).abs() < RESIDUAL_THRESHOLD
-    design = (depths[:, None] * rays)[agree].double()
-    return torch.linalg.lstsq(design, torch.ones_like(design[:, :1])).solution[:, 0].to(rays)
-
-
 def fit_robust_affine(
     x: Float[Tensor, "n c"], y: Float[Tensor, "n c"]
 ) -> tuple[Float[Tensor, "c"], Float[Tensor, "c"]]:

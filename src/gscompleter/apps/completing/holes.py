@@ -154,10 +154,6 @@ def write_hole(folder: Path, hole: ExportedHole, unit: float, ready: Prepared) -
         f"{name}_warped.png": shown.warped,
         f"{name}_reference.png": shown.reference.image,
     }
-    mosaic = None
-    if shown.mosaic is not None:
-        mosaic = f"{name}_mosaic.png"
-        pictures[mosaic] = shown.mosaic
     for file, picture in pictures.items():
         write_image(folder / file, picture)
     write_depth(folder / f"{name}_depth.png", hole.depth, unit)
@@ -180,7 +176,6 @@ def write_hole(folder: Path, hole: ExportedHole, unit: float, ready: Prepared) -
         "title": ready.opened.name_target(target),
         "depth_file_path": f"{name}_depth.png",
         "warped_path": f"{name}_warped.png",
-        "mosaic_path": mosaic,
         "reference_path": f"{name}_reference.png",
         "reference_frame": shown.reference.frame,
         "reference_file": files.get(shown.reference.frame),
