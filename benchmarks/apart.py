@@ -15,7 +15,7 @@ from gscompleter.evaluation.apart import (
     leave_out_apart,
     record_uses,
 )
-from gscompleter.evaluation.cases import Case, Place, list_places, read_cases
+from gscompleter.evaluation.cases import Case, ScenePlace, list_places, read_cases
 
 SCENES = Path(__file__).with_name("scenes.json")
 """Scenes of the protocols, with those that are kept apart."""
@@ -35,7 +35,7 @@ def read_used_cases(path: Path, uses_apart: bool, name: str = "") -> list[Case]:
 def select_scenes(names: Iterable[str], uses_apart: bool) -> set[str]:
     """Select the names of our scenes that may be used; other scenes are nobody's to keep apart."""
     known = {place.path.name: place for place in list_places(SCENES)}
-    places = [known.get(name, Place(Path(name))) for name in names]
+    places = [known.get(name, ScenePlace(Path(name))) for name in names]
     left_out: list[Apartable] = []
     used = list(leave_out_apart(places, uses_apart, left_out))
     print(*describe_left_out(left_out, len(used), "scenes"), file=sys.stderr)

@@ -25,7 +25,7 @@ from gscompleter.data.demo_scene import (
     get_motorcycle_cameras,
 )
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.reconstructors.plane_sweep.surfaces import ITERATIONS, fit_surfaces
+from gscompleter.reconstructors.plane_sweep.surfaces import SMOOTHING_ITERATIONS, fit_surfaces
 
 
 def report(name: str, depth: np.ndarray, truth: np.ndarray, seconds: float) -> None:
@@ -78,10 +78,10 @@ def main() -> None:
     fit_surfaces(heights, np.ones_like(heights), halves[0].astype(np.float32) / 255)
     surfaces = time.perf_counter() - start
     start = time.perf_counter()
-    denoise_tv_chambolle(heights, weight=0.1, eps=0.0, max_num_iter=ITERATIONS)
+    denoise_tv_chambolle(heights, weight=0.1, eps=0.0, max_num_iter=SMOOTHING_ITERATIONS)
     first_order = time.perf_counter() - start
     print(
-        f"{ITERATIONS} iterations: surfaces (second order, all levels) {surfaces:.2f} s, "
+        f"{SMOOTHING_ITERATIONS} iterations: surfaces (second order, all levels) {surfaces:.2f} s, "
         f"{surfaces / first_order:.2f} x scikit-image's total variation (one level)"
     )
 

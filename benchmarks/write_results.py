@@ -43,7 +43,7 @@ from typing import Any
 
 import yaml
 
-from gscompleter.evaluation.claims import HEAD, tabulate_claims
+from gscompleter.evaluation.claims import CLAIM_COLUMNS, tabulate_claims
 from gscompleter.evaluation.columns import BY_KEY
 from gscompleter.evaluation.measured_code import compute_method_digest
 from gscompleter.evaluation.paper import load_paper
@@ -234,7 +234,7 @@ def write_spans(name: str, key: str) -> str:
 
 def write_claims() -> str:
     """Write the verdicts on all claims of the paper."""
-    return format_markdown(HEAD, tabulate_claims(STORED / "tables", load_paper().claims))
+    return format_markdown(CLAIM_COLUMNS, tabulate_claims(STORED / "tables", load_paper().claims))
 
 
 def write_scores(file: str, *columns: str) -> str:

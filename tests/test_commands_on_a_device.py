@@ -30,7 +30,7 @@ from gscompleter.apps.command_line.chosen_config import ChosenConfig
 from gscompleter.apps.commands.live import LiveOptions, decide_live
 from gscompleter.apps.completing import complete
 from gscompleter.apps.live import saving
-from gscompleter.apps.live.session import Step, apply_step, save_camera
+from gscompleter.apps.live.session import SessionStep, apply_step, save_camera
 from gscompleter.data.scene import write_cameras
 from gscompleter.evaluation.metrics.coverage import sample_held_out_cameras
 from gscompleter.evaluation.store import list_row_paths
@@ -239,9 +239,9 @@ def test_a_session_in_the_browser_is_saved(room, tmp_path, actions):
     camera = save_camera(session, ASIDE.to("cuda"))
     aside = save_camera(session, BESIDE.to("cuda"))
     steps = {
-        "repair": Step("repair", camera, file.getvalue()),
-        "remove": Step("remove", camera, box=(-0.6, 0.2, 2.1, 0.4, 1.47, 3.1)),
-        "complete": Step("complete", aside),
+        "repair": SessionStep("repair", camera, file.getvalue()),
+        "remove": SessionStep("remove", camera, box=(-0.6, 0.2, 2.1, 0.4, 1.47, 3.1)),
+        "complete": SessionStep("complete", aside),
     }
     for action in actions:
         session, _ = apply_step(session, steps[action])

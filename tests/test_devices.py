@@ -14,7 +14,7 @@ from PIL import Image
 from elsewhere import DEVICE, Elsewhere, MixedError, There, without_autocast
 from gscompleter import GSCompleter, load_reconstructor, load_renderer
 from gscompleter.apps.live.difference import PageScene
-from gscompleter.apps.live.session import Session, Step, apply_step, save_camera
+from gscompleter.apps.live.session import Session, SessionStep, apply_step, save_camera
 from gscompleter.config import CompleterConfig
 from gscompleter.evaluation.baselines.optimization import OptimizationConfig, optimize
 from gscompleter.evaluation.baselines.reggs import RegGSConfig, register_by_similarity
@@ -114,9 +114,9 @@ def test_a_session_in_the_browser_stays_on_the_device_of_its_views(views):
     marks = file.getvalue()
     camera = save_camera(session, VIEWS[1].camera)
     for step in (
-        Step("remove", camera, marks),
-        Step("fill", camera, marks),
-        Step("remove", camera, box=(-0.6, 0.2, 2.1, 0.4, 1.47, 3.1)),
+        SessionStep("remove", camera, marks),
+        SessionStep("fill", camera, marks),
+        SessionStep("remove", camera, box=(-0.6, 0.2, 2.1, 0.4, 1.47, 3.1)),
     ):
         session, _ = apply_step(session, step)
         chunks = page.describe(session.latest)["chunks"]

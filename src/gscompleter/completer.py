@@ -50,7 +50,7 @@ from gscompleter.stages.target_view import TargetView, render_target
 from gscompleter.state import Completion, Photo
 from gscompleter.system.errors import InputError
 from gscompleter.system.progress import show_in_notebook, track
-from gscompleter.system.tensor_checks import describe, is_whole
+from gscompleter.system.tensor_checks import describe, is_whole_number
 from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.trust import Trust
@@ -102,7 +102,7 @@ class GSCompleter:
             raise InputError(
                 f"The config has to be a CompleterConfig, and is {describe(self.config)}."
             )
-        if not is_whole(self.seed) or not 0 <= self.seed < MAX_SEED:
+        if not is_whole_number(self.seed) or not 0 <= self.seed < MAX_SEED:
             raise InputError(
                 f"The seed has to be a whole number from 0 to 2^62, and is {describe(self.seed)}."
             )

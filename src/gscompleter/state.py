@@ -23,7 +23,7 @@ from gscompleter.types import Camera, ContextScene, ErrorBudget, Gaussians, View
 
 MAX_SHOWN_TARGETS = 4
 """Most targets whose pictures a notebook shows."""
-RESULTS = "gscompleter.apps.report.results"
+RESULTS_MODULE = "gscompleter.apps.report.results"
 """Module of the files and scores of a completion, which is above this one."""
 
 
@@ -102,7 +102,7 @@ class Completion(Displayed):
 
         One at the camera of a target scores that target; the others count as held out.
         """
-        scores: dict[str, Any] = load_function(RESULTS, "score_result")(self, unused_views)
+        scores: dict[str, Any] = load_function(RESULTS_MODULE, "score_result")(self, unused_views)
         return scores
 
     def save(
@@ -124,14 +124,14 @@ class Completion(Displayed):
         Raises:
             InputError: The folder is not empty, or the file holds another scene.
         """
-        folder: Path = load_function(RESULTS, "save_result")(
+        folder: Path = load_function(RESULTS_MODULE, "save_result")(
             self, out, unused_views, splat, overwrite
         )
         return folder
 
     def report(self, file: Path | str, unused_views: Sequence[View] = ()) -> Path:
         """Write the page `report.html` of the command alone, under any name; return its path."""
-        path: Path = load_function(RESULTS, "write_result_page")(self, file, unused_views)
+        path: Path = load_function(RESULTS_MODULE, "write_result_page")(self, file, unused_views)
         return path
 
     @property

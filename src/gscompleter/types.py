@@ -27,17 +27,17 @@ from gscompleter.system.errors import InputError
 from gscompleter.system.files.display import Displayed
 from gscompleter.system.tensor_checks import (
     BOOLS,
-    BYTES,
+    BYTE_DTYPES,
     FLOATS,
     INTEGERS,
     Form,
     check_tensors,
     describe,
     is_number,
-    is_whole,
+    is_whole_number,
 )
 
-MAX_SIDE = 16_384
+MAX_IMAGE_SIDE = 16_384
 """Largest width or height of an image, in pixels. Files hold float64 and the pipeline uses float32,
 where 1e300 is infinity and 1e-300 is zero: every real camera keeps these bounds, and squares and
 quotients of its numbers are finite."""
@@ -54,7 +54,7 @@ SH_C0 = 0.28209479177387814
 MAX_RIGID_ERROR = 1e-3
 """Largest entry of RᵀR - I that counts as rounding error of a rotation R."""
 
-MAX_SKEW = 1e-6
+MAX_ROUNDED_SKEW = 1e-6
 """Largest entry of K, relative to the focal length, that counts as rounding error of 0."""
 NUM_SH = (1, 4, 9, 16)
 """Spherical harmonics per channel, by degree."""
@@ -63,7 +63,7 @@ Origin = tuple[float, float, float]
 """Place in the coordinates of a file, in float64."""
 
 M = TypeVar("M", bound="TensorDataclass")
-V = TypeVar("V", bound="View")
+AnyView = TypeVar("AnyView", bound="View")
 
 
 @dataclass(frozen=True)
@@ -189,10 +189,10 @@ class Camera(Displayed, TensorDataclass):
 def _find_size_defect(width: object, height: object) -> str | None:
     """Return a sentence part about an impossible size of the image, or None."""
     for name, side in (("width", width), ("height", height)):
-        if not is_whole(side):
+        if not is_whole_number(side):
             return f"its {name} is {describe(side)}, and a whole number of pixels is needed"
-        if not 1 <= side <= MAX_SIDE:  # type: ignore[operator]
-            return f"its {name} is {side} pixels, and 1 to {MAX_SIDE} are possible"
+        if not 1 <= side <= MAX_IMAGE_SIDE:  # type: ignore[operator]
+            return f"its {name} is {side} pixels, and 1 to {MAX_IMAGE_SIDE} are possible"
     return None
 
 
@@ -201,7 +201,7 @@ def _find_padding_defect(padding: object, width: int, height: int) -> str | None
     if not (
         isinstance(padding, tuple)
         and len(padding) == 2
-        and all(is_whole(pixels) and pixels >= 0 for pixels in padding)
+        and all(is_whole_number(pixels) and pixels >= 0 for pixels in padding)
     ):
         return f"its padding is {describe(padding)}, and two numbers of pixels from 0 are needed"
     if 2 * padding[0] >= width or 2 * padding[1] >= height:
@@ -258,7 +258,7 @@ def _find_intrinsics_defect(K: Float[Tensor, "3 3"], width: int, height: int) ->
     if not (fx > 0 and fy > 0 and math.isfinite(fx + fy + cx + cy)):
         return f"its focal lengths are {fx:g} and {fy:g}, its centre is ({cx:g}, {cy:g})"
     # Renderers read the focal lengths and the centre only; rays take the inverse of the whole K.
-    if last != [0, 0, 1] or not max(abs(skew), abs(below)) <= MAX_SKEW * min(fx, fy):
+    if last != [0, 0, 1] or not max(abs(skew), abs(below)) <= MAX_ROUNDED_SKEW * min(fx, fy):
         return "its K has a skew or another last row than 0 0 1; pixels must be right-angled"
     low, high = FOCAL_RANGE
     if not (low <= fx / width <= high and low <= fy / height <= high):
@@ -331,7 +331,7 @@ class View(Displayed, TensorDataclass):
             raise InputError(
                 f"The camera of a view has to be a Camera, and is {describe(self.camera)}."
             )
-        if self.frame is not None and not is_whole(self.frame):
+        if self.frame is not None and not is_whole_number(self.frame):
             raise InputError(
                 f"The frame of a view is {describe(self.frame)}; give the number of a frame or "
                 "None."
@@ -400,7 +400,7 @@ class View(Displayed, TensorDataclass):
             return image
         return torch.where(self.ignore_mask[..., None], self.image, image)
 
-    def paint_ignored(self: V, image: Float[Tensor, "h w 3"]) -> V:
+    def paint_ignored(self: AnyView, image: Float[Tensor, "h w 3"]) -> AnyView:
         """Replace ignored pixels of the photograph by those of a render."""
         if self.ignore_mask is None:
             return self
@@ -444,7 +444,7 @@ class Gaussians(Displayed, TensorDataclass):
         "scales": (FLOATS, ("n", 3)),
         "opacities": (FLOATS, ("n",)),
         "sh": (FLOATS, ("n", "k", 3)),
-        "generated": (BYTES, ("n",)),
+        "generated": (BYTE_DTYPES, ("n",)),
         "encoded": (FLOATS, ("n", 4)),
     }
 

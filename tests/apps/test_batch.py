@@ -24,7 +24,7 @@ from command import run
 from gscompleter import InputError
 from gscompleter.apps.batch import engine as batch_engine
 from gscompleter.apps.batch.manifest import list_results, read_manifest
-from gscompleter.apps.commands.batch_rows import parse_row
+from gscompleter.apps.commands.batch_rows import parse_batch_row
 from gscompleter.apps.report.page import render_batch_page
 from gscompleter.system.errors import FullDiskError, OutputError, WorkerError
 from gscompleter.system.files.writing import replace_file
@@ -33,7 +33,7 @@ from gscompleter.system.jobs.engines import connect_to_ray, open_submitit
 from gscompleter.system.jobs.jobs import (
     Job,
     Pool,
-    Share,
+    WorkerShare,
     find_missing_jobs,
     parse_shard,
     run_job,
@@ -182,7 +182,7 @@ def test_workers_that_cannot_start_are_a_sentence_and_no_fault_of_the_input(
 ):
     @contextmanager
     def open_broken(workers: int) -> Iterator[Pool]:
-        def start(share: Share) -> Future[Exception | None]:
+        def start(share: WorkerShare) -> Future[Exception | None]:
             future: Future[Exception | None] = Future()
             future.set_exception(BrokenProcessPool("A process was terminated abruptly"))
             return future
@@ -310,12 +310,14 @@ def test_manifests_of_all_kinds_name_the_same_jobs(tmp_path):
     by_folder = read_manifest(tmp_path / "scenes", {})
     for jobs in (by_csv, by_json, by_folder):
         assert [job.name for job in jobs] == ["one", "two-scenes"]
-    options = [[parse_row(j.options, tmp_path / "o") for j in jobs] for jobs in (by_csv, by_json)]
+    options = [
+        [parse_batch_row(j.options, tmp_path / "o") for j in jobs] for jobs in (by_csv, by_json)
+    ]
     assert options[0] == options[1]
     assert options[0][0].target == ("4", "6")
     assert options[0][0].video
     assert options[0][0].config.changes == {"holes": {"max_alpha": 0.4}}
-    assert options[0][1] == parse_row(by_folder[1].options, tmp_path / "o")
+    assert options[0][1] == parse_batch_row(by_folder[1].options, tmp_path / "o")
 
 
 def test_rows_of_one_scene_need_names(tmp_path):
@@ -342,7 +344,7 @@ def test_rows_of_one_scene_need_names(tmp_path):
 )
 def test_a_wrong_row_is_a_sentence(row, sentence, tmp_path):
     with pytest.raises(InputError, match=sentence):
-        parse_row({"folder": "room", **row}, tmp_path / "out")
+        parse_batch_row({"folder": "room", **row}, tmp_path / "out")
 
 
 def test_a_path_that_is_no_text_fails_its_row_alone(tmp_path, monkeypatch, capsys):

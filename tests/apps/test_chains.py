@@ -19,7 +19,7 @@ from gscompleter.apps.commands.live import decide_live
 from gscompleter.apps.inputs.taken_out import describe_taken_out
 from gscompleter.apps.inputs.task import InputSplatFile
 from gscompleter.apps.live import saving
-from gscompleter.apps.live.session import Step, apply_step
+from gscompleter.apps.live.session import SessionStep, apply_step
 from gscompleter.cli import parse_command
 from gscompleter.render.loading import load_renderer
 from gscompleter.splats.edits import read_edits
@@ -68,7 +68,7 @@ def run_on(room: Path, name: str, splat: Path, out: Path, *others: object) -> Pa
     return out / "completed.ply"
 
 
-def run_live(words: tuple[object, ...], out: Path, *steps: Step) -> Path:
+def run_live(words: tuple[object, ...], out: Path, *steps: SessionStep) -> Path:
     """Do steps in a session of `live`, save it, and return its result."""
     quiet = Console(quiet=True)
     options = parse_command(["live", *map(str, words), "--out", str(out), "--quiet"])
@@ -228,7 +228,7 @@ def test_a_session_between_complete_and_update_is_kept_by_both(room, tmp_path):
 
     size = ("--resolution", WORKING_SIZE, WORKING_SIZE, "--far", 20)
     words = (room, "--scene", completed, *size)
-    stroke = Step("repair", TARGET, (room.parent / "mask.png").read_bytes())
+    stroke = SessionStep("repair", TARGET, (room.parent / "mask.png").read_bytes())
     painted = run_live(words, tmp_path / "live", stroke)
     check_counts(completed, painted)
     assert measure_emptiness(painted) > measure_emptiness(completed) + 1

@@ -210,7 +210,7 @@ def test_a_log_says_that_it_converts_a_large_file(tmp_path, monkeypatch, capsys)
     words = ("convert", tmp_path / "a.ply", tmp_path / "b.splat")
     assert run(monkeypatch, *words) == 0
     assert capsys.readouterr().err == ""
-    monkeypatch.setattr(converting, "MIN_SHOWN", 1)
+    monkeypatch.setattr(converting, "MIN_LOGGED_BYTES", 1)
     words = (*words, "--overwrite")
     assert run(monkeypatch, *words) == 0
     assert capsys.readouterr().err == "converting\n"

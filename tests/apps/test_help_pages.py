@@ -16,7 +16,7 @@ import pytest
 
 from command import run
 from gscompleter import __version__
-from gscompleter.apps.command_line.help_pages import GROUPS, LAST
+from gscompleter.apps.command_line.help_pages import HELP_GROUPS, LAST
 from gscompleter.apps.command_line.words import list_options
 from gscompleter.cli import COMMANDS, OptionClasses, parse_command
 from paths import TESTS
@@ -110,7 +110,7 @@ def test_options_stand_in_groups():
 
 
 def test_groups_name_options_that_there_are_and_each_once():
-    names = [name for group in GROUPS for name in group.options] + [*LAST]
+    names = [name for group in HELP_GROUPS for name in group.options] + [*LAST]
     assert len(names) == len(set(names))
     known = {f.name for kind in OptionClasses().values() for f in fields(kind)}
     assert set(names) <= known

@@ -12,7 +12,7 @@ import torch
 import gscompleter as gsc
 from command import run
 from gscompleter import load_ply, save_ply, save_splat
-from gscompleter.apps.completing.maker import describe_model
+from gscompleter.apps.completing.maker import record_model
 from gscompleter.data.scene import write_cameras
 from gscompleter.splats.formats import read_provenance
 from gscompleter.splats.provenance import ModelRecord, Provenance, RunRecord
@@ -162,15 +162,15 @@ def test_a_given_splat_is_known_by_its_hash(completed_room, room, tmp_path, monk
 
 def test_models_are_named_with_their_licences(tmp_path):
     (tmp_path / "weights").mkdir()
-    assert describe_model("mvsplat-re10k", None).licence is None
-    assert describe_model("lama", None) == ModelRecord("lama", "lama", "Apache-2.0")
+    assert record_model("mvsplat-re10k", None).licence is None
+    assert record_model("lama", None) == ModelRecord("lama", "lama", "Apache-2.0")
     klein = "black-forest-labs/FLUX.2-klein-4B@e7b7"
-    assert describe_model("flux2-klein", klein).licence == "Apache-2.0"
-    assert "non-commercial" in describe_model("pe-field", None).licence
+    assert record_model("flux2-klein", klein).licence == "Apache-2.0"
+    assert "non-commercial" in record_model("pe-field", None).licence
     # A path tells about the machine, and its name nothing about a licence.
-    own = describe_model("lama", tmp_path / "weights")
+    own = record_model("lama", tmp_path / "weights")
     assert own == ModelRecord("lama", "weights")
-    assert describe_model("my_package:load", None) == ModelRecord("my_package:load")
+    assert record_model("my_package:load", None) == ModelRecord("my_package:load")
 
 
 def my_painter(nearest, target, context):

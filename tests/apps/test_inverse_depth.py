@@ -7,7 +7,7 @@ import pytest
 
 from command import run
 from exact_room import make_cameras, write_colmap
-from gscompleter.apps.inputs.given_depth import MAX_DEVIATION, read_with_depth
+from gscompleter.apps.inputs.given_depth import MAX_DEPTH_DEVIATION, read_with_depth
 from gscompleter.apps.report.schema import read_summary
 from gscompleter.data.formats import open_photographs
 from inverse_depth import write_inverse_depth
@@ -32,7 +32,7 @@ def test_inverse_depth_that_agrees_with_points_is_measured_depth(scene):
         known = view.given_depth.numpy() > 0
         assert known.mean() > 0.8
         off = np.abs(view.given_depth.numpy() / camera.depth - 1)[known]
-        assert np.median(off) < MAX_DEVIATION / 3
+        assert np.median(off) < MAX_DEPTH_DEVIATION / 3
     (note,) = read.notes
     assert note.startswith("The inverse depth of photo_000.png, photo_001.png agrees")
 

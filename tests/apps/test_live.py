@@ -36,7 +36,7 @@ from gscompleter.apps.live.saving import PreparedSession
 from gscompleter.apps.live.server import LiveServer
 from gscompleter.apps.live.session import (
     Session,
-    Step,
+    SessionStep,
     apply_step,
     redo_step,
     save_camera,
@@ -71,7 +71,7 @@ FIELDS = ("means", "scales", "quats", "opacities", "sh", "generated")
 
 def complete_camera(session: Session, camera: Camera) -> tuple[Session, str]:
     """Complete the scene for a camera in the frame of the result."""
-    return apply_step(session, Step("complete", save_camera(session, camera)))
+    return apply_step(session, SessionStep("complete", save_camera(session, camera)))
 
 
 mark = partial(make_mark, SIZE)
@@ -299,7 +299,7 @@ def splat_begun(splat_ready) -> Session:
 
 
 def remove_box(session: Session, box: tuple[float, ...]) -> tuple[Session, str]:
-    step = Step("remove", save_camera(session, CAMERAS[0]), box=box)
+    step = SessionStep("remove", save_camera(session, CAMERAS[0]), box=box)
     return apply_step(session, step)
 
 
@@ -344,8 +344,8 @@ def test_after_a_removal_another_hole_is_completed_as_before(without_crate):
     assert elsewhere.latest.config == removed.latest.config
 
 
-def marked(session: Session, action: str, mask: bytes | None = SPOT) -> Step:
-    return Step(action, save_camera(session, CAMERAS[1]), mask)
+def marked(session: Session, action: str, mask: bytes | None = SPOT) -> SessionStep:
+    return SessionStep(action, save_camera(session, CAMERAS[1]), mask)
 
 
 @pytest.fixture(scope="module")
@@ -407,9 +407,9 @@ def test_marks_that_nothing_can_be_done_with_are_refused(splat_begun):
 def test_nothing_that_is_given_is_ignored(splat_begun):
     camera = save_camera(splat_begun, CAMERAS[1])
     for step in (
-        Step("fill", camera, SPOT, box=CRATE),
-        Step("remove", camera, SPOT, box=CRATE),
-        Step("complete", camera, SPOT),
+        SessionStep("fill", camera, SPOT, box=CRATE),
+        SessionStep("remove", camera, SPOT, box=CRATE),
+        SessionStep("complete", camera, SPOT),
     ):
         with pytest.raises(InputError, match=r"leave it out|takes no mask"):
             apply_step(splat_begun, step)
@@ -916,7 +916,7 @@ def test_a_session_of_a_splat_alone_is_replayed_to_the_same_bytes(tmp_path, monk
     begun = serving.begin_session(ready)
     camera = replace(camera_at(0.05, size=64), near=None, far=None)
     marked = make_mark(64, slice(24, 36), slice(28, 40))
-    step = Step("repair", save_camera(begun, camera), marked)
+    step = SessionStep("repair", save_camera(begun, camera), marked)
     session, _ = apply_step(begun, step)
     serving.save_session(ready, session)
     other = tmp_path / "other"

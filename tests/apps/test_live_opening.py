@@ -27,7 +27,7 @@ from gscompleter.apps.live import saving, serving
 from gscompleter.apps.live.journal import Journal
 from gscompleter.apps.live.opening import SessionRequest
 from gscompleter.apps.live.page import LivePage
-from gscompleter.apps.live.session import Session, Step, apply_step, redo_step, undo_step
+from gscompleter.apps.live.session import Session, SessionStep, apply_step, redo_step, undo_step
 from gscompleter.apps.live.strokes import list_steps
 from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.cli import parse_command
@@ -52,9 +52,9 @@ mark = partial(make_mark, SIZE)
 SPOT = mark(slice(18, 30), slice(20, 32))
 OTHER = mark(slice(2, 9), slice(34, 44))
 STEPS = (
-    Step("remove", CAMERAS[0], box=CRATE),
-    Step("remove", CAMERAS[1], SPOT),
-    Step("remove", CAMERAS[1], OTHER),
+    SessionStep("remove", CAMERAS[0], box=CRATE),
+    SessionStep("remove", CAMERAS[1], SPOT),
+    SessionStep("remove", CAMERAS[1], OTHER),
 )
 """Three steps that only remove, which takes no time."""
 
@@ -92,7 +92,7 @@ class Program:
     def session(self) -> Session:
         return self.page.session
 
-    def do(self, step: Step) -> None:
+    def do(self, step: SessionStep) -> None:
         session, text = apply_step(self.session, step)
         self.page._change_session(session, text)
 
@@ -334,7 +334,7 @@ def test_a_program_that_is_killed_while_it_writes_leaves_whole_steps(begun, tmp_
 
     monkeypatch.setattr("gscompleter.apps.live.journal.write_masks", die)
     with pytest.raises(KeyboardInterrupt):
-        journal.write(back.extended(begun.latest, Step("fill", CAMERAS[1], SPOT)))
+        journal.write(back.extended(begun.latest, SessionStep("fill", CAMERAS[1], SPOT)))
     # The step that was undone is given up before its mask is.
     assert actions_in(tmp_path / "out") == ["remove"]
     assert actions_in(tmp_path / "out", "undone") == []

@@ -11,7 +11,7 @@ from PIL import Image
 
 from command import run
 from gscompleter import load_cameras, load_splat, load_views
-from gscompleter.apps.commands.batch_rows import parse_row
+from gscompleter.apps.commands.batch_rows import parse_batch_row
 from gscompleter.apps.completing.path_video import plan_path
 from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.system.errors import InputError
@@ -300,7 +300,7 @@ def test_what_was_painted_is_not_exported_over(scene, holes, tmp_path, monkeypat
 
 def test_a_batch_exports_no_holes(tmp_path):
     with pytest.raises(InputError, match="A batch completes scenes and exports no holes"):
-        parse_row({"folder": "SCENE", "export_holes": "HOLES"}, tmp_path)
+        parse_batch_row({"folder": "SCENE", "export_holes": "HOLES"}, tmp_path)
 
 
 @pytest.mark.slow

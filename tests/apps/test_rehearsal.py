@@ -156,7 +156,7 @@ def test_the_models_are_compiled_in_a_process_beside_the_block(
         assert noted.read_text() == "plane-sweep warp-inpaint"
         assert rehearsed == []
     assert rehearsed == [["cpu", warmup.SPLAT_PART]]
-    assert warmup.list_missing(warmup.PARTS) == []
+    assert warmup.list_uncompiled(warmup.PARTS) == []
 
 
 def test_a_process_that_fails_is_told_and_its_part_compiled_here(
@@ -176,7 +176,7 @@ def test_an_error_beside_the_compilation_ends_it(rehearsed, children, monkeypatc
         raise InputError("A photograph is damaged.")
     assert children[0].poll() is not None
     assert rehearsed == []
-    assert warmup.list_missing(warmup.PARTS) == list(warmup.PARTS)
+    assert warmup.list_uncompiled(warmup.PARTS) == list(warmup.PARTS)
 
 
 def test_without_the_renderer_one_process_is_enough(rehearsed, children):

@@ -22,7 +22,7 @@ from gscompleter.evaluation.runner import (
     collect_settings,
     evaluate,
 )
-from gscompleter.evaluation.store import VERSION, claim, list_row_paths, read_run_file
+from gscompleter.evaluation.store import RUN_VERSION, claim, list_row_paths, read_run_file
 from gscompleter.evaluation.tables import write_tables
 from gscompleter.models.settings import PEFieldSettings
 from gscompleter.system.jobs.jobs import Job, write_json
@@ -74,7 +74,7 @@ def test_of_many_simultaneous_claims_none_is_refused(tmp_path):
     codes, refused = claimed(out, 60)
     assert codes == [0] * 60, refused
     assert os.listdir(out) == ["run.json"]
-    assert read_run_file(out / "run.json") == {"version": VERSION, "seed": 0}
+    assert read_run_file(out / "run.json") == {"version": RUN_VERSION, "seed": 0}
 
 
 @pytest.mark.slow

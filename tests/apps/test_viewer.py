@@ -26,8 +26,8 @@ from gscompleter.apps.report.schema import (
     AlignmentRow,
     CompletionSummary,
     ContextRow,
+    OpenedSceneRow,
     ResultFrame,
-    SceneRow,
     TargetRow,
 )
 from gscompleter.apps.viewer import packages
@@ -316,7 +316,7 @@ def completion_in(folder: Path, transform: np.ndarray, origin: np.ndarray) -> Pa
         settings={"folder": str(folder / "gone")},
         seed=0,
         device="cpu",
-        scene=SceneRow("nerfstudio", 1, 1),
+        scene=OpenedSceneRow("nerfstudio", 1, 1),
         outcome=OutcomeRow("completed", "The scene is completed."),
         frame=ResultFrame("similarity", tuple(map(tuple, transform.tolist())), tuple(origin)),
         depth_range={},

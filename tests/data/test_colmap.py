@@ -14,7 +14,7 @@ from PIL import Image
 from command import run
 from gscompleter import InputError, load_cameras
 from gscompleter.data.cameras import Distortion, distort
-from gscompleter.data.colmap import MODELS, _list_roots, build_intrinsics
+from gscompleter.data.colmap import CAMERA_MODELS, _list_roots, build_intrinsics
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.points import add_depth_range
 from gscompleter.system.files.image import write_image
@@ -306,11 +306,11 @@ class BentCamera(Camera):
         return torch.from_numpy(rays).float() @ self.c2w[:3, :3].T
 
 
-@pytest.mark.parametrize("model", MODELS)
+@pytest.mark.parametrize("model", CAMERA_MODELS)
 def test_photographs_of_every_lens_show_the_room_without_it(tmp_path, model):
     size = (LENS_SIZE, LENS_SIZE)
-    parameters = [LENS_NUMBERS[name] for name in MODELS[model].parameters.split()]
-    lens = build_intrinsics(MODELS[model], size, parameters, "the camera").distortion
+    parameters = [LENS_NUMBERS[name] for name in CAMERA_MODELS[model].parameters.split()]
+    lens = build_intrinsics(CAMERA_MODELS[model], size, parameters, "the camera").distortion
     straight = camera_at(size=LENS_SIZE)
     photograph, _ = cast(Room(), BentCamera(straight.c2w, straight.K, *size, lens=lens))
     (tmp_path / "images").mkdir()

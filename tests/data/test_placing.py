@@ -141,7 +141,7 @@ def test_reasons_follow_from_the_features_in_common(known, new, tmp_path, monkey
     ]
     script = f"import json\nprint(json.dumps(dict(new={rows}, error=0.5)))"
     stand_in(monkeypatch, tmp_path, script)
-    monkeypatch.setattr(placing, "PROCESS", "stand_in_mapping")
+    monkeypatch.setattr(placing, "PLACING_PROCESS", "stand_in_mapping")
     monkeypatch.setattr(poses, "find_spec", lambda name: True)
     with pytest.raises(InputError) as caught:
         place_photographs(new, known, tmp_path / "colmap")

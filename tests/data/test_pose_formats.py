@@ -12,7 +12,7 @@ from PIL import Image
 from gscompleter import InputError, load_cameras
 from gscompleter.data.formats import SCENE_FORMATS, open_photographs
 from gscompleter.data.local_origin import read_dataparser_transforms
-from gscompleter.data.points import MIN_POINTS, add_depth_range, compute_depth_range
+from gscompleter.data.points import MIN_RANGE_POINTS, add_depth_range, compute_depth_range
 from gscompleter.data.scene import write_cameras
 from gscompleter.types import Camera
 from pose_files import (
@@ -343,13 +343,13 @@ def test_dgp_says_what_is_missing(tmp_path):
 
 def test_planes_enclose_the_points_in_sight():
     camera = CAMERAS[0]
-    depths = torch.linspace(2.0, 4.0, MIN_POINTS + 1)
+    depths = torch.linspace(2.0, 4.0, MIN_RANGE_POINTS + 1)
     points = depths[:, None] * torch.tensor([0.1, 0.0, 1.0])
     # Points behind the camera and beside the image are ignored.
     behind, beside = torch.tensor([[0.0, 0, -9]]), torch.tensor([[50.0, 0, 9]])
     near, far = compute_depth_range(torch.cat([points, behind, beside]), [camera])
     assert (near, far) == (pytest.approx(0.5 * 2.02), pytest.approx(2 * 3.98))
-    assert compute_depth_range(points[: MIN_POINTS - 1], [camera]) is None
+    assert compute_depth_range(points[: MIN_RANGE_POINTS - 1], [camera]) is None
     assert compute_depth_range(points, []) is None
 
 

@@ -14,7 +14,7 @@ from command import run
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.sfm import poses
 from gscompleter.data.sfm.poses import (
-    MAX_SIDE,
+    MAX_COPY_SIDE,
     find_poses,
     list_photograph_files,
     make_sort_key,
@@ -232,10 +232,10 @@ def test_copies_stand_upright_and_know_their_focal_length(tmp_path):
     exif.get_ifd(0x8769)[FOCAL_35] = 43
     image.save(tmp_path / "a.jpg", exif=exif)
     copy = write_upright(tmp_path, "a.jpg", tmp_path)
-    assert (copy.width, copy.height) == (800, MAX_SIDE)
+    assert (copy.width, copy.height) == (800, MAX_COPY_SIDE)
     assert copy.focal == pytest.approx(43 / 43.2666 * (800**2 + 1600**2) ** 0.5)
     with Image.open(tmp_path / "images" / "a.jpg") as written:
-        assert written.size == (800, MAX_SIDE)
+        assert written.size == (800, MAX_COPY_SIDE)
         assert written.getexif().get(ORIENTATION, 1) == 1
         assert written.getpixel((400, 100))[2] > 200  # blue above
 
@@ -285,7 +285,7 @@ def test_photographs_alone_are_completed_and_their_cameras_kept(tmp_path, monkey
     shutil.rmtree(out)
     out.mkdir()
     (tmp_path / "colmap").rename(out / "colmap")
-    monkeypatch.setattr(poses, "PROCESS", "nobody")
+    monkeypatch.setattr(poses, "MAPPING_PROCESS", "nobody")
     words = [*words, "--target", 4, "--dry-run"]
     assert run(monkeypatch, *words) == 0  # with the cameras that are there
 

@@ -11,7 +11,7 @@ from gscompleter.data.cameras import (
     distort,
     undistort_pinhole,
 )
-from gscompleter.data.colmap import MODELS, build_intrinsics
+from gscompleter.data.colmap import CAMERA_MODELS, build_intrinsics
 
 PINHOLE = Pinhole(fl_x=130.0, fl_y=127.5, cx=81.5, cy=59.0, width=160, height=120)
 
@@ -158,7 +158,7 @@ REFERENCE = {
 def test_every_lens_of_colmap_bends_as_colmap_says(name):
     parameters, expected = REFERENCE[name]
     intrinsics = build_intrinsics(
-        MODELS[name], (160, 120), list(map(float, parameters)), "the camera"
+        CAMERA_MODELS[name], (160, 120), list(map(float, parameters)), "the camera"
     )
     pinhole = intrinsics.compute_pinhole(160, 120)
     bent = distort(POINTS, intrinsics.distortion)
@@ -167,14 +167,14 @@ def test_every_lens_of_colmap_bends_as_colmap_says(name):
 
 
 def test_all_models_that_are_read_have_a_reference():
-    assert set(REFERENCE) == set(MODELS)
+    assert set(REFERENCE) == set(CAMERA_MODELS)
 
 
 @pytest.mark.parametrize("name", REFERENCE)
 def test_every_lens_of_colmap_is_removed(name):
     parameters, _ = REFERENCE[name]
     intrinsics = build_intrinsics(
-        MODELS[name], (160, 120), list(map(float, parameters)), "the camera"
+        CAMERA_MODELS[name], (160, 120), list(map(float, parameters)), "the camera"
     )
     new = undistort_pinhole(intrinsics.compute_pinhole(160, 120), intrinsics.distortion)
     assert new is not None

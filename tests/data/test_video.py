@@ -234,7 +234,7 @@ def test_a_video_is_completed_by_one_command(video, tmp_path, monkeypatch, capsy
     off = np.linalg.norm(similarity_removed(found, true) - true, axis=1)
     assert off.max() < 0.04  # of an extent of 2.1
 
-    monkeypatch.setattr(poses, "PROCESS", "nobody")
+    monkeypatch.setattr(poses, "MAPPING_PROCESS", "nobody")
     words = [*words, "--context", 0, 2, "--target", 4, "--overwrite"]
     assert run(monkeypatch, *words) == 0  # with the cameras that are there
 

@@ -10,9 +10,9 @@ import pytest
 
 from apart import read_used_cases, select_scenes
 from command import run
-from gscompleter.evaluation.apart import HEAD, LEDGER, count_uses, record_uses
+from gscompleter.evaluation.apart import APART_HEAD, LEDGER, count_uses, record_uses
 from gscompleter.evaluation.case_file import read_case_file, read_scene_file
-from gscompleter.evaluation.cases import Place, list_places, read_cases
+from gscompleter.evaluation.cases import ScenePlace, list_places, read_cases
 from gscompleter.system.errors import InputError, OutputError
 from paths import ROOT
 from scenes import Room, camera_at, photographed
@@ -63,7 +63,7 @@ def test_a_file_keeps_apart_the_scenes_that_it_names(tmp_path, apart, expected):
     assert tuple(case.apart_by == path for case in read_cases(path)) == expected
     path.write_text(json.dumps({"scenes": ["a/seen", "unseen"], "apart": apart}))
     assert tuple(row.is_apart for row in read_scene_file(path)) == expected
-    places = [Place(tmp_path / "a" / "seen"), Place(tmp_path / "unseen")]
+    places = [ScenePlace(tmp_path / "a" / "seen"), ScenePlace(tmp_path / "unseen")]
     assert [place.path for place in list_places(path)] == [place.path for place in places]
 
 
@@ -115,7 +115,7 @@ def test_a_use_is_written_down_and_counted_once(tmp_path, rooms, monkeypatch, ca
     # The ledger is the one above the file of cases.
     folder = tmp_path / "cases"
     folder.mkdir()
-    (tmp_path / LEDGER).write_text(HEAD)
+    (tmp_path / LEDGER).write_text(APART_HEAD)
     for name in ("seen", "unseen"):
         (folder / name).symlink_to(rooms / name)
     cases = write_cases(folder / "apart.json", apart=["unseen"])

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from gscompleter.evaluation.claims import HEAD, judge_claim, tabulate_claims
+from gscompleter.evaluation.claims import CLAIM_COLUMNS, judge_claim, tabulate_claims
 from gscompleter.evaluation.paper import Claim, load_paper
 from gscompleter.evaluation.paper_tables import SIGNIFICANCE
 
@@ -121,7 +121,7 @@ def test_one_number_for_all_cases_has_no_test(tmp_path):
 def test_every_claim_of_the_paper_has_a_row(tmp_path):
     claims = load_paper().claims
     rows = tabulate_claims(tmp_path, claims)
-    assert all(len(cells) == len(HEAD) for cells in rows)
+    assert all(len(cells) == len(CLAIM_COLUMNS) for cells in rows)
     assert {cells[-1] for cells in rows} == {"not measured"}
     assert len({claim.says for claim in claims}) == len(claims)
     assert SIGNIFICANCE == 0.05

@@ -23,7 +23,7 @@ from gscompleter.evaluation import methods as runs_methods
 from gscompleter.evaluation import runner
 from gscompleter.evaluation.baselines.reggs import RegGSConfig
 from gscompleter.evaluation.cases import Case
-from gscompleter.evaluation.columns import GROUPS
+from gscompleter.evaluation.columns import COLUMN_GROUPS
 from gscompleter.evaluation.memory import measure_peak_memory
 from gscompleter.evaluation.methods import (
     BASELINES,
@@ -167,7 +167,7 @@ def test_geometry_of_few_pixels_is_left_out(finished):
     summary = summarize_run(rows)
     hole, median = (
         summary.compute_cell("full", column)
-        for column in GROUPS["Geometry"]
+        for column in COLUMN_GROUPS["Geometry"]
         if column.key.startswith("depth_hole")
     )
     assert hole == (pytest.approx(0.3), 3)

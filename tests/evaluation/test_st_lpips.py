@@ -14,16 +14,16 @@ import torch
 from gscompleter.evaluation.metrics import st_lpips
 from gscompleter.evaluation.metrics.st_lpips import (
     LAYERS,
-    MIN_SIDE,
-    PACKAGE,
-    WEIGHTS,
+    MIN_NETWORK_SIDE,
+    ST_LPIPS_PACKAGE,
+    ST_LPIPS_WEIGHTS,
     compute_st_lpips,
     halve_smoothly,
     load_weights,
 )
 
 CHANNELS = (64, 192, 384, 256, 256)
-SIZES = ((MIN_SIDE, MIN_SIDE), (64, 80), (255, 130))
+SIZES = ((MIN_NETWORK_SIDE, MIN_NETWORK_SIDE), (64, 80), (255, 130))
 AUTHORS = """
 import json, sys
 from types import ModuleType
@@ -64,7 +64,7 @@ def make_pair(height: int, width: int) -> torch.Tensor:
 
 
 def test_the_score_is_that_of_the_authors_code(tmp_path):
-    if find_spec(PACKAGE) is None:
+    if find_spec(ST_LPIPS_PACKAGE) is None:
         pytest.skip("needs gscompleter[evaluation]")
     pairs = [make_pair(*size) for size in SIZES]
     torch.save(pairs, tmp_path / "pairs.pt")
@@ -89,11 +89,11 @@ def install_random_weights(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         weights[f"net.{name}.bias"] = torch.zeros(channels)
         weights[f"lin{number}.model.1.weight"] = torch.full((1, channels, 1, 1), 1 / channels)
         before = channels
-    path = folder / PACKAGE / WEIGHTS
+    path = folder / ST_LPIPS_PACKAGE / ST_LPIPS_WEIGHTS
     path.parent.mkdir(parents=True)
     torch.save(weights, path)
     # Importing it would end the test: only its file is read.
-    (folder / PACKAGE / "__init__.py").write_text("raise AssertionError('imported')")
+    (folder / ST_LPIPS_PACKAGE / "__init__.py").write_text("raise AssertionError('imported')")
     monkeypatch.syspath_prepend(folder)
 
 
@@ -106,9 +106,9 @@ def test_equal_images_have_no_distance_and_colours_are_clipped(tmp_path, monkeyp
     assert score > 0
     assert compute_st_lpips(other, image) == pytest.approx(score, rel=1e-4)
     assert compute_st_lpips(image + 5 * (image == 1), other) == score
-    assert compute_st_lpips(image[: MIN_SIDE - 1], other[: MIN_SIDE - 1]) is None
-    assert compute_st_lpips(image[:MIN_SIDE], other[:MIN_SIDE]) is not None
-    assert PACKAGE not in sys.modules
+    assert compute_st_lpips(image[: MIN_NETWORK_SIDE - 1], other[: MIN_NETWORK_SIDE - 1]) is None
+    assert compute_st_lpips(image[:MIN_NETWORK_SIDE], other[:MIN_NETWORK_SIDE]) is not None
+    assert ST_LPIPS_PACKAGE not in sys.modules
 
 
 def test_halving_keeps_a_constant_and_averages_nine_pixels():

@@ -17,7 +17,7 @@ from gscompleter.data.frame import Frame
 from gscompleter.data.photographs import Photographs
 from gscompleter.evaluation import methods, steps, store
 from gscompleter.evaluation.baselines.reggs import RegGSConfig
-from gscompleter.evaluation.columns import GROUPS
+from gscompleter.evaluation.columns import COLUMN_GROUPS
 from gscompleter.evaluation.methods import METHODS
 from gscompleter.evaluation.metrics import scores
 from gscompleter.evaluation.metrics.scores import compute_depth_scale
@@ -98,7 +98,7 @@ def few_clusters():
 def small_holes():
     """Accept the small holes of this room, of about 45 to 60 pixels."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(scores, "MIN_PIXELS", 40)
+        patch.setattr(scores, "MIN_DEPTH_PIXELS", 40)
         yield
 
 
@@ -281,7 +281,7 @@ def test_without_measured_depth_the_scale_is_relative_to_the_model(begun):
 def test_the_drift_is_that_between_the_largest_and_the_smallest_scale():
     assert compute_scale_drift([1.0, 1.1, 0.9]) == pytest.approx(math.log(1.1 / 0.9))
     assert compute_scale_drift([1.0]) is None
-    drift = next(column for column in GROUPS["Sequences"] if column.key == "scale_drift")
+    drift = next(column for column in COLUMN_GROUPS["Sequences"] if column.key == "scale_drift")
     row = {"steps": [{"depth_scale": scale} for scale in (1.0, None, 2.0)]}
     assert drift.compute_row(row) == pytest.approx(math.log(2))
 

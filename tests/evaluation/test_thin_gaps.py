@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from gscompleter.evaluation.gap_pictures import LABEL_HEIGHT, ZOOM, draw_gap
+from gscompleter.evaluation.gap_pictures import LABEL_HEIGHT, PIXEL_ZOOM, draw_gap
 from gscompleter.evaluation.metrics.thin_gaps import (
     WINDOW,
     find_thin_gaps,
@@ -96,10 +96,10 @@ def test_the_worst_place_is_the_window_with_most_gaps_of_all_renders():
     assert torch.equal(worst.crop[..., 0], window)
 
     picture = draw_gap(worst)
-    side = ZOOM * WINDOW
+    side = PIXEL_ZOOM * WINDOW
     assert picture.shape == (LABEL_HEIGHT + side, 2 * side, 3)
     # The pixels of the window as squares below a line that is not empty, and again with marks.
-    pixels = picture[LABEL_HEIGHT::ZOOM, ::ZOOM]
+    pixels = picture[LABEL_HEIGHT::PIXEL_ZOOM, ::PIXEL_ZOOM]
     assert (pixels[:, :WINDOW, 0] == (255 * window + 0.5).int().numpy()).all()
     is_marked = (pixels[:, WINDOW:] == (255, 0, 255)).all(axis=-1)
     assert (is_marked == find_thin_gaps(much)[worst.box].numpy()).all()
@@ -109,5 +109,5 @@ def test_the_worst_place_is_the_window_with_most_gaps_of_all_renders():
 
 def test_without_gaps_there_is_no_place_and_the_picture_says_so():
     assert find_worst_gap({"at the target": make_render(torch.ones(80, 90))}) is None
-    assert draw_gap(None).shape == (LABEL_HEIGHT, 2 * ZOOM * WINDOW, 3)
+    assert draw_gap(None).shape == (LABEL_HEIGHT, 2 * PIXEL_ZOOM * WINDOW, 3)
     assert (draw_gap(None) == 0).any()

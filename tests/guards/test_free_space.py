@@ -76,7 +76,7 @@ def test_a_gaussian_just_beyond_the_border_shows_and_is_judged_by_the_border(mon
     far_outside = torch.tensor([[x - 1.0, 0.0, 1.0]])
     assert find_in_free_space(just_outside, see(wall(4.0))).all()
     assert not find_in_free_space(far_outside, see(wall(4.0))).any()
-    monkeypatch.setattr(free_space, "BORDER", 0)
+    monkeypatch.setattr(free_space, "OUTER_BORDER", 0)
     assert not find_in_free_space(just_outside, see(wall(4.0))).any()
 
 

@@ -1,6 +1,6 @@
 """The figures of `tests/support/density.py`, on a file that can be counted by hand."""
 
-from density import measure
+from density import find_repeated, measure, parse_files
 
 SOURCE = '''"""A module."""
 
@@ -24,6 +24,14 @@ def join(a, b):
 def run():
     return pack(WIDTH)
 '''
+
+
+def test_a_constant_of_two_modules_is_repeated_and_the_variable_of_a_comprehension_is_not(tmp_path):
+    (tmp_path / "a.py").write_text("SIDE: int = 3\nSIZES = [n for n in range(SIDE)]\n")
+    (tmp_path / "b.py").write_text("SIDE, _TOP = 4, 5\nDOUBLES = [2 * n for n in range(SIDE)]\n")
+    (tmp_path / "c.py").write_text("__all__ = []\n_TOP = 6\n")
+    (tmp_path / "d.py").write_text("from a import SIZES\n__all__ = []\n")
+    assert find_repeated(parse_files([tmp_path])) == ["SIDE", "_TOP"]
 
 
 def test_figures_are_those_that_one_counts(tmp_path):

@@ -9,7 +9,7 @@ from color_fits import fit_with, measure_covered
 from gscompleter.reconstructors.plane_sweep.linear_colors import (
     LinearColors,
     fit_linear_colors,
-    invert_symmetric,
+    invert_3x3,
 )
 from gscompleter.reconstructors.plane_sweep.virtual_views import (
     find_nearest_camera,
@@ -72,7 +72,7 @@ def test_a_matrix_times_its_inverse_is_one():
     generator = torch.Generator().manual_seed(0)
     roots = torch.randn(20, 3, 3, generator=generator)
     matrices = roots @ roots.transpose(1, 2) + 0.1 * torch.eye(3)
-    products = matrices @ invert_symmetric(matrices)
+    products = matrices @ invert_3x3(matrices)
     assert torch.allclose(products, torch.eye(3).expand(20, 3, 3), atol=1e-3)
 
 

@@ -15,8 +15,8 @@ from gscompleter.render import lod as proxies
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import (
-    MAX_DEVIATION,
     MAX_REACH,
+    MAX_RUN_DEVIATION,
     build_proxy,
     simplify_scene,
     thin_gaussians,
@@ -85,12 +85,12 @@ def test_runs_lie_within_half_a_pixel():
     pixel = pixel_at(CROWD[first])[PROXY.proxy_index]
     assert (apart <= 1.001 * MAX_REACH * pixel).all()
     shared = torch.bincount(PROXY.proxy_index)[PROXY.proxy_index] > 1
-    assert (CROWD.scales.amax(dim=1) <= 1.001 * MAX_DEVIATION * pixel)[shared].all()
+    assert (CROWD.scales.amax(dim=1) <= 1.001 * MAX_RUN_DEVIATION * pixel)[shared].all()
 
 
 def test_what_is_large_or_alone_stays_to_the_bit():
     scene = in_order(random_gaussians(500, sh_degree=1))
-    huge = replace(scene, scales=scene.scales + 100 * MAX_DEVIATION * pixel_at(scene)[:, None])
+    huge = replace(scene, scales=scene.scales + 100 * MAX_RUN_DEVIATION * pixel_at(scene)[:, None])
     for given in (huge, scene[::25]):
         proxy = simplify_scene(given, CAMERAS)
         assert len(proxy.rendered) == len(given)

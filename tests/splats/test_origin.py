@@ -11,7 +11,7 @@ import torch
 import gscompleter as gsc
 from command import run
 from gscompleter import InputError, load_ply, load_splat, merge, save_ply, save_splat
-from gscompleter.apps.inspection import describe_range
+from gscompleter.apps.inspection import describe_interval
 from gscompleter.splats import ply
 from gscompleter.splats.conversion import convert_splat
 from gscompleter.splats.formats import describe_oddities
@@ -214,9 +214,9 @@ def test_inspect_prints_digits_that_tell_the_ends_apart(tmp_path, monkeypatch, c
     assert np.abs(np.array(found["extent"])[:, 0] - means.min(0)).max() < EXACT
     assert np.abs(np.array(found["extent"])[:, 1] - means.max(0)).max() < EXACT
     assert any("is read relative to (50" in note for note in found["notes"])
-    assert describe_range(4649775.512, 4649777.489) == "4649775.512 to 4649777.489"
-    assert describe_range(-1.25, 2.5) == "-1.25 to 2.5"
-    assert describe_range(0.0, 0.0) == "0 to 0"
+    assert describe_interval(4649775.512, 4649777.489) == "4649775.512 to 4649777.489"
+    assert describe_interval(-1.25, 2.5) == "-1.25 to 2.5"
+    assert describe_interval(0.0, 0.0) == "0 to 0"
 
 
 def test_corners_have_digits_that_tell_their_sides():

@@ -13,7 +13,7 @@ from gscompleter import InputError, load_ply, load_splat, save_ply, save_splat
 from gscompleter.splats.formats import get_labels_path, read_provenance
 from gscompleter.splats.layout import save_like, strip
 from gscompleter.splats.provenance import (
-    MAX_TEXT,
+    MAX_NOTE_LENGTH,
     SCHEMA,
     ModelRecord,
     Provenance,
@@ -156,7 +156,7 @@ def test_a_damaged_record_beside_a_file_is_refused(tmp_path, table):
 def test_names_that_users_choose_are_short_enough_for_a_line(tmp_path):
     """Readers of .ply bound the length of a line, ours at 4096 bytes."""
     long = shorten("☃" * 500)
-    assert len(long) == MAX_TEXT
+    assert len(long) == MAX_NOTE_LENGTH
     model = ModelRecord(long, long, long)
     run_of_all = RunRecord("gscompleter", "0.1.0", (1, 254), model, None, model, None, 1, "f" * 64)
     save_ply(tmp_path / "a.ply", random_gaussians(5), made_by=Provenance((run_of_all,)))

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from gscompleter import GSCompleter
-from gscompleter.apps.report.plain_words import describe_losses
+from gscompleter.apps.report.plain_words import describe_empty_part
 from gscompleter.apps.report.schema import UnfilledRow
 from gscompleter.completer import check_any_completed
 from gscompleter.config import CompleterConfig
@@ -60,7 +60,7 @@ def test_the_guard_that_empties_a_part_is_named_with_its_place(monkeypatch):
     reason = "a filling would make given photographs worse"
     assert note == f"{share} % of the hole stays empty, because {reason}."
     assert note in result.warnings
-    (details,) = describe_losses(UnfilledRow(left.share, left.lost_by, left.regions))
+    (details,) = describe_empty_part(UnfilledRow(left.share, left.lost_by, left.regions))
     assert f"x {left.regions[0][0]} to {left.regions[0][2]}" in details
     assert "psnr " in details
 

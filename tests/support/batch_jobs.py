@@ -23,7 +23,7 @@ from gscompleter.system.jobs.jobs import (
     Engine,
     Job,
     Pool,
-    Share,
+    WorkerShare,
     find_missing_jobs,
     has_row,
     make_folder,
@@ -36,7 +36,7 @@ from gscompleter.system.jobs.jobs import (
 def open_here(workers: int) -> Iterator[Pool]:
     """Open a pool whose shares run in this process: no other has to start."""
 
-    def start(share: Share) -> Future[Exception | None]:
+    def start(share: WorkerShare) -> Future[Exception | None]:
         future: Future[Exception | None] = Future()
         future.set_result(share())
         return future

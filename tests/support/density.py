@@ -6,7 +6,7 @@ python tests/support/density.py [FOLDER OR FILE ...]
     packed     assignments of several unrelated values (`a, b = x, y`), per 100 functions
     one-use    functions of a module with at most eight lines and one use, of all of them
     length     lines of a function: the median, and what nine of ten stay below
-    repeated   public names that several modules define
+    repeated   names of functions, classes and constants that several modules define
 """
 
 from __future__ import annotations
@@ -16,8 +16,9 @@ import ast
 import re
 import tokenize
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from statistics import median, quantiles
 
@@ -65,6 +66,11 @@ def list_files(places: Sequence[Path]) -> list[Path]:
     ]
 
 
+def parse_files(places: Sequence[Path]) -> dict[Path, ast.Module]:
+    """Parse the files of folders, and files that are given themselves."""
+    return {file: ast.parse(file.read_text("utf-8")) for file in list_files(places)}
+
+
 def count_comments(file: Path) -> int:
     """Count the lines that hold a comment alone, without those that instruct a tool."""
     with tokenize.open(file) as text:
@@ -91,31 +97,50 @@ def measure_length(function: ast.FunctionDef | ast.AsyncFunctionDef) -> int:
     return (body[-1].end_lineno or 0) - body[0].lineno + 1
 
 
+def list_names(statement: ast.stmt) -> list[str]:
+    """List the names that a statement of a module defines, without those of Python itself."""
+    if isinstance(statement, (*FUNCTIONS, ast.ClassDef)):
+        return [statement.name]
+    targets: list[ast.expr] = []
+    if isinstance(statement, ast.Assign):
+        targets = statement.targets
+    elif isinstance(statement, ast.AnnAssign):
+        targets = [statement.target]
+    nodes = [node for target in targets for node in ast.walk(target)]
+    names = [node.id for node in nodes if isinstance(node, ast.Name)]
+    return [name for name in names if not name.startswith("__")]
+
+
 def iterate_functions(tree: ast.AST) -> Iterator[ast.FunctionDef | ast.AsyncFunctionDef]:
     """List all functions and methods."""
     return (node for node in ast.walk(tree) if isinstance(node, FUNCTIONS))
 
 
+def find_repeated(trees: Mapping[Path, ast.Module]) -> list[str]:
+    """Find the names that several modules define."""
+    homes = defaultdict[str, set[Path]](set)
+    for file, tree in trees.items():
+        for name in chain.from_iterable(map(list_names, tree.body)):
+            homes[name].add(file)
+    return sorted(name for name, files in homes.items() if len(files) > 1)
+
+
 def measure(places: Sequence[Path], users: Sequence[Path] = ()) -> Density:
     """Measure the files of some folders; uses of a function are counted in `users`, too."""
-    files = list_files(places)
-    trees = {file: ast.parse(file.read_text("utf-8")) for file in files}
+    trees = parse_files(places)
     words = Counter[str]()
-    for file in {*files, *list_files(users)}:
+    for file in {*trees, *list_files(users)}:
         words.update(re.findall(r"[A-Za-z_]\w*", file.read_text("utf-8")))
-    homes = defaultdict[str, set[Path]](set)
     own = []
-    for file, tree in trees.items():
+    for tree in trees.values():
         for node in tree.body:
-            if isinstance(node, (*FUNCTIONS, ast.ClassDef)) and not node.name.startswith("_"):
-                homes[node.name].add(file)
             if isinstance(node, FUNCTIONS):
                 own.append(node)
     definitions = Counter(function.name for function in own)
     nodes = [node for tree in trees.values() for node in ast.walk(tree)]
     return Density(
-        lines=sum(len(file.read_text("utf-8").splitlines()) for file in files),
-        comments=sum(map(count_comments, files)),
+        lines=sum(len(file.read_text("utf-8").splitlines()) for file in trees),
+        comments=sum(map(count_comments, trees)),
         packed=sum(map(is_packed, nodes)),
         lengths=[measure_length(f) for tree in trees.values() for f in iterate_functions(tree)],
         num_module_functions=len(own),
@@ -127,7 +152,7 @@ def measure(places: Sequence[Path], users: Sequence[Path] = ()) -> Density:
             and definitions[function.name] == 1
             and words[function.name] == 2
         ],
-        repeated=sorted(name for name, places in homes.items() if len(places) > 1),
+        repeated=find_repeated(trees),
     )
 
 

@@ -22,7 +22,7 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, script: str) -> No
     """Replace the process that runs COLMAP by a script."""
     (tmp_path / "stand_in_mapping.py").write_text(script)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(poses, "PROCESS", "stand_in_mapping")
+    monkeypatch.setattr(poses, "MAPPING_PROCESS", "stand_in_mapping")
     monkeypatch.setattr(poses, "find_spec", lambda name: True)  # COLMAP itself is not needed
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from PIL import Image
 
-from gscompleter.data.colmap import MODELS
+from gscompleter.data.colmap import CAMERA_MODELS
 from gscompleter.data.scene import write_cameras
 from gscompleter.system.files.image import write_image
 from gscompleter.types import Camera, View
@@ -72,7 +72,7 @@ def write_colmap_binary(
     """Write cameras.bin, images.bin and points3D.bin of the room's first cameras, with features."""
     folder.mkdir(parents=True, exist_ok=True)
     numbers = struct.pack(f"<{len(parameters)}d", *parameters)
-    camera = struct.pack("<QIiQQ", 1, 7, MODELS[model].number, *size) + numbers
+    camera = struct.pack("<QIiQQ", 1, 7, CAMERA_MODELS[model].number, *size) + numbers
     (folder / "cameras.bin").write_bytes(camera)
     images = struct.pack("<Q", len(names))
     for number, (name, camera_) in enumerate(zip(names, CAMERAS, strict=False)):

@@ -15,7 +15,7 @@ import torch
 from PIL import Image
 
 from gscompleter.system import progress
-from gscompleter.system.files.display import MAX_SIDE, embed_picture
+from gscompleter.system.files.display import MAX_NOTEBOOK_SIDE, embed_picture
 from gscompleter.system.progress import NotebookDisplay, show_in_notebook, stage, track
 from gscompleter.types import DepthMap, Render, View
 from scenes import Room, camera_at, random_gaussians, view_of
@@ -61,8 +61,8 @@ def test_a_notebook_shows_the_image_itself(view):
 
 
 def test_pictures_are_bounded_and_escaped():
-    html = embed_picture(torch.zeros(30, 3 * MAX_SIDE), "<script>")
-    assert f'width="{MAX_SIDE}"' in html
+    html = embed_picture(torch.zeros(30, 3 * MAX_NOTEBOOK_SIDE), "<script>")
+    assert f'width="{MAX_NOTEBOOK_SIDE}"' in html
     assert "<script>" not in html
     assert "http" not in html
 

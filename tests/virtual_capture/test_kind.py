@@ -93,7 +93,7 @@ def test_cameras_that_were_found_close_to_an_object_say_nothing(monkeypatch):
 def test_cameras_of_the_user_that_stand_between_walls_make_a_scene(monkeypatch):
     # A room whose walls nobody would take for those of a scene, if it were not for the cameras.
     monkeypatch.setattr(kind, "MAX_BOUNDED", 1.0)
-    monkeypatch.setattr(kind, "MIN_OPEN", 0.0)
+    monkeypatch.setattr(kind, "MIN_SEEN_FROM_OUTSIDE", 0.0)
     hall = room([face for face in ALL_FACES if face != CEILING])
     inside = [make_camera((x, 0.0, -1.2)) for x in (-1.0, 0.0, 1.0)]
     outside = [make_camera((x, -3.0, -9.0)) for x in (-1.0, 0.0, 1.0)]

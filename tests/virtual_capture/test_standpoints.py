@@ -10,7 +10,7 @@ from gscompleter.config.settings import COVERED
 from gscompleter.numerics.geometry import add_near_plane, measure_rotation
 from gscompleter.render.loading import load_renderer
 from gscompleter.types import Gaussians, merge
-from gscompleter.virtual_capture.quality import NOTHING, measure_quality
+from gscompleter.virtual_capture.quality import NOTHING, measure_camera_quality
 from gscompleter.virtual_capture.standpoints import (
     choose_cameras_around_place,
     find_standpoints,
@@ -30,7 +30,7 @@ def room() -> Gaussians:
 
 
 def measure(scene: Gaussians, camera) -> float:
-    return measure_quality(scene, camera, RENDERER.freeze(scene, camera)).score
+    return measure_camera_quality(scene, camera, RENDERER.freeze(scene, camera)).score
 
 
 def test_a_view_of_surfaces_is_better_than_one_of_mist_or_of_nothing(room):
@@ -38,7 +38,7 @@ def test_a_view_of_surfaces_is_better_than_one_of_mist_or_of_nothing(room):
     assert measure(room, inside) > 0.2
     assert measure(random_gaussians(2000), inside) < 0.5 * measure(room, inside)
     away = camera_at(z=-50.0, yaw=180, size=SIZE)
-    assert measure_quality(room, away, RENDERER.freeze(room, away)) == NOTHING
+    assert measure_camera_quality(room, away, RENDERER.freeze(room, away)) == NOTHING
     # Close to a wall, one Gaussian fills much of the image.
     assert measure(room, camera_at(z=4.9, size=SIZE)) < measure(room, inside)
 

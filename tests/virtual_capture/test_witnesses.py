@@ -12,8 +12,8 @@ from gscompleter.trust.lifted import find_pixel_center
 from gscompleter.types import Camera, Gaussians, merge
 from gscompleter.virtual_capture.witnesses import (
     MAX_WITNESSES,
-    SIDE,
     WIDE,
+    WITNESS_SIDE,
     Witnesses,
     choose_witnesses,
     divide_witnesses,
@@ -92,6 +92,6 @@ def test_witnesses_of_a_lifted_splat_stand_beside_its_camera():
     found = find_witnesses(scene, find_pixel_center(scene), UP, RENDERER)
     assert len(found) > 12
     for camera in found:
-        assert (camera.width, camera.height) == (SIDE, SIDE)
+        assert (camera.width, camera.height) == (WITNESS_SIDE, WITNESS_SIDE)
         assert camera.center.norm() < 1.5
         assert camera.forward[2] > 0.9

@@ -17,7 +17,7 @@ from torch import Tensor
 from gscompleter import __version__
 from gscompleter.apps.command_line.answers import print_answer
 from gscompleter.apps.completing.preparation import open_input, read_splat
-from gscompleter.apps.completing.run_info import describe_run, refuse_results
+from gscompleter.apps.completing.run_info import describe_run_values, refuse_results
 from gscompleter.apps.inputs.depth_range import apply_splat_range
 from gscompleter.apps.inputs.describing import describe_opening, print_lines
 from gscompleter.apps.inputs.reading import read_photographs
@@ -25,7 +25,7 @@ from gscompleter.apps.inputs.splat import locate_splat, move_to_splat
 from gscompleter.apps.inputs.taken_out import take_over_edits
 from gscompleter.apps.inputs.task import InputSplatFile
 from gscompleter.apps.report.cleaning_picture import (
-    PICTURE_FILE,
+    REMOVED_PICTURE_FILE,
     RemovalSeen,
     choose_cameras,
     draw_removal_rows,
@@ -55,8 +55,8 @@ from gscompleter.system.progress import show_progress, stage, track
 from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.types import Camera, Gaussians, View
 
-COMMAND = "clean"
-RESULTS = (COMPLETED_FILE, REMOVED_FILE, PICTURE_FILE, SUMMARY_FILE, *EDITS)
+CLEAN_COMMAND = "clean"
+CLEANING_FILES = (COMPLETED_FILE, REMOVED_FILE, REMOVED_PICTURE_FILE, SUMMARY_FILE, *EDITS)
 """Files that it may write."""
 
 
@@ -86,7 +86,7 @@ def clean_splat(request: CleaningRequest) -> None:
     console = make_console(stderr=True, quiet=results.answer.quiet)
     with (
         show_progress(console),
-        reserve_output(results.out, results.overwrite, COMMAND, RESULTS) as output,
+        reserve_output(results.out, results.overwrite, CLEAN_COMMAND, CLEANING_FILES) as output,
     ):
         if request.dry_run:
             refuse_results(results.out)
@@ -113,7 +113,7 @@ def clean_splat(request: CleaningRequest) -> None:
                 )
                 record_edit(
                     folder,
-                    EditDraft(COMMAND),
+                    EditDraft(CLEAN_COMMAND),
                     rows=len(cleaning.given),
                     appended=(),
                     given=cleaning.splat_file.path,
@@ -126,9 +126,9 @@ def clean_splat(request: CleaningRequest) -> None:
                 picture = draw_removal_rows(
                     cleaning.given, cleaning.removed, cleaning.cameras, cleaning.renderer
                 )
-                write_image(folder / PICTURE_FILE, picture)
+                write_image(folder / REMOVED_PICTURE_FILE, picture)
             (folder / SUMMARY_FILE).write_bytes(json.dumps(summary, indent=2).encode() + b"\n")
-    lines = describe_result(summary, request)
+    lines = describe_cleaned_files(summary, request)
     print_answer(results.answer, json.loads((results.out / SUMMARY_FILE).read_bytes()), lines)
 
 
@@ -166,7 +166,7 @@ def clean_by_photographs(
     config = request.config.strengthen(request.strength)
     with record_seconds(()) as seconds, timed_stage("clean"):
         removed = find_superfluous(given, task.views, renderer, config)
-    run_info = describe_run(
+    run_info = describe_run_values(
         photographs,
         splat,
         opened,
@@ -255,7 +255,7 @@ def score_cleaning(
     return rows, seen
 
 
-def describe_result(summary: Mapping[str, Any], request: CleaningRequest) -> list[str]:
+def describe_cleaned_files(summary: Mapping[str, Any], request: CleaningRequest) -> list[str]:
     """Describe what went, and which file is what; the last line names the cleaned splat."""
     counts = summary["gaussians"]
     out = request.results.out
@@ -265,7 +265,9 @@ def describe_result(summary: Mapping[str, Any], request: CleaningRequest) -> lis
         lines = [describe_cleaning(summary)]
     if counts["removed"] > 0:
         goes = "would go" if request.dry_run else "went"
-        lines.append(f"What {goes}: {out / REMOVED_FILE}; {out / PICTURE_FILE} shows it in red.")
+        lines.append(
+            f"What {goes}: {out / REMOVED_FILE}; {out / REMOVED_PICTURE_FILE} shows it in red."
+        )
     if request.dry_run:
         lines.append(f"Nothing was cleaned; leave out --dry-run to write {COMPLETED_FILE}.")
     else:

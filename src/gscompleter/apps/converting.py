@@ -37,9 +37,9 @@ from gscompleter.system.files.writing import REMOVED_FILE
 from gscompleter.system.progress import stage
 from gscompleter.types import Gaussians
 
-MAX_SHIFT = 1000.0
+MAX_EXACT_SHIFT = 1000.0
 """Longest shift, in scene units, after which coordinates certainly fit float32."""
-MIN_SHOWN = 50_000_000
+MIN_LOGGED_BYTES = 50_000_000
 """Size of the files, in bytes, from which on a log says that they are converted."""
 CAMERAS_FILE = "cameras.json"
 """File of a trainer with the cameras of its splat, which lies beside it."""
@@ -75,7 +75,7 @@ def convert(request: ConversionRequest) -> Conversion:
 def show_conversion(sources: Sequence[Path]) -> AbstractContextManager[object]:
     """Show the conversion of large files, which takes seconds; a small one is done at once."""
     size = sum(source.stat().st_size for source in sources if source.is_file())
-    return stage("converting") if size >= MIN_SHOWN else nullcontext()
+    return stage("converting") if size >= MIN_LOGGED_BYTES else nullcontext()
 
 
 def convert_sources(
@@ -140,7 +140,7 @@ def can_be_streamed(
         return False
     # The origin of a moved splat is chosen by all of its Gaussians.
     if operations.similarity is not None and (
-        max(map(abs, operations.translate)) > MAX_SHIFT or find_origin(sources[0]) is not None
+        max(map(abs, operations.translate)) > MAX_EXACT_SHIFT or find_origin(sources[0]) is not None
     ):
         return False
     return is_ply_to_ply(sources[0], request.out)

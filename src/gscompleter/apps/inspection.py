@@ -39,15 +39,13 @@ from gscompleter.splats.formats import (
     read_provenance,
 )
 from gscompleter.splats.origin import count_digits
+from gscompleter.splats.ply import MIDDLE_QUANTILES
 from gscompleter.splats.provenance import ModelRecord, RunRecord
 from gscompleter.splats.row_kinds import count_row_kinds
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import COMPLETED_FILE, SUMMARY_FILE
 from gscompleter.types import Camera, Gaussians, Origin, sh_from_rgb
-
-MIDDLE = (0.01, 0.99)
-"""Quantiles of the coordinates that floaters leave alone."""
 
 ORIGINS = {
     "given": "as they were",
@@ -64,7 +62,7 @@ Bounds = tuple[tuple[float, float], ...]
 
 
 @dataclass(frozen=True)
-class RunRow:
+class MadeRow:
     """Gaussians that one run added, or whose run the file does not name."""
 
     gaussians: int
@@ -107,7 +105,7 @@ class Inspection:
     from_photographs: int
     origins: Mapping[str, int] | None
     """Gaussians by their kind, as the record of edits beside the file tells; None if none does."""
-    runs: tuple[RunRow, ...]
+    runs: tuple[MadeRow, ...]
     record_defect: str | None
     """Why the record of the runs cannot be read; None if it can, or if there is none."""
     pictures: tuple[PictureRow, ...]
@@ -116,7 +114,7 @@ class Inspection:
 
 def inspect_splat(request: InspectionRequest) -> Inspection:
     """Inspect a file, and the pictures of it at the cameras that are known."""
-    path, folder = locate(request.file)
+    path, folder = locate_inspected(request.file)
     # Other readers refuse a file with NaN; here those Gaussians are counted, and left out.
     decoded = decode_splat(path)
     finite = find_finite(decoded)
@@ -161,7 +159,7 @@ def inspect_splat(request: InspectionRequest) -> Inspection:
     )
 
 
-def locate(file: Path) -> tuple[Path, Path | None]:
+def locate_inspected(file: Path) -> tuple[Path, Path | None]:
     """Find the splat, and the folder of the completion that it lies in, or None."""
     # The folder of `demo` holds that of its completion.
     for folder in (file, file / "completion"):
@@ -183,9 +181,9 @@ def make_bounds(
 
 
 def compute_middle(means: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Float[Tensor, "3"]]:
-    """Compute the quantiles `MIDDLE` of the coordinates, those of Gaussians that exist."""
+    """Compute the `MIDDLE_QUANTILES` of the coordinates of the Gaussians that exist."""
     # numpy sorts any number of them, and torch no more than 16 million.
-    low, high = np.quantile(means.numpy(), MIDDLE, axis=0, method="nearest")
+    low, high = np.quantile(means.numpy(), MIDDLE_QUANTILES, axis=0, method="nearest")
     return torch.from_numpy(low), torch.from_numpy(high)
 
 
@@ -194,7 +192,7 @@ def find_invented(labels: UInt8[Tensor, "n"]) -> Tensor:
     return (labels > 0) & (labels != NOT_INVENTED)
 
 
-def list_runs(labels: UInt8[Tensor, "n"], runs: Sequence[RunRecord]) -> Iterator[RunRow]:
+def list_runs(labels: UInt8[Tensor, "n"], runs: Sequence[RunRecord]) -> Iterator[MadeRow]:
     """List what each run invented, and at last what no run claims."""
     # A label that two runs name counts for the first of them, so that the counts add up.
     rest = find_invented(labels)
@@ -204,10 +202,10 @@ def list_runs(labels: UInt8[Tensor, "n"], runs: Sequence[RunRecord]) -> Iterator
             first, last = run.labels
             mine = rest & (labels >= first) & (labels <= last)
         rest = rest & ~mine
-        yield RunRow(int(mine.sum()), run.labels, run)
+        yield MadeRow(int(mine.sum()), run.labels, run)
     if rest.any():
         unknown = labels[rest]
-        yield RunRow(int(rest.sum()), (int(unknown.min()), int(unknown.max())), None)
+        yield MadeRow(int(rest.sum()), (int(unknown.min()), int(unknown.max())), None)
 
 
 def list_cameras(
@@ -293,7 +291,7 @@ def describe_splat(found: Inspection) -> Iterator[tuple[str, str]]:
         kinds = [f"{count:,} {ORIGINS[kind]}" for kind, count in found.origins.items()]
         yield "origins", ", ".join(kinds)
     for row in found.runs:
-        yield "made by", describe_run(row)
+        yield "made by", describe_run_row(row)
     if found.record_defect is not None:
         yield "made by", found.record_defect
     elif not found.runs:
@@ -303,16 +301,16 @@ def describe_splat(found: Inspection) -> Iterator[tuple[str, str]]:
 def describe_bounds(bounds: Bounds) -> str:
     """Describe an extent in scene units."""
     axes = zip("xyz", bounds, strict=True)
-    return ", ".join(f"{axis} {describe_range(low, high)}" for axis, (low, high) in axes)
+    return ", ".join(f"{axis} {describe_interval(low, high)}" for axis, (low, high) in axes)
 
 
-def describe_range(low: float, high: float) -> str:
+def describe_interval(low: float, high: float) -> str:
     """Describe a range with as many digits as tell its ends apart to a thousandth of it."""
     digits = count_digits(low, high)
     return f"{low:.{digits}g} to {high:.{digits}g}"
 
 
-def describe_run(row: RunRow) -> str:
+def describe_run_row(row: MadeRow) -> str:
     """Describe who made what, on one line."""
     if row.labels is None:
         part = "nothing invented"

@@ -20,7 +20,7 @@ from gscompleter.models.weights.published import PUBLISHED, PublishedWeights
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, quote_value
 
-KINDS = {
+WEIGHT_KINDS = {
     "Gaussians": "",
     "scene depth": ", scene depth only",
     "monocular depth": ", for --depth",
@@ -93,7 +93,7 @@ def format_model_cells(weights: PublishedWeights, path: Path | None) -> tuple[st
     count = weights.parameters
     return (
         weights.name,
-        weights.model + KINDS[weights.gives],
+        weights.model + WEIGHT_KINDS[weights.gives],
         "?" if count is None else f"{count / 1e6:.1f} M",
         f"{fewest}" if fewest == most else f"{fewest}-{most}",
         weights.size,

@@ -56,7 +56,7 @@ COSTS = {RENDERER_PART: 58, RECONSTRUCTOR_PART: 41, GENERATOR_PART: 18, SPLAT_PA
 """Time to compile each part that has kernels, in that of `time_compilation` (decision 098)."""
 PARTS = tuple(COSTS)
 """Renderer, models and part that have kernels."""
-MODELS = (RECONSTRUCTOR_PART, GENERATOR_PART)
+COMPILED_PARTS = (RECONSTRUCTOR_PART, GENERATOR_PART)
 """Parts that are compiled in a process of their own, beside the others."""
 CHILD = "import sys; from gscompleter.apps.warmup import rehearse; rehearse(sys.argv[1:])"
 """Program of that process."""
@@ -68,7 +68,7 @@ WALL_DEPTH = 2.0
 """Depth of the wall, in baselines."""
 
 
-def list_missing(names: Collection[str]) -> list[str]:
+def list_uncompiled(names: Collection[str]) -> list[str]:
     """List those of some parts whose kernels are not compiled."""
     return [name for name in PARTS if name in names and not is_compiled(name)]
 
@@ -76,7 +76,7 @@ def list_missing(names: Collection[str]) -> list[str]:
 def compile_kernels(names: Collection[str]) -> float | None:
     """Compile the missing kernels of these parts; return the seconds, or None if there are none."""
     # Without a cache each kernel is compiled when it is used, and a rehearsal gains nothing.
-    if not list_missing(names) or get_cache_folder() is None:
+    if not list_uncompiled(names) or get_cache_folder() is None:
         return None
     start = time.perf_counter()
     with compile_beside(names):
@@ -90,7 +90,7 @@ def compile_beside(names: Collection[str]) -> Iterator[None]:
 
     Within the block only what needs no kernels should be done, such as reading photographs.
     """
-    missing = list_missing(names)
+    missing = list_uncompiled(names)
     # As in `compile_kernels`.
     if not missing or get_cache_folder() is None:
         yield
@@ -120,8 +120,8 @@ def compile_beside(names: Collection[str]) -> Iterator[None]:
 
 def split_work(missing: Sequence[str], threads: int) -> tuple[list[str], list[str]]:
     """Split missing parts into those for a process of their own, and the others."""
-    models = [name for name in missing if name in MODELS]
-    others = [name for name in missing if name not in MODELS]
+    models = [name for name in missing if name in COMPILED_PARTS]
+    others = [name for name in missing if name not in COMPILED_PARTS]
     # Models call the renderer at the end. By then this process has compiled its kernels, and if it
     # need not, one process is enough.
     if threads == 1 or RENDERER_PART not in others:

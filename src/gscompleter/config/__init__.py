@@ -22,8 +22,8 @@ from gscompleter.config.settings import (
 from gscompleter.system.errors import InputError, quote_value, require_path
 from gscompleter.system.plugins import is_in_file
 
-Pixels = Annotated[int, Interval(ge=0, le=4096)]
-Step = Annotated[float, Interval(gt=0, le=10)]
+PixelCount = Annotated[int, Interval(ge=0, le=4096)]
+StepSize = Annotated[float, Interval(gt=0, le=10)]
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class RegistrationConfig(Settings):
 
     iterations: Count = 6
     """Iterations of Adam; 0 keeps the affine alignment (ablation without RC)."""
-    learning_rate: Step = 0.025
+    learning_rate: StepSize = 0.025
     """Learning rate of Adam, relative to the distance of each Gaussian; it decreases to zero."""
     degrees_of_freedom: Literal[1, 3] = 1
     """1 moves Gaussians along their rays, 3 moves them freely (ablation of the paper)."""
@@ -100,7 +100,7 @@ class PaperRegistrationConfig(Settings):
 
     iterations: Count = 50
     """Iterations of Adam; 0 keeps the affine alignment (ablation without RC)."""
-    learning_rate: Step = 0.01
+    learning_rate: StepSize = 0.01
     """Learning rate of Adam, in scene units."""
     degrees_of_freedom: Literal[1, 3] = 1
     """1 moves Gaussians along their rays, 3 moves them freely (ablation)."""
@@ -129,7 +129,7 @@ class HoleConfig(Settings):
     0.5."""
     min_covered: Share = 0.02
     """Smallest share of the target image that must show the scene; others are skipped."""
-    dilation: Pixels = 3
+    dilation: PixelCount = 3
     """Pixels by which the hole mask is dilated to hide seams; 0 disables it (paper)."""
     kind: Literal["all", "enclosed"] = "all"
     """What is a hole: all empty pixels, or in an object on nothing only those that it encloses."""
@@ -138,7 +138,7 @@ class HoleConfig(Settings):
     the border of the image."""
     forces_removed: bool = False
     """Pixels that showed something removed are holes, whatever stands behind it."""
-    candidate_radius: Pixels | None = 16
+    candidate_radius: PixelCount | None = 16
     """Distance to a hole, in pixels, within which Gaussians are registered (paper: None, all)."""
 
 
@@ -172,7 +172,7 @@ class RefineConfig(Settings):
     """Most iterations of Adam; 0 keeps the lifted opacities (ablation without MV)."""
     rel_tol: Share | None = 3e-4
     """Stop if the relative decrease of the loss falls to this value. None runs all iterations."""
-    learning_rate: Step = 0.24
+    learning_rate: StepSize = 0.24
     """Learning rate of Adam, in the unit of `parametrization`."""
     parametrization: Literal["logit", "linear"] = "logit"
     """Optimized variable: the logit, as 3DGS stores it, or the opacity clamped to [0, 1]."""

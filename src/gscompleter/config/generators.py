@@ -70,9 +70,9 @@ CHOICE = (
     "function of yours as file.py:function."
 )
 """Help of the option `--generator`."""
-C = TypeVar("C")
+SettingsClass = TypeVar("SettingsClass")
 
-PLUGINS = "gscompleter.generators"
+GENERATOR_PLUGINS = "gscompleter.generators"
 """Group of entry points that name tables of further generators, from name to loader.
 
 A loader that takes settings has their class as its attribute `settings`.
@@ -88,7 +88,7 @@ def get_settings_class(name: str) -> type[GeneratorSettings]:
         return GeneratorSettings
     if isinstance(name, str) and name in GENERATORS:
         return GENERATORS[name].settings
-    others = load_plugins(PLUGINS)
+    others = load_plugins(GENERATOR_PLUGINS)
     if isinstance(name, str) and name in others:
         return getattr(others[name], "settings", GeneratorSettings)
     raise InputError(
@@ -98,7 +98,7 @@ def get_settings_class(name: str) -> type[GeneratorSettings]:
     )
 
 
-def add_options(kind: type[C]) -> type[C]:
+def add_options(kind: type[SettingsClass]) -> type[SettingsClass]:
     """Add to a class of options a field for each setting that a row of the table explains.
 
     None, their default, leaves the setting to the generator.
@@ -152,7 +152,7 @@ class GeneratorOptions(Settings):
         # Refused, not ignored: the user would believe that the setting was obeyed.
         for setting in settings:
             if not hasattr(kind, setting):
-                names = [*GENERATORS, *load_plugins(PLUGINS)]
+                names = [*GENERATORS, *load_plugins(GENERATOR_PLUGINS)]
                 knowing = [name for name in names if hasattr(get_settings_class(name), setting)]
                 raise InputError(
                     f"The generator '{self.generator}' has no setting {setting}; leave it out, or "

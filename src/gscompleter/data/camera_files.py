@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.camera_paths import find_world, is_camera_path, parse_camera_path
+from gscompleter.data.camera_paths import FOV_RANGE, find_world, is_camera_path, parse_camera_path
 from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.colmap import has_colmap, is_image_file, read_image_file, read_scene_cameras
 from gscompleter.data.frame import Frame, keep_existing, locate_images
@@ -38,17 +38,14 @@ from gscompleter.data.json_fields import (
 )
 from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, Resolution, build_photographs
-from gscompleter.data.transforms import NAME as TRANSFORMS
-from gscompleter.data.transforms import read_frames
+from gscompleter.data.transforms import TRANSFORMS_FILE, read_frames
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import is_json_list, read_head, read_json
 
-NAME = "cameras.json"
-ADVICE = "export the cameras again"
+INRIA_CAMERAS_FILE = "cameras.json"
+CAMERAS_ADVICE = "export the cameras again"
 DEFAULT_FOV = 60.0
 """SuperSplat's default field of view, in degrees."""
-FOV_RANGE = (1.0, 179.0)
-"""Range of the field of view, in degrees."""
 SPLAT_FROM_WORLD = np.array([-1.0, -1.0, 1.0])
 """Axis factors from SuperSplat's world to the splat: 180° about z."""
 
@@ -64,7 +61,7 @@ EXPORTS = (
     ((".insp", ".insv"), b"", INSTA360),
 )
 """Endings of files that are not read, what their first bytes hold, their content and what to do."""
-MODELS = (".usdz", ".fbx", ".las", ".laz", ".obj", ".stl")
+MODEL_FILE_ENDINGS = (".usdz", ".fbx", ".las", ".laz", ".obj", ".stl")
 
 
 def read_cameras(path: Path, resolution: Resolution = None) -> list[Frame]:
@@ -72,8 +69,8 @@ def read_cameras(path: Path, resolution: Resolution = None) -> list[Frame]:
     if is_image_file(path):
         return read_image_file(path)
     if os.path.isdir(path):
-        is_colmap = not os.path.isfile(path / TRANSFORMS) and has_colmap(path)
-        return read_scene_cameras(path) if is_colmap else read_frames(path / TRANSFORMS)
+        is_colmap = not os.path.isfile(path / TRANSFORMS_FILE) and has_colmap(path)
+        return read_scene_cameras(path) if is_colmap else read_frames(path / TRANSFORMS_FILE)
     refuse_other_exports(path)
     content = read_json(path, "name a file of cameras")
 
@@ -98,7 +95,7 @@ def is_in_splat_frame(path: Path) -> bool:
 
 def has_camera_list(path: Path) -> bool:
     """Check whether `path` is a JSON list of cameras, or a folder with a `cameras.json`."""
-    file = path / NAME if os.path.isdir(path) else path
+    file = path / INRIA_CAMERAS_FILE if os.path.isdir(path) else path
     return file.suffix == ".json" and os.path.isfile(file) and is_json_list(file)
 
 
@@ -108,24 +105,24 @@ def open_camera_list(path: Path) -> Iterator[Photographs]:
     Photographs lie beside the file, in `images` or another usual folder. Frames are numbered by the
     sorted names of the photographs that exist.
     """
-    file = path / NAME if os.path.isdir(path) else path
+    file = path / INRIA_CAMERAS_FILE if os.path.isdir(path) else path
     frames = locate_images(read_camera_list(file), [file.parent])
     there, notes = keep_existing(frames, str(file))
-    name = file.resolve().parent.name if file.name == NAME else file.stem
+    name = file.resolve().parent.name if file.name == INRIA_CAMERAS_FILE else file.stem
     yield replace(build_photographs(name, str(file), there), notes=notes)
 
 
 def read_camera_list(path: Path) -> list[Frame]:
     """Read the cameras of a `cameras.json` in its order, without photographs."""
-    content = read_json(path, ADVICE)
+    content = read_json(path, CAMERAS_ADVICE)
     require(
         isinstance(content, list) and content,
-        f"{quote_value(path)} lists no cameras; a list of cameras is needed, {ADVICE}.",
+        f"{quote_value(path)} lists no cameras; a list of cameras is needed, {CAMERAS_ADVICE}.",
     )
-    return [_parse_camera(entry, number, path) for number, entry in enumerate(content)]
+    return [_parse_inria_camera(entry, number, path) for number, entry in enumerate(content)]
 
 
-def _parse_camera(entry: Any, number: int, path: Path) -> Frame:
+def _parse_inria_camera(entry: Any, number: int, path: Path) -> Frame:
     title = f"camera {number} of {quote_value(path)}"
     focal = get_focal(entry, title)
     size = get_size(entry, title)
@@ -155,7 +152,7 @@ def _parse_supersplat(content: Any, path: Path, resolution: Resolution) -> list[
         # A project may hold several sets of poses; the first is read.
         sets = get_part(content, "poseSets", list)
         content = get_part(sets[0] if sets else None, "poses", list)
-    require(content, f"{quote_value(path)} holds no poses; {ADVICE}.")
+    require(content, f"{quote_value(path)} holds no poses; {CAMERAS_ADVICE}.")
     return [
         _parse_supersplat_pose(pose, f"pose {number} of {quote_value(path)}", resolution)
         for number, pose in enumerate(content)
@@ -191,7 +188,7 @@ def _build_upright_c2w(
 def refuse_other_exports(path: Path) -> None:
     """Raise an InputError with advice if `path` holds cameras of an unsupported program."""
     require(
-        path.suffix.lower() not in MODELS,
+        path.suffix.lower() not in MODEL_FILE_ENDINGS,
         f"{quote_value(path)} is a model without photographs and cameras, which is all that "
         "Scaniverse exports; record with Polycam, Record3D or 3d Scanner App, or take photographs.",
     )

@@ -22,16 +22,15 @@ from gscompleter.data.frame import Frame
 from gscompleter.data.json_fields import get_array, get_number, get_part, get_size
 from gscompleter.data.limits import require
 from gscompleter.data.local_origin import read_dataparser_transforms
-from gscompleter.data.transforms import NAME as TRANSFORMS
-from gscompleter.data.transforms import OPENCV_FROM_OPENGL
+from gscompleter.data.transforms import OPENCV_FROM_OPENGL, TRANSFORMS_FILE
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.reading import read_json
 
 DATAPARSER_FILE = "dataparser_transforms.json"
 """File of a nerfstudio run with the transform that it applied to the scene."""
-ADVICE = "export the camera path again"
+CAMERA_PATH_ADVICE = "export the camera path again"
 FOV_RANGE = (1.0, 179.0)
-"""Range of the vertical field of view, in degrees."""
+"""Range of a field of view, in degrees."""
 
 
 def is_camera_path(content: Any) -> bool:
@@ -48,11 +47,11 @@ def parse_camera_path(content: Any, path: Path) -> list[Frame]:
         "perspective path.",
     )
     entries = get_part(content, "camera_path", list)
-    require(entries, f"{quote_value(path)} holds no camera; {ADVICE}.")
+    require(entries, f"{quote_value(path)} holds no camera; {CAMERA_PATH_ADVICE}.")
     size = get_size(content, str(path), "render_width", "render_height")
     to_photographs = find_world(path)
     return [
-        _parse_camera(entry, f"camera {number} of {quote_value(path)}", size, to_photographs)
+        _parse_path_camera(entry, f"camera {number} of {quote_value(path)}", size, to_photographs)
         for number, entry in enumerate(entries)
     ]
 
@@ -66,9 +65,11 @@ def find_world(path: Path) -> Float[np.ndarray, "4 4"] | None:
         return None
     # The trained frame is `dataparser` applied to the reconstruction, so its inverse leads back.
     to_original = np.linalg.inv(read_dataparser_transforms(dataparser))
-    scenes = [folder / TRANSFORMS for folder in folders if os.path.isfile(folder / TRANSFORMS)]
+    scenes = [
+        folder / TRANSFORMS_FILE for folder in folders if os.path.isfile(folder / TRANSFORMS_FILE)
+    ]
     for scene in scenes:
-        content = read_json(scene, ADVICE)
+        content = read_json(scene, CAMERA_PATH_ADVICE)
         if isinstance(content, dict) and content.get("applied_transform") is not None:
             # `ns-process-data` rotates COLMAP's world before it writes transforms.json. Photographs
             # read from that file are in the rotated world.
@@ -77,7 +78,7 @@ def find_world(path: Path) -> Float[np.ndarray, "4 4"] | None:
     return to_original
 
 
-def _parse_camera(
+def _parse_path_camera(
     entry: Any,
     title: str,
     size: tuple[int, int],

@@ -31,6 +31,9 @@ FLOAT_NOISE = 1e-6
 SAME_ASPECT = 0.02
 """Relative difference of aspect ratios that rounding of sizes explains."""
 
+Poses = Float[np.ndarray, "n 4 4"]
+"""Camera-to-world matrices."""
+
 
 @dataclass(frozen=True)
 class Pinhole:

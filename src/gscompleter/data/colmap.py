@@ -34,12 +34,12 @@ from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import read_point_cloud
 from gscompleter.system.errors import InputError, quote_value, refuse_pointer
 from gscompleter.system.files.reading import open_file, read_lines
-from gscompleter.types import MAX_SIDE
+from gscompleter.types import MAX_IMAGE_SIDE
 
-HOMES = ("sparse", "colmap/sparse", "distorted/sparse", "")
+MODEL_HOMES = ("sparse", "colmap/sparse", "distorted/sparse", "")
 """Folders that are models or hold numbered ones, in search order."""
 
-ENDINGS = (".bin", ".txt")
+MODEL_ENDINGS = (".bin", ".txt")
 """Endings of the files of a model, the preferred one first."""
 
 MAX_NAME = 1024
@@ -48,9 +48,9 @@ FEATURE_SIZE = 24
 """Bytes of a feature: x, y and the number of its point."""
 SIGHTING_SIZE = 8
 """Bytes of a point's sighting: the numbers of the image and of the feature."""
-MAX_LINE = 1 << 22
+MAX_FEATURES_LINE = 1 << 22
 """Longest line in characters: the features of an image."""
-MAX_BYTES = 1 << 34
+MAX_MODEL_BYTES = 1 << 34
 """Longest text file, in bytes."""
 
 
@@ -89,7 +89,7 @@ class Model(NamedTuple):
     projection: Projection = "perspective"
 
 
-MODELS = {
+CAMERA_MODELS = {
     "SIMPLE_PINHOLE": Model(0, "f cx cy"),
     "PINHOLE": Model(1, "fx fy cx cy"),
     "SIMPLE_RADIAL": Model(2, "f cx cy k1"),
@@ -109,30 +109,30 @@ MODELS = {
 }
 """Models by COLMAP's names; k4 to k6 of FULL_OPENCV are d1 to d3, sx1 and sy1 are s1 and s3."""
 
-NUMBERS = {model.number: name for name, model in MODELS.items()}
+CAMERA_MODEL_NAMES = {model.number: name for name, model in CAMERA_MODELS.items()}
 
 _IN_PIXELS = ("f", "fx", "fy", "cx", "cy")
 
 
 def find_model(name: str | int, title: str) -> Model:
     """Return the model of a name or number."""
-    known = NUMBERS.get(name) if isinstance(name, int) else name
-    if known not in MODELS:
+    known = CAMERA_MODEL_NAMES.get(name) if isinstance(name, int) else name
+    if known not in CAMERA_MODELS:
         raise InputError(
             f"The camera model {quote_value(str(name))} of {title} is not supported; undistort the "
             "photographs with `colmap image_undistorter`, which writes a PINHOLE model."
         )
-    return MODELS[known]
+    return CAMERA_MODELS[known]
 
 
 def build_intrinsics(
     model: Model, size: tuple[int, int], numbers: Sequence[float], title: str
 ) -> Intrinsics:
     """Build the intrinsics and distortion of a camera, and check their range."""
-    if not all(1 <= side <= MAX_SIDE for side in size):
+    if not all(1 <= side <= MAX_IMAGE_SIDE for side in size):
         raise InputError(
             f"The size of {title} is {quote_value(size[0])} × {quote_value(size[1])}; sides from "
-            f"1 to {MAX_SIDE} pixels are needed."
+            f"1 to {MAX_IMAGE_SIDE} pixels are needed."
         )
     names = model.parameters.split()
     if len(numbers) != len(names):
@@ -166,7 +166,7 @@ def build_intrinsics(
 def read_intrinsics(path: Path) -> dict[int, Intrinsics]:
     """Read the cameras of a cameras.bin or cameras.txt by number."""
     if _is_text(path):
-        entries = _parse_lines(path, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS…", _parse_camera)
+        entries = _parse_lines(path, "CAMERA_ID MODEL WIDTH HEIGHT PARAMS…", _parse_camera_line)
     else:
         entries = _read_binary_cameras(path)
     cameras = {}
@@ -217,16 +217,16 @@ def _is_text(path: Path) -> bool:
 def _read_binary_cameras(path: Path) -> Iterator[CameraEntry]:
     with _open_binary(path) as content:
         for _ in range(_read_count(content)):
-            number, model, width, height = _unpack(content, "<IiQQ")
+            number, model, width, height = _unpack_struct(content, "<IiQQ")
             title = f"camera {number} of {quote_value(path)}"
             count = len(find_model(model, title).parameters.split())
-            yield number, model, (width, height), _unpack(content, f"<{count}d")
+            yield number, model, (width, height), _unpack_struct(content, f"<{count}d")
 
 
 def _read_binary_images(path: Path) -> Iterator[PosedImage]:
     with _open_binary(path) as content:
         for _ in range(_read_count(content)):
-            number, *pose, camera = _unpack(content, "<I4d3dI")
+            number, *pose, camera = _unpack_struct(content, "<I4d3dI")
             # A name of any length, which ends with a zero byte.
             start = content.tell()
             end = content.find(b"\0", start, start + MAX_NAME)
@@ -242,7 +242,7 @@ def _read_binary_points(path: Path) -> Iterator[Track]:
     with _open_binary(path) as content:
         for _ in range(_read_count(content)):
             # Between the position and the length of its track, a point has a colour and an error.
-            xyz = _unpack(content, "<Q3d3Bd")[1:4]
+            xyz = _unpack_struct(content, "<Q3d3Bd")[1:4]
             track = content.read(_read_count(content) * SIGHTING_SIZE)
             yield xyz, [image for image, _ in struct.iter_unpack("<II", track)]
 
@@ -265,18 +265,18 @@ def _open_binary(path: Path) -> Iterator[mmap.mmap]:
             ) from error
 
 
-def _unpack(content: mmap.mmap, form: str) -> tuple[Any, ...]:
+def _unpack_struct(content: mmap.mmap, form: str) -> tuple[Any, ...]:
     return struct.unpack(form, content.read(struct.calcsize(form)))
 
 
 def _read_count(content: mmap.mmap) -> int:
-    return int(_unpack(content, "<Q")[0])
+    return int(_unpack_struct(content, "<Q")[0])
 
 
 def _parse_lines(path: Path, form: str, parse: Callable[[str], Entry]) -> Iterator[Entry]:
     """Parse the lines with content; a line without the words of `form` becomes an InputError."""
     # Names may have any encoding and are passed to the file system unchanged.
-    lines = read_lines(path, MAX_LINE, MAX_BYTES, errors="surrogateescape")
+    lines = read_lines(path, MAX_FEATURES_LINE, MAX_MODEL_BYTES, errors="surrogateescape")
     for number, raw_line in enumerate(lines, start=1):
         line = raw_line.strip()
         if not line or line.startswith("#"):
@@ -291,7 +291,7 @@ def _parse_lines(path: Path, form: str, parse: Callable[[str], Entry]) -> Iterat
         yield entry
 
 
-def _parse_camera(line: str) -> CameraEntry:
+def _parse_camera_line(line: str) -> CameraEntry:
     number, model, width, height, *words = line.split()
     return int(number), model, (int(width), int(height)), [float(word) for word in words]
 
@@ -332,7 +332,7 @@ def open_colmap(path: Path) -> Iterator[Photographs]:
     notes += (*missing, *depth_notes)
     notes += _describe_orientation(there[0])
     photographs = build_photographs(roots[-1].name, str(model), there)
-    yield replace(photographs, notes=notes, sparse=_make_point_reader(model))
+    yield replace(photographs, notes=notes, sparse=_make_model_point_reader(model))
 
 
 def _describe_orientation(frame: Frame) -> tuple[str, ...]:
@@ -372,7 +372,7 @@ def _select_largest(path: Path) -> tuple[Path, list[Frame], tuple[str, ...]]:
 def is_image_file(path: Path) -> bool:
     """Check whether `path` is the images file of a COLMAP model."""
     name = path.name.casefold()
-    return name in {f"images{ending}" for ending in ENDINGS} and os.path.isfile(path)
+    return name in {f"images{ending}" for ending in MODEL_ENDINGS} and os.path.isfile(path)
 
 
 def _find_models(path: Path) -> list[Path]:
@@ -381,7 +381,7 @@ def _find_models(path: Path) -> list[Path]:
         return [path]
     if not os.path.isdir(path):
         return []
-    for name in HOMES:
+    for name in MODEL_HOMES:
         home = find_path(path, name)
         if home is None or not os.path.isdir(home):
             continue
@@ -401,7 +401,7 @@ def _find_models(path: Path) -> list[Path]:
 
 def _find_model_file(folder: Path, name: str) -> Path | None:
     """Find a file of a model, preferring binary; None if there is none."""
-    return find_file([folder], [name + ending for ending in ENDINGS])
+    return find_file([folder], [name + ending for ending in MODEL_ENDINGS])
 
 
 def read_image_file(path: Path) -> list[Frame]:
@@ -449,7 +449,7 @@ def _list_roots(scene: Path, model: Path) -> list[Path]:
     # Photographs may lie beside the model, or beside any folder on the way up to the scene.
     top = Path(os.path.abspath(scene))
     roots = [Path(os.path.abspath(model))]
-    parts = {part for home in HOMES if home for part in home.split("/")}
+    parts = {part for home in MODEL_HOMES if home for part in home.split("/")}
     while True:
         folder = roots[-1]
         home = folder.parent if folder.name.isdecimal() else folder
@@ -458,7 +458,7 @@ def _list_roots(scene: Path, model: Path) -> list[Path]:
         roots.append(folder.parent)
 
 
-def _make_point_reader(model: Path) -> partial[Float[np.ndarray, "n 3"]] | None:
+def _make_model_point_reader(model: Path) -> partial[Float[np.ndarray, "n 3"]] | None:
     """Return a reader of the model's points; None if it has no file of points."""
     path = _find_model_file(model, "points3D")
     if path is not None:

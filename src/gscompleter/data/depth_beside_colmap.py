@@ -27,13 +27,13 @@ from gscompleter.data.limits import MAX_NUMBER, require
 from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.image import open_image
 from gscompleter.system.files.reading import read_bytes, read_json
-from gscompleter.types import MAX_SIDE
+from gscompleter.types import MAX_IMAGE_SIDE
 
 DENSE = "stereo/depth_maps"
 """Folder of COLMAP's dense depth."""
 DENSE_ENDINGS = (".geometric.bin", ".photometric.bin")
 """Its files after the name of the photograph; the first are checked against other photographs."""
-PARAMETERS = "depth_params.json"
+DEPTH_PARAMETERS_FILE = "depth_params.json"
 """File with the scale and offset of each map of inverse depth."""
 INVERSE_FOLDERS = ("depths", "depth", "depths_any")
 """Folders of inverse depth, as the pages of 3DGS and its successors call them."""
@@ -46,9 +46,9 @@ MIN_INVERSE_SHARE = 0.02
 where the error of a prediction is a multiple of what it says."""
 DENSE_KIND = "depth of COLMAP's dense stereo"
 INVERSE_KIND = "inverse depth of 3DGS"
-KINDS = (DENSE_KIND, INVERSE_KIND)
+DEPTH_KINDS = (DENSE_KIND, INVERSE_KIND)
 """Names of the two kinds in notes, by which the report tells them from the depth of points."""
-MAX_NAMED = 3
+MAX_UNSCALED_PHOTOGRAPHS = 3
 """Photographs that a note names."""
 
 
@@ -72,19 +72,19 @@ def attach_depth_maps(
             for frame, path in zip(frames, dense, strict=True)
         ]
         notes.append(f"{count} of {len(frames)} photographs have {DENSE_KIND}.")
-    if not os.path.isfile(model / PARAMETERS):
+    if not os.path.isfile(model / DEPTH_PARAMETERS_FILE):
         return tuple(frames), tuple(notes)
 
-    parameters = read_parameters(model / PARAMETERS)
+    parameters = read_parameters(model / DEPTH_PARAMETERS_FILE)
     predicted = [_attach_predicted(frame, roots, parameters, listings) for frame in frames]
     count = sum(frame.predicted_depth is not None for frame in predicted)
     folders = ", ".join(INVERSE_FOLDERS)
-    note = f"{count} of {len(frames)} photographs have {INVERSE_KIND} ({PARAMETERS})"
+    note = f"{count} of {len(frames)} photographs have {INVERSE_KIND} ({DEPTH_PARAMETERS_FILE})"
     if count == 0:
         note += f"; its maps are searched in {folders} beside the photographs, as NAME.png"
     distrusted = [frame.name for frame in frames if _is_distrusted(frame, parameters)]
     if distrusted:
-        names = join_names(distrusted, MAX_NAMED)
+        names = join_names(distrusted, MAX_UNSCALED_PHOTOGRAPHS)
         note += f"; that of {names} is not used, because its scale is none or far from the others"
     return tuple(predicted), (*notes, f"{note}.")
 
@@ -154,7 +154,7 @@ def read_dense(path: Path) -> Float[np.ndarray, "h w"]:
     try:
         width, height, channels, values = data.split(b"&", 3)
         size = int(width), int(height)
-        if int(channels) != 1 or not all(1 <= side <= MAX_SIDE for side in size):
+        if int(channels) != 1 or not all(1 <= side <= MAX_IMAGE_SIDE for side in size):
             raise ValueError("it is no map of one channel")
         depth = np.frombuffer(values, "<f4").reshape(size[1], size[0])
     except ValueError as error:

@@ -26,7 +26,7 @@ FEWEST = 6
 """Fewest photographs of a camera that are searched; with fewer, nothing is found."""
 MOST = 12
 """Most photographs of a camera that are searched."""
-SIDE = 256
+COPY_SIDE = 256
 """Longer side of the small copies, in pixels."""
 MAX_TURN = 25.0
 """Largest deviation of the travel direction and the down axis from their means, in degrees."""
@@ -48,21 +48,21 @@ MAX_ROW_STEP = 4
 """Largest change of the outline from one column to the next, in rows."""
 BEND_COST = 0.1
 """Cost of each such row, relative to an edge that is static in every photograph."""
-MIN_WIDTH = 0.25
+MIN_EDGE_SHARE = 0.25
 """Smallest share of the columns with a static edge that moving ground would have moved."""
 MIN_SUPPORT = 0.6
 """Smallest static share of the length of an outline."""
-MIN_AREA = 0.01
+MIN_VEHICLE_AREA = 0.01
 """Smallest share of the image that a vehicle covers."""
 MAX_AREA = 0.5
 """Largest share of the image that a vehicle covers."""
 MAX_STATIC_ELSEWHERE = 0.3
 """Largest static share of the edges elsewhere; above it the camera hardly moves."""
-CLEARANCE = 4
+OUTLINE_CLEARANCE = 4
 """Rows between two outlines, and between an outline and other edges, in small copies."""
 MAX_DIP_WIDTH = 0.12
 """Largest width of a dip of the outline that is filled, as a share of the columns."""
-MARGIN = 1
+OUTLINE_MARGIN = 1
 """Rows added above the outline, in pixels of the small copies."""
 
 
@@ -111,7 +111,7 @@ def read_small(frames: Sequence[Frame]) -> dict[Frame, Float[np.ndarray, "h w"]]
             photograph = frame.require_photograph()
             # No vehicle carries the camera of a render.
             if isinstance(photograph, StoredPhotograph):
-                small = read_brightness(photograph.stored, SIDE)
+                small = read_brightness(photograph.stored, COPY_SIDE)
                 copies[frame] = turn_upright(small, frame.find_turn())
     shape = next((image.shape for image in copies.values()), None)
     return {frame: image for frame, image in copies.items() if image.shape == shape}
@@ -197,15 +197,15 @@ def find_static_region(
     highest = np.full(width, height)
     limit = np.full(width, height)
     while True:
-        outline = trace_outline(edges, first, limit, STRICT)
+        outline = trace_vehicle_outline(edges, first, limit, STRICT)
         if not is_vehicle(edges, outline):
             break
         # Once a vehicle is certain, its outline may be followed where it is faint.
-        top = max(first, int(outline.min()) - CLEARANCE)
-        fainter = trace_outline(edges, top, limit, LENIENT)
+        top = max(first, int(outline.min()) - OUTLINE_CLEARANCE)
+        fainter = trace_vehicle_outline(edges, top, limit, LENIENT)
         highest = np.minimum(highest, np.minimum(outline, fainter))
         # The next outline has to lie above this one.
-        limit = np.where(highest < height, highest - CLEARANCE, height)
+        limit = np.where(highest < height, highest - OUTLINE_CLEARANCE, height)
     if (highest == height).all():
         return None
 
@@ -215,7 +215,7 @@ def find_static_region(
     rows = np.pad(highest, width // 2, mode="edge").astype(np.float32)[None]
     opened = cv2.morphologyEx(rows, cv2.MORPH_OPEN, dips)[0]
     filled = opened[width // 2 :][:width].astype(np.int64)
-    return fill_below(np.where(filled < height, filled - MARGIN, height), height)
+    return fill_below(np.where(filled < height, filled - OUTLINE_MARGIN, height), height)
 
 
 def find_edges(images: Float[np.ndarray, "n h w"], flow: Float[np.ndarray, "h w 2"]) -> Edges:
@@ -235,7 +235,7 @@ def find_edges(images: Float[np.ndarray, "n h w"], flow: Float[np.ndarray, "h w 
     )
 
 
-def trace_outline(
+def trace_vehicle_outline(
     edges: Edges, first: int, limit: Int[np.ndarray, "w"], cost: float
 ) -> Int[np.ndarray, "w"]:
     """Trace the outline along the most static edges by dynamic programming over columns.
@@ -272,7 +272,7 @@ def is_vehicle(edges: Edges, outline: Int[np.ndarray, "w"]) -> bool:
     """Decide whether the region below an outline moves with the camera."""
     height, width = edges.static_share.shape
     inside = fill_below(outline, height)
-    if not MIN_AREA <= inside.mean() <= MAX_AREA:
+    if not MIN_VEHICLE_AREA <= inside.mean() <= MAX_AREA:
         return False
 
     # Most of the outline has to be static, and enough of it where moving ground would have moved
@@ -284,11 +284,11 @@ def is_vehicle(edges: Edges, outline: Int[np.ndarray, "w"]) -> bool:
     near = np.ones((3, 1), np.uint8)  # a row above and one below
     staying = cv2.dilate(kept.astype(np.uint8), near)[rows, columns] > 0
     staying_across = cv2.dilate(across.astype(np.uint8), near)[rows, columns] > 0
-    if staying.mean() < MIN_SUPPORT or staying_across.sum() < MIN_WIDTH * width:
+    if staying.mean() < MIN_SUPPORT or staying_across.sum() < MIN_EDGE_SHARE * width:
         return False
 
     # If most other edges are static too, the camera hardly moved, and the outline says nothing.
-    elsewhere = ~fill_below(outline - CLEARANCE, height)
+    elsewhere = ~fill_below(outline - OUTLINE_CLEARANCE, height)
     occurring = np.where(elsewhere, edges.edge_share, 0)
     return bool(occurring[kept].sum() <= MAX_STATIC_ELSEWHERE * occurring.sum())
 

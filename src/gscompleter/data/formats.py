@@ -35,7 +35,7 @@ from gscompleter.data.real_estate import (
     open_chunks,
 )
 from gscompleter.data.rgbd import has_replica, has_scannet, open_replica, open_scannet
-from gscompleter.data.sfm.poses import ENDINGS, is_own, list_unplaced
+from gscompleter.data.sfm.poses import PHOTOGRAPH_ENDINGS, is_own, list_unplaced
 from gscompleter.data.transforms import has_transforms, open_transforms
 from gscompleter.data.unused_files import list_unused
 from gscompleter.system.errors import InputError, join_names, quote_value, require_path
@@ -61,9 +61,9 @@ UNREAD = (
 )
 # fmt: on
 """Endings of photographs that are not read: raw data of cameras, and formats of other programs."""
-MAX_NAMED = 4
+MAX_NAMED_SCENES = 4
 """Most scenes that the message names."""
-MAX_BELOW = 1000
+MAX_SEARCHED_FOLDERS = 1000
 """Most folders below a path that are searched for scenes to name."""
 
 SCENE_FORMATS = {
@@ -166,14 +166,14 @@ def refuse_scenes_below(path: Path) -> None:
 
     if not os.path.isdir(path) or has_image_folder(path):
         return
-    if any(name.lower().endswith(ENDINGS) for name in os.listdir(path)):
+    if any(name.lower().endswith(PHOTOGRAPH_ENDINGS) for name in os.listdir(path)):
         return
 
     # Two levels down: a folder of scenes, or one of such folders.
     near = [folder for folder in list_folders(path) if is_own(folder)]
     inside = [child for folder in near for child in list_folders(folder)]
     require(
-        len(near) + len(inside) <= MAX_BELOW,
+        len(near) + len(inside) <= MAX_SEARCHED_FOLDERS,
         f"{quote_value(path)} is no scene itself, and has {len(near) + len(inside):,} folders "
         "below it; name the folder of one scene.",
     )
@@ -183,7 +183,7 @@ def refuse_scenes_below(path: Path) -> None:
     scenes = posed or (plain if len(plain) > 1 else [])
     # A folder of a scene, such as sparse/0, may be readable by itself and is not another scene.
     scenes = [folder for folder in scenes if folder.parent not in scenes]
-    names = join_names([folder.relative_to(path) for folder in scenes], MAX_NAMED, 20)
+    names = join_names([folder.relative_to(path) for folder in scenes], MAX_NAMED_SCENES, 20)
     require(
         not scenes,
         f"{quote_value(path, 50)} is no scene itself, but holds {len(scenes)} scene(s) below it: "

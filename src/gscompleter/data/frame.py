@@ -24,9 +24,9 @@ from gscompleter.data.file_names import FolderListings, list_endings
 from gscompleter.data.photograph import Photograph, StoredPhotograph
 from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.image import QUARTER_TURNS, turn_upright
-from gscompleter.types import MAX_SIDE
+from gscompleter.types import MAX_IMAGE_SIDE
 
-ENDINGS = ("", ".png", ".jpg", ".jpeg")
+TRIED_ENDINGS = ("", ".png", ".jpg", ".jpeg")
 """Image file endings tried for names without one."""
 
 DOWNSCALE_FACTORS = (2, 4, 8)
@@ -39,7 +39,7 @@ DISTORTED = "distorted"
 """Folder of the model with distortion, beside undistorted photographs (3DGS's scripts)."""
 MASKS = "masks"
 """Folder of masks beside the photographs or their folder."""
-MAX_NAMED = 3
+MAX_MISSING_PHOTOGRAPHS = 3
 """Missing photographs that a note names."""
 
 
@@ -166,8 +166,8 @@ class Frame:
         """Describe why the camera is impossible at this photograph size; None if it is valid."""
         if self.lack is not None:
             return self.lack
-        if max(width, height) > MAX_SIDE:
-            return f"its {width} × {height} pixels have a side above {MAX_SIDE}"
+        if max(width, height) > MAX_IMAGE_SIDE:
+            return f"its {width} × {height} pixels have a side above {MAX_IMAGE_SIDE}"
         if not self.intrinsics.fits(width, height):
             w, h = self.intrinsics.size or (width, height)
             return (
@@ -228,17 +228,17 @@ def find_image(path: Path, listings: FolderListings | None = None) -> Path | Non
     folders = [path.parent]
     if path.parent.name == "images":
         folders += [path.parent.with_name(f"images_{n}") for n in DOWNSCALE_FACTORS]
-    candidates = (folder / (path.name + ending) for folder in folders for ending in ENDINGS)
+    candidates = (folder / (path.name + ending) for folder in folders for ending in TRIED_ENDINGS)
     # The name as written comes first, because most folders need no listing.
     exact = next((candidate for candidate in candidates if os.path.isfile(candidate)), None)
     if exact is not None or listings is None:
         return exact
     # A camera that the file calls DSC_1.jpg may have its photograph under DSC_1.JPG, or in Images.
-    beside = find_file([path.parent], [path.name + ending for ending in ENDINGS], listings)
+    beside = find_file([path.parent], [path.name + ending for ending in TRIED_ENDINGS], listings)
     if beside is not None:
         return beside
     home = f"{path.parent.name}/{path.name}"
-    return find_file([path.parent.parent], [home + ending for ending in ENDINGS], listings)
+    return find_file([path.parent.parent], [home + ending for ending in TRIED_ENDINGS], listings)
 
 
 def capitalize(text: str) -> str:
@@ -270,7 +270,7 @@ def locate_images(frames: Sequence[Frame], roots: Sequence[Path]) -> list[Frame]
     for frame in frames:
         # A name may be a path of another machine, or lack its ending.
         names = list(dict.fromkeys([frame.name, *list_endings(frame.name)]))
-        images = [name + ending for name in names for ending in ENDINGS]
+        images = [name + ending for name in names for ending in TRIED_ENDINGS]
         stems = [os.path.splitext(name)[0] for name in names]
         image = find_file(folders, images, listings)
         mask = find_file(masks, [f"{name}.png" for name in [*names, *stems]], listings)
@@ -311,7 +311,7 @@ def keep_existing(frames: Sequence[Frame], title: str) -> tuple[tuple[Frame, ...
         return tuple(there), ()
     note = (
         f"{len(missing)} of {len(frames)} photographs of {title} are missing and left out: "
-        f"{join_names(missing, MAX_NAMED)}."
+        f"{join_names(missing, MAX_MISSING_PHOTOGRAPHS)}."
     )
     return tuple(there), (note,)
 
@@ -325,13 +325,14 @@ def describe_unposed(frames: Sequence[Frame], title: str) -> tuple[str, ...]:
     if len(lost) == len(frames):
         raise InputError(
             f"The poses of all {len(frames)} cameras of {title} hold NaN or infinity "
-            f"({join_names(lost, MAX_NAMED)}); export the scene again."
+            f"({join_names(lost, MAX_MISSING_PHOTOGRAPHS)}); export the scene again."
         )
     if not lost:
         return ()
     return (
         f"{len(lost)} of {len(frames)} cameras of {title} are not used, because their poses hold "
-        f"NaN or infinity: {join_names(lost, MAX_NAMED)}; the others keep their numbers.",
+        f"NaN or infinity: {join_names(lost, MAX_MISSING_PHOTOGRAPHS)}; "
+        "the others keep their numbers.",
     )
 
 

@@ -14,13 +14,13 @@ from jaxtyping import Float
 from gscompleter.data.cameras import Intrinsics, compute_rotation
 from gscompleter.data.limits import MAX_NUMBER, MAX_PATH, require
 from gscompleter.system.errors import quote_value
-from gscompleter.types import MAX_COORDINATE, MAX_SIDE
+from gscompleter.types import MAX_COORDINATE, MAX_IMAGE_SIDE
 
-NUMBERS = (int, float, np.integer, np.floating)
-Part = TypeVar("Part")
+NUMBER_TYPES = (int, float, np.integer, np.floating)
+JsonPart = TypeVar("JsonPart")
 
 
-def get_part(entry: Any, key: str, kind: type[Part]) -> Part:
+def get_part(entry: Any, key: str, kind: type[JsonPart]) -> JsonPart:
     """Return the list or object at `key`; an empty one if there is none."""
     value = _get(entry, key)
     return value if isinstance(value, kind) else kind()
@@ -30,7 +30,7 @@ def get_number(entry: Any, key: str, title: str, low: float, high: float) -> flo
     """Return the number at `key`, checked to lie in [low, high]."""
     value = _get(entry, key)
     require(value is not None, f"The `{key}` of {title} is missing; add it.")
-    is_number = isinstance(value, NUMBERS) and not isinstance(value, bool)
+    is_number = isinstance(value, NUMBER_TYPES) and not isinstance(value, bool)
     require(
         is_number and low <= value <= high,
         f"The `{key}` of {title} is {quote_value(value)}; a number from {low:g} to {high:g} is "
@@ -48,8 +48,8 @@ def get_size(
     entry: Any, title: str, width: str = "width", height: str = "height"
 ) -> tuple[int, int]:
     """Return width and height in pixels, at the keys of these names."""
-    w = get_number(entry, width, title, 1.0, float(MAX_SIDE))
-    h = get_number(entry, height, title, 1.0, float(MAX_SIDE))
+    w = get_number(entry, width, title, 1.0, float(MAX_IMAGE_SIDE))
+    h = get_number(entry, height, title, 1.0, float(MAX_IMAGE_SIDE))
     require(
         w == int(w) and h == int(h),
         f"The `{width}` and `{height}` of {title} are no whole numbers; correct them.",

@@ -24,14 +24,16 @@ from gscompleter.data.points import FAR_FACTOR, NEAR_FACTOR
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import check_file
 
-NAME = "poses_bounds.npy"
-IMAGES = (".jpg", ".jpeg", ".png")
-ADVICE = "run LLFF's imgs2poses again"
+POSES_BOUNDS_FILE = "poses_bounds.npy"
+LLFF_ENDINGS = (".jpg", ".jpeg", ".png")
+LLFF_ADVICE = "run LLFF's imgs2poses again"
 
 
 def has_llff(path: Path) -> bool:
     """Check whether `path` is a `poses_bounds.npy`, or a folder with one."""
-    return os.path.isfile(path / NAME) or (path.name.endswith(NAME) and os.path.isfile(path))
+    return os.path.isfile(path / POSES_BOUNDS_FILE) or (
+        path.name.endswith(POSES_BOUNDS_FILE) and os.path.isfile(path)
+    )
 
 
 def open_llff(path: Path) -> Iterator[Photographs]:
@@ -40,11 +42,11 @@ def open_llff(path: Path) -> Iterator[Photographs]:
     Rows belong to the sorted photographs beside it, in `images` or another usual folder. The near
     and far planes enclose all bounds.
     """
-    file = path / NAME if os.path.isdir(path) else path
-    rows = _read_rows(file)
+    file = path / POSES_BOUNDS_FILE if os.path.isdir(path) else path
+    rows = _read_pose_rows(file)
     images = _find_photographs(file, len(rows))
     frames = [
-        _parse_frame(image, row, f"row {number} of {quote_value(file)}")
+        _parse_llff_frame(image, row, f"row {number} of {quote_value(file)}")
         for number, (image, row) in enumerate(zip(images, rows, strict=True))
     ]
     near = NEAR_FACTOR * rows[:, 15].min().item()
@@ -53,7 +55,7 @@ def open_llff(path: Path) -> Iterator[Photographs]:
     yield replace(scene, near=near, far=far)
 
 
-def _parse_frame(image: Path, row: Float[np.ndarray, "17"], title: str) -> Frame:
+def _parse_llff_frame(image: Path, row: Float[np.ndarray, "17"], title: str) -> Frame:
     down, right, back, center, (height, width, focal) = row[:15].reshape(3, 5).T
     size = get_size({"width": width, "height": height}, title)
     c2w = np.eye(4)
@@ -63,29 +65,33 @@ def _parse_frame(image: Path, row: Float[np.ndarray, "17"], title: str) -> Frame
     return Frame(image.name, title, c2w, intrinsics, image)
 
 
-def _read_rows(path: Path) -> Float[np.ndarray, "n 17"]:
+def _read_pose_rows(path: Path) -> Float[np.ndarray, "n 17"]:
     check_file(path)
     try:
         # Mapping refuses an array that claims more than the file holds.
         rows = np.load(path, mmap_mode="r").astype(np.float64, casting="same_kind")
     except Exception as error:  # damaged headers raise anything
-        raise InputError(f"{quote_value(path)} is no array of real numbers; {ADVICE}.") from error
+        raise InputError(
+            f"{quote_value(path)} is no array of real numbers; {LLFF_ADVICE}."
+        ) from error
     require(
         rows.ndim == 2 and rows.shape[1] == 17 and len(rows) > 0,
-        f"{quote_value(path)} has the shape {list(rows.shape)}, not 17 columns; {ADVICE}.",
+        f"{quote_value(path)} has the shape {list(rows.shape)}, not 17 columns; {LLFF_ADVICE}.",
     )
     low, high = DEPTH_RANGE
     near = rows[:, 15]
     far = rows[:, 16]
     bounded = ((near >= low) & (near < far) & (far <= high)).all()
-    require(bounded, f"The bounds in {quote_value(path)} are no z-depths, nearest first; {ADVICE}.")
+    require(
+        bounded, f"The bounds in {quote_value(path)} are no z-depths, nearest first; {LLFF_ADVICE}."
+    )
     return rows
 
 
 def _find_photographs(file: Path, count: int) -> list[Path]:
     """List the photographs of the first folder with one for each row."""
     for folder in list_image_folders([file.parent]):
-        images = sorted(path for path in folder.iterdir() if path.suffix.lower() in IMAGES)
+        images = sorted(path for path in folder.iterdir() if path.suffix.lower() in LLFF_ENDINGS)
         if len(images) == count:
             return images
     raise InputError(

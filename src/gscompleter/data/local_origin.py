@@ -24,7 +24,7 @@ SCALE_RANGE = (1e-9, 1e9)
 """Accepted range of the `scale` in a file of nerfstudio."""
 MAX_REMOTENESS = 1e3
 """Ratio of the largest coordinate to the camera spread above which a local origin is used."""
-MAX_STEP = 1e-3
+MAX_CAMERA_STEP = 1e-3
 """Coarsest float32 step of coordinates, relative to the camera spread."""
 
 
@@ -80,7 +80,7 @@ def shift_to_origin(
     centers = torch.stack([camera.center.cpu() for camera in cameras])
     spread = (centers - centers[0]).norm(dim=-1).max().item()
     require(
-        step <= MAX_STEP * spread,
+        step <= MAX_CAMERA_STEP * spread,
         f"The scene lies {np.abs(origin).max():g} units from its origin, where float32 has steps "
         f"of {step:g}, and its cameras are {spread:g} apart; export the scene and its photographs "
         "relative to a local origin.",

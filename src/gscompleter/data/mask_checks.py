@@ -24,9 +24,9 @@ MAX_TAKEN = 0.5
 """Largest share, of its image or of the splat, that a mask takes away without being asked about."""
 MAX_READ = 16
 """Most masks that are read for a check, at even steps of all."""
-MAX_NAMED = 2
+MAX_NAMED_MASKS = 2
 """Masks or folders that a sentence names."""
-MAX_NAME_LENGTH = 50
+MAX_MASK_NAME_LENGTH = 50
 
 
 def are_probably_inverted(shares: Sequence[float]) -> bool:
@@ -150,7 +150,7 @@ def name_ways_out(reading: MaskReading, hides: bool = False) -> str:
 
 def name_masks(paths: Iterable[Path]) -> str:
     """Name masks, or the folders of them."""
-    return join_names(list(dict.fromkeys(paths)), MAX_NAMED, MAX_NAME_LENGTH)
+    return join_names(list(dict.fromkeys(paths)), MAX_NAMED_MASKS, MAX_MASK_NAME_LENGTH)
 
 
 def format_share(shares: Sequence[float]) -> str:

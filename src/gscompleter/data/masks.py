@@ -28,9 +28,9 @@ from gscompleter.system.files.image import HALF_OPAQUE, read_mask, turn_upright
 
 MASK_FOLDERS = (MASKS, "mask")
 """Folders of masks, beside the photographs, in their folder or beside it."""
-ENDINGS = (".png", ".jpg", ".jpeg")
+MASK_ENDINGS = (".png", ".jpg", ".jpeg")
 """Image file endings of masks."""
-FORMS = tuple(product(("{}_mask", "{}.mask", "{}-mask"), ENDINGS))
+FORMS = tuple(product(("{}_mask", "{}.mask", "{}-mask"), MASK_ENDINGS))
 """Names of masks by those of their photographs, and their endings."""
 INVERTED = "dynamic_mask_"
 """Beginning of the names of instant-ngp's masks, in which white is ignored."""
@@ -137,8 +137,8 @@ def list_mask_names(photograph: PurePosixPath, is_beside: bool = True) -> list[s
     named = [f"{photograph}.png", *(form.format(stem) + end for form, end in FORMS)]
     if is_beside:
         inverted = photograph.with_name(INVERTED + photograph.stem)
-        return [*named, *(f"{inverted}{ending}" for ending in ENDINGS)]
-    same = [f"{path}{ending}" for path in (photograph, stem) for ending in ENDINGS]
+        return [*named, *(f"{inverted}{ending}" for ending in MASK_ENDINGS)]
+    same = [f"{path}{ending}" for path in (photograph, stem) for ending in MASK_ENDINGS]
     return [*same, *named]
 
 

@@ -8,9 +8,9 @@ from jaxtyping import Bool, Float
 
 from gscompleter.types import Camera
 
-NEAREST = 0.1
+MIN_CORNER_DEPTH = 0.1
 """Smallest z-depth of the corners of a box, in metres."""
-MAX_PIXELS = 1e5
+MAX_CORNER_COORDINATE = 1e5
 """Largest pixel coordinate of a projected corner; rasterisers use integers."""
 
 
@@ -27,12 +27,12 @@ def mask_moving(
     for corners in boxes - origin:
         # Into camera axes: R^T (corner - centre), written for rows.
         local = (corners - c2w[:3, 3]) @ c2w[:3, :3]
-        if np.isfinite(local).all() and local[:, 2].max() > NEAREST:
+        if np.isfinite(local).all() and local[:, 2].max() > MIN_CORNER_DEPTH:
             # Corners behind the camera have no image. Pulled before it they only make the mask
             # larger.
-            local[:, 2] = np.maximum(local[:, 2], NEAREST)
+            local[:, 2] = np.maximum(local[:, 2], MIN_CORNER_DEPTH)
             # OpenCV puts the centre of the first pixel at (0, 0).
             pixels = (local @ K.T)[:, :2] / local[:, 2:] - 0.5
-            pixels = np.rint(np.clip(pixels, -MAX_PIXELS, MAX_PIXELS))
+            pixels = np.rint(np.clip(pixels, -MAX_CORNER_COORDINATE, MAX_CORNER_COORDINATE))
             cv2.fillConvexPoly(mask, cv2.convexHull(pixels.astype(np.int32)), 1)
     return mask > 0

@@ -31,21 +31,21 @@ from gscompleter.data.number_files import parse_numbers
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_bytes, read_zip_entry
-from gscompleter.types import MAX_SIDE
+from gscompleter.types import MAX_IMAGE_SIDE
 
 CAMS = "cams"
 ENDING = "_cam.txt"
 MVS_FOLDERS = ("images", "blended_images", "image")
-DEPTH = "rendered_depth_maps"
+RENDERED_DEPTH_FOLDER = "rendered_depth_maps"
 IDR_FILES = ("cameras_sphere.npz", "cameras.npz")
 IDR_FOLDERS = ("image", "images", "rgb")
-IMAGES = (".jpg", ".jpeg", ".png")
-ADVICE = "fetch the scene again"
+MVS_ENDINGS = (".jpg", ".jpeg", ".png")
+MVS_ADVICE = "fetch the scene again"
 MAX_MATRICES = 1 << 26
 """Largest file of matrices, in bytes."""
 MAX_MATRIX = 1 << 12
 """Largest matrix with its header, in bytes."""
-MAX_SKEW = 1e-3
+MAX_LENS_SKEW = 1e-3
 """Largest skew of a lens relative to its focal length."""
 
 
@@ -61,8 +61,8 @@ def open_mvsnet(path: Path) -> Iterator[Photographs]:
     frames = []
     for file in sorted((path / CAMS).glob(f"*{ENDING}")):
         stem = file.name.removesuffix(ENDING)
-        image = find_file(folders, [f"{stem}{ending}" for ending in IMAGES], listings)
-        depth = find_file([path / DEPTH], [f"{stem}.pfm"], listings)
+        image = find_file(folders, [f"{stem}{ending}" for ending in MVS_ENDINGS], listings)
+        depth = find_file([path / RENDERED_DEPTH_FOLDER], [f"{stem}.pfm"], listings)
         c2w, lens = read_cam(file)
         name = stem if image is None else f"{image.parent.name}/{image.name}"
         frame = Frame(
@@ -70,7 +70,7 @@ def open_mvsnet(path: Path) -> Iterator[Photographs]:
             f"frame {quote_value(name)} of {quote_value(path)}",
             c2w,
             lens,
-            image or path / MVS_FOLDERS[0] / f"{stem}{IMAGES[0]}",
+            image or path / MVS_FOLDERS[0] / f"{stem}{MVS_ENDINGS[0]}",
             None if depth is None else partial(read_pfm, depth),
         )
         frames.append(frame.with_rigid_pose())
@@ -88,20 +88,20 @@ def read_cam(path: Path) -> tuple[Float[np.ndarray, "4 4"], Intrinsics]:
     parts = re.split(rb"extrinsic|intrinsic", read_bytes(path, MAX_MATRICES))
     require(
         len(parts) == 3,
-        f"{title} has no `extrinsic` before its `intrinsic`; {ADVICE}.",
+        f"{title} has no `extrinsic` before its `intrinsic`; {MVS_ADVICE}.",
     )
-    viewmat = parse_numbers(parts[1], f"The `extrinsic` of {title}", (4, 4), ADVICE)
+    viewmat = parse_numbers(parts[1], f"The `extrinsic` of {title}", (4, 4), MVS_ADVICE)
     # After the matrix of the lens come the depths of a sweep.
     lens = b" ".join(parts[2].split()[:9])
-    matrix = parse_numbers(lens, f"The `intrinsic` of {title}", (3, 3), ADVICE)
+    matrix = parse_numbers(lens, f"The `intrinsic` of {title}", (3, 3), MVS_ADVICE)
     return invert_viewmat(viewmat), build_lens(matrix, title)
 
 
 def build_lens(matrix: Float[np.ndarray, "3 3"], title: str) -> Intrinsics:
     """Build intrinsics of the photograph's size from the matrix of a lens."""
     (fx, skew, cx), (_, fy, cy), _ = matrix.tolist()
-    is_lens = fx > 0 and fy > 0 and abs(skew) <= MAX_SKEW * fx and max(fx, fy) <= MAX_NUMBER
-    require(is_lens, f"The lens of {title} has skew, or no focal length; {ADVICE}.")
+    is_lens = fx > 0 and fy > 0 and abs(skew) <= MAX_LENS_SKEW * fx and max(fx, fy) <= MAX_NUMBER
+    require(is_lens, f"The lens of {title} has skew, or no focal length; {MVS_ADVICE}.")
     return Intrinsics(None, (fx, fy), (cx, cy))
 
 
@@ -110,7 +110,7 @@ def read_pfm(path: Path) -> Float[np.ndarray, "h w"]:
     data = read_bytes(path)
     try:
         kind, width, height, scale, values = _split_pfm(data)
-        if kind != b"Pf" or not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
+        if kind != b"Pf" or not (1 <= width <= MAX_IMAGE_SIDE and 1 <= height <= MAX_IMAGE_SIDE):
             raise ValueError("it is no grey map")
         # A negative scale stands for little endian.
         order = "<f4" if scale < 0 else ">f4"
@@ -118,7 +118,7 @@ def read_pfm(path: Path) -> Float[np.ndarray, "h w"]:
     except ValueError as error:
         raise InputError(
             f"{quote_value(path)} is no depth map (.pfm of grey values), or ends too early; "
-            f"{ADVICE}, or move it away."
+            f"{MVS_ADVICE}, or move it away."
         ) from error
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0.0).astype(np.float32)
 
@@ -144,13 +144,13 @@ def open_idr(path: Path) -> Iterator[Photographs]:
     file = _find_matrices(path)
     assert file is not None
     home = next(path / name for name in IDR_FOLDERS if (path / name).is_dir())
-    images = sorted(one for one in home.iterdir() if one.suffix.lower() in IMAGES)
+    images = sorted(one for one in home.iterdir() if one.suffix.lower() in MVS_ENDINGS)
     matrices = read_matrices(file)
     count = sum(name.startswith("world_mat_") and name[10:].isdecimal() for name in matrices)
     require(
         len(images) == count and count > 0,
         f"{quote_value(file)} has {count:,} cameras, and {quote_value(home)} {len(images):,} "
-        f"photographs, which belong to them in order of their names; {ADVICE}.",
+        f"photographs, which belong to them in order of their names; {MVS_ADVICE}.",
     )
     listings = FolderListings()
     frames = []
@@ -160,11 +160,11 @@ def open_idr(path: Path) -> Iterator[Photographs]:
         matrix = matrices.get(key)
         require(
             matrix is not None and matrix.shape in ((4, 4), (3, 4)),
-            f"The `{key}` of {quote_value(file)} is no matrix of 4 × 4 numbers; {ADVICE}.",
+            f"The `{key}` of {quote_value(file)} is no matrix of 4 × 4 numbers; {MVS_ADVICE}.",
         )
         assert matrix is not None
         c2w, lens = decompose_projection(matrix[:3], title)
-        names = [f"{image.stem}{ending}" for ending in IMAGES]
+        names = [f"{image.stem}{ending}" for ending in MVS_ENDINGS]
         mask = find_file([path / "mask"], names, listings)
         frame = Frame(f"{home.name}/{image.name}", title, c2w, lens, image, mask=mask)
         frames.append(frame.with_rigid_pose())
@@ -180,7 +180,7 @@ def read_matrices(path: Path) -> dict[str, Float[np.ndarray, "n m"]]:
     except InputError:
         raise
     except Exception as error:  # damaged archives raise anything
-        raise InputError(f"{quote_value(path)} is no archive of matrices; {ADVICE}.") from error
+        raise InputError(f"{quote_value(path)} is no archive of matrices; {MVS_ADVICE}.") from error
     return {name.removesuffix(".npy"): table for name, table in tables.items() if table.ndim == 2}
 
 
@@ -196,7 +196,7 @@ def decompose_projection(
     """Decompose a projection to pixels into camera-to-world and the lens."""
     require(
         bool(np.isfinite(projection).all()) and abs(np.linalg.det(projection[:, :3])) > 0,
-        f"The projection of {title} has no inverse; {ADVICE}.",
+        f"The projection of {title} has no inverse; {MVS_ADVICE}.",
     )
     # A projection may have any factor; with a positive one, what is seen lies in front.
     signed = projection * np.sign(np.linalg.det(projection[:, :3]))

@@ -11,7 +11,7 @@ from gscompleter.data.limits import MAX_NUMBER, require
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_bytes
 
-MAX_BYTES = 1 << 26
+MAX_NUMBERS_BYTES = 1 << 26
 """Largest such file."""
 
 
@@ -22,7 +22,7 @@ def read_numbers(
 
     Infinity is kept: it stands for a pose that is unknown. `advice` ends the sentence of errors.
     """
-    return parse_numbers(read_bytes(path, MAX_BYTES), quote_value(path), shape, advice)
+    return parse_numbers(read_bytes(path, MAX_NUMBERS_BYTES), quote_value(path), shape, advice)
 
 
 def parse_numbers(

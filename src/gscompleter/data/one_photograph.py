@@ -19,7 +19,7 @@ from gscompleter.data.panorama import has_panoramas
 from gscompleter.data.photograph import FULL_FRAME_DIAGONAL, StoredPhotograph
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.sfm.poses import (
-    ENDINGS,
+    PHOTOGRAPH_ENDINGS,
     iterate_photographs,
 )
 from gscompleter.system.errors import quote_value
@@ -32,7 +32,7 @@ PHONE_FOCAL = 26 / FULL_FRAME_DIAGONAL
 def find_photograph(path: Path) -> Path | None:
     """Return an image file, or the only photograph of a folder; None for anything else."""
     if os.path.isfile(path):
-        return path if path.suffix.lower() in ENDINGS else None
+        return path if path.suffix.lower() in PHOTOGRAPH_ENDINGS else None
     # Two are enough to know that there are several.
     photographs = list(islice(iterate_photographs(path), 2))
     return photographs[0] if len(photographs) == 1 else None

@@ -24,13 +24,13 @@ from gscompleter.system.files.reading import read_head
 
 VIEWS = (*((yaw, 0) for yaw in range(0, 360, 60)), *((yaw, 50) for yaw in range(0, 360, 120)))
 """Yaw and pitch (upwards) of the views in degrees, each 90° wide; the first faces the middle."""
-MAX_SIDE = 1600
+MAX_VIEW_SIDE = 1600
 """Largest side of a view in pixels."""
-BORDER = 4
+REPEATED_COLUMNS = 4
 """Columns that are repeated on the other side, in pixels."""
-MARK = b"equirectangular"
+GPANO_MARK = b"equirectangular"
 """Projection in Google's photo sphere metadata (GPano)."""
-HEAD = 1 << 18
+METADATA_BYTES = 1 << 18
 """First bytes of a file that hold the metadata."""
 SMALL_WIDTH = 1024
 """Width at which borders are compared."""
@@ -50,7 +50,7 @@ def has_panoramas(files: Sequence[Path]) -> bool:
     """
     sizes = [read_image_size(path) for path in files]
     wide = [path for path, (w, h) in zip(files, sizes, strict=True) if w == 2 * h]
-    marked = any(MARK in read_head(path, HEAD) for path in wide)
+    marked = any(GPANO_MARK in read_head(path, METADATA_BYTES) for path in wide)
     if not marked:
         num_closed = sum(_is_closed(path) for path in wide)
         if 2 * num_closed <= len(wide):
@@ -82,22 +82,29 @@ def _is_closed(path: Path) -> bool:
 def split_panorama(
     path: Path, hidden: Bool[np.ndarray, "h w"] | None = None
 ) -> Iterator[tuple[UInt8[np.ndarray, "s s 3"], Bool[np.ndarray, "s s"] | None]]:
-    """Draw the `VIEWS` of a panorama and of its mask, at its resolution or `MAX_SIDE`.
+    """Draw the `VIEWS` of a panorama and of its mask, at its resolution or `MAX_VIEW_SIDE`.
 
     `hidden` are the pixels of the panorama that its mask hides, or None without one.
     """
-    # As large as makes a view of 90° `MAX_SIDE` wide: its centre has `width` / π pixels per unit.
-    widest = math.ceil(math.pi * MAX_SIDE)
+    # As large as makes a view of 90° `MAX_VIEW_SIDE` wide: its centre has `width` / π pixels per
+    # unit.
+    widest = math.ceil(math.pi * MAX_VIEW_SIDE)
     with open_image(path) as image:
         image.draft("RGB", (widest, widest // 2))
         panorama = image.convert("RGB")
     panorama.thumbnail((widest, widest), Image.Resampling.LANCZOS)
     # Repeated columns let the interpolation continue across the seam.
-    pixels = np.pad(np.asarray(panorama), ((0, 0), (BORDER, BORDER), (0, 0)), mode="wrap")
+    pixels = np.pad(
+        np.asarray(panorama), ((0, 0), (REPEATED_COLUMNS, REPEATED_COLUMNS), (0, 0)), mode="wrap"
+    )
     mask = None
     if hidden is not None:
         scaled = Image.fromarray(hidden).resize(panorama.size, Image.Resampling.NEAREST)
-        mask = np.pad(np.asarray(scaled, np.uint8), ((0, 0), (BORDER, BORDER)), mode="wrap")
+        mask = np.pad(
+            np.asarray(scaled, np.uint8),
+            ((0, 0), (REPEATED_COLUMNS, REPEATED_COLUMNS)),
+            mode="wrap",
+        )
     for view in VIEWS:
         places = _project_rays(compute_view_rotation(*view), panorama.width)
         seen = None if mask is None else remap(mask, places, cv2.INTER_NEAREST) > 0
@@ -114,7 +121,7 @@ def _project_rays(rotation: Float[np.ndarray, "3 3"], width: int) -> Float[np.nd
     longitude = np.arctan2(rays[..., 0], rays[..., 2])
     latitude = np.arctan2(rays[..., 1], np.hypot(rays[..., 0], rays[..., 2]))
     # Pixel positions as `remap` counts them: 0 is the centre of the first column without border.
-    x = (longitude / (2 * np.pi) + 0.5) * width - 0.5 + BORDER
+    x = (longitude / (2 * np.pi) + 0.5) * width - 0.5 + REPEATED_COLUMNS
     y = (latitude / np.pi + 0.5) * width / 2 - 0.5
     return np.stack([x, y], axis=-1).astype(np.float32)
 

@@ -30,7 +30,7 @@ from gscompleter.numerics.geometry import compute_sparse_depth
 from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.image import composite_over_black, convert_to_image
 from gscompleter.system.files.names import fold_name
-from gscompleter.types import MAX_SIDE, Camera, View
+from gscompleter.types import MAX_IMAGE_SIDE, Camera, View
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ MAX_FOV = 100.0
 MAX_TRANSLATION = 1e3
 """Largest camera coordinate that benchmarks keep, in scene units from the origin."""
 
-MAX_NAMED = 2
+MAX_MASK_FOLDERS = 2
 """Folders of masks that a sentence names."""
 MAX_MAP_COORDINATE = 100.0
 """Largest vehicle coordinate without a local origin, in metres."""
@@ -158,11 +158,13 @@ class Photographs:
             return None
         chosen = [self.frame(number) for number in frames]
         named = [frame.mask for frame in chosen if frame.mask is not None]
-        num_transparent = sum(_has_alpha(frame) for frame in chosen)
+        num_transparent = sum(_has_alpha_channel(frame) for frame in chosen)
         kinds = []
         if named:
             places = list(dict.fromkeys(path.parent for path in named))
-            kinds.append(f"masks of {len(named)} photographs ({join_names(places, MAX_NAMED)})")
+            kinds.append(
+                f"masks of {len(named)} photographs ({join_names(places, MAX_MASK_FOLDERS)})"
+            )
         if num_transparent:
             kinds.append(f"the alpha channel of {num_transparent} photographs")
         return " and ".join(kinds) if kinds else None
@@ -187,7 +189,7 @@ class Photographs:
     def is_hidden(self, frame: int) -> bool:
         """Check whether a mask or the alpha channel hides all of a photograph."""
         chosen = self.frame(frame)
-        if not self.is_masked or (chosen.mask is None and not _has_alpha(chosen)):
+        if not self.is_masked or (chosen.mask is None and not _has_alpha_channel(chosen)):
             return False
         hidden = self._load_colors(chosen)[1]
         return hidden is not None and bool(hidden.all())
@@ -261,7 +263,7 @@ class Photographs:
         if len(numbers) > 1:
             raise InputError(
                 f"{len(numbers)} photographs of {self.title} are called {quote_value(word)}: "
-                f"{join_names(names, MAX_NAMED)}; name the path of one of them."
+                f"{join_names(names, MAX_MASK_FOLDERS)}; name the path of one of them."
             )
         if not numbers:
             example = self.frame(0).file_name
@@ -433,7 +435,7 @@ def _ends_alike(one: Sequence[str], other: Sequence[str]) -> bool:
     return shorter > 0 and one[-shorter:] == other[-shorter:]
 
 
-def _has_alpha(frame: Frame) -> bool:
+def _has_alpha_channel(frame: Frame) -> bool:
     return frame.file is not None and frame.file.has_alpha
 
 
@@ -488,10 +490,10 @@ def compute_framing(width: int, height: int, resolution: Resolution) -> Framing:
     else:
         scale = max(new_height / height, new_width / width)
         scaled = max(round(width * scale), new_width), max(round(height * scale), new_height)
-    if max(scaled) > MAX_SIDE:
+    if max(scaled) > MAX_IMAGE_SIDE:
         raise InputError(
             f"An image of {width} × {height} pixels that covers {new_width} × {new_height} has a "
-            f"side above {MAX_SIDE}; choose a smaller resolution, or crop the image."
+            f"side above {MAX_IMAGE_SIDE}; choose a smaller resolution, or crop the image."
         )
     # Symmetric, with the odd pixel at the right and the lower side.
     corner = (scaled[0] - new_width) // 2, (scaled[1] - new_height) // 2
@@ -509,11 +511,11 @@ def resize(
 
 def _is_side(value: object) -> bool:
     is_whole = isinstance(value, Integral) and not isinstance(value, bool)
-    return is_whole and 1 <= value <= MAX_SIDE  # type: ignore[operator]
+    return is_whole and 1 <= value <= MAX_IMAGE_SIDE  # type: ignore[operator]
 
 
 def check_resolution(resolution: Resolution) -> None:
-    """Raise an InputError if a side is not within 1 to `MAX_SIDE`."""
+    """Raise an InputError if a side is not within 1 to `MAX_IMAGE_SIDE`."""
     if resolution is None:
         return
     if isinstance(resolution, AuthorsCrop):
@@ -525,5 +527,5 @@ def check_resolution(resolution: Resolution) -> None:
         named = " × ".join(quote_value(side) for side in sides)
         raise InputError(
             f"The resolution {named} is impossible; height and "
-            f"width have to be positive, and at most {MAX_SIDE}."
+            f"width have to be positive, and at most {MAX_IMAGE_SIDE}."
         )

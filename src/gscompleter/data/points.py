@@ -18,7 +18,7 @@ from gscompleter.system.files.ply import read_ply_file
 from gscompleter.types import Camera
 
 AXES = ("x", "y", "z")
-MIN_POINTS = 100
+MIN_RANGE_POINTS = 100
 """Fewest visible points that define a depth range."""
 PERCENTILES = (0.01, 0.99)
 """Percentiles of z-depth; points beyond are taken for mismatches."""
@@ -55,7 +55,7 @@ def compute_depth_range(
         pixels, z = project(points, camera)
         seen.append(z[is_inside(pixels, z, camera)])
     depths = torch.cat(seen)
-    if len(depths) < MIN_POINTS:
+    if len(depths) < MIN_RANGE_POINTS:
         return None
     low, high = np.quantile(depths.double().numpy(), PERCENTILES).tolist()
     near = NEAR_FACTOR * low

@@ -29,39 +29,43 @@ from gscompleter.system.files.reading import read_json
 
 COLOR = "color"
 POSE = "pose"
-DEPTH = "depth"
-LENS = "intrinsic/intrinsic_color.txt"
-RESULTS = "results"
+DEPTH_FOLDER = "depth"
+LENS_FILE = "intrinsic/intrinsic_color.txt"
+RESULTS_FOLDER = "results"
 TRAJECTORY = "traj.txt"
-PARAMETERS = "cam_params.json"
-IMAGES = (".jpg", ".jpeg", ".png")
+CAM_PARAMETERS_FILE = "cam_params.json"
+RGBD_ENDINGS = (".jpg", ".jpeg", ".png")
 MILLIMETRES = 1e-3
-ADVICE = "export the recording again"
+RGBD_ADVICE = "export the recording again"
 
 
 def has_scannet(path: Path) -> bool:
     """Check whether a folder is a scene that ScanNet's reader exported."""
-    return all((path / name).is_dir() for name in (COLOR, POSE)) and (path / LENS).is_file()
+    return all((path / name).is_dir() for name in (COLOR, POSE)) and (path / LENS_FILE).is_file()
 
 
 def open_scannet(path: Path) -> Iterator[Photographs]:
     """Open a scene of ScanNet; frames are numbered by the numbers of its photographs."""
-    fx, fy, cx, cy = read_numbers(path / LENS, (4, 4), ADVICE)[[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
+    fx, fy, cx, cy = read_numbers(path / LENS_FILE, (4, 4), RGBD_ADVICE)[
+        [0, 1, 0, 1], [0, 1, 2, 2]
+    ].tolist()
     lens = Intrinsics(None, (fx, fy), (cx, cy))
     listings = FolderListings()
-    images = [file for file in (path / COLOR).iterdir() if file.suffix.lower() in IMAGES]
+    images = [file for file in (path / COLOR).iterdir() if file.suffix.lower() in RGBD_ENDINGS]
     numbered = {int(file.stem): file for file in images if file.stem.isdecimal()}
-    require(numbered, f"There are no photographs N.jpg in {quote_value(path / COLOR)}; {ADVICE}.")
+    require(
+        numbered, f"There are no photographs N.jpg in {quote_value(path / COLOR)}; {RGBD_ADVICE}."
+    )
     frames = []
     for number in sorted(numbered):
         pose = find_file([path / POSE], [f"{number}.txt"], listings)
-        depth = find_file([path / DEPTH], [f"{number}.png"], listings)
+        depth = find_file([path / DEPTH_FOLDER], [f"{number}.png"], listings)
         image = numbered[number]
         name = f"{COLOR}/{image.name}"
         frame = Frame(
             name,
             f"frame {quote_value(name)} of {quote_value(path)}",
-            np.full((4, 4), np.nan) if pose is None else read_numbers(pose, (4, 4), ADVICE),
+            np.full((4, 4), np.nan) if pose is None else read_numbers(pose, (4, 4), RGBD_ADVICE),
             lens,
             image,
             None if depth is None else partial(read_depth, depth, MILLIMETRES),
@@ -73,12 +77,12 @@ def open_scannet(path: Path) -> Iterator[Photographs]:
 
 def has_replica(path: Path) -> bool:
     """Check whether a folder is a scene of Replica that was rendered for SLAM."""
-    has_results = (path / RESULTS).is_dir() and (path / TRAJECTORY).is_file()
+    has_results = (path / RESULTS_FOLDER).is_dir() and (path / TRAJECTORY).is_file()
     return has_results and _find_parameters(path) is not None
 
 
 def _find_parameters(path: Path) -> Path | None:
-    files = [folder / PARAMETERS for folder in (path, path.resolve().parent)]
+    files = [folder / CAM_PARAMETERS_FILE for folder in (path, path.resolve().parent)]
     return next((file for file in files if os.path.isfile(file)), None)
 
 
@@ -86,7 +90,7 @@ def open_replica(path: Path) -> Iterator[Photographs]:
     """Open a scene of Replica; frames are numbered by their order."""
     file = _find_parameters(path)
     assert file is not None
-    content = read_json(file, ADVICE)
+    content = read_json(file, RGBD_ADVICE)
     camera = content.get("camera") if isinstance(content, dict) else None
     title = f"`camera` of {quote_value(file)}"
     lens = get_intrinsics(camera, title)
@@ -97,20 +101,20 @@ def open_replica(path: Path) -> Iterator[Photographs]:
     lens = Intrinsics(get_size(camera, title, "w", "h"), lens.focal, (cx + 0.5, cy + 0.5))
     unit = 1 / get_number(camera, "scale", title, *DEPTH_RANGE)
 
-    files = sorted((path / RESULTS).iterdir())
-    images = [f for f in files if f.name.startswith("frame") and f.suffix.lower() in IMAGES]
-    poses = read_numbers(path / TRAJECTORY, (None, 16), ADVICE).reshape(-1, 4, 4)
+    files = sorted((path / RESULTS_FOLDER).iterdir())
+    images = [f for f in files if f.name.startswith("frame") and f.suffix.lower() in RGBD_ENDINGS]
+    poses = read_numbers(path / TRAJECTORY, (None, 16), RGBD_ADVICE).reshape(-1, 4, 4)
     require(
         len(images) == len(poses),
         f"{quote_value(path / TRAJECTORY)} has {len(poses):,} poses, and {quote_value(path)} "
-        f"{len(images):,} photographs; {ADVICE}.",
+        f"{len(images):,} photographs; {RGBD_ADVICE}.",
     )
     listings = FolderListings()
     frames = []
     for image, c2w in zip(images, poses, strict=True):
         stem = image.stem.replace("frame", "depth")
         depth = find_file([image.parent], [f"{stem}.png"], listings)
-        name = f"{RESULTS}/{image.name}"
+        name = f"{RESULTS_FOLDER}/{image.name}"
         frame = Frame(
             name,
             f"frame {quote_value(name)} of {quote_value(path)}",

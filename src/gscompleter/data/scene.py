@@ -18,7 +18,7 @@ from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL, parse_camera_frame
 from gscompleter.system.errors import quote_value, require_path
-from gscompleter.system.files.result_format import MARK
+from gscompleter.system.files.result_format import RESULT_MARK
 from gscompleter.system.files.writing import replace_file
 from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import Camera, View
@@ -51,7 +51,7 @@ def load_views(
     or the most pixels of the longer side; `near` and `far` are z-depths in scene units, if known.
     """
     reading = MaskReading(invert_masks, large_masks)
-    photographs = place_photographs(open_photographs(scene, near=near, far=far), origin)
+    photographs = shift_photographs(open_photographs(scene, near=near, far=far), origin)
     refuse_nothing_to_invert(photographs.list_masks(), reading)
     photographs = read_masks_as_asked(photographs, reading)
     chosen = photographs.posed if frames is None else frames
@@ -76,7 +76,7 @@ def load_camera(
 
     `frame` is its number, or the name of its photograph. `origin` is as in `load_views`.
     """
-    photographs = place_photographs(open_photographs(scene, near=near, far=far), origin)
+    photographs = shift_photographs(open_photographs(scene, near=near, far=far), origin)
     require(
         frame is not None or len(photographs) == 1,
         f"{photographs.title} has {len(photographs)} frames; choose one, from 0 to "
@@ -85,7 +85,7 @@ def load_camera(
     return photographs.camera(0 if frame is None else frame, resolution)
 
 
-def place_photographs(photographs: Photographs, origin: Sequence[float] | None) -> Photographs:
+def shift_photographs(photographs: Photographs, origin: Sequence[float] | None) -> Photographs:
     """Return photographs relative to an origin, or to their own if it is None."""
     if origin is None:
         return photographs
@@ -153,7 +153,7 @@ def write_cameras(
     if file_paths is not None:
         pairs = zip(file_paths, frames, strict=True)
         frames = [{"file_path": file_path, **frame} for file_path, frame in pairs]
-    content = {**MARK, "camera_model": "PINHOLE", "frames": frames}
+    content = {**RESULT_MARK, "camera_model": "PINHOLE", "frames": frames}
     with replace_file(path) as file:
         file.write((json.dumps(content, indent=1) + "\n").encode())
 

@@ -30,11 +30,11 @@ from gscompleter.system.files.image import read_depth
 from gscompleter.system.files.reading import is_json_list, read_json
 from gscompleter.system.files.result_format import is_marked, refuse_later
 
-NAME = "transforms.json"
-ADVICE = "export the scene again"
+TRANSFORMS_FILE = "transforms.json"
+TRANSFORMS_ADVICE = "export the scene again"
 SPLITS = tuple(f"transforms_{split}.json" for split in ("train", "val", "test"))
 """Files of a scene in parts, as in NeRF's synthetic scenes."""
-HOMES = ("", "nerfstudio")
+TRANSFORMS_HOMES = ("", "nerfstudio")
 """Subfolders that may hold the file; DL3DV has the second."""
 
 OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -47,7 +47,7 @@ ANGLE_RANGE = (1e-5, 3.14159)
 """Range of fields of view in radians, below π."""
 DEPTH_UNITS = ("depth_unit_scale_factor", "integer_depth_scale")
 
-Pair = tuple[float | None, float | None]
+NumberPair = tuple[float | None, float | None]
 
 
 def has_transforms(path: Path) -> bool:
@@ -69,17 +69,21 @@ def open_transforms(path: Path) -> Iterator[Photographs]:
     if all(frame.image is not None for frame in frames):
         frames = sorted(frames, key=lambda frame: frame.name)
     folder = files[0].resolve().parent
-    name = (folder.parent if folder.name in HOMES else folder).name
-    if len(files) == 1 and files[0].name not in (NAME, *SPLITS):
+    name = (folder.parent if folder.name in TRANSFORMS_HOMES else folder).name
+    if len(files) == 1 and files[0].name not in (TRANSFORMS_FILE, *SPLITS):
         name = files[0].stem
     scene = build_photographs(name, str(files[0] if len(files) == 1 else path), frames)
-    yield replace(scene, sparse=_make_point_reader(files))
+    yield replace(scene, sparse=_make_cloud_reader(files))
 
 
 def _find_files(scene: Path) -> list[Path]:
     if not os.path.isdir(scene):
         return [scene]
-    groups = [[scene / home / n for n in names] for home in HOMES for names in ((NAME,), SPLITS)]
+    groups = [
+        [scene / home / n for n in names]
+        for home in TRANSFORMS_HOMES
+        for names in ((TRANSFORMS_FILE,), SPLITS)
+    ]
     for group in groups:
         files = [file for file in group if os.path.isfile(file)]
         if files:
@@ -87,10 +91,10 @@ def _find_files(scene: Path) -> list[Path]:
     return []
 
 
-def _make_point_reader(files: Sequence[Path]) -> partial[Float[np.ndarray, "n 3"]] | None:
+def _make_cloud_reader(files: Sequence[Path]) -> partial[Float[np.ndarray, "n 3"]] | None:
     """Return a reader of the points that a file names; None if there are none."""
     for file in files:
-        name = get_text(read_json(file, ADVICE), "ply_file_path", str(file))
+        name = get_text(read_json(file, TRANSFORMS_ADVICE), "ply_file_path", str(file))
         path = None if name is None else locate(file.parent, name, _find_any_case)
         if path is not None and os.path.isfile(path):
             return partial(read_point_cloud, path)
@@ -104,7 +108,7 @@ def _find_any_case(path: Path, listings: FolderListings | None = None) -> Path |
 
 def read_frames(path: Path) -> list[Frame]:
     """Read the frames of a JSON file in its order, with exactly rigid poses (`make_rigid`)."""
-    content = read_json(path, ADVICE)
+    content = read_json(path, TRANSFORMS_ADVICE)
     if is_marked(content):  # `targets.json`, for example
         refuse_later(content, quote_value(path))
     entries = get_part(content, "frames", list)
@@ -114,11 +118,12 @@ def read_frames(path: Path) -> list[Frame]:
     unit = next((unit for unit in units if unit is not None), 1e-3)
     listings = FolderListings()
     return [
-        _parse_frame(entry, i, content, unit, path, listings) for i, entry in enumerate(entries)
+        _parse_transforms_frame(entry, i, content, unit, path, listings)
+        for i, entry in enumerate(entries)
     ]
 
 
-def _parse_frame(
+def _parse_transforms_frame(
     entry: Any,
     position: int,
     content: Mapping[str, Any],
@@ -171,7 +176,7 @@ def parse_camera_frame(entry: Any, title: str, content: Mapping[str, Any] | None
 
 
 def _parse_intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
-    def read_pair(*keys: str, low: float = -MAX_NUMBER, high: float = MAX_NUMBER) -> Pair:
+    def read_pair(*keys: str, low: float = -MAX_NUMBER, high: float = MAX_NUMBER) -> NumberPair:
         x_key, y_key = keys
         x = get_optional_number(entry, x_key, title, low, high)
         y = get_optional_number(entry, y_key, title, low, high)

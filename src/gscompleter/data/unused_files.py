@@ -32,7 +32,7 @@ DEPTH_FILES = ("*depth*.png", "*depth*.exr", "*depth*.npy", "*depth*.tif*", "*de
 """Depth maps beside photographs."""
 SWEEPS = ("lidar", "velodyne", "velodyne_points", "fused.ply", "*.las", "*.laz", "*.e57", "*.pcd")
 """Laser sweeps, and point clouds of scanners and dense stereo."""
-POSES = {
+POSE_FILES = {
     "pose": "poses as text, a file for each photograph",
     "poses": "poses, a file for each photograph",
     "cams": "cameras of MVSNet",
@@ -58,7 +58,7 @@ POSES = {
     "frame_annotations.jgz": "cameras of CO3D",
 }
 """Files and folders of poses in layouts that are not read, and what they are."""
-MAX_NAMED = 3
+MAX_UNUSED_FILES = 3
 """Files that a phrase names."""
 
 
@@ -87,11 +87,12 @@ def list_unused(folder: Path, frames: Sequence[Frame], has_found_cameras: bool) 
     if has_found_cameras:
         kinds: dict[str, list[str]] = {}
         for name in names:
-            pattern = next((one for one in POSES if fnmatch(name.casefold(), one)), None)
+            pattern = next((one for one in POSE_FILES if fnmatch(name.casefold(), one)), None)
             if pattern is not None:
                 kinds.setdefault(pattern, []).append(name)
         unused += [
-            f"{join_names(found, MAX_NAMED)} ({POSES[pattern]})" for pattern, found in kinds.items()
+            f"{join_names(found, MAX_UNUSED_FILES)} ({POSE_FILES[pattern]})"
+            for pattern, found in kinds.items()
         ]
     return (*unused, *_list_without_camera(frames))
 
@@ -153,7 +154,7 @@ def _list_without_camera(frames: Sequence[Frame]) -> list[str]:
             noun = "photograph" if len(extra) == 1 else "photographs"
             phrases.append(
                 f"{len(extra):,} {noun} in {home.name} without a camera "
-                f"({join_names(extra, MAX_NAMED)})"
+                f"({join_names(extra, MAX_UNUSED_FILES)})"
             )
     return phrases
 

@@ -21,31 +21,31 @@ from gscompleter.system.files.video import read_video
 from gscompleter.system.progress import stage
 
 Image8 = UInt8[np.ndarray, "h w"]
-Corners = Float[np.ndarray, "n 1 2"]
+MotionCorners = Float[np.ndarray, "n 1 2"]
 Values = Float[np.ndarray, "n"]
 
-ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm")
+SOURCE_VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm")
 """Endings of videos, in any case."""
 NUM_FRAMES = 40
 """Default number of frames to choose."""
 MIN_FRAMES = 3
 SMALL_SIDE = 640
 """Longer side in pixels at which frames are measured."""
-STEP = 0.02
+REFERENCE_MOTION = 0.02
 """Motion from one reference frame to the next, in longer sides."""
-QUANTILE = 0.75
+MOTION_QUANTILE = 0.75
 """Quantile of the motions of corners; around a thing at the centre most move little."""
 NUM_CORNERS = 200
 """Most corners that are tracked."""
 MIN_TRACKED = 0.5
 """Share of corners below which the reference frame is out of sight."""
-QUALITY = 95
+FRAME_JPEG_QUALITY = 95
 """JPEG quality of the chosen frames."""
 
 
 def is_video(path: Path) -> bool:
     """Check whether `path` is a file with the name of a video."""
-    return path.suffix.lower() in ENDINGS and path.is_file()
+    return path.suffix.lower() in SOURCE_VIDEO_ENDINGS and path.is_file()
 
 
 def extract_frames(video: Path, folder: Path, count: int) -> None:
@@ -63,13 +63,13 @@ def extract_frames(video: Path, folder: Path, count: int) -> None:
         images = read_video(video, f"select='{_write_choice(chosen)}'", is_grey=False)
         for number, pixels in zip(chosen, images, strict=True):
             path = folder / f"frame_{number:06d}.jpg"
-            Image.fromarray(pixels).save(path, quality=QUALITY, subsampling=0)
+            Image.fromarray(pixels).save(path, quality=FRAME_JPEG_QUALITY, subsampling=0)
 
 
 def measure_frames(frames: Iterable[Image8]) -> tuple[Values, Values]:
     """Measure the variance of the Laplacian of each frame, and its motion since the first one.
 
-    Motion is in steps of `STEP`; the fraction is the way from the last reference frame.
+    Motion is in steps of `REFERENCE_MOTION`; the fraction is the way from the last reference frame.
     """
     sharpness = list[float]()
     motion = list[float]()
@@ -90,13 +90,15 @@ def measure_frames(frames: Iterable[Image8]) -> tuple[Values, Values]:
     return np.array(sharpness), np.array(motion)
 
 
-def _measure_motion(reference: Image8, corners: Corners, frame: Image8) -> float:
+def _measure_motion(reference: Image8, corners: MotionCorners, frame: Image8) -> float:
     """Measure the motion of most corners in steps, at most 1; 1 if too many are lost."""
     corners_now, status, _ = cv2.calcOpticalFlowPyrLK(reference, frame, corners, corners.copy())
     if status.mean() < MIN_TRACKED:
         return 1.0
     moved = np.linalg.norm((corners_now - corners)[status == 1], axis=-1)
-    return min(float(np.quantile(moved, QUANTILE)) / (STEP * max(frame.shape)), 1.0)
+    return min(
+        float(np.quantile(moved, MOTION_QUANTILE)) / (REFERENCE_MOTION * max(frame.shape)), 1.0
+    )
 
 
 def select_frames(sharpness: Values, motion: Values, count: int) -> list[int]:

@@ -29,9 +29,9 @@ from gscompleter.types import Gaussians, View
 
 FADED_OPACITY = 0.02
 """Largest opacity of a faded Gaussian; at zero it would have no gradient."""
-MIN_ERROR = 1e-12
+MIN_REFERENCE_ERROR = 1e-12
 """Smallest mean squared error that fractions refer to."""
-MAX_TRIALS = 16
+MAX_RETURN_ROUNDS = 16
 """Rounds of putting back what a photograph needs most, before it gets back all that it sees."""
 GRADIENT_OPACITY = 0.1
 """Opacity factor at which gradients of missing Gaussians are evaluated; at 0 there are none."""
@@ -109,7 +109,7 @@ def predict_error_change(
     # A pixel is linear in the opacity of one Gaussian, so the error is a parabola in it:
     # E(o) = E + gradient (o - current) + square (o - current)², and this is E(0) - E(full).
     change = square * (current**2 - (full - current) ** 2) - gradient * full
-    return change / max(error, MIN_ERROR)
+    return change / max(error, MIN_REFERENCE_ERROR)
 
 
 def estimate_squared_gradient(
@@ -182,11 +182,11 @@ def find_needed_by_photographs(
 ) -> Bool[Tensor, "n"]:
     """Find the missing Gaussians that a photograph needs back to be within its limit.
 
-    Opacities [n] are those that the Gaussians have if they are not missing. After `MAX_TRIALS`
-    rounds the photograph gets back all that it sees.
+    Opacities [n] are those that the Gaussians have if they are not missing. After
+    `MAX_RETURN_ROUNDS` rounds the photograph gets back all that it sees.
     """
     back = torch.zeros_like(missing)
-    for _ in range(MAX_TRIALS):
+    for _ in range(MAX_RETURN_ROUNDS):
         absent = missing & ~back
         image = view.fill_ignored(plan(torch.where(absent, 0.0, opacities)).image)
         error = compute_squared_error(image, view.image).item()

@@ -16,19 +16,19 @@ from gscompleter.types import Gaussians, merge
 Region = Callable[[Float[Tensor, "n 3"]], Bool[Tensor, "n"]]
 """Finds the points that lie in a region."""
 
-REACH = 3.0
+GAUSSIAN_REACH = 3.0
 """Standard deviations up to which a Gaussian reaches."""
-PIECE = 1 / 3
+PIECE_DEVIATION = 1 / 3
 """Standard deviation of a piece, relative to that of its Gaussian."""
-STEP = 2 / 3
+PIECE_DISTANCE = 2 / 3
 """Distance of neighbouring pieces, in standard deviations of their Gaussian."""
-STEPS = 4
+PIECES_PER_SIDE = 4
 """Pieces on either side of the middle one, along an axis."""
 MIN_LENGTH = 0.25
 """Length, relative to the longest axis, from which on the second axis is divided as well."""
-MAX_OPACITY = 0.99
+MAX_DIVIDED_OPACITY = 0.99
 """Largest opacity that is divided, as a logarithm is taken."""
-MIN_OPACITY = 1 / 255
+MIN_PIECE_OPACITY = 1 / 255
 """Smallest opacity that is rendered."""
 
 
@@ -39,7 +39,7 @@ def cut(gaussians: Gaussians, contains: Region) -> tuple[Gaussians, Gaussians]:
     """
     # A Gaussian lies in the region as a whole if the six ends of its axes do. One whose centre lies
     # outside is not cut either.
-    ends = REACH * torch.cat([torch.eye(3), -torch.eye(3)]).to(gaussians.means)
+    ends = GAUSSIAN_REACH * torch.cat([torch.eye(3), -torch.eye(3)]).to(gaussians.means)
     is_inside = torch.stack([contains(move(gaussians, end)) for end in ends]).all(dim=0)
     is_whole = is_inside | ~contains(gaussians.means)
 
@@ -64,7 +64,7 @@ def split(gaussians: Gaussians) -> Gaussians:
     one of variance 1. What adds up when they are composited are logarithms of transmittance.
     """
     # A cell is a step along the longest and one along the second axis, in standard deviations.
-    steps = STEP * torch.arange(-STEPS, STEPS + 1)
+    steps = PIECE_DISTANCE * torch.arange(-PIECES_PER_SIDE, PIECES_PER_SIDE + 1)
     grid = torch.cartesian_prod(steps, steps).to(gaussians.means)
 
     # Needles are divided along their longest axis alone: they take the cells without a second step.
@@ -78,16 +78,16 @@ def split(gaussians: Gaussians) -> Gaussians:
     divided = order[row, :2]
     step = torch.zeros_like(whole.scales).scatter(1, divided, grid[cell])
     is_divided = num_axes[:, None] > torch.arange(2).to(num_axes)
-    factors = torch.where(is_divided, PIECE, 1.0).to(step)
+    factors = torch.where(is_divided, PIECE_DEVIATION, 1.0).to(step)
     shrunk = torch.ones_like(step).scatter(1, divided, factors)
 
     # Convolved with a piece of variance PIECE², these weights give a Gaussian of variance 1. The
     # division by the root of the variance, per axis, keeps its height at 1.
-    variance = 1 - PIECE**2
+    variance = 1 - PIECE_DEVIATION**2
     weights = (-(step**2).sum(dim=1) / (2 * variance)).exp() / variance ** (num_axes / 2)
-    transmittance = 1 - (weights * whole.opacities).clamp_max(MAX_OPACITY)
-    # About PIECE / STEP * sqrt(2 pi) pieces overlap at a point, along each axis.
-    share = (STEP / PIECE / math.sqrt(2 * math.pi)) ** num_axes
+    transmittance = 1 - (weights * whole.opacities).clamp_max(MAX_DIVIDED_OPACITY)
+    # About PIECE_DEVIATION / PIECE_DISTANCE * sqrt(2 pi) pieces overlap at a point of an axis.
+    share = (PIECE_DISTANCE / PIECE_DEVIATION / math.sqrt(2 * math.pi)) ** num_axes
     pieces = replace(
         whole,
         means=move(whole, step),
@@ -95,4 +95,4 @@ def split(gaussians: Gaussians) -> Gaussians:
         opacities=1 - transmittance**share,
         encoded=None,
     )
-    return pieces[pieces.opacities > MIN_OPACITY]
+    return pieces[pieces.opacities > MIN_PIECE_OPACITY]

@@ -25,9 +25,9 @@ from gscompleter.types import Gaussians
 
 MAX_BREADTH = 10.0
 """Largest factor by which the limit of opacity rises with the size of a Gaussian."""
-BLOCK = 25_000
+FLOATER_BLOCK = 25_000
 """Gaussians whose neighbours are measured at a time, to save memory."""
-NEIGHBORS = "Searching for neighbours"
+NEIGHBOR_SEARCH = "Searching for neighbours"
 
 
 class Surroundings:
@@ -41,7 +41,7 @@ class Surroundings:
         self._means = scene.means
         self._longest = scene.scales.max(dim=1).values
         # One more, because the nearest of all to a Gaussian is itself.
-        self._nearest = NearestGaussians(scene.means, scene.means, neighbors + 1, NEIGHBORS)
+        self._nearest = NearestGaussians(scene.means, scene.means, neighbors + 1, NEIGHBOR_SEARCH)
         self.sigma = torch.empty_like(self._longest)
         """Median of the neighbours' largest standard deviations, in scene units."""
         self.distance = torch.empty_like(self._longest)
@@ -57,13 +57,13 @@ class Surroundings:
 
     def measure_spacing(self, rows: Int64[Tensor, "m"]) -> Float[Tensor, "m"]:
         """Measure the median of `distance` over the neighbours, at least that of all `rows`."""
-        parts = [self.distance[self._list_neighbors(part)] for part in rows.split(BLOCK)]
+        parts = [self.distance[self._list_neighbors(part)] for part in rows.split(FLOATER_BLOCK)]
         spacing = torch.cat([part.median(dim=1).values for part in parts])
         # At least that of the scene, so that nothing is remote in its densest parts.
         return spacing.clamp_min(self.distance[rows].median())
 
     def _measure(self, rows: Int64[Tensor, "m"]) -> None:
-        for part in track(rows.split(BLOCK), "Comparing neighbours"):
+        for part in track(rows.split(FLOATER_BLOCK), "Comparing neighbours"):
             others = self._list_neighbors(part)
             offsets = self._means[part, None].double() - self._means[others].double()
             apart = offsets.norm(dim=2).to(self.distance.dtype)

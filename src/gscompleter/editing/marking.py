@@ -13,7 +13,7 @@ from gscompleter.numerics.geometry import compute_z_depths, look_up
 from gscompleter.render.protocols import Renderer
 from gscompleter.types import Camera, Gaussians
 
-MIN_SHOWN = 1e-3
+MIN_SHOWN_WEIGHT = 1e-3
 """Compositing weight, summed over pixels, from which on a Gaussian is shown."""
 BEHIND = 1.06
 """Depth relative to that of the marked surface up to which a Gaussian belongs to it."""
@@ -33,7 +33,7 @@ def find_marked(
     for camera, mark in zip(cameras, marks, strict=True):
         frozen = renderer.freeze(scene, camera)
         sums = sum_in_mask(frozen, mark.to(scene.means))
-        found |= (sums[:, 0] > sums[:, 1]) & (sums[:, 0] > MIN_SHOWN)
+        found |= (sums[:, 0] > sums[:, 1]) & (sums[:, 0] > MIN_SHOWN_WEIGHT)
         # What stands right behind the surface would come to light as a part of it.
         surface: Float[Tensor, "n"] = look_up(frozen.render.depth, scene, camera)
         z = compute_z_depths(scene.means, camera)

@@ -31,17 +31,17 @@ from gscompleter.trust import Trust
 from gscompleter.trust.photometric import PhotoObservations, gather_observations
 from gscompleter.types import ContextScene, Gaussians, View, merge
 
-TOLERANCE = 0.003
+REVEALED_TOLERANCE = 0.003
 """Largest loss of PSNR of a photograph, in dB, by revealed Gaussians that do not return."""
 MIN_REVEALED = 0.5
 """Share of a Gaussian, in some photograph, that has to come to light for it to be revealed."""
-MIN_CONFIRMED = 0.25
+MIN_SHOWN_BEFORE = 0.25
 """Share of it that a photograph has to show, before the removal, for it to stay."""
 MIN_OUTSIDE = 0.05
 """Share of a revealed Gaussian that has to be seen outside of the hole for it to return."""
-MAX_ROUNDS = 8
+MAX_LAYERS = 8
 """Layers of unseen Gaussians that are removed behind each other."""
-COLOR_ROUNDS = 8
+HOLE_COLOR_ROUNDS = 8
 """Rounds of fitting colours of additions to the photographs around the hole."""
 
 
@@ -154,7 +154,7 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
         view.paint_ignored(scene.composite(added).image.clamp(0, 1))
         for view, scene in zip(views, frozen, strict=True)
     ]
-    fitted = fit_colors(added, frozen, images, [RELAXATION] * COLOR_ROUNDS)
+    fitted = fit_colors(added, frozen, images, [RELAXATION] * HOLE_COLOR_ROUNDS)
     return replace(
         state,
         source=remaining,
@@ -180,7 +180,7 @@ def find_needed_revealed(
     # The scene with all candidates, but without additions, sets the limit of each photograph.
     # Candidates are rows of the scene between what is known and what was added.
     whole = merge([known, candidates])
-    limits = limit_errors(whole, views, TOLERANCE, renderer)
+    limits = limit_errors(whole, views, REVEALED_TOLERANCE, renderer)
     row = torch.arange(len(whole) + len(added), device=is_outside.device)
     is_candidate = (row >= len(known)) & (row < len(whole))
     superfluous = exclude_needed(merge([whole, added]), is_candidate, views, limits, renderer)
@@ -215,7 +215,7 @@ def fade_harmful(
     """
     added = merge([context[:0], *(part.gaussians for part in parts)])
     config = state.config.psnr_guard
-    config = replace(config, max_drop=max(config.max_drop, TOLERANCE))
+    config = replace(config, max_drop=max(config.max_drop, REVEALED_TOLERANCE))
     views = [photo.view for photo in state.photos]
     frozen = [renderer.freeze(context, view.camera) for view in views]
     budgets = [
@@ -253,13 +253,13 @@ def find_revealed(
     before = observe(state, torch.ones_like(gone), scenes)
     confirmed_area = (before.areas * before.agreement).amax(dim=0)
     # A round reveals the next layer: what is behind it was hidden until then.
-    for _ in range(MAX_ROUNDS):
+    for _ in range(MAX_LAYERS):
         areas = torch.zeros_like(before.areas)
         areas[:, ~gone] = observe(state, ~gone, scenes).areas
         largest = areas.amax(dim=0)
         revealed = (areas - before.areas).amax(dim=0) > MIN_REVEALED * largest
         # What a photograph showed before, in the right colours, was trained on and stays.
-        revealed &= confirmed_area < MIN_CONFIRMED * largest
+        revealed &= confirmed_area < MIN_SHOWN_BEFORE * largest
         if not revealed.any():
             break
         gone = gone | revealed

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gscompleter.config import FloaterConfig
+from gscompleter.editing.cutting import GAUSSIAN_REACH
 from gscompleter.editing.nearest import NearestGaussians
 from gscompleter.numerics.geometry import quats_to_rotations
 from gscompleter.render.outside import Extent, look_from_outside, measure_extent
@@ -23,19 +24,17 @@ from gscompleter.render.protocols import Renderer
 from gscompleter.system.progress import track
 from gscompleter.types import Gaussians
 
-STEPS = (-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5)
+PLACES_ALONG = (-1.5, -1.0, -0.5, 0.0, 0.5, 1.0, 1.5)
 """Places along a Gaussian that are looked at, in its standard deviations."""
-NEIGHBORS = 16
+NUM_NEIGHBORS = 16
 """Gaussians around each of these places that may lie there."""
-REACH = 3.0
-"""Standard deviations up to which a Gaussian reaches."""
-MIN_OPACITY = 0.05
+MIN_STREAK_OPACITY = 0.05
 """Least opacity of a Gaussian along which another one may lie."""
 SUSPECT_SHARE = 0.3
 """Share of `max_free` from which on renders decide."""
-SIDE = 128
+STREAK_RENDER_SIDE = 128
 """Width and height of these renders, in pixels."""
-BLOCK = 5_000
+STREAK_BLOCK = 5_000
 """Long Gaussians that are compared with their neighbours at a time, to save memory."""
 
 
@@ -46,7 +45,7 @@ class LongGaussians:
     rows: Int64[Tensor, "m"]
     """Their numbers in the scene."""
     places: Float[Tensor, "m t 3"]
-    """Places along each at `STEPS`, in the world."""
+    """Places along each at `PLACES_ALONG`, in the world."""
     width: Float[Tensor, "m"]
     """Second largest standard deviation, in scene units."""
 
@@ -60,7 +59,7 @@ def find_streaks(scene: Gaussians, config: FloaterConfig, renderer: Renderer) ->
         return ~left
 
     # The first one near a place is often the Gaussian that it belongs to.
-    count = min(NEIGHBORS + 1, len(scene))
+    count = min(NUM_NEIGHBORS + 1, len(scene))
     places = long.places.flatten(0, 1)
     nearest = NearestGaussians(places, scene.means, count, "Looking along streaks")
     while True:
@@ -70,7 +69,7 @@ def find_streaks(scene: Gaussians, config: FloaterConfig, renderer: Renderer) ->
         left &= ~gone
         if not gone.any() or left.sum() < count:
             break
-        nearest.take_away(gone, left, left[long.rows].repeat_interleave(len(STEPS)))
+        nearest.take_away(gone, left, left[long.rows].repeat_interleave(len(PLACES_ALONG)))
 
     suspects = long.rows[left[long.rows] & (free > SUSPECT_SHARE * config.max_free)]
     others = left.index_fill(0, suspects, False)
@@ -89,7 +88,7 @@ def list_long_gaussians(scene: Gaussians, radius: float, config: FloaterConfig) 
     # The column of the rotation that belongs to the largest scale.
     columns = order[rows, :1, None].expand(-1, 3, 1)
     axes = quats_to_rotations(scene.quats[rows]).gather(2, columns)
-    steps = torch.tensor(STEPS).to(axes) * scales[rows, :1]
+    steps = torch.tensor(PLACES_ALONG).to(axes) * scales[rows, :1]
     places = scene.means[rows, None] + steps[..., None] * axes.mT
     return LongGaussians(rows, places, scales[rows, 1])
 
@@ -98,22 +97,26 @@ def measure_free_length(
     scene: Gaussians, long: LongGaussians, nearest: NearestGaussians
 ) -> Float[Tensor, "m"]:
     """Measure the share of long Gaussians, by their density, along which no other one lies."""
-    steps = torch.tensor(STEPS).to(scene.means)
+    steps = torch.tensor(PLACES_ALONG).to(scene.means)
     weights = (-(steps**2) / 2).softmax(dim=0)
     shares = [torch.zeros(0).to(weights)]
-    for start in track(range(0, len(long.rows), BLOCK), "Comparing streaks"):
-        block = slice(start, start + BLOCK)
+    for start in track(range(0, len(long.rows), STREAK_BLOCK), "Comparing streaks"):
+        block = slice(start, start + STREAK_BLOCK)
         own = long.rows[block, None, None]
-        numbers = nearest.rows[start * len(STEPS) : (start + BLOCK) * len(STEPS)]
-        others = torch.from_numpy(numbers).long().to(own.device).unflatten(0, (-1, len(STEPS)))
+        numbers = nearest.rows[
+            start * len(PLACES_ALONG) : (start + STREAK_BLOCK) * len(PLACES_ALONG)
+        ]
+        others = (
+            torch.from_numpy(numbers).long().to(own.device).unflatten(0, (-1, len(PLACES_ALONG)))
+        )
         # Offsets along the axes of the other one, in standard deviations of both together: across,
         # a long one is as wide as it is.
         offset = long.places[block, :, None] - scene.means[others]
         rotations = quats_to_rotations(scene.quats[others])
         along = (rotations.mT @ offset[..., None])[..., 0]
         variance = scene.scales[others] ** 2 + long.width[block, None, None, None] ** 2
-        touches = (along**2 / variance.clamp_min(1e-30)).sum(dim=-1) < REACH**2
-        touches &= (others != own) & (scene.opacities[others] > MIN_OPACITY)
+        touches = (along**2 / variance.clamp_min(1e-30)).sum(dim=-1) < GAUSSIAN_REACH**2
+        touches &= (others != own) & (scene.opacities[others] > MIN_STREAK_OPACITY)
         shares.append((~touches.any(dim=2)).to(weights) @ weights)
     return torch.cat(shares)
 
@@ -124,7 +127,7 @@ def measure_uncovered(
     """Measure the share of what suspects cover, seen from outside, where no others are."""
     beside = torch.zeros_like(suspects.opacities)
     total = torch.zeros_like(suspects.opacities)
-    views = look_from_outside(others, renderer, SIDE, extent)
+    views = look_from_outside(others, renderer, STREAK_RENDER_SIDE, extent)
     for view in track(views, "Comparing renders"):
         empty = (~view.silhouette).to(beside)
         counted = torch.stack([empty, torch.ones_like(empty), torch.zeros_like(empty)], dim=-1)

@@ -18,7 +18,7 @@ from gscompleter.system.errors import InputError, OutputError, quote_value
 
 LEDGER = "apart_uses.md"
 """Table of uses: that in the folder of the file, or else the first one in a folder above it."""
-HEAD = """# Uses of what is kept apart
+APART_HEAD = """# Uses of what is kept apart
 
 A row for each run that computed scores of cases which their file keeps apart. `gscompleter evaluate
 --apart` and the scripts in `benchmarks` append to it.
@@ -91,7 +91,7 @@ def record_uses(items: Sequence[Apartable], used_by: str) -> None:
         try:
             # Opened for appending, a row is one write, which other runs cannot tear.
             with open(ledger, "a", encoding="utf-8") as out:
-                out.write(row if out.tell() else HEAD + row)
+                out.write(row if out.tell() else APART_HEAD + row)
         except OSError as error:
             raise OutputError(
                 f"The use of {quote_value(file)} cannot be noted in {quote_value(ledger)} "

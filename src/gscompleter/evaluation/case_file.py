@@ -21,7 +21,7 @@ from typing import Any
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_json
 from gscompleter.system.tensor_checks import is_number
-from gscompleter.types import MAX_SIDE
+from gscompleter.types import MAX_IMAGE_SIDE
 
 FILE_KEYS = ("resolution", "cases", "about", "apart")
 """Keys of the file; `about` is a remark for people."""
@@ -73,7 +73,7 @@ def read_case_file(path: Path) -> CaseFile:
 
     size = content.get("resolution")
     sides = size if isinstance(size, list) else []
-    if len(sides) != 2 or not all(type(s) is int and 1 <= s <= MAX_SIDE for s in sides):
+    if len(sides) != 2 or not all(type(s) is int and 1 <= s <= MAX_IMAGE_SIDE for s in sides):
         raise InputError(
             f"{name}: resolution has to be height and width in pixels, as in [256, 256], and is "
             f"{show(size)}."
@@ -81,7 +81,7 @@ def read_case_file(path: Path) -> CaseFile:
     rows = content.get("cases")
     if not isinstance(rows, list) or not rows:
         raise InputError(f"{name}: cases has to be a list of cases, and is {show(rows)}.")
-    parsed = [parse_row(row, f"{name}: case {n}") for n, row in enumerate(rows, start=1)]
+    parsed = [parse_case_row(row, f"{name}: case {n}") for n, row in enumerate(rows, start=1)]
 
     # The scores of two cases of one name would overwrite each other.
     names = [(row.scene, row.context, row.target) for row in parsed]
@@ -149,7 +149,7 @@ def parse_apart(apart: Any, scenes: Sequence[str], name: str) -> list[bool]:
     return [scene in apart for scene in known]
 
 
-def parse_row(row: Any, name: str) -> CaseRow:
+def parse_case_row(row: Any, name: str) -> CaseRow:
     """Parse a case; sentences begin with its name."""
     if not isinstance(row, dict):
         raise InputError(f"{name} has to be an object with scene, context and target.")

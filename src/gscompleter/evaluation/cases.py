@@ -87,7 +87,7 @@ class SkippedScene:
 
 
 @dataclass(frozen=True)
-class Place:
+class ScenePlace:
     """A file or folder of scenes that a protocol chooses frames of."""
 
     path: Path
@@ -95,12 +95,12 @@ class Place:
     """File of scenes that keeps it apart, or None."""
 
 
-def list_places(path: Path) -> list[Place]:
+def list_places(path: Path) -> list[ScenePlace]:
     """List the scenes that a file of scenes names; else the path itself."""
     if not is_scene_file(path):
-        return [Place(path)]
+        return [ScenePlace(path)]
     return [
-        Place(path.parent / os.path.expandvars(row.scene), path if row.is_apart else None)
+        ScenePlace(path.parent / os.path.expandvars(row.scene), path if row.is_apart else None)
         for row in read_scene_file(path)
     ]
 

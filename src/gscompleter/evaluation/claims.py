@@ -22,7 +22,16 @@ from gscompleter.evaluation.paper import Claim
 from gscompleter.evaluation.paper_tables import SIGNIFICANCE, Estimate, estimate_mean, get_scene
 from gscompleter.evaluation.store import read_run_file
 
-HEAD = ("claim", "the paper", "table", "measured", "t test", "in favour", "sign test", "verdict")
+CLAIM_COLUMNS = (
+    "claim",
+    "the paper",
+    "table",
+    "measured",
+    "t test",
+    "in favour",
+    "sign test",
+    "verdict",
+)
 """Titles of the columns of a table of claims."""
 
 Rows = list[Mapping[str, Any]]
@@ -61,7 +70,7 @@ class Judgement:
 
 
 def tabulate_claims(folder: Path, claims: Iterable[Claim]) -> list[list[str]]:
-    """Judge the claims by the tables in a folder; return a row for each, below `HEAD`."""
+    """Judge the claims by the tables in a folder; return a row for each, below `CLAIM_COLUMNS`."""
     rows = []
     for claim in claims:
         judgement = judge_claim(folder, claim)

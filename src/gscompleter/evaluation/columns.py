@@ -20,7 +20,7 @@ StepRow = dict[str, Any]
 Reduction = Callable[[Sequence[float]], Any]
 """Reduces several numbers to one, or to None."""
 
-MIN_PIXELS = 500
+MIN_GEOMETRY_PIXELS = 500
 """Smallest number of pixels over which a geometry score counts."""
 
 
@@ -38,12 +38,12 @@ class Column:
     reduce_steps: Reduction = statistics.fmean
     reduce_tasks: Reduction = statistics.fmean
     pixels: str | None = None
-    """Place of the number of pixels, of which `MIN_PIXELS` are needed."""
+    """Place of the number of pixels, of which `MIN_GEOMETRY_PIXELS` are needed."""
 
     def get_value(self, step: StepRow) -> float | None:
         """Return the number of a step; None without ground truth."""
         # A score of few pixels says more about them than about the method.
-        if self.pixels is not None and (find_number(step, self.pixels) or 0) < MIN_PIXELS:
+        if self.pixels is not None and (find_number(step, self.pixels) or 0) < MIN_GEOMETRY_PIXELS:
             return None
         value = find_number(step, self.path)
         # A list has a number for each view; the subtracted ones are then as many.
@@ -106,7 +106,7 @@ PSNR_BEFORE = Column("psnr_before", "PSNR before", 2, BEFORE)
 PSNR = Column("psnr", "PSNR", 2, AFTER)
 GAIN = Column("gain", "ΔPSNR", 2, AFTER, BEFORE)
 
-GROUPS = {
+COLUMN_GROUPS = {
     "Images": (
         PSNR,
         GAIN,
@@ -185,5 +185,5 @@ PAPER = (
 """Further columns of the paper's tables, which are means over cases; all lifted Gaussians are
 compared with the context, at the rim only those that are added."""
 
-BY_KEY = {column.key: column for group in (*GROUPS.values(), PAPER) for column in group}
+BY_KEY = {column.key: column for group in (*COLUMN_GROUPS.values(), PAPER) for column in group}
 """All columns by their key."""

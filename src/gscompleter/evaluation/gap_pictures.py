@@ -10,7 +10,7 @@ from gscompleter.evaluation.metrics.thin_gaps import WINDOW, WorstGap
 from gscompleter.numerics.image_ops import paint_marked
 from gscompleter.system.files.image import convert_to_pixels
 
-ZOOM = 4
+PIXEL_ZOOM = 4
 """Pixels of the picture for each one of the window."""
 LABEL_HEIGHT = 52
 """Height of two lines of text, in pixels."""
@@ -24,7 +24,7 @@ def draw_gap(worst: WorstGap | None) -> UInt8[np.ndarray, "h w 3"]:
     A line above them says where it is, and how much of it are gaps. Without thin gaps there are
     only words that say so.
     """
-    side = ZOOM * WINDOW
+    side = PIXEL_ZOOM * WINDOW
     height = LABEL_HEIGHT + (0 if worst is None else side)
     canvas = Image.new("RGB", (2 * side, height), "white")
     label = NOTHING_THIN if worst is None else f"Thin gaps: {worst.describe()}"

@@ -12,7 +12,7 @@ import subprocess
 from functools import cache
 from pathlib import Path
 
-PACKAGE = Path(__file__).parents[1]
+PACKAGE_FOLDER = Path(__file__).parents[1]
 METHOD = (
     *("completer.py", "state.py", "types.py", "config", "data", "evaluation/methods.py"),
     *("evaluation/steps.py", "evaluation/metrics", "evaluation/baselines", "generators", "guards"),
@@ -28,7 +28,7 @@ def find_commit() -> str | None:
     It ends with `-dirty` if the sources differ from it; results that lie in the checkout may.
     """
     # From src/gscompleter of a checkout; an installed package has no .git there.
-    root = PACKAGE.parents[1]
+    root = PACKAGE_FOLDER.parents[1]
     if not (root / ".git").exists() or shutil.which("git") is None:
         return None
     git = ["git", "-C", str(root)]
@@ -43,7 +43,7 @@ def find_commit() -> str | None:
     return described.stdout.strip() + ("-dirty" if changed.stdout.strip() else "")
 
 
-def compute_method_digest(package: Path = PACKAGE) -> str:
+def compute_method_digest(package: Path = PACKAGE_FOLDER) -> str:
     """Compute the digest of the method of the package in a folder, 16 hexadecimal digits."""
     digest = hashlib.sha256()
     for path in list_method_files(package):

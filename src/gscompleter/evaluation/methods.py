@@ -206,7 +206,7 @@ METHODS: dict[str, Method] = {
 }
 """All methods by name, in the order of the tables."""
 
-GROUPS: dict[str, tuple[str, ...]] = {
+METHOD_GROUPS: dict[str, tuple[str, ...]] = {
     "ablations": tuple(_ABLATIONS),
     "baselines": tuple(BASELINES),
     "all": ("context", "full", "paper", *_ABLATIONS, *BASELINES),
@@ -216,7 +216,7 @@ GROUPS: dict[str, tuple[str, ...]] = {
 
 def expand_methods(names: Sequence[str]) -> tuple[str, ...]:
     """Replace groups by their methods and drop duplicates; raise as `check_methods`."""
-    chosen = dict.fromkeys(method for name in names for method in GROUPS.get(name, (name,)))
+    chosen = dict.fromkeys(method for name in names for method in METHOD_GROUPS.get(name, (name,)))
     check_methods(tuple(chosen))
     return tuple(chosen)
 
@@ -224,7 +224,7 @@ def expand_methods(names: Sequence[str]) -> tuple[str, ...]:
 def check_methods(names: Sequence[str], steps: int = 1) -> None:
     """Raise InputError for no or unknown names and methods that cannot do `steps`."""
     known = ", ".join(
-        [*GROUPS, *(name for name in METHODS if not name.startswith(("paper/", "steps-")))]
+        [*METHOD_GROUPS, *(name for name in METHODS if not name.startswith(("paper/", "steps-")))]
     )
     if not names:
         raise InputError(f"No method was named; choose one or more of {known}.")

@@ -28,7 +28,7 @@ from gscompleter.types import View
 
 INDICES = Path(__file__).parent / "indices"
 """Folder of the evaluation indices in the package; its README.md has the rule."""
-VERSION = 1
+INDEX_VERSION = 1
 """Version of the files that `write_evaluation_index` writes."""
 
 Frames = Annotated[tuple[Annotated[int, Ge(0)], ...], MinLen(1)]
@@ -169,15 +169,15 @@ def read_evaluation_index(path: Path) -> EvaluationIndex:
     content = read_json(path, "download it again")
     if not isinstance(content, dict) or "version" not in content:
         # A published index names the scene alone; the rest is added.
-        content = {"version": VERSION, "protocol": path.stem, "scenes": content}
+        content = {"version": INDEX_VERSION, "protocol": path.stem, "scenes": content}
     try:
         file = TypeAdapter(IndexFile).validate_json(json.dumps(content), strict=True)
     except ValidationError as error:
         defect = error.errors(include_url=False)[0]
         place = quote_value(".".join(str(part) for part in defect["loc"]))
         raise InputError(
-            f"{path} is no evaluation index of version {VERSION} ({place}: {defect['msg']}); it "
-            "has to map the name of each scene to its context and target frames, or to null."
+            f"{path} is no evaluation index of version {INDEX_VERSION} ({place}: {defect['msg']}); "
+            "it has to map the name of each scene to its context and target frames, or to null."
         ) from None
     # A scene has one split, several, or null, which leaves it out.
     scenes = {
@@ -194,7 +194,7 @@ def write_evaluation_index(path: Path | str, index: EvaluationIndex) -> None:
         name: [{"context": s.context, "target": s.targets} for s in splits] or None
         for name, splits in index.scenes.items()
     }
-    content = {"version": VERSION, "protocol": index.name, "scenes": scenes}
+    content = {"version": INDEX_VERSION, "protocol": index.name, "scenes": scenes}
     with replace_file(path) as file:
         file.write((json.dumps(content, indent=1) + "\n").encode())
 

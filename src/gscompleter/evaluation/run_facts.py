@@ -62,15 +62,15 @@ def read_run_facts(out: Path, rows: Sequence[RunRow]) -> RunFacts:
     }
     given = {k.removeprefix(SETTING): v for k, v in settings.items() if k.startswith(SETTING)}
     return RunFacts(
-        name_model(settings["reconstructor"], extras),
-        name_model(settings["generator"], given),
+        name_model_with_settings(settings["reconstructor"], extras),
+        name_model_with_settings(settings["generator"], given),
         settings["seed"],
         settings["source"].get("apart", 0),
         tuple(sorted({row["commit"] for row in rows if row.get("commit")})),
     )
 
 
-def name_model(name: str, settings: Mapping[str, Any]) -> str:
+def name_model_with_settings(name: str, settings: Mapping[str, Any]) -> str:
     """Name a model with the settings that have a value."""
     known = {key: value for key, value in settings.items() if value is not None}
     described = [f"{key} {strip_folder(str(value))}" for key, value in known.items()]

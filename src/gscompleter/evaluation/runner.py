@@ -272,7 +272,7 @@ def build_row(
         if prepared.context_notes:
             outcome["context_notes"] = list(prepared.context_notes)
     named = {key: getattr(task, key) for key in ("name", "context", "targets", "neighbours")}
-    row = {"version": store.VERSION, "task": named, "method": method, **outcome}
+    row = {"version": store.RUN_VERSION, "task": named, "method": method, **outcome}
     commit = find_commit()
     return row if commit is None else {**row, "commit": commit}
 

@@ -37,7 +37,7 @@ RUN = "run.json"
 """File with the settings of a run."""
 TASKS = "tasks"
 """Folder that holds the tasks."""
-VERSION = 4
+RUN_VERSION = 4
 """Version of the files of a run."""
 FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated")
 """Tensors of Gaussians that are saved."""
@@ -83,7 +83,7 @@ def list_row_paths(out: Path) -> list[Path]:
 def claim(out: Path, settings: Mapping[str, Any]) -> None:
     """Create the folder of a run, or check that it holds a run with the same settings."""
     # Through JSON, which turns tuples into lists: compared is what the file holds.
-    wanted = json.loads(json.dumps({"version": VERSION, **settings}))
+    wanted = json.loads(json.dumps({"version": RUN_VERSION, **settings}))
     claim_folder(out, "run", wanted)
     existing = read_run_settings(out)
     for key in {**wanted, **existing}:
@@ -101,9 +101,9 @@ def read_run_settings(out: Path) -> dict[str, Any]:
         raise InputError(f"{out} holds no run; name a folder that `evaluate` wrote.")
     settings = read_run_file(out / RUN, "name another folder")
     version = settings.get("version") if isinstance(settings, dict) else None
-    if version != VERSION:
+    if version != RUN_VERSION:
         raise InputError(
-            f"{out} holds a run of version {quote_value(version)}, and version {VERSION} is "
+            f"{out} holds a run of version {quote_value(version)}, and version {RUN_VERSION} is "
             "needed; name another folder and run it again."
         )
     return dict(settings)

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from gscompleter.evaluation.columns import (
-    GROUPS,
-    MIN_PIXELS,
+    COLUMN_GROUPS,
+    MIN_GEOMETRY_PIXELS,
     PSNR,
     PSNR_BEFORE,
     Column,
@@ -43,7 +43,9 @@ Fids = dict[str, float] | str
 
 ORDER = ("reconstruct", *STAGES, "optimize")
 """Order of stages in the tables."""
-FEW_PIXELS_NOTE = f"A geometry score counts if it is measured over at least {MIN_PIXELS} pixels."
+FEW_PIXELS_NOTE = (
+    f"A geometry score counts if it is measured over at least {MIN_GEOMETRY_PIXELS} pixels."
+)
 REGGS_NOTE = (
     "reggs gets our metric lift and the true poses. RegGS in its paper gets neither, so this "
     "row is not comparable with that paper."
@@ -87,7 +89,7 @@ class RunSummary:
         """Columns in which any method has a value, by the title of their table."""
         groups = {
             title: [column for column in columns if self.has_value(column)]
-            for title, columns in GROUPS.items()
+            for title, columns in COLUMN_GROUPS.items()
         }
         if not self.sequences:
             del groups["Sequences"]
@@ -149,13 +151,13 @@ def read_run_rows(out: Path) -> list[RunRow]:
     return list(rows.values())
 
 
-def rank(order: Iterable[str], name: str) -> tuple[int, str]:
+def rank_name(order: Iterable[str], name: str) -> tuple[int, str]:
     """Return the sort key of a name in tables: its place in `order`, unknown ones last."""
     return ([*order, name].index(name), name)
 
 
-rank_method = partial(rank, METHODS)
-rank_stage = partial(rank, ORDER)
+rank_method = partial(rank_name, METHODS)
+rank_stage = partial(rank_name, ORDER)
 
 
 def summarize_run(rows: Sequence[RunRow]) -> RunSummary:
@@ -324,7 +326,7 @@ def collect_score_content(summary: RunSummary, fids: Fids, facts: RunFacts) -> d
     """Return all scores with full precision, for JSON."""
     values: dict[str, float] = {} if isinstance(fids, str) else fids
     reason = fids if isinstance(fids, str) else None
-    columns = [column for group in GROUPS.values() for column in group]
+    columns = [column for group in COLUMN_GROUPS.values() for column in group]
     methods = {}
     for method in summary.methods:
         cells = {column.key: summary.compute_cell(method, column) for column in columns}

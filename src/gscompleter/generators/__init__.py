@@ -11,15 +11,15 @@ from torch import Tensor
 
 from gscompleter.config import SynthesisConfig
 from gscompleter.config.generators import (
+    GENERATOR_PLUGINS,
     GENERATORS,
-    PLUGINS,
     GeneratorSettings,
     get_settings_class,
 )
 from gscompleter.config.settings import validate
 from gscompleter.system.errors import InputError
 from gscompleter.system.plugins import is_in_file, load_from_file, load_function, load_plugins
-from gscompleter.system.tensor_checks import describe, is_whole
+from gscompleter.system.tensor_checks import describe, is_whole_number
 from gscompleter.types import Camera, GeneratorInput, View
 
 
@@ -100,7 +100,7 @@ def as_generator(phi: Any) -> Generator:
             f"returns, and is {describe(phi)}."
         )
     generator: Generator = phi if is_object else FunctionGenerator(phi)
-    if not is_whole(generator.max_batch_size) or generator.max_batch_size < 1:
+    if not is_whole_number(generator.max_batch_size) or generator.max_batch_size < 1:
         raise InputError(
             "The max_batch_size of the generator has to be a whole number from 1, and is "
             f"{describe(generator.max_batch_size)}."
@@ -141,5 +141,5 @@ def load_generator(
     if name in GENERATORS:
         load = load_function(*GENERATORS[name].load.split(":"))
     else:
-        load = load_plugins(PLUGINS)[name]
+        load = load_plugins(GENERATOR_PLUGINS)[name]
     return as_generator(load(settings, seed, photographs, device))

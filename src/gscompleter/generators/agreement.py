@@ -15,18 +15,18 @@ from gscompleter.numerics.image_ops import smooth_masked
 from gscompleter.numerics.robust import fit_robust_affine
 from gscompleter.system.errors import InputError
 
-BLUR_RADIUS = 2
+COMPARED_BLUR = 2
 """Blur in pixels before colours are compared; edges may be a pixel off."""
 MAX_SHARE = 0.6
 """Largest residual of a consistent image, relative to that of a constant colour."""
-QUANTILE = 0.7
+RESIDUAL_QUANTILE = 0.7
 """Quantile of the residuals; higher than the median, which may be a blank wall."""
 MIN_LIMIT = 0.03
 """Residual that is always accepted, for colours in [0, 1]."""
-MAX_GAIN = 1.6
+MAX_SHIFT_GAIN = 1.6
 """Largest gain of a colour shift; its inverse is the smallest."""
 MAX_OFFSET = 0.25
-MIN_PIXELS = 200
+MIN_OBSERVED_PIXELS = 200
 """Fewest observed pixels for a comparison."""
 
 
@@ -97,23 +97,23 @@ def compare_with_observed(
     zeros = torch.zeros(3).to(image)
     if not image.isfinite().all():
         return Agreement(ones, zeros, float("inf"), MIN_LIMIT, False, image)
-    if int(known.sum()) < MIN_PIXELS:
+    if int(known.sum()) < MIN_OBSERVED_PIXELS:
         return Agreement(ones, zeros, 0.0, MIN_LIMIT, True, image)
 
-    painted = smooth_masked(image, known, BLUR_RADIUS)[known]
-    photographed = smooth_masked(observed, known, BLUR_RADIUS)[known]
+    painted = smooth_masked(image, known, COMPARED_BLUR)[known]
+    photographed = smooth_masked(observed, known, COMPARED_BLUR)[known]
     gain, offset = fit_robust_affine(painted, photographed)
     differences = (gain * painted + offset - photographed).abs().mean(dim=-1)
-    residual = compute_quantile(differences, QUANTILE)
+    residual = compute_quantile(differences, RESIDUAL_QUANTILE)
 
     # A single colour would match photographs of a blank wall as well, so the residual of one is
     # the scale that an image has to be better than.
     median = photographed.median(dim=0).values
-    contrast = compute_quantile((photographed - median).abs().mean(dim=-1), QUANTILE)
+    contrast = compute_quantile((photographed - median).abs().mean(dim=-1), RESIDUAL_QUANTILE)
     limit = max(MIN_LIMIT, MAX_SHARE * contrast)
 
     # With any gain and offset an image of another scene could be fitted, too.
-    is_gain_plausible = bool(((gain >= 1 / MAX_GAIN) & (gain <= MAX_GAIN)).all())
+    is_gain_plausible = bool(((gain >= 1 / MAX_SHIFT_GAIN) & (gain <= MAX_SHIFT_GAIN)).all())
     is_offset_plausible = bool((offset.abs() <= MAX_OFFSET).all())
     agrees = is_gain_plausible and is_offset_plausible and residual <= limit
     if agrees and not correct_color:

@@ -8,13 +8,11 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-MIN_PIXELS = 100
+from gscompleter.numerics.image_ops import BRIGHTEST, DARKEST
+
+MIN_EXPOSURE_PIXELS = 100
 """Fewest shared pixels to compare two photographs."""
-DARKEST = 0.05
-"""Smallest usable value; darker ones are noise."""
-BRIGHTEST = 0.95
-"""Largest usable value; brighter ones may be clipped."""
-MAX_GAIN = 2.0
+MAX_EXPOSURE_GAIN = 2.0
 """Largest plausible gain; its inverse is the smallest."""
 
 
@@ -37,11 +35,11 @@ def match_exposures(
         best, known, num_shared = max(pairs, key=lambda pair: pair[2])
         waiting.remove(best)
         gains[best] = ones
-        if num_shared >= MIN_PIXELS:
+        if num_shared >= MIN_EXPOSURE_PIXELS:
             overlap = visible[best] & visible[known]
             ratio = compute_median_ratio(colors[best][overlap], colors[known][overlap])
             gains[best] = gains[known] * ratio
-    return [gains[i].clamp(1 / MAX_GAIN, MAX_GAIN) for i in range(len(colors))]
+    return [gains[i].clamp(1 / MAX_EXPOSURE_GAIN, MAX_EXPOSURE_GAIN) for i in range(len(colors))]
 
 
 def compute_median_ratio(
@@ -54,6 +52,6 @@ def compute_median_ratio(
         other_values = other[:, channel]
         is_exposed = torch.minimum(own_values, other_values) > DARKEST
         is_exposed &= torch.maximum(own_values, other_values) < BRIGHTEST
-        if int(is_exposed.sum()) >= MIN_PIXELS:
+        if int(is_exposed.sum()) >= MIN_EXPOSURE_PIXELS:
             ratios[channel] = (other_values[is_exposed] / own_values[is_exposed]).median()
     return ratios

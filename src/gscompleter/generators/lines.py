@@ -24,9 +24,9 @@ TENSOR_SIGMA = 3.0
 """Standard deviation in pixels of the blur of the products of gradients."""
 RIM_WIDTH = 2
 """Width in pixels of the rim of known pixels whose gradients depend on the filling of a hole."""
-REACH = 0.08
+LINE_DECAY = 0.08
 """Length at which the weight of a line falls to 1/e, relative to the longer image side."""
-MIN_WEIGHT = 0.1
+LINE_END_WEIGHT = 0.1
 """Weight at which a line ends."""
 
 
@@ -47,10 +47,10 @@ def continue_lines(
     angle = 0.5 * torch.atan2(2 * xy, xx - yy)
     directions = torch.stack([-angle.sin(), angle.cos()], dim=-1)
 
-    # A line is given up at the length at which its weight would fall below MIN_WEIGHT. Where even
+    # A line is given up at the length at which its weight falls below LINE_END_WEIGHT. Where even
     # the straight way to a known pixel is longer, none is traced. Lengths are in pixels.
-    reach = REACH * max(known.shape)
-    limits = reach * (coherence.where(~known, 0.0) / MIN_WEIGHT).clamp_min(1).log()
+    reach = LINE_DECAY * max(known.shape)
+    limits = reach * (coherence.where(~known, 0.0) / LINE_END_WEIGHT).clamp_min(1).log()
     limits = limits.where(limits > compute_distance_to_known(known), 0.0)
 
     layers = (image, known, directions, limits)

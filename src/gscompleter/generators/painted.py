@@ -26,16 +26,16 @@ from gscompleter.system.errors import InputError
 from gscompleter.system.tensor_checks import BOOLS, Form
 from gscompleter.types import Camera, View
 
-MAX_STRETCH = 0.01
+MAX_ASPECT_DIFFERENCE = 0.01
 """Largest relative difference between the aspect ratios of a painted image and of its target."""
 MAX_DIFFERENCE = 0.12
 """Difference of colours in [0, 1] beside the hole, after the fit of the exposure, from which on it
 is said where they differ; the same as that of things that moved between photographs."""
-BLUR_RADIUS = 4
+DIFFERENCE_RADIUS = 4
 """Radius in pixels over which that difference is averaged, since fine detail may differ."""
 MIN_DIFFERING = 0.005
 """Share of the image that differs from which on it is said."""
-MIN_OPEN = 0.005
+MIN_UNPAINTED = 0.005
 """Share of the hole without paint from which on it is said."""
 
 
@@ -159,7 +159,7 @@ def fit_mask(
 
 def check_aspect(name: str, width: int, height: int, camera: Camera) -> None:
     """Raise InputError if an image has another aspect ratio than a camera."""
-    if abs(width * camera.height / (height * camera.width) - 1) > MAX_STRETCH:
+    if abs(width * camera.height / (height * camera.width) - 1) > MAX_ASPECT_DIFFERENCE:
         raise InputError(
             f"{name} has {width} x {height} pixels, and its target {camera.width} x "
             f"{camera.height}; scale it to any size of the same aspect ratio, without cropping."
@@ -193,7 +193,7 @@ def describe_differences(
     comparable: Bool[Tensor, "h w"],
 ) -> str:
     """Write where an image, in the exposure of the scene, differs from it outside of the mask."""
-    difference = smooth_masked((image - scene).abs(), comparable, BLUR_RADIUS).mean(dim=-1)
+    difference = smooth_masked((image - scene).abs(), comparable, DIFFERENCE_RADIUS).mean(dim=-1)
     differs = comparable & (difference > MAX_DIFFERENCE)
     share = differs.float().mean().item()
     if share < MIN_DIFFERING:
@@ -211,7 +211,7 @@ def describe_differences(
 def describe_open(name: str, is_open: Bool[Tensor, "h w"], hole: Bool[Tensor, "h w"]) -> str:
     """Write how much of the hole was not painted."""
     share = int(is_open.sum()) / max(int(hole.sum()), 1)
-    if share < MIN_OPEN:
+    if share < MIN_UNPAINTED:
         return ""
     return (
         f"{name} leaves {share:.1%} of the hole open, where it is transparent or the mask of the "

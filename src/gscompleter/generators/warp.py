@@ -16,11 +16,11 @@ from gscompleter.numerics.geometry import is_inside, measure_baseline, project, 
 from gscompleter.numerics.image_ops import dilate, smooth_masked
 from gscompleter.types import Camera, GeneratorInput, Render, TensorDataclass, View
 
-DEPTH_TOLERANCE = 0.03
+WARP_DEPTH_TOLERANCE = 0.03
 """Relative depth error at which the weight of a photograph falls to 1/e."""
-SHARPNESS = 4.0
+NEAREST_SHARPNESS = 4.0
 """Exponent of the weights; larger values prefer the nearest photograph."""
-MIN_WEIGHT = 1.0
+MIN_OBSERVING_WEIGHT = 1.0
 """Smallest weight, before the exponent, of a photograph that observes a surface."""
 DYNAMIC_MARGIN = 4
 """Pixels around a dynamic mask without trust in the rendered colour."""
@@ -58,7 +58,7 @@ def warp_photographs(nearest: View, target: Camera, context: GeneratorInput) -> 
     scene = context.target_render
     known = ~context.holes
     points = unproject(scene.depth, target)
-    min_weight = MIN_WEIGHT**SHARPNESS
+    min_weight = MIN_OBSERVING_WEIGHT**NEAREST_SHARPNESS
     colours = []
     weights = []
     dynamic = torch.zeros_like(known)
@@ -66,7 +66,7 @@ def warp_photographs(nearest: View, target: Camera, context: GeneratorInput) -> 
         pixels, z = project(points, view.camera)
         visible = _compute_visibility(pixels, z, view, render)
         # The high power prefers the photograph from the most similar direction.
-        weight = (visible * _compute_closeness(points, target, view)) ** SHARPNESS
+        weight = (visible * _compute_closeness(points, target, view)) ** NEAREST_SHARPNESS
         colours.append(sample(view.image, pixels))
         weights.append(weight * ~_touches_mask(~view.static_mask, pixels))
         if view.dynamic_mask is not None:
@@ -130,7 +130,7 @@ def add_unexplained(filled: WarpedImage, target: Camera, context: GeneratorInput
         empty = sample(render.alpha[..., None], pixels)[..., 0] < COVERED
         unexplained = empty & is_inside(pixels, z, view.camera) & ~filled.known
         unexplained &= ~_touches_mask(~view.static_mask, pixels)
-        weight = unexplained * _compute_closeness(points, target, view) ** SHARPNESS
+        weight = unexplained * _compute_closeness(points, target, view) ** NEAREST_SHARPNESS
         colour = colour + weight[..., None] * gain * sample(view.image, pixels)
         total = total + weight
     is_shown = total > 0
@@ -204,7 +204,7 @@ def _compute_visibility(
     """Compute how well depth `z` matches the surface at `pixels` of a view, in [0, 1]."""
     layers = torch.stack([render.depth, render.alpha], dim=-1)
     depth, alpha = sample(layers, pixels).unbind(-1)
-    error = (z - depth).abs() / (DEPTH_TOLERANCE * z.abs().clamp_min(1e-12))
+    error = (z - depth).abs() / (WARP_DEPTH_TOLERANCE * z.abs().clamp_min(1e-12))
     visible = is_inside(pixels, z, view.camera) & (alpha >= COVERED)
     return torch.exp(-(error**2)) * visible
 

@@ -30,7 +30,7 @@ from gscompleter.generators.warp import (
 )
 from gscompleter.numerics.image_ops import dilate, smooth_masked
 from gscompleter.numerics.kernels import patchmatch
-from gscompleter.numerics.kernels.patchmatch import RADIUS, SIDE
+from gscompleter.numerics.kernels.patchmatch import PATCHMATCH_RADIUS, PATCHMATCH_SIDE
 from gscompleter.types import Camera, GeneratorInput, View
 
 STRUCTURE_REACH = 0.15
@@ -187,7 +187,7 @@ class Sources:
 
 
 @dataclass(frozen=True)
-class Level:
+class InpaintLevel:
     """One pyramid level: image, known pixels, expected log-depth and sources."""
 
     image: Float[Tensor, "h w 3"]
@@ -214,7 +214,7 @@ def fill_by_patches(
     """
     # Coarse to fine (Wexler et al. 2007): the coarsest level decides what goes where, and each
     # finer one starts from its matches.
-    levels = [Level(image, known, expected, sources)]
+    levels = [InpaintLevel(image, known, expected, sources)]
     while min(levels[-1].known.shape) // 2 >= MIN_SIZE:
         levels.append(downsample_level(levels[-1]))
 
@@ -227,14 +227,16 @@ def fill_by_patches(
         # second one on each diagonal, as scores do not change (decision 045).
         spacing = FINEST_SPACING if number == 0 else 1
         rows, columns = np.indices(level.known.shape)
-        centres = dilate(~level.known, RADIUS).numpy() & ((rows + columns) % spacing == 0)
+        centres = dilate(~level.known, PATCHMATCH_RADIUS).numpy() & (
+            (rows + columns) % spacing == 0
+        )
         # Each level and round draws other random numbers; the steps between seeds are primes.
         filled, field = search_and_vote(level, field, centres, rounds, seed + 7919 * number)
     return filled
 
 
 def search_and_vote(
-    level: Level,
+    level: InpaintLevel,
     coarse_field: Field | None,
     centres: Bool[ndarray, "h w"],
     rounds: int,
@@ -265,7 +267,11 @@ def search_and_vote(
     channel_weight = patchmatch.pad_border(np.repeat(weight[..., None], 3, axis=-1))
     # Beyond the image a patch has no weight.
     total_weight = cv2.boxFilter(
-        weight, -1, (SIDE, SIDE), normalize=False, borderType=cv2.BORDER_CONSTANT
+        weight,
+        -1,
+        (PATCHMATCH_SIDE, PATCHMATCH_SIDE),
+        normalize=False,
+        borderType=cv2.BORDER_CONSTANT,
     )
     costs = patchmatch.Costs(
         max_bias=np.float32(MAX_BIAS),
@@ -320,9 +326,9 @@ def compute_likelihood(cost: Float32[ndarray, "q"]) -> Float32[ndarray, "q"]:
 
 def find_usable_centres(valid: Bool[Tensor, "s h w"]) -> Bool[ndarray, "s h w"]:
     """Mark the pixels whose whole patch is valid and inside the image."""
-    is_missing = pad(~valid, (RADIUS,) * 4, value=True)
-    inner = slice(RADIUS, -RADIUS)
-    return np.stack([~dilate(mask, RADIUS)[inner, inner].numpy() for mask in is_missing])
+    is_missing = pad(~valid, (PATCHMATCH_RADIUS,) * 4, value=True)
+    inner = slice(PATCHMATCH_RADIUS, -PATCHMATCH_RADIUS)
+    return np.stack([~dilate(mask, PATCHMATCH_RADIUS)[inner, inner].numpy() for mask in is_missing])
 
 
 def init_matches(
@@ -373,7 +379,7 @@ def find_nearest(mask: Bool[ndarray, "h w"]) -> Int64[ndarray, "h w 2"]:
     return places[labels]
 
 
-def downsample_level(level: Level) -> Level:
+def downsample_level(level: InpaintLevel) -> InpaintLevel:
     """Halve a level and its sources; averages leave out unknown and invalid pixels."""
     # Means of the known and of the guessed pixels of a block, each divided by its share.
     known = level.known.float()[..., None]
@@ -397,7 +403,7 @@ def downsample_level(level: Level) -> Level:
         valid.append(usable_share[..., 0] > 0.75)
         log_depths.append(means[..., 3])
     halved = Sources(torch.stack(images), torch.stack(valid), torch.stack(log_depths))
-    return Level(image, known_share[..., 0] > 0.5, expected, halved)
+    return InpaintLevel(image, known_share[..., 0] > 0.5, expected, halved)
 
 
 def pool_pixels(values: Float[Tensor, "*s h w c"]) -> Float[Tensor, "*s h2 w2 c"]:

@@ -10,7 +10,7 @@ from gscompleter.guards import Attempt, Guard
 from gscompleter.render.protocols import FrozenScene
 from gscompleter.types import Gaussians
 
-MIN_WEIGHT = 0.002
+MIN_CONTRIBUTION = 0.002
 """Summed compositing weight up to which no pixel shows a Gaussian by more than this share."""
 
 
@@ -33,4 +33,4 @@ def find_shown(added: Gaussians, frozen: FrozenScene) -> Bool[Tensor, "n"]:
     """Find Gaussians with enough summed weight in the image of a frozen scene."""
     # The weights do not depend on the colours that are fitted, so any colours and image will do.
     _, sums = frozen.vary_colors(added)(torch.zeros_like(added.means), frozen.render.image)
-    return sums > MIN_WEIGHT
+    return sums > MIN_CONTRIBUTION

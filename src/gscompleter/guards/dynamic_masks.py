@@ -43,7 +43,7 @@ NUM_NEIGHBOURS = 2
 """Nearest photographs that each one is compared with."""
 MIN_SHARED_PIXELS = 100
 """Fewest pixels that two compared photographs must share."""
-MAX_SHIFT = 2
+MAX_DISPLACEMENT = 2
 """Tolerated displacement in each direction, in pixels."""
 PATCH_RADIUS = 2
 """Radius of the patches over which differences are averaged, in pixels."""
@@ -51,20 +51,20 @@ MAX_MEDIAN_RATIO = 6.0
 """Multiple of a pair's median difference that reflections and exposure may cause."""
 HIDDEN_TOLERANCE = 0.05
 """Tolerated distance of a visible surface behind the other depth map, relative to depth."""
-BORDER = 3
+IGNORED_BORDER = 3
 """Width of the image border that is not compared, in pixels."""
 GAP_RADIUS = 3
 """Radius of gaps that are closed in a region, in pixels: moving objects may match by chance."""
 NOISE_RADIUS = 2
 """Radius of the largest parts that are removed as noise, in pixels."""
-MIN_AREA = 0.005
+MIN_REGION_AREA = 0.005
 """Smallest region, as a fraction of the image."""
-OUTLINE_WIDTH = 3
+REGION_OUTLINE_WIDTH = 3
 """Width of the outline of a region, in pixels."""
 MAX_OUT_OF_FRAME = 0.1
 """Largest fraction of an outline outside of the other image.
 An object that enters there occludes the scene, and its depth is unknown."""
-MIN_CONFIRMED = 0.4
+MIN_OUTLINE_CONFIRMED = 0.4
 """Smallest fraction of an outline that the other photograph confirms."""
 MIN_SHARED_REGION = 0.5
 """Smallest fraction of a region that projects onto regions of the other photograph."""
@@ -196,8 +196,8 @@ def compare_photographs(photo: SmallPhoto, other: SmallPhoto, min_difference: fl
     Masks of the result have the size of `photo`.
     """
     pixels, z = project(unproject(photo.depth, photo.camera), other.camera)
-    in_frame = is_inside(pixels - BORDER, z, other.camera)
-    in_frame &= is_inside(pixels + BORDER, z, other.camera)
+    in_frame = is_inside(pixels - IGNORED_BORDER, z, other.camera)
+    in_frame &= is_inside(pixels + IGNORED_BORDER, z, other.camera)
     # Bilinear samples are 1 only if all pixels around are valid.
     is_valid_there = sample(other.valid_mask[..., None].float(), pixels)[..., 0] == 1
     known = in_frame & photo.valid_mask & is_valid_there
@@ -238,7 +238,9 @@ def compute_patch_difference(
 
     # Errors of depth and pose displace what is compared by a pixel or two.
     # One tensor of all shifts: each would be copied to the GPU by itself.
-    shifts = pixels.new_tensor(list(product(range(-MAX_SHIFT, MAX_SHIFT + 1), repeat=2)))
+    shifts = pixels.new_tensor(
+        list(product(range(-MAX_DISPLACEMENT, MAX_DISPLACEMENT + 1), repeat=2))
+    )
     smallest = torch.ones_like(photo.image[..., 0])
     for shift in shifts:
         shown = sample(normalized, pixels + shift)
@@ -267,7 +269,7 @@ def find_moving_regions(comparison: Comparison) -> Bool[Tensor, "h w"]:
     """Find regions in conflict that are large enough and surrounded by confirmed pixels."""
     # Beyond the image nothing is in frame and nothing confirmed, so that an outline that leaves it
     # counts there like one that the other photograph does not show.
-    width = GAP_RADIUS + OUTLINE_WIDTH
+    width = GAP_RADIUS + REGION_OUTLINE_WIDTH
 
     def pad_mask(mask: Bool[Tensor, "h w"]) -> UInt8[np.ndarray, "padded_h padded_w"]:
         return np.pad(mask.cpu().numpy().astype(np.uint8), width)
@@ -279,16 +281,16 @@ def find_moving_regions(comparison: Comparison) -> Bool[Tensor, "h w"]:
     # Parts of a moving object may match by chance: such gaps are closed, then specks removed.
     closed = cv2.morphologyEx(conflict, cv2.MORPH_CLOSE, make_disc(GAP_RADIUS))
     opened = cv2.morphologyEx(closed, cv2.MORPH_OPEN, make_disc(NOISE_RADIUS))
-    min_size = MIN_AREA * comparison.conflict_mask.numel()
+    min_size = MIN_REGION_AREA * comparison.conflict_mask.numel()
     regions = np.zeros(conflict.shape, bool)
     for region in split_parts(opened):
         # The outline is a ring around the region, without the pixels that touch it.
         mask = region.astype(np.uint8)
-        outer = cv2.dilate(mask, make_disc(OUTLINE_WIDTH)) > 0
+        outer = cv2.dilate(mask, make_disc(REGION_OUTLINE_WIDTH)) > 0
         outline = outer & (cv2.dilate(mask, make_disc(1)) == 0)
         is_framed = in_frame[outline].mean() >= 1 - MAX_OUT_OF_FRAME
         # Around an object the background agrees; around a wrong depth little does.
-        is_surrounded = confirmed[outline].mean() >= MIN_CONFIRMED
+        is_surrounded = confirmed[outline].mean() >= MIN_OUTLINE_CONFIRMED
         if region.sum() >= min_size and is_framed and is_surrounded:
             regions |= region
     inner = regions[width:-width, width:-width]

@@ -28,12 +28,12 @@ from gscompleter.types import Camera, Gaussians, Render
 
 SLIDE_STEP = 0.04
 """Step of a Gaussian along its ray, relative to its distance before the step."""
-CLEARANCE = 0.01
+OCCLUSION_CLEARANCE = 0.01
 """Least distance behind an observed surface, relative to its depth, that counts as occluded.
 A Gaussian there is invisible to the camera and still closes the hole."""
 STEPS_AT_ONCE = 8
 """Steps that a GPU tests together, without an answer in between for which the host would wait."""
-BORDER = 3
+OUTER_BORDER = 3
 """Pixels beyond the border of an image up to which a Gaussian there still shows inside."""
 FOOTPRINT_RADIUS = 3.0
 """Distance from its mean up to which a Gaussian is visible, in pixels of the target. Additions
@@ -207,8 +207,8 @@ def is_before_surface(points: Float[Tensor, "n 3"], observed: Observed) -> Bool[
     camera = observed.camera
     pixels, z = project(points, camera)
     x, y = pixels.unbind(-1)
-    visible = (z > 0) & (pixels > -BORDER).all(-1)
-    visible &= (x < camera.width + BORDER) & (y < camera.height + BORDER)
+    visible = (z > 0) & (pixels > -OUTER_BORDER).all(-1)
+    visible &= (x < camera.width + OUTER_BORDER) & (y < camera.height + OUTER_BORDER)
 
     # A mean just outside of the image reads the pixel at its border, since the Gaussian still
     # covers that. The pixels of invisible means, which may be infinite, are replaced first.
@@ -217,7 +217,7 @@ def is_before_surface(points: Float[Tensor, "n 3"], observed: Observed) -> Bool[
     depth = observed.depth[row, column]
 
     # Depth is 0 where no surface is seen, so that nothing is in front of it.
-    before = z < (1 + CLEARANCE) * depth
+    before = z < (1 + OCCLUSION_CLEARANCE) * depth
     # Half-way between an object and the wall, a mean is hidden by the object, but its footprint
     # shows beside the edge, before the wall (decision 049). It has to slide on to the wall. Where
     # its own pixel shows no surface, nothing hides it: it is in a hole of this camera and may stay.

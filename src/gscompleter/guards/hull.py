@@ -7,7 +7,7 @@ from gscompleter.render.outside import find_in_hull, look_from_outside
 from gscompleter.stages.target_view import TargetView
 from gscompleter.types import Gaussians
 
-SIDE = 192
+SILHOUETTE_SIDE = 192
 """Width and height of the silhouettes, in pixels."""
 
 
@@ -21,5 +21,5 @@ class Hull(Guard):
         """Keep candidates that lie in the silhouettes of the scene from all sides."""
         # Also with what was removed from it, whose place may be filled.
         given = view.state.source.gaussians
-        silhouettes = look_from_outside(given, view.scenes.renderer, SIDE)
+        silhouettes = look_from_outside(given, view.scenes.renderer, SILHOUETTE_SIDE)
         return candidates[find_in_hull(candidates, silhouettes)]

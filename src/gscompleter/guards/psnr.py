@@ -18,7 +18,7 @@ from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.state import Completion
 from gscompleter.types import Gaussians
 
-COLOR_ROUNDS = 4
+WORSE_COLOR_ROUNDS = 4
 """Rounds in which colours are fitted to photographs that additions make worse."""
 
 
@@ -75,7 +75,7 @@ class PsnrGuard(Guard):
             else image.paint_ignored(scene.composite(added).image)
             for image, scene in zip(images, frozen, strict=True)
         ]
-        added = fit_colors(added, frozen, wanted, [RELAXATION] * COLOR_ROUNDS)
+        added = fit_colors(added, frozen, wanted, [RELAXATION] * WORSE_COLOR_ROUNDS)
         plans = [scene.vary_opacities(added) for scene in view.frozen_photos]
 
         hole = dilate(view.empty, state.config.holes.dilation)

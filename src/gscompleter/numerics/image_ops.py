@@ -11,6 +11,12 @@ from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, interpolate, max_pool2d, pad
 
+DARKEST = 0.05
+"""Smallest colour that tells how bright a surface is; darker ones are noise."""
+BRIGHTEST = 0.95
+"""Largest one; brighter ones may be clipped."""
+MIN_CONTRAST = 0.02
+"""Range of brightness in 5 x 5 smoothed pixels that counts as texture; colours are in [0, 1]."""
 SSIM_RADIUS = 5
 """Radius of the Gaussian window of SSIM, in pixels."""
 SSIM_SIGMA = 1.5
@@ -54,11 +60,11 @@ def push_pull(
     See Gortler et al., The Lumigraph, 1996. If all weights are zero, the result is 0.
     """
     weighted = (values * weight[..., None]).permute(2, 0, 1)[None]
-    filled = _fill(weighted, weight[None, None])
+    filled = _fill_from_coarse(weighted, weight[None, None])
     return filled[0].permute(1, 2, 0)
 
 
-def _fill(
+def _fill_from_coarse(
     weighted: Float[Tensor, "1 c h w"], weight: Float[Tensor, "1 1 h w"]
 ) -> Float[Tensor, "1 c h w"]:
     """Fill what has no weight from an image of half the size, which is filled first."""
@@ -67,7 +73,7 @@ def _fill(
     # A full image needs no smaller ones. To ask a GPU for that takes longer than to compute them.
     if max(size) == 1 or (not weight.is_cuda and bool((weight > 0).all())):
         return own
-    coarse = _fill(
+    coarse = _fill_from_coarse(
         avg_pool2d(weighted, 2, ceil_mode=True, count_include_pad=False),
         avg_pool2d(weight, 2, ceil_mode=True, count_include_pad=False),
     )

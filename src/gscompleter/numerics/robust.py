@@ -6,7 +6,7 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-MAX_TRIALS = 512
+MAX_HYPOTHESES = 512
 """Two-point hypotheses."""
 HYPOTHESES_PER_BATCH = 32
 """Hypotheses that are scored together, so few that their residuals stay in the cache."""
@@ -36,7 +36,7 @@ def fit_line_ransac(
     """
     device = device or x.device
     # A line through two points each. Equal x give a scale of 0, which no hypothesis may have.
-    i, j = torch.randint(len(x), (2, MAX_TRIALS), generator=rng).to(x.device)
+    i, j = torch.randint(len(x), (2, MAX_HYPOTHESES), generator=rng).to(x.device)
     scales = (y[i] - y[j]) / torch.where(x[i] == x[j], torch.inf, x[i] - x[j])
     shifts = y[i] - scales * x[i]
     # (scale x + shift - y) / y = scale (x / y) + shift (1 / y) - 1, for all pairs in one product.
@@ -65,30 +65,6 @@ def fit_line_ransac(
             break
         scale, shift = torch.linalg.solve(normal, design.T @ (y[agree] * weight)).tolist()
     return scale, shift
-
-
-def fit_plane_ransac(
-    rays: Float[Tensor, "n 3"], depths: Float[Tensor, "n"], rng: torch.Generator
-) -> Float[Tensor, "3"]:
-    """Fit the plane `plane · x = 1` to the most inliers among points `depths * rays`, then refit.
-
-    Rays have z = 1, so that residuals are relative errors of inverse depth. There are three points
-    or more.
-    """
-    # Three points each: rays @ plane = 1 / depth. Those on one line have no solution, and a plane
-    # of zeros has no inliers.
-    index = torch.randint(len(rays), (MAX_TRIALS, 3), generator=rng).to(rays.device)
-    solved = torch.linalg.solve_ex(rays[index].double(), (1 / depths[index]).double()[..., None])
-    planes = solved.result[..., 0].nan_to_num(0.0, 0.0, 0.0).to(rays)
-    counts = [
-        ((depths * (batch @ rays.T) - 1).abs() < RESIDUAL_THRESHOLD).sum(dim=1)
-        for batch in planes.split(HYPOTHESES_PER_BATCH)
-    ]
-    plane = planes[torch.cat(counts).argmax()]
-
-    agree = (depths * (rays @ plane) - 1).abs() < RESIDUAL_THRESHOLD
-    design = (depths[:, None] * rays)[agree].double()
-    return torch.linalg.lstsq(design, torch.ones_like(design[:, :1])).solution[:, 0].to(rays)
 
 
 def fit_robust_affine(

@@ -17,7 +17,7 @@ from torch import Tensor
 from gscompleter.numerics.kernels.parallel import share
 from gscompleter.numerics.kernels.splat_rows import mark_usable
 from gscompleter.system.errors import InputError
-from gscompleter.system.memory import check_images
+from gscompleter.system.memory import check_image_memory
 from gscompleter.system.tensor_checks import describe, name_dtype
 from gscompleter.types import Camera, DepthMap, Gaussians, View
 
@@ -27,7 +27,7 @@ LARGEST_SH = 1e6
 """Largest spherical harmonic; colours are in [0, 1], and 1e38 would add up to infinity."""
 MIN_QUAT_LENGTH = 1e-12
 """Smallest length of a quaternion: `torch.nn.functional.normalize` divides by no less."""
-MIN_SIDE = 8
+MIN_PHOTOGRAPH_SIDE = 8
 """Smallest width and height of a photograph or target, in pixels; stereo needs as many."""
 COLOR_TOLERANCE = 0.01
 """Largest tolerated excess of a colour beyond [0, 1], as resampling causes it."""
@@ -113,7 +113,7 @@ def check_inputs(
         check_camera(target, f"Target {number}")
     # Before anything of this size is allocated.
     cameras = [*(view.camera for view in (*views, *check_photos)), *targets]
-    check_images(sum(camera.width * camera.height for camera in cameras), len(cameras))
+    check_image_memory(sum(camera.width * camera.height for camera in cameras), len(cameras))
     tensors = {f"context view {number}": view.image for number, view in enumerate(views)}
     tensors |= {f"check view {number}": view.image for number, view in enumerate(check_photos)}
     tensors |= {f"target {number}": target.K for number, target in enumerate(targets)}
@@ -153,7 +153,7 @@ def check_given_views(views: object) -> None:
 def check_views(views: object, name: str) -> None:
     """Raise InputError unless these are photographs to work on.
 
-    They are a list of `View`, at least `MIN_SIDE` pixels wide and high, with colours
+    They are a list of `View`, at least `MIN_PHOTOGRAPH_SIDE` pixels wide and high, with colours
     in [0, 1], depths of at least 0, and some pixel that is not ignored. `name` is for the
     sentences, such as "context".
     """
@@ -228,10 +228,10 @@ def check_camera(camera: object, name: str) -> None:
             f"{describe(camera)}."
         )
     _check_float32(camera.K, name)
-    if min(camera.width, camera.height) < MIN_SIDE:
+    if min(camera.width, camera.height) < MIN_PHOTOGRAPH_SIDE:
         raise InputError(
             f"{name} has an image of {camera.width} × {camera.height} pixels, and at least "
-            f"{MIN_SIDE} × {MIN_SIDE} are needed; choose a larger resolution."
+            f"{MIN_PHOTOGRAPH_SIDE} × {MIN_PHOTOGRAPH_SIDE} are needed; choose a larger resolution."
         )
     camera.to("cpu")  # whose constructor reads the numbers, which it does not on a GPU
 

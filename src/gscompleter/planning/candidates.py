@@ -33,7 +33,7 @@ MOVES_ASIDE = (0, 1, 10, 11)
 """Moves of `make_moves` to the right and left, straight and around what the camera looks at."""
 TURNS_UP_AND_DOWN = (8, 9)
 """Moves of `make_moves` that stand still and look at the floor or the ceiling."""
-MIN_COVERAGE = 0.05
+MIN_SHOWN_SCENE = 0.05
 """Fraction of its image that must show the scene for a camera to have a known depth."""
 
 
@@ -201,6 +201,6 @@ def compute_depth_quantiles(renders: Sequence[Render], share: float) -> list[flo
         raise ValueError("no camera sees the scene, so its distance is unknown")
     usual = torch.cat(depths).quantile(share).item()
     return [
-        values.quantile(share).item() if mask.float().mean().item() >= MIN_COVERAGE else usual
+        values.quantile(share).item() if mask.float().mean().item() >= MIN_SHOWN_SCENE else usual
         for values, mask in zip(depths, valid, strict=True)
     ]

@@ -14,7 +14,7 @@ from gscompleter.render.view_map import get_view_map
 from gscompleter.state import Completion
 from gscompleter.types import Camera
 
-MAX_CANDIDATES = 64
+MAX_SCORED_PHOTOGRAPHS = 64
 """Most photographs that are scored; of more, those far apart."""
 
 
@@ -26,7 +26,7 @@ class PhotographPlanner(ViewPlanner):
         self, completion: Completion, cameras: Sequence[Camera]
     ) -> tuple[list[Candidate], float]:
         """Return the cameras as candidates, and their spacing; no surface is too close to them."""
-        chosen = sorted(select_spread_cameras(cameras, MAX_CANDIDATES))
+        chosen = sorted(select_spread_cameras(cameras, MAX_SCORED_PHOTOGRAPHS))
         ranged = [completion.with_depth_range(cameras[index]) for index in chosen]
         propose = partial(self.propose, completion)
         candidates = list(get_view_map(completion.context.means)(propose, ranged, chosen))

@@ -20,7 +20,7 @@ from gscompleter.system.tensor_checks import describe
 from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import Camera, Gaussians, View
 
-NUM_TARGETS = 4
+MAX_REMOVAL_TARGETS = 4
 """Most photographs for which the place is completed if no targets are named."""
 
 
@@ -69,7 +69,7 @@ def remove(
         done = completer.complete(begun, targets)
     else:
         cameras = [view.camera for view in views]
-        done, _ = PhotographPlanner(completer).explore(begun, cameras, NUM_TARGETS)
+        done, _ = PhotographPlanner(completer).explore(begun, cameras, MAX_REMOVAL_TARGETS)
     return restore_surroundings(done, completer.renderer)
 
 

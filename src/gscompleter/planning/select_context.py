@@ -17,11 +17,11 @@ from torch import Tensor
 from gscompleter.numerics.geometry import is_inside, project
 from gscompleter.types import Camera
 
-MAX_POINTS = 1000
+MAX_TARGET_POINTS = 1000
 """Points that are scored for all targets together."""
-MAX_CANDIDATES = 32
+MAX_NEAR_PHOTOGRAPHS = 32
 """Photographs closest to the targets whose pairs are scored."""
-MIN_POINTS = 20
+MIN_TARGET_POINTS = 20
 """Fewest visible points of a target; with fewer, a plane in the middle of the scene is used."""
 GRID_SIDE = 8
 """Points of such a plane per image side."""
@@ -29,13 +29,13 @@ PLANES = (0.1, 0.3, 0.5, 0.7, 0.9)
 """Planes that represent an unknown scene, in normalized inverse depth from near to far."""
 HALF_SCORE_ANGLE = 5.0
 """Angle between viewing directions at which the score of a photograph is halved, in degrees."""
-BEST_ANGLE = 0.5
+BEST_CONTEXT_ANGLE = 0.5
 """Best triangulation angle of a pair, in degrees: some pixels of parallax."""
 NARROW_FALLOFF = 0.3
 """Angle below it, in degrees, at which the score of a pair falls to a third."""
 WIDE_FALLOFF = 20.0
 """Angle above it, in degrees, at which the score of a pair falls to a third."""
-MIN_PAIR_SCORE = 0.1
+MIN_SHOWING_SCORE = 0.1
 """Pair score below which no pair shows a point."""
 OUTSIDE_SCORE = 1e-3
 """Score of a point outside of an image; it ranks photographs that show none."""
@@ -51,7 +51,7 @@ def select_context(
 
     `points` are on or near surfaces, in world coordinates; at least one.
     """
-    num_points = max(MAX_POINTS // len(targets), 1)
+    num_points = max(MAX_TARGET_POINTS // len(targets), 1)
     seen = [find_visible_points(target, points, num_points) for target in targets]
     # `worth` [c, p] is the score of each candidate at each point that some target sees.
     worth = torch.cat(
@@ -63,7 +63,7 @@ def select_context(
     )
 
     # Pairs are scored for the best candidates alone: their number grows with the square.
-    closest = worth.sum(1).argsort(descending=True, stable=True)[:MAX_CANDIDATES]
+    closest = worth.sum(1).argsort(descending=True, stable=True)[:MAX_NEAR_PHOTOGRAPHS]
     rays = compute_directions([candidates[i] for i in closest.tolist()], torch.cat(seen))
     chosen = select_greedily(worth[closest], rays, count)
     return sorted(closest[chosen].tolist())
@@ -88,7 +88,7 @@ def select_greedily(
         now = (pairs[chosen].amax(0) - best).clamp_min(0).sum(-1)
         # Points that no pair shows may need two further photographs. Each counts half of what they
         # gain together, since the first alone gains nothing.
-        later = (pairs.amax(0) * (best < MIN_PAIR_SCORE)).sum(-1) / 2
+        later = (pairs.amax(0) * (best < MIN_SHOWING_SCORE)).sum(-1) / 2
         # The last term breaks ties by what a photograph shows on its own.
         gains = torch.maximum(now, later) + OUTSIDE_SCORE * worth.sum(-1)
         gains[chosen] = -1.0
@@ -104,7 +104,7 @@ def score_pairs(
     """Score the pairs of candidate `one` with all others at each point."""
     # Below the best angle, depth is uncertain, and the score falls fast; above, images get less
     # alike, and it falls slowly.
-    excess = compute_angles(rays[one], rays) - BEST_ANGLE
+    excess = compute_angles(rays[one], rays) - BEST_CONTEXT_ANGLE
     width = torch.where(excess < 0, NARROW_FALLOFF, WIDE_FALLOFF)
     together = torch.minimum(worth[one], worth) * torch.exp(-((excess / width) ** 2))
     same_place = (rays[one] == rays).all(-1)
@@ -122,11 +122,11 @@ def score_cameras(
 
 
 def find_visible_points(
-    target: Camera, points: Float[Tensor, "n 3"], count: int = MAX_POINTS
+    target: Camera, points: Float[Tensor, "n 3"], count: int = MAX_TARGET_POINTS
 ) -> Float[Tensor, "p 3"]:
     """Return every n-th point that a target sees, or points on a plane if there are few."""
     seen = points[is_inside(*project(points, target), target)]
-    if len(seen) < MIN_POINTS:
+    if len(seen) < MIN_TARGET_POINTS:
         seen = make_plane_in_front(target, (points - target.center).norm(dim=-1).median().item())
     step = math.ceil(len(seen) / count)
     return seen[::step]

@@ -24,7 +24,7 @@ from gscompleter.types import Camera
 
 MAX_OVERVIEW = 16
 """Most cameras that represent all others."""
-NUM_ROUNDS = 20
+MAX_MEDOID_ROUNDS = 20
 """Most iterations of k-medoids."""
 MIN_SHARED_FRACTION = 0.3
 """Smallest fraction of visible points that the other camera of a pair must see, too."""
@@ -62,7 +62,7 @@ def find_medoids(cameras: Sequence[Camera], count: int) -> list[int]:
     places = embed_cameras(cameras)
     distances = torch.cdist(places, places)
     medoids = select_spread_cameras(cameras, count)
-    for _ in range(NUM_ROUNDS):
+    for _ in range(MAX_MEDOID_ROUNDS):
         # Each camera joins the nearest medoid; of each group, the camera with the smallest squared
         # distances to the others is the next one.
         nearest = distances[:, medoids].argmin(dim=1)

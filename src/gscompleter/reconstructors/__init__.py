@@ -17,7 +17,7 @@ from gscompleter.reconstructors.depth_predictors import DepthPredictor, load_dep
 from gscompleter.reconstructors.own_models import load_own_model
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.plugins import is_in_file, load_plugins
-from gscompleter.system.tensor_checks import describe, is_whole, iterate_tensors, name_dtype
+from gscompleter.system.tensor_checks import describe, is_whole_number, iterate_tensors, name_dtype
 from gscompleter.types import Reconstruction, View
 
 
@@ -171,7 +171,7 @@ def _check_depths(output: Reconstruction, views: Sequence[View]) -> None:
 def _check_contradicted(output: Reconstruction, views: Sequence[View]) -> None:
     wrong = output.contradicted_depths
     is_listed = isinstance(wrong, (tuple, list))
-    if not is_listed or not all(is_whole(n) and 0 <= n < len(views) for n in wrong):
+    if not is_listed or not all(is_whole_number(n) and 0 <= n < len(views) for n in wrong):
         raise InputError(
             f"The contradicted_depths of the reconstruction have to be indices of its "
             f"{len(views)} views, counted from 0, and are {describe(wrong)}."
@@ -227,13 +227,13 @@ RECONSTRUCTORS: dict[str, Callable[[Path | None, str], Reconstructor]] = {
 }
 """Loader of each built-in reconstructor: (weights path or None for the default, device) -> Ψ."""
 
-PLUGINS = "gscompleter.reconstructors"
+RECONSTRUCTOR_PLUGINS = "gscompleter.reconstructors"
 """Group of entry points that name further tables of this form."""
 
 
 def list_reconstructors() -> dict[str, Callable[[Path | None, str], Reconstructor]]:
     """List the loaders of all reconstructors, by name."""
-    return RECONSTRUCTORS | load_plugins(PLUGINS)
+    return RECONSTRUCTORS | load_plugins(RECONSTRUCTOR_PLUGINS)
 
 
 def find_loader(name: str) -> Callable[[Path | None, str], Reconstructor] | None:

@@ -65,7 +65,7 @@ DEPTH_PREDICTORS: dict[str, Callable[[Path | None, str], DepthPredictor]] = {
 }
 """Loader of each built-in predictor: (weights path or None for the published, device)."""
 
-PLUGINS = "gscompleter.depth_predictors"
+DEPTH_PLUGINS = "gscompleter.depth_predictors"
 """Group of entry points that name further tables of this form."""
 
 
@@ -77,7 +77,7 @@ def load_depth_predictor(
         form = "a View to a DepthMap"
         own: DepthPredictor = load_own_model(name, "depth", form, weights, "depth-weights")
         return own
-    loaders = DEPTH_PREDICTORS | load_plugins(PLUGINS)
+    loaders = DEPTH_PREDICTORS | load_plugins(DEPTH_PLUGINS)
     if name not in loaders:
         raise InputError(
             f"There is no depth '{quote_value(name)}'; choose one of {', '.join(loaders)}, or name "

@@ -30,9 +30,9 @@ from gscompleter.render.viewpoint import (
 from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, Gaussians, Render
 
-BLOCK = 1_000_000
+FROZEN_BLOCK = 1_000_000
 """Gaussians that are frozen at a time."""
-MAX_SIDE = TILE * np.iinfo(np.int16).max
+MAX_TILED_SIDE = TILE * np.iinfo(np.int16).max
 """Largest side of an image in pixels, since kernels number tiles in 16 bits."""
 
 
@@ -82,8 +82,8 @@ class CpuFrozenScene:
     def extend(self, new: Gaussians) -> CpuFrozenScene:
         """Freeze context and `new` together, in that order, some at a time to save memory."""
         frozen = self
-        for start in range(0, len(new), BLOCK):
-            frozen = frozen._extend(new[start : start + BLOCK])
+        for start in range(0, len(new), FROZEN_BLOCK):
+            frozen = frozen._extend(new[start : start + FROZEN_BLOCK])
         return frozen
 
     def _extend(self, new: Gaussians) -> CpuFrozenScene:
@@ -326,10 +326,15 @@ def freeze_nothing(viewpoint: Viewpoint) -> CpuFrozenScene:
 
 def make_pinhole(camera: Camera) -> CameraArrays:
     """Convert a camera for the kernels, whose image must not be too large for them."""
-    if not 0 < min(camera.width, camera.height) <= max(camera.width, camera.height) <= MAX_SIDE:
+    if (
+        not 0
+        < min(camera.width, camera.height)
+        <= max(camera.width, camera.height)
+        <= MAX_TILED_SIDE
+    ):
         raise InputError(
             f"An image of {camera.width} x {camera.height} pixels cannot be rendered; its sides "
-            f"must have 1 to {MAX_SIDE:,} pixels."
+            f"must have 1 to {MAX_TILED_SIDE:,} pixels."
         )
     # In float64 until the end, so that the inverse is as exact as float32 holds it.
     K = camera.K.detach().to("cpu", torch.float64)

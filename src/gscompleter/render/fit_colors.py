@@ -16,7 +16,7 @@ from gscompleter.types import SH_C0, Gaussians, View
 
 RELAXATION = 1.7
 """Step size as a multiple of the mean residual; below 2 the rounds converge."""
-MIN_WEIGHT = 0.05
+DAMPED_WEIGHT = 0.05
 """Summed weight up to which colours are damped, as the images hardly show them."""
 
 
@@ -51,7 +51,7 @@ def fit_colors(
         for pull, weight in get_view_map(change)(measure, range(len(frozen)), images):
             sums = sums + pull
             weights = weights + weight
-        change = change + relaxation * sums / weights.clamp_min(MIN_WEIGHT)[:, None]
+        change = change + relaxation * sums / weights.clamp_min(DAMPED_WEIGHT)[:, None]
     # Beside a scene with absurd colours, which a Ψ of one's own may give, a fit would exceed what a
     # file may hold.
     constant = (new.sh[:, :1] + change[:, None] / SH_C0).clamp(-LARGEST_SH, LARGEST_SH)

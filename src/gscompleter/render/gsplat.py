@@ -24,7 +24,7 @@ from gscompleter.types import Camera, Gaussians, Render, merge, sh_from_rgb
 
 EPS_2D = 0.3
 """Low-pass of 3DGS: pixels² that are added to the variances of each footprint."""
-MIN_ALPHA = 1e-10
+MIN_DIVIDING_ALPHA = 1e-10
 """Smallest alpha that gsplat divides a depth by."""
 TILE_SIZE = 16
 """Side of a tile in pixels, gsplat's default."""
@@ -78,7 +78,7 @@ class CudaRenderer:
         """Return True for Gaussians whose box touches the image: gsplat gives them a radius."""
         if len(gaussians) == 0:
             return torch.zeros_like(gaussians.generated, dtype=torch.bool)
-        radii, *_ = project_gaussians(gaussians, [camera])
+        radii, *_ = project_with_gsplat(gaussians, [camera])
         return (radii[0] > 0).all(dim=-1)
 
     @torch.no_grad()
@@ -104,7 +104,7 @@ class CudaRenderer:
         return render
 
 
-def project_gaussians(
+def project_with_gsplat(
     gaussians: Gaussians, cameras: Sequence[Camera]
 ) -> tuple[
     Int[Tensor, "c n 2"],
@@ -161,7 +161,7 @@ def project_and_bin(
     forms = {(camera.width, camera.height, camera.near_plane, camera.padding) for camera in cameras}
     are_alike = len(forms) == 1 and cameras[0].padding == (0, 0)
     groups = [cameras] if are_alike else [[camera] for camera in cameras]
-    projected = [project_gaussians(gaussians, group) for group in groups]
+    projected = [project_with_gsplat(gaussians, group) for group in groups]
     radii, means2d, depths, conics, antialiasing = (
         parts[0] if len(parts) == 1 else torch.cat(parts) for parts in zip(*projected, strict=True)
     )
@@ -244,7 +244,7 @@ class BinnedGaussians:
         """Render in these colours, and opacities at most those of the Gaussians."""
         # The depth is composited as a fourth colour, and divided by alpha as in "RGB+ED".
         sums, alpha = self.composite(torch.cat([colors, self.depths[..., None]], dim=-1), opacities)
-        depth = sums[..., 3] / alpha.clamp_min(MIN_ALPHA)
+        depth = sums[..., 3] / alpha.clamp_min(MIN_DIVIDING_ALPHA)
         return [
             Render(
                 sums[i, :height, :width, :3], depth[i, :height, :width], alpha[i, :height, :width]

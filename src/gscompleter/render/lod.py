@@ -31,10 +31,10 @@ MIN_PROXY_GAUSSIANS = 500_000
 """Gaussians from which on a proxy saves more time than it takes to build."""
 MAX_REACH = 0.5
 """Largest distance of a Gaussian from the first of its run, in pixels."""
-MAX_DEVIATION = 2.0
+MAX_RUN_DEVIATION = 2.0
 """Largest standard deviation of a Gaussian that shares a run, in pixels."""
 MAX_GROWTH = 8.0
-"""Largest factor on MAX_REACH and MAX_DEVIATION, if the proxy would be too large otherwise."""
+"""Largest factor on MAX_REACH and MAX_RUN_DEVIATION, if the proxy would be too large otherwise."""
 FAR_AWAY = 1e4
 """Distance, in radii of the scene, of a camera to which all of it is equally far."""
 BISECTIONS = 20
@@ -71,7 +71,7 @@ def merge_runs(scene: Gaussians, start: Int64[ndarray, "bounds"]) -> Gaussians:
         *[np.empty((num_runs, *array.shape[1:]), np.float32) for array in arrays]
     )
     shares = np.empty(len(scene), np.float32)
-    share(kernels.merge_runs, num_runs, start, arrays, shares, merged_arrays)
+    share(kernels.merge_run_range, num_runs, start, arrays, shares, merged_arrays)
 
     first = torch.from_numpy(start[:-1])
     return Gaussians(
@@ -103,7 +103,7 @@ def merge_nearby(scene: Gaussians, max_gaussians: int) -> Gaussians:
         focal = np.array([FAR_AWAY * radius / distance], np.float32)
         place = to_float32(centre + FAR_AWAY * radius * torch.tensor([0.0, 0.0, 1.0]))[None]
         begins = np.empty(len(scene), np.bool_)
-        num_blocks = -(-len(scene) // kernels.BLOCK)
+        num_blocks = -(-len(scene) // kernels.RUN_BLOCK)
         share(
             kernels.mark_run_starts,
             num_blocks,
@@ -139,7 +139,7 @@ def find_run_starts(
     focals = to_float32(torch.stack([camera.K[0, 0] for camera in cameras]))
     begins = np.empty(len(means), np.bool_)
     max_runs = count_fitting_gaussians(len(cameras))
-    num_blocks = -(-len(means) // kernels.BLOCK)
+    num_blocks = -(-len(means) // kernels.RUN_BLOCK)
     # A coarser proxy is better than one that does not fit in memory.
     growth = 1.0
     while True:
@@ -152,7 +152,7 @@ def find_run_starts(
             centers,
             focals,
             np.float32(growth * MAX_REACH),
-            np.float32(growth * MAX_DEVIATION),
+            np.float32(growth * MAX_RUN_DEVIATION),
             begins,
         )
         if np.count_nonzero(begins) <= max_runs or growth >= MAX_GROWTH:
@@ -164,7 +164,7 @@ MAX_GAUSSIANS = 400_000
 """Largest number of Gaussians that are kept by default."""
 MAX_PREVIEW_GAUSSIANS = 25_000
 """Largest number that is kept for previews: several per pixel of a small image."""
-SAMPLE_SIZE = 100_000
+SIZE_SAMPLE = 100_000
 """Gaussians from which the distribution of sizes is estimated."""
 
 
@@ -206,6 +206,6 @@ def compute_keep_probabilities(scene: Gaussians, max_gaussians: int) -> Float[Te
     # The product of the two longer standard deviations: the area of the largest face.
     cross_section = scene.scales.prod(dim=1) / scene.scales.amin(dim=1).clamp_min(1e-30)
     size = (cross_section * scene.opacities).sqrt()
-    sample = size[:: max(1, len(size) // SAMPLE_SIZE)]
+    sample = size[:: max(1, len(size) // SIZE_SAMPLE)]
     size = size.clamp(max=sample.quantile(0.99)).clamp_min(1e-30)
     return (max_gaussians * (size / size.sum(dtype=torch.float64))).clamp(max=1).to(size)

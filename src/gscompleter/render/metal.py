@@ -21,7 +21,7 @@ from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, Gaussians, Render
 
-PACKAGE = "metal_gauss"
+METAL_PACKAGE = "metal_gauss"
 
 
 @dataclass(frozen=True)
@@ -110,6 +110,6 @@ def explain_missing_metal(device: str = "mps") -> str | None:
     """Explain why metal-gauss cannot draw on a device; None if nothing is known to be missing."""
     if device == "mps" and not torch.backends.mps.is_available():
         return "torch sees no GPU of a Mac"
-    if importlib.util.find_spec(PACKAGE) is None:
+    if importlib.util.find_spec(METAL_PACKAGE) is None:
         return "metal-gauss is not installed (pip install 'gscompleter[metal]')"
     return None

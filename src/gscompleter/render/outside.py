@@ -20,16 +20,16 @@ from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
 from gscompleter.types import Camera, Gaussians, Render
 
-CORE = (0.02, 0.98)
+EXTENT_QUANTILES = (0.02, 0.98)
 """Quantiles of the coordinates, weighted by opacity, between which the extent lies."""
-NUM_SAMPLES = 2000
+NUM_COMPARED_MEANS = 2000
 """Means that are compared."""
-SEED = 0
+OUTSIDE_SEED = 0
 NUM_TURNS = 300
 """Random boxes that are tried."""
 NUM_BEST = 6
 """Boxes that are kept from round to round."""
-NUM_STEPS = 40
+NUM_RANDOM_TURNS = 40
 """Random turns of each of them."""
 REACHES = (0.15, 0.05, 0.02, 0.007)
 """Standard deviations of half of these turns in each round, in radians."""
@@ -37,7 +37,7 @@ DISTANCE = 4.0
 """Distance of the cameras from the middle, in radii of the extent: twice its diagonal."""
 FIELD = 2.0
 """Half of the width that an image shows at the middle, in radii of the extent."""
-NEAR = 1.0
+OUTSIDE_NEAR = 1.0
 """Near plane of these cameras, in radii of the extent: what stands before it is far outside."""
 SLACK = 1
 """Pixels by which a silhouette is dilated, since Gaussians on its rim reach out of it."""
@@ -86,17 +86,17 @@ def measure_extent(scene: Gaussians) -> Extent:
     and of the best of them turned a little, the smallest lies along walls and floor.
     """
     points = sample_by_opacity(scene)
-    generator = torch.Generator().manual_seed(SEED)
+    generator = torch.Generator().manual_seed(OUTSIDE_SEED)
     draws = torch.randn((NUM_TURNS, 4), generator=generator)
     turns = torch.cat([torch.eye(3)[None], quats_to_rotations(draws)])
     for reach in REACHES:
         best = turns[measure_volumes(points, turns).topk(NUM_BEST, largest=False).indices]
-        steps = reach * torch.randn((NUM_BEST, NUM_STEPS, 4), generator=generator)
+        steps = reach * torch.randn((NUM_BEST, NUM_RANDOM_TURNS, 4), generator=generator)
         steps[..., 0] = 1.0
         turned = quats_to_rotations(steps) @ best[:, None]
         turns = torch.cat([best, turned.reshape(-1, 3, 3)])
     axes = turns[measure_volumes(points, turns).argmin()]
-    low, high = (points @ axes.T).quantile(torch.tensor(CORE), dim=0)
+    low, high = (points @ axes.T).quantile(torch.tensor(EXTENT_QUANTILES), dim=0)
     # In one order, so that what follows is the same whatever the axes of the file are.
     order = (high - low).argsort()
     low, high, axes = low[order], high[order], axes[order]
@@ -107,7 +107,7 @@ def measure_extent(scene: Gaussians) -> Extent:
 def sample_by_opacity(scene: Gaussians) -> Float[Tensor, "n 3"]:
     """Sample means on the CPU, each as often as its opacity says."""
     sums = scene.opacities.double().cpu().cumsum(0)
-    steps = (torch.arange(NUM_SAMPLES) + 0.5) / NUM_SAMPLES * sums[-1]
+    steps = (torch.arange(NUM_COMPARED_MEANS) + 0.5) / NUM_COMPARED_MEANS * sums[-1]
     rows = torch.searchsorted(sums, steps).clamp_max(len(scene) - 1)
     return scene.means.cpu()[rows]
 
@@ -117,7 +117,7 @@ def measure_volumes(
 ) -> Float[Tensor, "t"]:
     """Measure the volume of the box that holds points, along each triple of axes."""
     turned = torch.einsum("tij,nj->tin", turns, points)
-    low, high = compute_quantiles(turned, CORE)
+    low, high = compute_quantiles(turned, EXTENT_QUANTILES)
     return (high - low).prod(dim=1)
 
 
@@ -167,18 +167,18 @@ def list_outside_cameras(extent: Extent, side: int) -> list[Camera]:
     directions = list_directions().to(extent.center) @ extent.axes
     half = FIELD / DISTANCE
     return [
-        place_camera(
+        place_outside_camera(
             extent.center + DISTANCE * extent.radius * direction,
             -direction,
             half,
             side,
-            NEAR * extent.radius,
+            OUTSIDE_NEAR * extent.radius,
         )
         for direction in directions
     ]
 
 
-def place_camera(
+def place_outside_camera(
     center: Float[Tensor, "3"], forward: Float[Tensor, "3"], half: float, side: int, near: float
 ) -> Camera:
     """Place a camera with a square image, whose border is `half` aside at a depth of 1."""

@@ -95,7 +95,7 @@ def project_gaussians(gaussians: Gaussians, camera: Camera) -> ProjectedSplats:
         opacities = opacities * compute_compensations(flat, covariances)
     return ProjectedSplats(
         centers=points[:, :2] / points[:, 2:] * K.diagonal()[:2] + K[:2, 2],
-        precisions=invert_symmetric(covariances),
+        precisions=invert_2x2(covariances),
         depths=points[:, 2],
         opacities=opacities,
         colors=evaluate_colors(gaussians.sh, gaussians.means, c2w[:3, 3]),
@@ -120,7 +120,7 @@ def compute_jacobians(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Ten
     return torch.stack(rows, dim=1)
 
 
-def invert_symmetric(matrices: Float[Tensor, "n 2 2"]) -> Float[Tensor, "n 2 2"]:
+def invert_2x2(matrices: Float[Tensor, "n 2 2"]) -> Float[Tensor, "n 2 2"]:
     """Invert symmetric matrices."""
     a, b, c = matrices[:, 0, 0], matrices[:, 0, 1], matrices[:, 1, 1]
     adjugates = torch.stack([c, -b, -b, a], dim=-1).view(-1, 2, 2)

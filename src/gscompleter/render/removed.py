@@ -13,9 +13,9 @@ from gscompleter.render.cache import make_camera_key
 from gscompleter.render.protocols import Renderer
 from gscompleter.types import Camera, ContextScene, Gaussians
 
-MIN_WEIGHT = 0.1
+MIN_REMOVED_WEIGHT = 0.1
 """Compositing weight of removed Gaussians from which on a pixel shows them."""
-MARGIN = 0.01
+REMOVED_MARGIN = 0.01
 """Width of the border around such pixels, relative to the longer side of the image."""
 
 
@@ -26,7 +26,7 @@ def mask_removed(source: ContextScene, camera: Camera, renderer: Renderer) -> Bo
 
 def add_border(shown: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
     """Add the border of pixels that showed something removed."""
-    return dilate(shown, max(round(MARGIN * max(shown.shape)), 1))
+    return dilate(shown, max(round(REMOVED_MARGIN * max(shown.shape)), 1))
 
 
 def find_removed(source: ContextScene, camera: Camera, renderer: Renderer) -> Bool[Tensor, "h w"]:
@@ -52,4 +52,4 @@ def mark_shown(
     """Mark the pixels that show Gaussians among others."""
     # With a value of 1 for these and 0 for the others, the image is their weight.
     values = torch.cat([torch.zeros_like(others.opacities), torch.ones_like(gaussians.opacities)])
-    return renderer.freeze(others, camera).extend(gaussians).splat(values) > MIN_WEIGHT
+    return renderer.freeze(others, camera).extend(gaussians).splat(values) > MIN_REMOVED_WEIGHT

@@ -16,7 +16,7 @@ MAX_PALETTE_SIZE = 1 << 16
 """Most entries of a palette, whose numbers have 16 bits."""
 ROWS_PER_ENTRY = 4
 """Rows that share an entry of a palette between these sizes."""
-ITERATIONS = 5
+CODEBOOK_ITERATIONS = 5
 
 
 def fit_codebook(
@@ -30,7 +30,7 @@ def fit_codebook(
     covering = np.linspace(values.min(), values.max(), half)
     book = np.sort([*np.quantile(values, np.linspace(0, 1, half)), *covering])
     # Lloyd's iterations on numbers; an entry that is nearest to none stays where it is.
-    for _ in range(ITERATIONS):
+    for _ in range(CODEBOOK_ITERATIONS):
         nearest = _find_nearest(book, values).ravel()
         counts = np.bincount(nearest, minlength=CODEBOOK_SIZE)
         sums = np.bincount(nearest, values.ravel(), CODEBOOK_SIZE)
@@ -77,7 +77,7 @@ def _run_kmeans(
 ) -> tuple[Float[ndarray, "m k"], Int32[ndarray, "n"]]:
     """Find centres by k-means, and the nearest to each row; OpenCV needs rows as vectors."""
     cv2.setRNGSeed(0)
-    stop = (cv2.TERM_CRITERIA_MAX_ITER, ITERATIONS, 0.0)
+    stop = (cv2.TERM_CRITERIA_MAX_ITER, CODEBOOK_ITERATIONS, 0.0)
     nearest = np.zeros(len(rows), np.int32)
     _, _, centres = cv2.kmeans(rows[:, None], count, nearest, stop, 1, cv2.KMEANS_PP_CENTERS)
     return np.asarray(centres), nearest

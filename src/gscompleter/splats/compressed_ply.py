@@ -67,7 +67,7 @@ def tabulate_rest() -> Float32[ndarray, "256"]:
     return shares * 8 - 4
 
 
-REST_VALUES = tabulate_rest()
+PLY_REST_VALUES = tabulate_rest()
 """Coefficient of SH of degree 1 and above that each byte stands for."""
 
 
@@ -148,7 +148,7 @@ def _unpack_sh_rest(table: ndarray) -> Float[ndarray, "n k 3"]:
     rows = table.view(np.uint8).reshape(len(table), table.dtype.itemsize)
     rest = np.empty((len(table), *columns.shape), np.float32)
     for block in iterate_blocks(len(table)):
-        rest[block] = REST_VALUES[rows[block][:, columns]]
+        rest[block] = PLY_REST_VALUES[rows[block][:, columns]]
     return rest
 
 

@@ -25,7 +25,7 @@ from gscompleter.splats.ply import LABEL_COLUMN, read_labels, read_scene, save_p
 from gscompleter.splats.provenance import RunRecord
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import hash_file
-from gscompleter.system.files.result_format import MARK
+from gscompleter.system.files.result_format import RESULT_MARK
 from gscompleter.system.files.typed_json import read_typed_json
 from gscompleter.system.files.writing import (
     COMPLETED_FILE,
@@ -38,8 +38,8 @@ from gscompleter.types import Gaussians
 EDITS_FOLDER = "edits"
 EDITS = (EDITS_FILE, f"{EDITS_FOLDER}/*.ply", REFINED_POSES_FILE)
 """Globs of the files that are written, with the poses that the splat was made with."""
-ADVICE = "take all files of its folder again, or move it away to do without the record"
-_NAME = re.compile(r"removed\.ply|edits/\d{1,5}_(originals|taken_out)\.ply")
+EDITS_ADVICE = "take all files of its folder again, or move it away to do without the record"
+_EDITS_FILE = re.compile(r"removed\.ply|edits/\d{1,5}_(originals|taken_out)\.ply")
 
 
 RowKind = Literal["recolored", PartKind]
@@ -120,7 +120,9 @@ class Edits:
         """Find a file of an edit, or raise InputError."""
         path = self.folder / name
         if not path.is_file():
-            raise InputError(f"{quote_value(path)} is missing, which {EDITS_FILE} names; {ADVICE}.")
+            raise InputError(
+                f"{quote_value(path)} is missing, which {EDITS_FILE} names; {EDITS_ADVICE}."
+            )
         return path
 
 
@@ -138,12 +140,12 @@ def read_edits(splat: Path) -> Edits:
     path = splat.with_name(EDITS_FILE)
     if not path.is_file() or not splat.is_file():
         return Edits(splat.parent)
-    content = read_typed_json(EditsFile, path, ADVICE)
+    content = read_typed_json(EditsFile, path, EDITS_ADVICE)
     # Names of a file that may come from elsewhere lead to nothing outside of its folder.
     for edit in content.edits:
         for name in edit.files:
-            if not _NAME.fullmatch(name):
-                raise InputError(f"{quote_value(path)} names {quote_value(name)}; {ADVICE}.")
+            if not _EDITS_FILE.fullmatch(name):
+                raise InputError(f"{quote_value(path)} names {quote_value(name)}; {EDITS_ADVICE}.")
     is_unchanged = content.sha256 == hash_file(splat)
     if not is_unchanged and splat.name != content.file:
         return Edits(splat.parent)
@@ -261,7 +263,7 @@ def write_edits(folder: Path, splat: Path, earlier: Edits, edit: Edit) -> None:
             break
 
     content = asdict(EditsFile(hash_file(splat), tuple(edits), splat.name))
-    text = json.dumps({**MARK, **content}, indent=2, default=str)
+    text = json.dumps({**RESULT_MARK, **content}, indent=2, default=str)
     (folder / EDITS_FILE).write_bytes(text.encode() + b"\n")
     remove_empty(folder / EDITS_FOLDER)
 

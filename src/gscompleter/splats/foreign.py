@@ -14,7 +14,7 @@ from pathlib import Path
 
 from gscompleter.data.formats import find_format
 from gscompleter.data.frame import FOLDERS
-from gscompleter.data.sfm.poses import ENDINGS, holds_packed_splat
+from gscompleter.data.sfm.poses import PHOTOGRAPH_ENDINGS, holds_packed_splat
 from gscompleter.splats.packing import ZIP_MAGIC
 from gscompleter.splats.sog import LOD_KEY, LOD_META, META
 from gscompleter.splats.splat_format import list_zip
@@ -26,7 +26,7 @@ OF_STREAMED = (
     "in several levels of detail; write one of them to a .ply with `gscompleter convert`, and name "
     "that"
 )
-MAX_JSON = 1 << 26
+MAX_SEARCHED_JSON = 1 << 26
 """Largest JSON that is looked into, in bytes."""
 CHECKPOINTS = (".pt", ".pth", ".ckpt")
 POINT_CLOUDS = (".las", ".laz", ".e57", ".pcd", ".xyz", ".pts")
@@ -106,7 +106,7 @@ def holds_splat_alone(folder: Path) -> bool:
     if find_newest_splat(folder) is None or find_format(folder) not in SPLAT_NEIGHBOURS:
         return False
     names = [name.lower() for name in os.listdir(folder)]
-    return not any(name in FOLDERS or name.endswith(ENDINGS) for name in names)
+    return not any(name in FOLDERS or name.endswith(PHOTOGRAPH_ENDINGS) for name in names)
 
 
 def resolve_splat(path: Path) -> Path:
@@ -207,7 +207,7 @@ def _describe_json(path: Path) -> str:
     """Describe a JSON file that is none of a splat."""
     table: object = None
     with suppress(OSError, ValueError, RecursionError):
-        if os.path.getsize(path) <= MAX_JSON:
+        if os.path.getsize(path) <= MAX_SEARCHED_JSON:
             table = json.loads(path.read_bytes())
     keys = set(table) if isinstance(table, dict) else set()
     ending = path.suffix.lower()

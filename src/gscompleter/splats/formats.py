@@ -96,11 +96,11 @@ def load_splat(
         return load_ply(path, drop_nonfinite, ignore_properties)
     gaussians = decode_splat(path, leaves_out_band_4)
     if not ignore_properties:
-        refuse_other_kinds(list_names(path), path)
+        refuse_other_kinds(list_property_names(path), path)
     return require_finite(gaussians, path, drop_nonfinite)
 
 
-def list_names(path: Path) -> Sequence[str]:
+def list_property_names(path: Path) -> Sequence[str]:
     """List the properties of a file that `decode_splat` reads, at least those it does not use."""
     name = detect_splat_format(path)
     if name == "ply":
@@ -167,10 +167,10 @@ def load_splat_at(path: Path, origin: Origin | None, drop_nonfinite: bool = Fals
 def describe_oddities(path: Path) -> list[str]:
     """Describe in sentences what a file has that plain 3DGS does not, and how it is read."""
     path = resolve_splat(path)
-    further = describe_further(list_names(path))
+    further = describe_further(list_property_names(path))
     lines = [] if further is None else [further]
     if detect_splat_format(path) == "ply":
-        # As in `list_names`.
+        # As in `list_property_names`.
         lines = [*describe_values(read_scene(path, leaves_out_band_4=True)), *lines]
     return lines
 

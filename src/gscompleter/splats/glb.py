@@ -44,10 +44,10 @@ from gscompleter.system.files.reading import read_bytes
 from gscompleter.system.files.writing import replace_file
 from gscompleter.types import SH_C0, Gaussians, Origin
 
-MAGIC = b"glTF"
+GLB_MAGIC = b"glTF"
 FILE_HEADER = struct.Struct("<4sII")
 CHUNK_HEADER = struct.Struct("<II")
-JSON = 0x4E4F534A
+JSON_CHUNK = 0x4E4F534A
 """Type of the chunk of JSON: its name in ASCII."""
 BINARY = 0x004E4942
 """Type of the binary chunk: "BIN" in ASCII."""
@@ -55,10 +55,10 @@ EXTENSION = "KHR_gaussian_splatting"
 COMPRESSIONS = tuple(f"{EXTENSION}_compression_spz{version}" for version in ("", "_2"))
 """Extensions whose buffer holds a .spz: the name, and that of its later drafts."""
 SH_NAMES = [f"{EXTENSION}:SH_DEGREE_{d}_COEF_{i}" for d in range(4) for i in range(2 * d + 1)]
-LABELS = "_GENERATED"
+LABELS_ATTRIBUTE = "_GENERATED"
 """Attribute of the labels, if anything was generated; names of applications begin with `_`."""
-KNOWN = {
-    *("POSITION", "NORMAL", "COLOR_0", LABELS, *SH_NAMES),
+KNOWN_ATTRIBUTES = {
+    *("POSITION", "NORMAL", "COLOR_0", LABELS_ATTRIBUTE, *SH_NAMES),
     *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY")),
 }
 """Attributes that are read, and what viewers of points show."""
@@ -116,7 +116,9 @@ def list_glb_names(path: Path) -> list[str]:
     primitives = _find_primitives(_parse_document(read_bytes(path)))
     attributes = dict.fromkeys(name for one, _ in primitives for name in one["attributes"])
     # Attributes of applications begin with `_`, as `_TRBF_CENTER`.
-    further = [name.removeprefix(f"{EXTENSION}:") for name in attributes if name not in KNOWN]
+    further = [
+        name.removeprefix(f"{EXTENSION}:") for name in attributes if name not in KNOWN_ATTRIBUTES
+    ]
     return [name.lstrip("_").lower() for name in further]
 
 
@@ -139,9 +141,9 @@ def _parse_document(data: bytes) -> GlbDocument:
         if start > len(data):
             raise DamagedError(f"it ends after {len(data):,} of {start:,} bytes")
         chunks.setdefault(kind, data[start - size : start])
-    if JSON not in chunks:
+    if JSON_CHUNK not in chunks:
         raise DamagedError("it holds no description of its content")
-    return GlbDocument(json.loads(chunks[JSON]), chunks.get(BINARY, b""))
+    return GlbDocument(json.loads(chunks[JSON_CHUNK]), chunks.get(BINARY, b""))
 
 
 def _find_primitives(
@@ -235,9 +237,9 @@ def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gauss
         read_attribute(f"{EXTENSION}:OPACITY", "SCALAR")[:, 0],
         np.stack(sh, axis=1),
     )
-    if LABELS not in primitive["attributes"]:
+    if LABELS_ATTRIBUTE not in primitive["attributes"]:
         return gaussians
-    return with_labels(gaussians, read_attribute(LABELS, "SCALAR")[:, 0])
+    return with_labels(gaussians, read_attribute(LABELS_ATTRIBUTE, "SCALAR")[:, 0])
 
 
 def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[ndarray, "n k"]:
@@ -278,8 +280,10 @@ def write_glb(path: Path, gaussians: Gaussians, made_by: Provenance = NOTHING_KN
     if total > MAX_FILE_BYTES:
         raise InputError(f"{quote_value(path)} would exceed the 4 GiB of a .glb; write a .ply.")
     with replace_file(path) as file:
-        file.write(FILE_HEADER.pack(MAGIC, 2, total))
-        file.write(CHUNK_HEADER.pack(len(text), JSON) + text + CHUNK_HEADER.pack(size, BINARY))
+        file.write(FILE_HEADER.pack(GLB_MAGIC, 2, total))
+        file.write(
+            CHUNK_HEADER.pack(len(text), JSON_CHUNK) + text + CHUNK_HEADER.pack(size, BINARY)
+        )
         for column in columns.values():
             file.write(column.data)
 
@@ -300,7 +304,7 @@ def _make_columns(gaussians: Gaussians) -> dict[str, Float[ndarray, "n k"]]:
         **dict(zip(SH_NAMES, gaussians.sh.unbind(1), strict=False)),
     }
     if gaussians.generated.any():
-        columns[LABELS] = gaussians.generated[:, None].float()
+        columns[LABELS_ATTRIBUTE] = gaussians.generated[:, None].float()
     return {name: np.require(tensor.numpy(), "<f4", ["C"]) for name, tensor in columns.items()}
 
 
@@ -342,7 +346,7 @@ GLB = SplatFormat(
     name="glb",
     endings=(".glb",),
     read=read_glb,
-    starts=(MAGIC,),
+    starts=(GLB_MAGIC,),
     write=write_glb,
     read_record=read_glb_record,
     list_names=list_glb_names,

@@ -29,7 +29,7 @@ from gscompleter.types import Gaussians, merge
 
 HEADER_BYTES = 4096
 SECTION_HEADER_BYTES = 1024
-HEADER = struct.Struct("<BBxxI12xH14xff")
+KSPLAT_HEADER = struct.Struct("<BBxxI12xH14xff")
 """Version, number of sections, level of compression, SH values of bytes 0 and 255 at level 2."""
 SECTION_HEADER = struct.Struct("<IIIIfHxxI4xIIH")
 DEFAULT_STEPS = 32767
@@ -65,7 +65,7 @@ def read_ksplat(path: Path) -> Gaussians:
     data = memoryview(read_bytes(path))
     if len(data) < HEADER_BYTES:
         raise DamagedError("it ends within its header")
-    major, minor, num_sections, level, *sh_range = HEADER.unpack_from(data)
+    major, minor, num_sections, level, *sh_range = KSPLAT_HEADER.unpack_from(data)
     if major != 0 or minor < 1 or level > 2:
         raise UnsupportedError(
             f"is .ksplat version {major}.{minor} with compression {level}, and version 0.1 with "

@@ -12,14 +12,14 @@ from gscompleter.numerics.kernels.splat_rows import permute_rows
 from gscompleter.types import Gaussians
 
 BITS_PER_AXIS = 21
-SAMPLE_SIZE = 100_000
+BOUNDS_SAMPLE = 100_000
 """Gaussians from which the bounds of the scene are estimated."""
 
 
 def argsort_nearby(gaussians: Gaussians) -> Int64[Tensor, "n"]:
     """Compute the order along the curve; outliers count as lying at the border."""
     means = gaussians.means.detach().cpu().double().numpy()
-    low, high = np.quantile(means[:: max(1, len(means) // SAMPLE_SIZE)], (0.01, 0.99), axis=0)
+    low, high = np.quantile(means[:: max(1, len(means) // BOUNDS_SAMPLE)], (0.01, 0.99), axis=0)
     return argsort_morton(means, low, high).to(gaussians.means.device)
 
 

@@ -21,7 +21,7 @@ from gscompleter.types import Gaussians, Origin
 LEAST_DIGITS = 4
 MOST_DIGITS = 15
 """Digits that float64 holds."""
-MAX_STEP = 0.01
+MAX_POSITION_STEP = 0.01
 """Largest step of positions, relative to the size of the median Gaussian."""
 
 
@@ -53,7 +53,7 @@ def is_too_far(middle: Float[ndarray, "3"], size: float) -> bool:
     """
     farthest = float(np.abs(middle).max())
     # A size of zero tells nothing of what is visible.
-    return math.isfinite(farthest) and 0 < MAX_STEP * size < find_step(farthest)
+    return math.isfinite(farthest) and 0 < MAX_POSITION_STEP * size < find_step(farthest)
 
 
 def choose_origin(middle: Float[ndarray, "3"], size: float) -> Origin | None:

@@ -74,7 +74,7 @@ SAMPLE_ROWS = 1024
 """Rows of each block of a sample."""
 MIN_TELLING = 100
 """Fewest Gaussians whose numbers tell how they are stored."""
-MIDDLE = (0.01, 0.99)
+MIDDLE_QUANTILES = (0.01, 0.99)
 """Quantiles of positions that floaters leave alone."""
 LARGE_SIZE = 0.1
 """Largest size of the median Gaussian that is plausible, relative to the extent of the scene."""
@@ -178,11 +178,11 @@ def read_scene(path: Path, leaves_out_band_4: bool = False) -> SceneFile:
         **vars(scene),
         has_linear_scales=has_linear_scales,
         has_plain_opacities=find_plain_opacities(scene.rows, has_linear_scales),
-        origin=find_origin(scene.rows, has_linear_scales),
+        origin=find_rows_origin(scene.rows, has_linear_scales),
     )
 
 
-def find_origin(rows: ndarray, has_linear_scales: bool) -> Origin | None:
+def find_rows_origin(rows: ndarray, has_linear_scales: bool) -> Origin | None:
     """Find the place to which positions are read that float32 would round; None for zero."""
     if not has_doubles(rows):
         return None
@@ -251,7 +251,7 @@ def _measure_scales(rows: ndarray) -> tuple[float, float, float]:
 def _measure_extent(rows: ndarray) -> float:
     """Measure the largest side of the box around nearly all Gaussians, in scene units."""
     means = read_columns(sample_rows(rows), MEANS)
-    return float(np.ptp(np.quantile(means, MIDDLE, axis=0), axis=0).max())
+    return float(np.ptp(np.quantile(means, MIDDLE_QUANTILES, axis=0), axis=0).max())
 
 
 def find_plain_opacities(rows: ndarray, has_linear_scales: bool) -> bool:

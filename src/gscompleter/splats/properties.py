@@ -15,7 +15,7 @@ from gscompleter.system.errors import InputError, join_names, quote_value
 
 OPTION = "ignore_properties"
 """Argument and option that goes on with a file whose properties change what is seen."""
-MAX_NAMED = 4
+MAX_NAMED_PROPERTIES = 4
 """Most properties that a sentence names."""
 
 _PLAIN = re.compile(
@@ -72,7 +72,7 @@ TEXTURED = SplatKind(
     "export plain Gaussians with its trainer",
     re.compile(r"texture_\w+|tex_\w+"),
 )
-KINDS = (MOVING, OTHER_KERNEL, TEXTURED)
+WRONG_KINDS = (MOVING, OTHER_KERNEL, TEXTURED)
 """Kinds whose picture is surely wrong without their own properties."""
 
 
@@ -91,7 +91,7 @@ def find_further(names: Sequence[str]) -> FurtherProperties:
         name for name in names if not (_PLAIN.fullmatch(name) or _HARMLESS.fullmatch(name))
     )
     # The names that tell a kind are named first.
-    for kind in KINDS:
+    for kind in WRONG_KINDS:
         telling = tuple(name for name in further if kind.names.fullmatch(name))
         if telling:
             rest = tuple(name for name in further if name not in telling)
@@ -105,7 +105,8 @@ def refuse_other_kinds(names: Sequence[str], path: Path) -> None:
     if further.kind is not None:
         kind = further.kind
         raise InputError(
-            f"{quote_value(path)} is {kind.description} ({join_names(further.names, MAX_NAMED)}): "
+            f"{quote_value(path)} is {kind.description} "
+            f"({join_names(further.names, MAX_NAMED_PROPERTIES)}): "
             f"{kind.consequence}; {kind.remedy}, or go on without these properties.",
             OPTION,
         )
@@ -116,7 +117,7 @@ def describe_further(names: Sequence[str]) -> str | None:
     further = find_further(names)
     if not further.names:
         return None
-    shown = join_names(further.names, MAX_NAMED)
+    shown = join_names(further.names, MAX_NAMED_PROPERTIES)
     if further.kind is None:
         return f"Properties that plain 3DGS does not have are not used: {shown}."
     kind = further.kind

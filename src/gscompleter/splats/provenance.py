@@ -21,10 +21,10 @@ SCHEMA = "gscompleter-provenance/1"
 """Name and version of the schema; another number means other fields."""
 KEY = "provenance"
 """Name of the record in JSON and in OpenUSD."""
-MAX_TEXT = 100
+MAX_NOTE_LENGTH = 100
 """Longest name or licence, in characters; readers of .ply bound the length of a line."""
 DROP = "drop the record (`gscompleter convert --plain`)"
-ADVICE = f"export the file again, or {DROP}"
+PROVENANCE_ADVICE = f"export the file again, or {DROP}"
 _LINE = re.compile(rb"^comment (gscompleter-provenance/\d+) (.*?)\r?\n", re.MULTILINE)
 
 
@@ -82,8 +82,8 @@ NOTHING_KNOWN = Provenance(())
 
 
 def shorten(text: str) -> str:
-    """Shorten a name that a user chose to `MAX_TEXT` characters."""
-    return text if len(text) <= MAX_TEXT else f"{text[: MAX_TEXT - 1]}…"
+    """Shorten a name that a user chose to `MAX_NOTE_LENGTH` characters."""
+    return text if len(text) <= MAX_NOTE_LENGTH else f"{text[: MAX_NOTE_LENGTH - 1]}…"
 
 
 def parse_provenance(table: object, name: str) -> Provenance:
@@ -103,9 +103,9 @@ def parse_provenance(table: object, name: str) -> Provenance:
             )
         raise InputError(
             f"{name} says who made it by the schema {quote_value(str(schema))}, and {SCHEMA} is "
-            f"read; {ADVICE}."
+            f"read; {PROVENANCE_ADVICE}."
         )
-    return validate_typed(Provenance, table, f"The record of {name}", ADVICE)
+    return validate_typed(Provenance, table, f"The record of {name}", PROVENANCE_ADVICE)
 
 
 def make_comment_lines(runs: Sequence[RunRecord], ending: bytes = b"\n") -> bytes:
@@ -123,7 +123,7 @@ def parse_comments(header: bytes, name: str) -> object:
         try:
             runs.append(json.loads(text))
         except (ValueError, RecursionError):
-            raise InputError(f"The record of {name} is no JSON; {ADVICE}.") from None
+            raise InputError(f"The record of {name} is no JSON; {PROVENANCE_ADVICE}.") from None
     return {"schema": schema, "runs": runs} if runs else None
 
 

@@ -53,7 +53,7 @@ LOD_META = "lod-meta.json"
 """Index of a streamed scene: one .sog for each level and place."""
 LOD_KEY = "lodLevels"
 """Entry of that index: the number of levels."""
-LABELS = "generated"
+LABELS_IMAGE = "generated"
 """Name in `meta.json` of an image of the labels, if anything was generated; ours alone."""
 PALETTE_WIDTH = 64
 """Entries of the SH palette in each row of its image."""
@@ -68,14 +68,14 @@ MAX_PIXEL_BYTES = 8
 
 ROTATION_MARK = 252
 """Fourth byte of a rotation, plus the number of the dropped component."""
-BLOCK = 4
+WIDTH_MULTIPLE = 4
 """Number of pixels of which the width of images is a multiple, as in other writers."""
 
 FileReader = Callable[[str, int], bytes]
 """Function that reads a file of the scene by name and most bytes, from a folder or a bundle."""
 Coded = tuple[dict[str, Any], dict[str, bytes]]
 """A property as numbers for `meta.json`, and images by file name."""
-READ = ("means", "scales", "quats", "sh0", "shN", LABELS)
+READ = ("means", "scales", "quats", "sh0", "shN", LABELS_IMAGE)
 """Properties that are read."""
 
 
@@ -88,7 +88,7 @@ def read_sog(path: Path) -> Gaussians:
     if not data.startswith(ZIP_MAGIC):
         return _read_folder(path.parent, path.name)
     with zipfile.ZipFile(io.BytesIO(data)) as bundle:
-        return _read_files(partial(_read_entry, bundle), META, len(data))
+        return _read_files(partial(_read_bundle_entry, bundle), META, len(data))
 
 
 def _read_folder(folder: Path, meta: str) -> Gaussians:
@@ -117,12 +117,12 @@ def _read_meta(path: Path) -> dict[str, Any]:
         data = read_bytes(path)
         if data.startswith(ZIP_MAGIC):
             with zipfile.ZipFile(io.BytesIO(data)) as bundle:
-                data = _read_entry(bundle, META, MAX_META)
+                data = _read_bundle_entry(bundle, META, MAX_META)
     table: dict[str, Any] = json.loads(data)
     return table
 
 
-def _read_entry(bundle: zipfile.ZipFile, name: str, most: int) -> bytes:
+def _read_bundle_entry(bundle: zipfile.ZipFile, name: str, most: int) -> bytes:
     if name not in bundle.NameToInfo:
         raise DamagedError(f"it lacks its file {quote_value(name)}")
     if bundle.getinfo(name).flag_bits & 1:
@@ -162,9 +162,9 @@ def _decode_scene(read: FileReader, table: dict[str, Any], stored: int) -> Gauss
         rgba[:, 3] if is_coded else 1 / (1 + np.exp(-rgba[:, 3])),
         assemble_sh(0.5 + SH_C0 * rgba[:, :3], rest),
     )
-    if LABELS not in table:
+    if LABELS_IMAGE not in table:
         return gaussians
-    (labels,) = table[LABELS]["files"]
+    (labels,) = table[LABELS_IMAGE]["files"]
     return with_labels(gaussians, _read_pixels(read, labels, count)[:, 0])
 
 
@@ -302,7 +302,7 @@ def _encode_scene(gaussians: Gaussians) -> dict[str, Coded]:
         coded["shN"] = _encode_sh_rest(gaussians)
     if gaussians.generated.any():
         labels = _encode_image(gaussians.generated[:, None].expand(-1, 3).numpy())
-        coded[LABELS] = ({}, {"generated.webp": labels})
+        coded[LABELS_IMAGE] = ({}, {"generated.webp": labels})
     return coded
 
 
@@ -335,7 +335,7 @@ def _encode_sh_rest(gaussians: Gaussians) -> Coded:
 def _encode_image(values: Shaped[ndarray, "n k"], width: int = 0) -> bytes:
     """Encode rows of 3 or 4 bytes as a lossless image, by default about square."""
     n, k = values.shape
-    width = width or BLOCK * math.ceil(math.sqrt(n) / BLOCK)
+    width = width or WIDTH_MULTIPLE * math.ceil(math.sqrt(n) / WIDTH_MULTIPLE)
     # Pixels beyond the last Gaussian are white and opaque.
     pixels = np.full((math.ceil(n / width), width, 4), 255, np.uint8)
     pixels.reshape(-1, 4)[:n, :k] = values

@@ -44,9 +44,9 @@ from gscompleter.system.files.reading import read_bytes
 from gscompleter.system.files.writing import replace_file
 from gscompleter.types import SH_C0, Gaussians
 
-MAGIC = b"NGSP"
+SPZ_MAGIC = b"NGSP"
 GZIP = b"\x1f\x8b"
-HEADER = struct.Struct("<4sIIBBBB")
+SPZ_HEADER = struct.Struct("<4sIIBBBB")
 """Magic, version, count, SH degree, fractional bits, flags, and the number of streams."""
 ANTIALIASED_FLAG = 0x1
 EXTENSIONS_FLAG = 0x2
@@ -58,9 +58,9 @@ COLOR_SCALE = 0.15
 SIGN_SIZE_BITS = (1, 9) * 3
 """Bits of sign and size of three components of a rotation."""
 MAX_FRACTIONAL_BITS = 16
-BLOCK = 1 << 16
+ENCODED_BLOCK = 1 << 16
 """Gaussians that are encoded at a time."""
-REST_VALUES = (np.arange(256, dtype=np.float32) - 128) / 128
+SPZ_REST_VALUES = (np.arange(256, dtype=np.float32) - 128) / 128
 """Coefficient of SH of degree 1 and above that each byte stands for."""
 GZIP_HEADER = gzip.compress(b"", compresslevel=6, mtime=0)[:10]
 """Signature, method, no time and the mark of the system, as the module `gzip` writes them."""
@@ -105,7 +105,7 @@ def decode_spz(data: bytes, max_degree: int = 3) -> Gaussians:
         data = _unpack_gzip(data, max_degree)
     header = _parse_header(data, max_degree)
     if header.version < 4:
-        ends = np.cumsum([HEADER.size, *header.stream_sizes]).tolist()
+        ends = np.cumsum([SPZ_HEADER.size, *header.stream_sizes]).tolist()
         streams = [data[start:end] for start, end in pairwise(ends)]
     else:
         streams = _read_zstd(header, data)
@@ -117,15 +117,15 @@ def list_spz_names(path: Path) -> list[str]:
     """List what is stored besides the attributes, and is not read."""
     data = read_bytes(path)
     if data.startswith(GZIP):
-        data = zlib.decompressobj(wbits=GZIP_BITS).decompress(data, HEADER.size)
+        data = zlib.decompressobj(wbits=GZIP_BITS).decompress(data, SPZ_HEADER.size)
     return ["extensions"] if _parse_header(data, 4).flags & EXTENSIONS_FLAG else []
 
 
 def _parse_header(data: bytes, max_degree: int) -> SpzHeader:
-    if len(data) < HEADER.size:
+    if len(data) < SPZ_HEADER.size:
         raise DamagedError("it ends within its header")
-    header = SpzHeader(*HEADER.unpack_from(data))
-    if header.magic != MAGIC:
+    header = SpzHeader(*SPZ_HEADER.unpack_from(data))
+    if header.magic != SPZ_MAGIC:
         raise DamagedError("it is no .spz but other data")
     if header.version not in (2, 3, 4) or header.degree > 4:
         raise UnsupportedError(
@@ -140,7 +140,7 @@ def _parse_header(data: bytes, max_degree: int) -> SpzHeader:
 def _unpack_gzip(data: bytes, max_degree: int) -> bytes:
     # The header says how long the content is; a bomb is refused before it is unpacked.
     unpacker = zlib.decompressobj(wbits=GZIP_BITS)
-    start = unpacker.decompress(data, HEADER.size)
+    start = unpacker.decompress(data, SPZ_HEADER.size)
     header = _parse_header(start, max_degree)
     check_count(header.num_gaussians, len(data))
     size = sum(header.stream_sizes)
@@ -158,9 +158,9 @@ def _read_zstd(header: SpzHeader, data: bytes) -> list[bytes]:
 
     check_count(header.num_gaussians, len(data))
     # After the header lies the offset of a table with the packed and unpacked size of each stream.
-    if len(data) < HEADER.size + 4:
+    if len(data) < SPZ_HEADER.size + 4:
         raise DamagedError("it ends within its header")
-    (place,) = struct.unpack_from("<I", data, HEADER.size)
+    (place,) = struct.unpack_from("<I", data, SPZ_HEADER.size)
     check_rows(len(data) - place, 16, header.num_streams, "entries of its table of contents")
     table = np.frombuffer(data, "<u8", 2 * header.num_streams, place).reshape(-1, 2)
     start = place + table.nbytes
@@ -187,7 +187,7 @@ def _decode_streams(header: SpzHeader, streams: list[bytes]) -> Gaussians:
         for stream, width in zip(streams, header.widths, strict=True)
     ]
     colour = 0.5 + SH_C0 * (colours.astype(np.float32) / 255 - 0.5) / COLOR_SCALE
-    higher = REST_VALUES[rest].reshape(n, -1, 3)[:, : NUM_SH_REST[min(header.degree, 3)]]
+    higher = SPZ_REST_VALUES[rest].reshape(n, -1, 3)[:, : NUM_SH_REST[min(header.degree, 3)]]
     return build_gaussians(
         np.ldexp(_decode_int24(positions).astype(np.float32), -header.fractional_bits),
         _decode_quats_v2(rotations) if header.version == 2 else _decode_quats_v3(rotations),
@@ -244,7 +244,7 @@ def encode_spz_blocks(path: Path, make_blocks: Callable[[], Iterable[Gaussians]]
             stream.append(content)
         degree = block.sh_degree
         flags = ANTIALIASED_FLAG if block.is_antialiased else 0
-    header = HEADER.pack(MAGIC, 3, sum(count for count, _ in parts), degree, bits, flags, 0)
+    header = SPZ_HEADER.pack(SPZ_MAGIC, 3, sum(count for count, _ in parts), degree, bits, flags, 0)
     # What `gzip.compress` gives for all of it at once: a header, the packed data, and its checksum.
     packer = zlib.compressobj(6, zlib.DEFLATED, -zlib.MAX_WBITS)
     packed = io.BytesIO()
@@ -263,7 +263,7 @@ def encode_spz_blocks(path: Path, make_blocks: Callable[[], Iterable[Gaussians]]
 
 
 def _cut(count: int) -> Iterator[slice]:
-    return (slice(start, start + BLOCK) for start in range(0, count, BLOCK))
+    return (slice(start, start + ENCODED_BLOCK) for start in range(0, count, ENCODED_BLOCK))
 
 
 def _encode_streams(gaussians: Gaussians, bits: int) -> tuple[bytes, ...]:
@@ -318,16 +318,16 @@ def is_spz(path: Path, head: bytes) -> bool:
         return True
     content = b""
     with suppress(zlib.error):
-        content = zlib.decompressobj(GZIP_BITS).decompress(head, max_length=HEADER.size)
+        content = zlib.decompressobj(GZIP_BITS).decompress(head, max_length=SPZ_HEADER.size)
     # The reader says what is wrong with one whose content is damaged.
-    return content.startswith(MAGIC) or path.suffix.lower() == ".spz"
+    return content.startswith(SPZ_MAGIC) or path.suffix.lower() == ".spz"
 
 
 SPZ = SplatFormat(
     name="spz",
     endings=(".spz",),
     read=read_spz,
-    starts=(MAGIC, GZIP),
+    starts=(SPZ_MAGIC, GZIP),
     recognize=is_spz,
     write=write_spz,
     list_names=list_spz_names,

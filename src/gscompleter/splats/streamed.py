@@ -19,7 +19,7 @@ from gscompleter.types import Gaussians, merge
 
 MAX_NODES = 1_000_000
 """Most boxes of a tree."""
-Part = tuple[int, int, int]
+FileRange = tuple[int, int, int]
 """Number of a file, of its first Gaussian, and of Gaussians."""
 
 
@@ -48,11 +48,11 @@ def load_level(path: Path, level: int, drop_nonfinite: bool = False) -> Gaussian
         raise InputError(f"{name} names no Gaussians of level {level}; export the scene again.")
 
     gaussians = []
-    by_file: dict[int, list[Part]] = {}
+    by_file: dict[int, list[FileRange]] = {}
     for part in parts:
         by_file.setdefault(part[0], []).append(part)
     for number, wanted in track(list(by_file.items()), "reading places"):
-        place = _locate(index, files[number])
+        place = _locate_sog(index, files[number])
         scene = load_splat(place)
         if any(first + count > len(scene) for _, first, count in wanted):
             raise InputError(
@@ -63,7 +63,7 @@ def load_level(path: Path, level: int, drop_nonfinite: bool = False) -> Gaussian
     return merge(gaussians)
 
 
-def _list_parts(tree: Mapping[str, Any], level: int) -> Iterator[Part]:
+def _list_parts(tree: Mapping[str, Any], level: int) -> Iterator[FileRange]:
     """List what the boxes of a tree name for a level."""
     nodes = [tree]
     for _ in range(MAX_NODES):
@@ -77,7 +77,7 @@ def _list_parts(tree: Mapping[str, Any], level: int) -> Iterator[Part]:
     raise ValueError("its tree has too many boxes")
 
 
-def _locate(index: Path, file: str) -> Path:
+def _locate_sog(index: Path, file: str) -> Path:
     """Locate a .sog that an index names, in its own folder or below."""
     path = index.parent / file
     if not path.resolve().is_relative_to(index.parent.resolve()):

@@ -19,7 +19,7 @@ from gscompleter.splats.origin import choose_origin, measure_size
 from gscompleter.splats.packing import UnsupportedError
 from gscompleter.types import Gaussians, Origin, merge
 
-MAX_SKEW = 1e-3
+MAX_SIMILARITY_ERROR = 1e-3
 """Largest relative error of a similarity of a file."""
 HALF_TURN_X = (1.0, -1.0, -1.0)
 """Signs of the axes after half a turn about x."""
@@ -58,7 +58,7 @@ def require_similarity(place: Float[Tensor, "4 4"], name: str) -> None:
     volume = float(torch.linalg.det(linear))
     shape = linear @ linear.T / max(volume, 1e-30) ** (2 / 3)
     identity = torch.eye(3, dtype=place.dtype)
-    if not volume > 0 or not torch.allclose(shape, identity, atol=MAX_SKEW):
+    if not volume > 0 or not torch.allclose(shape, identity, atol=MAX_SIMILARITY_ERROR):
         raise UnsupportedError(f"has a {name} that mirrors Gaussians or stretches them unevenly")
 
 

@@ -97,7 +97,7 @@ def undo_edits(path: Path, edits: Edits, numbers: Collection[int], out: Path) ->
     originals = join_originals(left_out)
 
     had_labels = all_edits[0].had_labels
-    header, dtype = make_header(layout, all_edits, remaining, had_labels)
+    header, dtype = make_remaining_header(layout, all_edits, remaining, had_labels)
 
     def generate_blocks() -> Iterator[ndarray]:
         for block in iterate_blocks(len(keys)):
@@ -209,7 +209,7 @@ def join_originals(parts: Sequence[Originals]) -> Originals:
     return Originals(keys[order], scenes, np.concatenate(places)[order])
 
 
-def make_header(
+def make_remaining_header(
     layout: SceneFile, edits: Sequence[Edit], remaining: Sequence[int], had_labels: str | None
 ) -> tuple[bytes, np.dtype]:
     """Make header and type of rows without the comments of the edits that are taken off.

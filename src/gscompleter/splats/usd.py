@@ -52,12 +52,12 @@ if TYPE_CHECKING:
 
 KIND = "ParticleField3DGaussianSplat"
 SH_NAME = "radiance:sphericalHarmonics"
-LABELS = "generated"
+LABELS_PRIMVAR = "generated"
 """Attribute of the labels, if anything was generated; ours alone."""
 PROBE_BYTES = 2**20
 """Bytes that are written to find out why OpenUSD could not."""
 LAYER_ENDINGS = (".usdc", ".usda", ".usd")
-ENDINGS = (*LAYER_ENDINGS, ".usdz")
+USD_ENDINGS = (*LAYER_ENDINGS, ".usdz")
 LINEAR = "lin_"
 """Start of the names of linear colour spaces."""
 Y_FROM_Z_UP = ((1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1))
@@ -150,7 +150,7 @@ def _make_stage(gaussians: Gaussians) -> Usd.Stage:
         prim.GetAttribute(name).Set(np.ascontiguousarray(value.numpy()))
     prim.GetAttribute(f"{SH_NAME}Degree").Set(gaussians.sh_degree)
     if gaussians.generated.any():
-        labels = prim.CreateAttribute(LABELS, Sdf.ValueTypeNames.UCharArray, custom=True)
+        labels = prim.CreateAttribute(LABELS_PRIMVAR, Sdf.ValueTypeNames.UCharArray, custom=True)
         labels.Set(Vt.UCharArray.FromNumpy(gaussians.generated.numpy()))
     return stage
 
@@ -199,7 +199,7 @@ def _open_stage(path: Path) -> Iterator[Usd.Stage]:
 
     with ExitStack() as stack:
         place = path
-        if path.suffix.lower() not in ENDINGS:
+        if path.suffix.lower() not in USD_ENDINGS:
             # On Windows, a file that OpenUSD still maps cannot be removed.
             temporary = tempfile.TemporaryDirectory(ignore_cleanup_errors=True)
             folder = stack.enter_context(temporary)
@@ -222,7 +222,7 @@ def _read_prim(prim: Usd.Prim, has_z_up: bool) -> Gaussians:
     space = _find_color_space(prim)
     if space.startswith(LINEAR):
         raise UnsupportedError(f"has colours in the linear space {quote_value(space)}")
-    positions = _read_array(prim, "positions", 3)
+    positions = _read_prim_array(prim, "positions", 3)
     count = len(positions)
     degree = int(prim.GetAttribute(f"{SH_NAME}Degree").Get(Usd.TimeCode.EarliestTime()))
     if not 0 <= degree < len(NUM_SH_REST):
@@ -230,12 +230,12 @@ def _read_prim(prim: Usd.Prim, has_z_up: bool) -> Gaussians:
     width = 1 + NUM_SH_REST[degree]
     gaussians = build_gaussians(
         positions,
-        np.roll(_read_array(prim, "orientations", 4), 1, axis=1),
-        _read_array(prim, "scales", 3),
-        _read_array(prim, "opacities", 1)[:, 0],
-        _read_array(prim, f"{SH_NAME}Coefficients", 3).reshape(count, width, 3),
+        np.roll(_read_prim_array(prim, "orientations", 4), 1, axis=1),
+        _read_prim_array(prim, "scales", 3),
+        _read_prim_array(prim, "opacities", 1)[:, 0],
+        _read_prim_array(prim, f"{SH_NAME}Coefficients", 3).reshape(count, width, 3),
     )
-    labels = prim.GetAttribute(LABELS)
+    labels = prim.GetAttribute(LABELS_PRIMVAR)
     if labels and labels.HasAuthoredValue():
         gaussians = with_labels(gaussians, np.asarray(labels.Get(Usd.TimeCode.EarliestTime())))
 
@@ -261,7 +261,7 @@ def _find_color_space(prim: Usd.Prim) -> str:
     return ""
 
 
-def _read_array(prim: Usd.Prim, name: str, width: int) -> Float[ndarray, "n w"]:
+def _read_prim_array(prim: Usd.Prim, name: str, width: int) -> Float[ndarray, "n w"]:
     """Read an array of a prim, that of single precision if there are both."""
     from pxr import Usd
 

@@ -43,11 +43,11 @@ from gscompleter.system.progress import track
 from gscompleter.trust.photometric import compute_color_differences
 from gscompleter.types import DepthMap, Gaussians, Reconstruction, Render, View, merge
 
-MAX_ROUNDS = 3
+MAX_RECONSTRUCTIONS = 3
 """Most reconstructions. One fills what it sees; a further one serves photographs elsewhere."""
-MAX_PHOTOS = 8
+MAX_STEREO_PHOTOS = 8
 """Most photographs of one reconstruction, spread over those that show something missing."""
-MIN_SHARE = 0.002
+MIN_ADDED_SHARE = 0.002
 """Smallest share of a photograph that is worth adding."""
 MIN_REGION = 0.005
 """Smallest contradicted region, as a share of the photograph. In a splat that lacks nothing, such
@@ -64,7 +64,7 @@ MIN_NEARER = 0.5
 """Smallest share of the measured pixels of a contradicted region that have to be nearer."""
 SAME_SURFACE = 0.03
 """Relative distance from the depth of a photograph within which a Gaussian is what it shows."""
-COLOR_ROUNDS = 5
+OBSERVED_COLOR_ROUNDS = 5
 """Rounds in which colours are fitted to all photographs."""
 
 
@@ -108,7 +108,7 @@ def add_observed(
         return state
     views = [photo.view for photo in state.photos]
     reconstructed: set[int] = set()
-    for _ in track(range(MAX_ROUNDS), "Adding what photographs show"):
+    for _ in track(range(MAX_RECONSTRUCTIONS), "Adding what photographs show"):
         frozen = scenes.freeze_at(state.parts, [view.camera for view in views])
         renders = [scene.render for scene in frozen]
         lacks = find_lacks(views, renders, state.config.holes)
@@ -167,7 +167,7 @@ def choose_photographs(
     showing = [
         index
         for index, lack in enumerate(lacks)
-        if lack.share >= MIN_SHARE and index not in reconstructed
+        if lack.share >= MIN_ADDED_SHARE and index not in reconstructed
     ]
     if not showing:
         return []
@@ -177,7 +177,7 @@ def choose_photographs(
     alike = [index for index, view in enumerate(views) if view.image.shape == size]
     showing = [index for index in showing if index in alike]
     # Spread over all of them: eight neighbours left the far photographs 1.4 dB lower.
-    spread = select_spread_cameras([views[index].camera for index in showing], MAX_PHOTOS)
+    spread = select_spread_cameras([views[index].camera for index in showing], MAX_STEREO_PHOTOS)
     chosen = [showing[index] for index in spread]
 
     # Stereo needs a second place: photographs from one place get the nearest one from elsewhere.
@@ -321,7 +321,7 @@ def refine_to_photographs(
     wanted = [
         view.paint_ignored(scene.render.image) for view, scene in zip(views, frozen, strict=True)
     ]
-    colored = fit_colors(placed, frozen, wanted, [RELAXATION] * COLOR_ROUNDS)
+    colored = fit_colors(placed, frozen, wanted, [RELAXATION] * OBSERVED_COLOR_ROUNDS)
     plans = tuple(scene.vary_opacities(colored) for scene in frozen)
     settings = replace(state.config.refine, target_weight=1.0)
     refined, losses = refine_opacities(colored, plans[0], views[0], plans[1:], views[1:], settings)

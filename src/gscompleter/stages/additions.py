@@ -70,7 +70,7 @@ class Additions:
         return make_part(self.origin, self.gaussians)
 
 
-Place = Callable[[Additions], Additions]
+Placement = Callable[[Additions], Additions]
 """Moves or drops candidates."""
 Refinement = Callable[[Gaussians], Refined]
 """Fits colours and opacities."""
@@ -78,7 +78,9 @@ Verify = Callable[[Additions, Refined], Additions]
 """Fades or drops what was refined."""
 
 
-def accept(candidates: Additions, place: Place, refine: Refinement, verify: Verify) -> Additions:
+def accept(
+    candidates: Additions, place: Placement, refine: Refinement, verify: Verify
+) -> Additions:
     """Accept candidates into a scene as far as they can be placed, refined and verified there.
 
     Everything that is added goes through here: what is generated for a target, what closes the

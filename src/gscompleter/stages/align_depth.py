@@ -14,8 +14,8 @@ import torch
 from gscompleter.config import AlignmentConfig
 from gscompleter.numerics.robust import find_affine_inliers
 from gscompleter.stages.align_paper import (
-    MIN_INLIERS,
-    MIN_PIXELS,
+    MIN_FIT_PIXELS,
+    MIN_INLIER_SHARE,
     align_as_paper,
     fit_affine,
     pair_depths,
@@ -25,7 +25,7 @@ from gscompleter.stages.target_view import TargetView
 from gscompleter.system.timing import timed_stage
 from gscompleter.types import DepthAffine, DepthMap, DepthPairs, Lift
 
-MAX_PAIRS = 1000
+MAX_DEPTH_PAIRS = 1000
 """Most compared depths that are kept as a sample."""
 
 
@@ -65,14 +65,14 @@ def refit_at_target(
     is better, the paper's choice stays.
     """
     x, y = pair_depths(predicted, context)
-    if len(x) < MIN_PIXELS:
+    if len(x) < MIN_FIT_PIXELS:
         return affine
     agree = find_affine_inliers(x, y, affine.scale, affine.shift).double().mean().item()
     affine = replace(affine, agreement=agree, coverage=len(x) / context.depth.numel())
     if agree >= config.min_agreement:
         return affine
     refitted = fit_affine(predicted, context, rng)
-    if refitted.inliers < max(MIN_INLIERS, 2 * agree):
+    if refitted.inliers < max(MIN_INLIER_SHARE, 2 * agree):
         return affine
     return replace(refitted, agreement=refitted.inliers, is_refitted_at_target=True)
 
@@ -85,7 +85,7 @@ def sample_depth_pairs(
 ) -> DepthPairs:
     """Sample the depths that `affine` was fitted to."""
     x, y = pair_depths(predicted, context)
-    step = max(1, -(-len(x) // MAX_PAIRS))
+    step = max(1, -(-len(x) // MAX_DEPTH_PAIRS))
     x, y = x[::step], y[::step]
     inlier_mask = find_affine_inliers(x, y, affine.scale, affine.shift)
     # All tensors of a completion lie on one device.

@@ -14,13 +14,13 @@ from gscompleter.numerics.robust import find_affine_inliers, fit_line_ransac
 from gscompleter.stages.select_anchor import Anchor
 from gscompleter.types import DepthAffine, DepthMap, Lift
 
-MAX_PIXELS = 8192
+MAX_SCORED_PIXELS = 8192
 """Pixels that hypotheses are scored on; of more, a random sample is used. Our reading: the paper
 names no number."""
-MIN_PIXELS = 64
+MIN_FIT_PIXELS = 64
 """Fewest comparable pixels that a fit needs. Our reading, as are both limits below: the paper does
 not say what happens where RANSAC finds nothing."""
-MIN_INLIERS = 0.3
+MIN_INLIER_SHARE = 0.3
 """Smallest inlier fraction of a reliable fit."""
 MIN_DEPTH_SPREAD = 0.05
 """Smallest (p95 - p5) / median of depths that separates scale and shift.
@@ -42,10 +42,10 @@ def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> 
     The fallback is the median ratio with shift 0, and the identity if nothing can be compared.
     """
     x, y = pair_depths(predicted, context)
-    if len(x) < MIN_PIXELS:
+    if len(x) < MIN_FIT_PIXELS:
         return DepthAffine()
-    if len(x) > MAX_PIXELS:
-        sample = torch.randperm(len(x), generator=rng)[:MAX_PIXELS]
+    if len(x) > MAX_SCORED_PIXELS:
+        sample = torch.randperm(len(x), generator=rng)[:MAX_SCORED_PIXELS]
         x, y = x[sample], y[sample]
 
     # In a flat view, such as a wall from the front, scale and shift cannot be told apart.
@@ -54,7 +54,7 @@ def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> 
         # Our reading: ρ counts pixels whose error, relative to their depth, is small.
         scale, shift = fit_line_ransac(x, y, rng, predicted.depth.device)
         inliers = find_affine_inliers(x, y, scale, shift).double().mean().item()
-        if scale > 0 and inliers >= MIN_INLIERS:
+        if scale > 0 and inliers >= MIN_INLIER_SHARE:
             return DepthAffine(scale, shift, inliers, "ransac")
 
     scale = (y / x).median().item()

@@ -30,11 +30,11 @@ from gscompleter.state import Completion
 from gscompleter.system.timing import timed_stage
 from gscompleter.types import Camera, Gaussians, View
 
-RIM = 1
+GAP_RIM = 1
 """Pixels around a gap that are covered as well, and whose mixed colours and depths do not count."""
-REACH = 16
+GAP_REACH = 16
 """Radius in pixels around a known pixel within which the farthest surface is looked for."""
-SHARPNESS = 16
+DEPTH_SHARPNESS = 16
 """Power of the depth of a pixel, relative to the largest one there, by which it weighs in a gap."""
 
 
@@ -58,7 +58,7 @@ def view_gaps(
 
     More is a hole there than at a target: gaps at the edges of surfaces are half transparent.
     """
-    holes = replace(state.config.holes, max_alpha=config.max_alpha, dilation=RIM)
+    holes = replace(state.config.holes, max_alpha=config.max_alpha, dilation=GAP_RIM)
     strict = replace(state, config=replace(state.config, holes=holes))
     camera = move_on(state.with_depth_range(target), state.views, config.displacement)
     return render_target(strict, pad_camera(camera, 0.0), scenes)
@@ -84,9 +84,9 @@ def continue_surfaces(
     # Of two surfaces that adjoin a gap the farther one goes on in it. A power and no limit, as most
     # steps of depth are small, and a slanted surface has its own.
     depths = layers[..., 3].exp().where(known, 0.0)
-    side = 2 * REACH + 1
-    farthest = max_pool2d(depths[None, None], side, stride=1, padding=REACH)[0, 0]
-    weight = (depths / farthest.where(known, 1.0)) ** SHARPNESS
+    side = 2 * GAP_REACH + 1
+    farthest = max_pool2d(depths[None, None], side, stride=1, padding=GAP_REACH)[0, 0]
+    weight = (depths / farthest.where(known, 1.0)) ** DEPTH_SHARPNESS
     filled = continue_smoothly(layers.cpu(), weight.cpu()).to(layers)
 
     # Known pixels keep their colours, from which those of the additions are blended.
@@ -95,7 +95,7 @@ def continue_surfaces(
     depth = filled[..., 3].exp()
     discs = make_discs(reference, depth, compute_normals(depth, reference), DISC_SIGMA)
 
-    chosen = dilate(gaps, RIM).flatten() & known.any()
+    chosen = dilate(gaps, GAP_RIM).flatten() & known.any()
     added = adapt_to_mode(view.state.rendered_context, discs[chosen], camera)
     return reference, added
 
@@ -108,7 +108,7 @@ def collect_layers(view: TargetView) -> tuple[Float[Tensor, "h w 4"], Bool[Tenso
     render = view.render
     max_alpha = view.state.config.holes.max_alpha
     surface = render.depth_map(max_alpha)
-    known = surface.valid & ~dilate(view.empty, RIM)
+    known = surface.valid & ~dilate(view.empty, GAP_RIM)
     # The render is over black: its colours are divided by alpha.
     colors = render.image / render.alpha.clamp_min(max_alpha)[..., None]
     depth = surface.depth.where(known, 1.0)

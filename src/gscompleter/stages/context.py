@@ -13,6 +13,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 
 from gscompleter.config import CompleterConfig, get_named_config
 from gscompleter.numerics.geometry import add_near_plane, compute_z_depths, project_mask
+from gscompleter.numerics.image_ops import MIN_CONTRAST
 from gscompleter.reconstructors import (
     DepthAware,
     NearPlaneFinder,
@@ -30,8 +31,6 @@ from gscompleter.system.errors import InputError
 from gscompleter.trust.lifted import is_lifted
 from gscompleter.types import Camera, ContextScene, Gaussians, Reconstruction, View
 
-MIN_CONTRAST = 0.02
-"""Brightness range in 5 x 5 smoothed pixels that counts as texture; colours are in [0, 1]."""
 MIN_TEXTURED = 0.01
 """Smallest textured fraction of an image."""
 

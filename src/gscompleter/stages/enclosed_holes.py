@@ -28,13 +28,13 @@ from gscompleter.numerics.geometry import (
 from gscompleter.numerics.image_ops import dilate, fill_smoothly, is_enclosed, label_regions
 from gscompleter.types import Camera, Render
 
-SIDE = 224
+ENCLOSURE_SIDE = 224
 """Longer side, in pixels, of the images from other sides."""
-MIN_PIXELS = 12
+MIN_PART_PIXELS = 12
 """Pixels of the smallest part that can be judged; smaller ones stay empty."""
-OPAQUE = 0.9
+OBJECT_ALPHA = 0.9
 """Alpha from which a pixel beside a hole counts as the object."""
-BORDER = 0.02
+HOLE_BORDER = 0.02
 """Width of the border of a hole, relative to the longer side of the image."""
 MIN_BORDER_PIXELS = 12
 """Fewest opaque pixels in the border that a surface is fitted to."""
@@ -82,10 +82,10 @@ def is_hole_in_object(
     render_at: Callable[[Camera], Render],
 ) -> bool:
     """Judge one connected part of the empty pixels; the cheap criteria come first."""
-    if not is_enclosed(part) or int(part.sum()) < MIN_PIXELS:
+    if not is_enclosed(part) or int(part.sum()) < MIN_PART_PIXELS:
         return False
-    opaque = render.alpha >= OPAQUE
-    width = max(3, round(BORDER * max(part.shape)))
+    opaque = render.alpha >= OBJECT_ALPHA
+    width = max(3, round(HOLE_BORDER * max(part.shape)))
     beside = dilate(part, 1)
     border = dilate(part, width + 1) & ~beside & opaque
     if int(border.sum()) < MIN_BORDER_PIXELS:
@@ -124,7 +124,7 @@ def measure_roughness(depth: Float[Tensor, "h w"], border: Bool[Tensor, "h w"]) 
 
 def turn_around(camera: Camera, plug: Float[Tensor, "n 3"]) -> Iterator[Camera]:
     """Turn a small camera about the middle of a plug, about its own vertical axis."""
-    small = shrink_camera(camera, SIDE)
+    small = shrink_camera(camera, ENCLOSURE_SIDE)
     middle = plug.mean(dim=0)
     for degrees in TURNS:
         turn = axis_angle_to_matrix(camera.c2w[:3, 1], math.radians(degrees))

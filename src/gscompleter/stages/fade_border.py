@@ -19,7 +19,7 @@ from gscompleter.types import Gaussians
 
 FADED_SHARE = 0.125
 """Part of the padding over which additions fade."""
-MIN_OPACITY = 1 / 255
+MIN_DRAWN_OPACITY = 1 / 255
 """Opacity below which a Gaussian is not drawn by any renderer."""
 
 
@@ -43,10 +43,10 @@ def fade_border(added: Gaussians, view: TargetView) -> Gaussians:
     if bool((share == 1).all()):
         return added
     faded = replace(added, opacities=share * added.opacities, encoded=None)
-    return faded[faded.opacities >= MIN_OPACITY]
+    return faded[faded.opacities >= MIN_DRAWN_OPACITY]
 
 
-def find_border(view: TargetView) -> Bool[Tensor, "h w"]:
+def find_fading_border(view: TargetView) -> Bool[Tensor, "h w"]:
     """Find the pixels of the padded target in which additions may fade."""
     camera = view.camera.padded
     width = math.ceil(compute_width(view))

@@ -26,13 +26,13 @@ from gscompleter.types import View
 
 MAX_DROP = 6.0
 """PSNR in dB below the best third of the photographs from which on a photograph is new."""
-MIN_ERROR = 1e-4
+REPRODUCED_ERROR = 1e-4
 """Mean squared error up to which a photograph is reproduced, 40 dB."""
 MAX_DISTRUST = 0.5
 """Distrust up to which a pixel is compared in exposure."""
-MIN_KNOWN = 0.05
+MIN_KNOWN_SHARE = 0.05
 """Smallest fraction of such pixels."""
-MAX_PHOTOS = 32
+MAX_NEW_PHOTOS = 32
 """Most new photographs that are used; of more, those far apart."""
 
 
@@ -48,7 +48,7 @@ def find_new_photos(
     )
     # The scene reproduces what it was trained on about equally well. Even if most photographs are
     # new, the best third is not: its median is the error of a photograph that was trained on.
-    trained_error = errors.sort().values[len(errors) // 6].clamp_min(MIN_ERROR)
+    trained_error = errors.sort().values[len(errors) // 6].clamp_min(REPRODUCED_ERROR)
     return torch.nonzero(errors > trained_error * 10 ** (MAX_DROP / 10))[:, 0].tolist()
 
 
@@ -76,7 +76,7 @@ def match_exposure(
 
     If hardly any pixel is, the photograph stays as it is.
     """
-    if int(known.sum()) < MIN_KNOWN * known.numel():
+    if int(known.sum()) < MIN_KNOWN_SHARE * known.numel():
         return photograph
     gain, offset = fit_robust_affine(photograph[known], image.clamp(0, 1)[known])
     return (gain * photograph + offset).clamp(0, 1)
@@ -88,7 +88,7 @@ def recolor_to_photos(
     """Recolour the scene to new photographs, held in the directions of all others."""
     chosen: list[int] = []
     if photos:
-        chosen = select_spread_cameras([photo.camera for photo in photos], MAX_PHOTOS)
+        chosen = select_spread_cameras([photo.camera for photo in photos], MAX_NEW_PHOTOS)
     for index in track(sorted(chosen), "Learning new photographs"):
         photo = photos[index]
         view = render_target(state, pad_camera(photo.camera, 0.0), scenes)

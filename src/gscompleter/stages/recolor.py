@@ -27,7 +27,7 @@ from gscompleter.system.timing import timed_stage
 from gscompleter.trust import HeldViews
 from gscompleter.types import Camera, Gaussians, View, merge
 
-MIN_WEIGHT = 1e-3
+UNSEEN_WEIGHT = 1e-3
 """Summed weight, in pixels, up to which a Gaussian is not seen."""
 CHUNK = 4096
 """Gaussians that are solved for at a time, which bounds the memory."""
@@ -106,7 +106,7 @@ def fit_image_colors(
     # channels are backprojected at once: all pixels, wanting pixels, and nothing.
     layers = torch.stack([torch.ones_like(weight), weight, torch.zeros_like(weight)], dim=-1)
     sums, open_sums, _ = frozen.backproject(layers).unbind(-1)
-    is_open = open_sums > MIN_WEIGHT
+    is_open = open_sums > UNSEEN_WEIGHT
     num_context = held.sums.shape[1]
     is_open[num_context:] = False
     rows = torch.nonzero(is_open)[:, 0]

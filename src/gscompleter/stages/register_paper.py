@@ -71,7 +71,7 @@ def optimize_paper_distances(
     # earlier targets added.
     context_at_target = view.render.depth_map()
     context_at_anchor = anchor.render.depth_map()
-    move = MOVES[config.degrees_of_freedom]
+    move = MOTIONS[config.degrees_of_freedom]
 
     # Adam changes δ_i, beginning with 0, in d_i = d_i^init + δ_i (scene units). Its steps depend on
     # gradients alone, so that they are those of optimizing d_i. For 3-DoF, δ_i is a vector.
@@ -80,7 +80,7 @@ def optimize_paper_distances(
         device=initial.means.device,
         requires_grad=True,
     )
-    optimizer = Adam([(offsets, config.learning_rate)], ADAM_BETAS)
+    optimizer = Adam([(offsets, config.learning_rate)], PAPER_ADAM_BETAS)
     losses = []
     for _ in track(range(config.iterations), "Registering"):
         moved = move(initial, offsets, target)
@@ -116,9 +116,9 @@ def move_freely(initial: Gaussians, offsets: Float[Tensor, "n 3"], camera: Camer
     return replace(initial, means=initial.means + offsets, encoded=None)
 
 
-MOVES = {1: move_on_rays, 3: move_freely}
+MOTIONS = {1: move_on_rays, 3: move_freely}
 """Motion by degrees of freedom."""
-ADAM_BETAS = (0.9, 0.999)
+PAPER_ADAM_BETAS = (0.9, 0.999)
 """Adam's usual decay rates; the paper names neither the optimizer nor its rates."""
 
 

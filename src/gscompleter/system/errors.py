@@ -8,14 +8,14 @@ from contextlib import suppress
 from pathlib import Path
 from reprlib import Repr
 
-PROGRAM = "gscompleter: "
+MESSAGE_PREFIX = "gscompleter: "
 """Prefix of every error message."""
 MAX_MESSAGE_LENGTH = 300
 MAX_QUOTE_LENGTH = 60
 MAX_PATH_LENGTH = 250
 MAX_NAME_BYTES = 255
 """Longest name of a file or folder on usual disks."""
-ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")
+MEMORY_ADDRESS = re.compile(r" at 0x[0-9a-fA-F]+")
 """Place in memory in the text of an object without one of its own."""
 
 LFS_POINTER = b"version https://git-lfs"
@@ -41,7 +41,7 @@ class InputError(ValueError):
 
     def __str__(self) -> str:
         option = 0 if self.argument is None else len(f" (--{self.argument}).")
-        return shorten_message(super().__str__(), MAX_MESSAGE_LENGTH - len(PROGRAM) - option)
+        return shorten_message(super().__str__(), MAX_MESSAGE_LENGTH - len(MESSAGE_PREFIX) - option)
 
 
 class OutputError(InputError):
@@ -63,7 +63,8 @@ class WorkerError(InputError):
 def print_error(sentence: str) -> None:
     """Print a sentence as one line of the standard error, shortened to `MAX_MESSAGE_LENGTH`."""
     print(
-        f"{PROGRAM}{shorten_message(sentence, MAX_MESSAGE_LENGTH - len(PROGRAM))}", file=sys.stderr
+        f"{MESSAGE_PREFIX}{shorten_message(sentence, MAX_MESSAGE_LENGTH - len(MESSAGE_PREFIX))}",
+        file=sys.stderr,
     )
 
 
@@ -77,7 +78,7 @@ def quote_value(value: object, length: int | None = None) -> str:
         length = MAX_PATH_LENGTH if isinstance(value, os.PathLike) else MAX_QUOTE_LENGTH
     is_text = isinstance(value, (str, os.PathLike))
     # The place of an object in memory tells nothing, and is another one in each run.
-    text = str(value) if is_text else re.sub(ADDRESS, "", _REPR.repr(value))
+    text = str(value) if is_text else re.sub(MEMORY_ADDRESS, "", _REPR.repr(value))
     # Only the ends of very long texts are processed.
     ends = text if len(text) <= 4 * length else text[: 2 * length] + text[-2 * length :]
     # Line breaks and control characters would split the sentence or drive the terminal.

@@ -44,7 +44,7 @@ def estimate_bytes(pixels: int, images: int) -> int:
     return PROGRAM_BYTES + pixels * (BYTES_PER_PIXEL + images * BYTES_PER_VIEW_PIXEL)
 
 
-def check_images(pixels: int, images: int) -> None:
+def check_image_memory(pixels: int, images: int) -> None:
     """Raise InputError if images of `pixels` pixels in all need more memory than there is.
 
     This is a lower bound for models of any kind: the images, their Gaussians and their renders.

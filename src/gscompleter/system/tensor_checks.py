@@ -19,7 +19,7 @@ from gscompleter.system.errors import InputError, quote_value
 FLOATS = (torch.float32, torch.float64)
 """Types of numbers that are stored; float64 is for files and comparisons."""
 BOOLS = (torch.bool,)
-BYTES = (torch.uint8,)
+BYTE_DTYPES = (torch.uint8,)
 INTEGERS = (torch.int32, torch.int64)
 
 Form = tuple[tuple[torch.dtype, ...], tuple[int | str, ...]]
@@ -121,7 +121,7 @@ def name_dtype(dtype: torch.dtype) -> str:
     return str(dtype).removeprefix("torch.")
 
 
-def is_whole(value: object) -> bool:
+def is_whole_number(value: object) -> bool:
     """Return True for a whole number, NumPy's too; booleans are none."""
     return isinstance(value, Integral) and not isinstance(value, bool)
 

@@ -17,13 +17,15 @@ from torch import Tensor
 
 from gscompleter.system.tensor_checks import iterate_tensors
 
-Parameters = ParamSpec("Parameters")
+FunctionParameters = ParamSpec("FunctionParameters")
 Result = TypeVar("Result")
 
 CPU = torch.device("cpu")
 
 
-def run_in_plain_torch(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+def run_in_plain_torch(
+    function: Callable[FunctionParameters, Result],
+) -> Callable[FunctionParameters, Result]:
     """Run a function with torch as it starts, whatever the script has switched.
 
     Tensors of inference mode among its arguments are copied, because no gradient can be computed
@@ -31,7 +33,7 @@ def run_in_plain_torch(function: Callable[Parameters, Result]) -> Callable[Param
     """
 
     @functools.wraps(function)
-    def run(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+    def run(*args: FunctionParameters.args, **kwargs: FunctionParameters.kwargs) -> Result:
         with use_plain_torch():
             plain_args = [copy_inference_tensors(value) for value in args]
             plain_kwargs = {key: copy_inference_tensors(value) for key, value in kwargs.items()}

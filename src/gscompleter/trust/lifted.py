@@ -23,19 +23,19 @@ It was 0.02 to 0.24 in 32 contexts of two photographs, and 0.59 to 1.00 in train
 """
 MAX_SAMPLES = 8000
 """Gaussians that are compared."""
-MIN_OPACITY = 0.3
+MIN_COMPARED_OPACITY = 0.3
 """Least opacity of a Gaussian that is compared."""
-SEED = 0
+SEARCH_SEED = 0
 NUM_STARTS = 600
-"""Random centres that are tried first, within `REACH` radii of the middle of the splat."""
-REACH = 3.0
-STEPS = (0.6, 0.3, 0.15, 0.08, 0.04, 0.02, 0.01)
+"""Random centres that are tried first, within `START_REACH` radii of the splat's middle."""
+START_REACH = 3.0
+STEP_DEVIATIONS = (0.6, 0.3, 0.15, 0.08, 0.04, 0.02, 0.01)
 """Standard deviations of the steps of each further round, in radii."""
 NUM_KEPT = 8
 """Centres that are kept from round to round."""
-NUM_STEPS = 40
+NUM_RANDOM_STEPS = 40
 """Random steps from each of them."""
-CORE = (0.03, 0.97)
+CORE_QUANTILES = (0.03, 0.97)
 """Quantiles of the coordinates between which the core of a splat lies."""
 
 
@@ -55,7 +55,9 @@ class Core:
 
 def measure_core(means: Float[Tensor, "n 3"]) -> Core:
     """Measure the core of a splat."""
-    low, high = torch.quantile(means[:: max(1, len(means) // 100_000)], means.new_tensor(CORE), 0)
+    low, high = torch.quantile(
+        means[:: max(1, len(means) // 100_000)], means.new_tensor(CORE_QUANTILES), 0
+    )
     return Core((low + high) / 2, (high - low) / 2)
 
 
@@ -66,8 +68,8 @@ def is_lifted(scene: Gaussians) -> bool:
 
 def find_pixel_center(scene: Gaussians) -> Float[Tensor, "3"] | None:
     """Find the centre of the camera of a pixel-aligned splat; None for other splats."""
-    generator = torch.Generator().manual_seed(SEED)
-    opaque = torch.nonzero(scene.opacities > MIN_OPACITY)[:, 0].cpu()
+    generator = torch.Generator().manual_seed(SEARCH_SEED)
+    opaque = torch.nonzero(scene.opacities > MIN_COMPARED_OPACITY)[:, 0].cpu()
     if len(opaque) < NUM_KEPT:
         return None
     chosen = opaque[torch.randperm(len(opaque), generator=generator)[:MAX_SAMPLES]]
@@ -84,10 +86,10 @@ def find_pixel_center(scene: Gaussians) -> Float[Tensor, "3"] | None:
         return measure_spread(sizes - distances.log())
 
     starts = 2 * torch.rand((NUM_STARTS, 3), generator=generator) - 1
-    centers = core.center + REACH * core.radius * starts
-    for step in STEPS:
+    centers = core.center + START_REACH * core.radius * starts
+    for step in STEP_DEVIATIONS:
         best = centers[measure(centers).topk(NUM_KEPT, largest=False).indices]
-        steps = torch.randn((NUM_KEPT, NUM_STEPS, 3), generator=generator)
+        steps = torch.randn((NUM_KEPT, NUM_RANDOM_STEPS, 3), generator=generator)
         around = best[:, None] + step * core.radius * steps
         centers = torch.cat([best, around.reshape(-1, 3)])
     spreads = measure(centers)

@@ -33,7 +33,7 @@ from gscompleter.system.threads import use_one_torch_thread
 from gscompleter.trust import HeldViews, Trust
 from gscompleter.types import Camera, Gaussians, Render, View
 
-BLUR_RADIUS = 0.01
+BOX_RADIUS = 0.01
 """Radius of box filters, relative to the longer side; it tolerates edges off by a pixel."""
 EXPOSURE_PIXELS = 10_000
 """Pixels that the exposure fit uses."""
@@ -84,7 +84,7 @@ class PhotometricTrust(Trust):
         # Added Gaussians follow those of the context.
         weights = pad(trust, (0, len(sums) - num_context), value=1.0)
         # The blur also spreads trust into holes, where no more can be trusted than is opaque.
-        return torch.minimum(blur(frozen.splat(weights)), frozen.render.alpha)
+        return torch.minimum(apply_box_filter(frozen.splat(weights)), frozen.render.alpha)
 
     def accept(
         self, frozen: FrozenScene, camera: Camera, rows: Int64[Tensor, "r"]
@@ -212,7 +212,9 @@ def compute_color_difference(render: Render, view: View) -> Float[Tensor, "h w"]
     shown_pixels = shown.reshape(-1, 3)[valid][::step]
     photo_pixels = view.image.reshape(-1, 3)[valid][::step]
     gain, offset = fit_robust_affine(shown_pixels, photo_pixels)
-    return blur((view.fill_ignored(gain * shown + offset) - view.image).abs().mean(dim=-1))
+    return apply_box_filter(
+        (view.fill_ignored(gain * shown + offset) - view.image).abs().mean(dim=-1)
+    )
 
 
 def compute_trust(
@@ -254,6 +256,6 @@ def sum_weights(frozen: FrozenScene) -> Float[Tensor, "n"]:
     return frozen.backproject(torch.ones_like(frozen.render.image))[:, 0]
 
 
-def blur(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
-    """Apply the box filter of radius `BLUR_RADIUS`."""
-    return average_box(values, max(round(BLUR_RADIUS * max(values.shape)), 1))
+def apply_box_filter(values: Float[Tensor, "h w"]) -> Float[Tensor, "h w"]:
+    """Apply the box filter of radius `BOX_RADIUS`."""
+    return average_box(values, max(round(BOX_RADIUS * max(values.shape)), 1))

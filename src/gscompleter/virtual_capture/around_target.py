@@ -35,11 +35,11 @@ from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
 from gscompleter.types import Camera, Gaussians, Render
 
-NUM_CAMERAS = 3
+MAX_CHOSEN_CAMERAS = 3
 """Most cameras that are chosen around a target."""
-SIDE = 72
+COMPARED_SIDE = 72
 """Longer side, in pixels, of the images in which cameras are compared."""
-STEPS = (0.12, 0.3)
+MOVE_LENGTHS = (0.12, 0.3)
 """Lengths of moves, relative to the depth of the hole's border."""
 TURN = 0.25
 """Turns in place, relative to the field of view."""
@@ -57,9 +57,9 @@ DIRECTIONS = (
 """Directions of moves in the axes of the target: right, left, down, up, back, and back aside."""
 BORDER_RADIUS = 0.12
 """Width of a hole's border, relative to the longer side of the image."""
-NEAREST = 0.05
+NEAREST_TARGET_QUANTILE = 0.05
 """Quantile of the target's depths that counts as its nearest surface."""
-CLEARANCE = 0.5
+SURFACE_CLEARANCE = 0.5
 """Depth below which a surface is too close, relative to that nearest surface."""
 MAX_CLOSE = 0.02
 """Largest share of an image that surfaces that are too close may fill."""
@@ -71,7 +71,7 @@ ENOUGH_APART = 0.1
 """The same between two chosen cameras."""
 KNOWN_WORTH = 0.25
 """Worth of a camera that shows no new part of the border, relative to one that shows all of it."""
-MIN_GAIN = 1e-4
+MIN_CAMERA_GAIN = 1e-4
 """Gain below which no further camera is chosen."""
 
 
@@ -104,7 +104,7 @@ def choose_cameras_around(
     target: Camera,
     renderer: Renderer,
     holes: Bool[Tensor, "h w"] | None = None,
-    count: int = NUM_CAMERAS,
+    count: int = MAX_CHOSEN_CAMERAS,
 ) -> list[Camera]:
     """Choose up to `count` cameras around a target, the best first; none if it sees no hole.
 
@@ -112,7 +112,7 @@ def choose_cameras_around(
     """
     target = replace(target, near=None, far=None)
     small_scene = thin_gaussians(scene, MAX_PREVIEW_GAUSSIANS)
-    border = find_border(scene, small_scene, target, renderer, holes)
+    border = find_hole_border(scene, small_scene, target, renderer, holes)
     if border is None:
         return []
     rate = partial(rate_camera, small_scene, border, target, renderer)
@@ -121,7 +121,7 @@ def choose_cameras_around(
     return choose_greedily(rated, border, count)
 
 
-def find_border(
+def find_hole_border(
     scene: Gaussians,
     small_scene: Gaussians,
     target: Camera,
@@ -131,7 +131,7 @@ def find_border(
     """Find the surfaces around the hole of a target; None without a hole or a surface."""
     if holes is None:
         holes = renderer.render(scene, add_near_plane(target, scene.means)).alpha < COVERED
-    small = shrink_camera(add_near_plane(target, scene.means), SIDE)
+    small = shrink_camera(add_near_plane(target, scene.means), COMPARED_SIDE)
     # A pixel of the small image is a hole if any of its pixels is: a mean would lose thin holes.
     size = (small.height, small.width)
     small_holes = adaptive_max_pool2d(holes[None, None].float(), size)[0, 0] > 0
@@ -146,7 +146,7 @@ def find_border(
         points[beside],
         points[covered],
         render.depth[beside].median().item(),
-        render.depth[covered].quantile(NEAREST).item(),
+        render.depth[covered].quantile(NEAREST_TARGET_QUANTILE).item(),
     )
 
 
@@ -157,7 +157,7 @@ def propose_around(target: Camera, border: HoleBorder) -> list[Camera]:
     middle = border.points.mean(dim=0)
     no_turn = torch.eye(3).to(axes)
     proposed = []
-    for step in STEPS:
+    for step in MOVE_LENGTHS:
         for direction in DIRECTIONS:
             along = torch.tensor(direction).to(axes)
             shift = step * border.depth * (along / along.norm()) @ axes
@@ -184,10 +184,10 @@ def rate_camera(
     it sees, times its baseline up to what is enough, times one half to one by the share of the
     target's surfaces that it sees. It is 0 if something is too close.
     """
-    small = shrink_camera(replace(camera, near=0.1 * border.nearest), SIDE)
+    small = shrink_camera(replace(camera, near=0.1 * border.nearest), COMPARED_SIDE)
     render = renderer.render(scene, small)
     covered = render.alpha >= COVERED
-    close = covered & (render.depth < CLEARANCE * border.nearest)
+    close = covered & (render.depth < SURFACE_CLEARANCE * border.nearest)
     seen = find_seen(border.points, small, render)
     if close.float().mean().item() > MAX_CLOSE:
         return Rated(camera, 0.0, seen)
@@ -216,7 +216,7 @@ def choose_greedily(rated: Sequence[Rated], border: HoleBorder, count: int) -> l
     while left and len(chosen) < count:
         gains = [compute_gain_beside(one, chosen, known, border) for one in left]
         best = gains.index(max(gains))
-        if gains[best] < MIN_GAIN:
+        if gains[best] < MIN_CAMERA_GAIN:
             break
         known = known | left[best].seen
         chosen.append(left.pop(best))

@@ -22,13 +22,13 @@ from gscompleter.render.outside import (
     OutsideView,
     look_from_outside,
     measure_extent,
-    place_camera,
+    place_outside_camera,
 )
 from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
 from gscompleter.types import Camera, Gaussians
 
-SIDE = 64
+OUTSIDE_SIDE = 64
 """Width and height of the images from outside, in pixels."""
 MAX_SURROUNDED = 0.1
 """Largest share of the border of an image from outside that an object covers. It was 0.00 to 0.02
@@ -42,7 +42,7 @@ LOOK_SIDE = 16
 MAX_BOUNDED = 0.48
 """Largest mean share of these looks that ends on an object. It was 0.00 to 0.46 for objects, and
 0.50 to 0.87 for rooms and streets (decision 080)."""
-MIN_OPEN = 0.05
+MIN_SEEN_FROM_OUTSIDE = 0.05
 """Least share of the points that has to be seen from outside. Of a closed box nearly none is."""
 MAX_FLATNESS = 0.3
 """Largest ratio of the shortest to the middle side of the extent of open ground."""
@@ -62,7 +62,7 @@ def is_object(scene: Gaussians, renderer: Renderer, given: Sequence[Camera] = ()
     that is closed on all sides, are scenes. `given` are cameras of the user, none that was found:
     if they stand between walls, it is a scene, too.
     """
-    views = look_from_outside(scene, renderer, SIDE)
+    views = look_from_outside(scene, renderer, OUTSIDE_SIDE)
     if max(view.border_share for view in views) > MAX_SURROUNDED:
         return False
     extent = measure_extent(scene)
@@ -72,7 +72,7 @@ def is_object(scene: Gaussians, renderer: Renderer, given: Sequence[Camera] = ()
     small = thin_gaussians(scene, MAX_PREVIEW_GAUSSIANS)
     points = list_points(extent)
     points = points[find_seen_from_outside(points, views)]
-    if len(points) < MIN_OPEN * GRID**3:
+    if len(points) < MIN_SEEN_FROM_OUTSIDE * GRID**3:
         return False
     if measure_bounded(small, extent, points, renderer) > MAX_BOUNDED:
         return False
@@ -115,7 +115,7 @@ def measure_bounded(
     def look(point: Float[Tensor, "3"]) -> Float[Tensor, ""]:
         offset = extent.axes @ (point - extent.center)
         forward = normalize(offset / extent.half.clamp_min(1e-12) ** 2, dim=0) @ extent.axes
-        camera = place_camera(point, forward, math.tan(half_angle), LOOK_SIDE, near)
+        camera = place_outside_camera(point, forward, math.tan(half_angle), LOOK_SIDE, near)
         covered = renderer.render(scene, camera).alpha >= COVERED
         weights = weigh_directions(camera, math.cos(half_angle))
         return (weights * covered).sum() / weights.sum()
@@ -140,17 +140,17 @@ def is_ground(scene: Gaussians, extent: Extent, renderer: Renderer) -> bool:
     axis = extent.axes[0]
     # From so far that lines of sight are nearly parallel.
     distance = 20 * extent.radius
-    camera = place_camera(
+    camera = place_outside_camera(
         extent.center - distance * axis,
         axis,
         (1.5 * longest / distance).item(),
-        2 * SIDE,
+        2 * OUTSIDE_SIDE,
         distance - 2 * extent.radius,
     )
     covered = renderer.render(small, camera).alpha >= COVERED
     # Points all over the extent, as the camera sees them.
-    steps = torch.linspace(-1, 1, SIDE).to(extent.half)
-    level = torch.zeros((SIDE, SIDE, 3)).to(extent.half)
+    steps = torch.linspace(-1, 1, OUTSIDE_SIDE).to(extent.half)
+    level = torch.zeros((OUTSIDE_SIDE, OUTSIDE_SIDE, 3)).to(extent.half)
     level[..., 1] = middle * steps
     level[..., 2] = longest * steps[:, None]
     pixels, _ = project(extent.center + level.reshape(-1, 3) @ extent.axes, camera)
@@ -163,7 +163,7 @@ def measure_around(scene: Gaussians, camera: Camera, extent: Extent, renderer: R
     center = camera.center.to(scene.means)
     for axis in torch.eye(3).to(scene.means):
         for forward in (axis, -axis):
-            face = place_camera(center, forward, 1.0, LOOK_SIDE, 0.01 * extent.radius)
+            face = place_outside_camera(center, forward, 1.0, LOOK_SIDE, 0.01 * extent.radius)
             covered = renderer.render(scene, face).alpha >= COVERED
             weights = weigh_directions(face, 0.0)
             shares.append((weights * covered).sum() / weights.sum())

@@ -17,7 +17,7 @@ from gscompleter.types import Camera, Gaussians
 
 INNER = 0.93
 """Share of the directions, along each axis of the image, that the camera shows."""
-MOVES = (
+SIDEWAYS_MOVES = (
     (0.08, 0.0, 0.0),
     (-0.08, 0.0, 0.0),
     (0.0, 0.05, 0.0),
@@ -57,7 +57,7 @@ def move_beside(camera: Camera, depth: float) -> list[Camera]:
     """Return a camera and small moves of it, relative to a z-depth in scene units."""
     no_turn = torch.eye(3).to(camera.c2w)
     axes = camera.c2w[:3, :3].T
-    shifts = [depth * torch.tensor(move).to(axes) @ axes for move in MOVES]
+    shifts = [depth * torch.tensor(move).to(axes) @ axes for move in SIDEWAYS_MOVES]
     return [camera, *(move_camera(camera, no_turn, shift) for shift in shifts)]
 
 

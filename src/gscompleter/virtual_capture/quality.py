@@ -20,12 +20,12 @@ HALF_MIST = 0.1
 """Mist at which the quality is halved."""
 HALF_FOOTPRINT = 0.05
 """Footprint at which the quality is halved."""
-NEAREST = 0.05
+NEAREST_SURFACE_QUANTILE = 0.05
 """Quantile of the depths that counts as the nearest surface."""
 
 
 @dataclass(frozen=True)
-class Quality:
+class CameraQuality:
     """Quality of a camera."""
 
     covered: float
@@ -44,11 +44,11 @@ class Quality:
         return self.covered**2 * clear
 
 
-NOTHING = Quality(0.0, 1.0, 1.0, 0.0)
+NOTHING = CameraQuality(0.0, 1.0, 1.0, 0.0)
 """Quality of a camera that sees nothing."""
 
 
-def measure_quality(scene: Gaussians, camera: Camera, frozen: FrozenScene) -> Quality:
+def measure_camera_quality(scene: Gaussians, camera: Camera, frozen: FrozenScene) -> CameraQuality:
     """Measure the quality of a camera; `frozen` is the scene there."""
     render = frozen.render
     covered = render.alpha >= COVERED
@@ -64,9 +64,9 @@ def measure_quality(scene: Gaussians, camera: Camera, frozen: FrozenScene) -> Qu
     distance = (scene.means - camera.center).norm(dim=1).clamp_min(1e-30)
     size = scene.scales.amax(dim=1) / distance * camera.K[0, 0] / camera.width
     footprint = frozen.splat(size.clamp(0, 1e3))[covered] / weight
-    return Quality(
+    return CameraQuality(
         covered.float().mean().item(),
         spread.mean().item(),
         footprint.median().item(),
-        torch.quantile(render.depth[covered], NEAREST).item(),
+        torch.quantile(render.depth[covered], NEAREST_SURFACE_QUANTILE).item(),
     )

@@ -19,15 +19,15 @@ from gscompleter.render.view_map import get_view_map
 from gscompleter.trust.lifted import Core, measure_core
 from gscompleter.types import Camera, Gaussians
 from gscompleter.virtual_capture.pixel_aligned import make_intrinsics
-from gscompleter.virtual_capture.quality import measure_quality
+from gscompleter.virtual_capture.quality import measure_camera_quality
 
-SIDE = 48
+STANDPOINT_SIDE = 48
 """Width and height of the images in which cameras are compared."""
 FIELD_OF_VIEW = 60.0
 """Field of view of cameras that are found, in degrees."""
-NEAR = 0.02
+STANDPOINT_NEAR = 0.02
 """Near plane of the images that are compared, in radii of the core."""
-SEED = 0
+STANDPOINT_SEED = 0
 
 NUM_RANDOM = 200
 """Random cameras of the search for standpoints; with 300 those found of a trained splat are no
@@ -43,7 +43,7 @@ FREE_NEAREST = 0.12
 """The same, from which on it does not matter."""
 APART = (0.35, 0.6)
 """Distance, in radii of the core, and angle, in radians, of standpoints that count as others."""
-MIN_SHARE = 0.3
+MIN_RELATIVE_SCORE = 0.3
 """Least score of a standpoint, relative to the best."""
 
 DISTANCES = (2.5, 4.0, 6.0)
@@ -51,7 +51,7 @@ DISTANCES = (2.5, 4.0, 6.0)
 AZIMUTH_STEP = 20
 ELEVATIONS = (0, 20, 45)
 """Directions of cameras around a place, in degrees."""
-MIN_SHOWN = 0.35
+MIN_BALL_SHARE = 0.35
 """Least share of a place, against a ball of its size, that a camera around it has to show."""
 AROUND_APART = 35.0
 """Angle, in degrees, from which on cameras around a place show other sides of it."""
@@ -82,10 +82,10 @@ def find_standpoints(
     core = measure_core(scene.means)
     small = thin_gaussians(scene, MAX_PREVIEW_GAUSSIANS)
     up = normalize(up, dim=0)
-    generator = torch.Generator().manual_seed(SEED)
+    generator = torch.Generator().manual_seed(STANDPOINT_SEED)
 
     def rate(camera: Camera) -> Standpoint:
-        quality = measure_quality(small, camera, renderer.freeze(small, camera))
+        quality = measure_camera_quality(small, camera, renderer.freeze(small, camera))
         nearest = quality.nearest / core.radius
         if nearest < MIN_NEAREST:
             return Standpoint(0.0, camera)
@@ -94,7 +94,7 @@ def find_standpoints(
     def rate_all(cameras: Sequence[Camera]) -> list[Standpoint]:
         return list(get_view_map(scene.means)(rate, cameras))
 
-    found = rate_all([draw_camera(core, up, generator) for _ in range(NUM_RANDOM)])
+    found = rate_all([sample_camera(core, up, generator) for _ in range(NUM_RANDOM)])
     for reach in (1.0, 0.5):
         found.sort(key=lambda one: -one.score)
         moved = [
@@ -109,7 +109,7 @@ def find_standpoints(
         distances = (centers - other.center).norm(dim=1) / core.radius
         return distances / APART[0] + measure_turns(cameras, other) / APART[1]
 
-    chosen = choose_apart(found, measure_apart, count, MIN_SHARE)
+    chosen = choose_apart(found, measure_apart, count, MIN_RELATIVE_SCORE)
     return [replace(resize_camera(camera, side, side), near=None) for camera in chosen]
 
 
@@ -137,14 +137,16 @@ def choose_cameras_around_place(
         distance, azimuth, elevation = place
         aside = make_direction(up, math.radians(azimuth), math.radians(elevation))
         center = middle + distance * radius * aside
-        camera = make_camera(center, -aside, up, 0.05 * radius)
+        camera = make_standpoint_camera(center, -aside, up, 0.05 * radius)
         frozen = renderer.freeze(small, camera)
         # A ball of that radius covers this share of the image.
         expected = math.pi / distance**2 / (4 * half**2)
         shown = (frozen.splat(values) > 0.5).float().mean().item() / expected
-        if shown < MIN_SHOWN:
+        if shown < MIN_BALL_SHARE:
             return Standpoint(0.0, camera)
-        return Standpoint(measure_quality(small, camera, frozen).score * min(shown, 1.0), camera)
+        return Standpoint(
+            measure_camera_quality(small, camera, frozen).score * min(shown, 1.0), camera
+        )
 
     places = list(product(DISTANCES, range(0, 360, AZIMUTH_STEP), ELEVATIONS))
     rated = list(get_view_map(scene.means)(rate, places))
@@ -200,7 +202,7 @@ def thin_with_values(
     return small, small.generated.to(small.means)
 
 
-def draw_camera(core: Core, up: Float[Tensor, "3"], generator: torch.Generator) -> Camera:
+def sample_camera(core: Core, up: Float[Tensor, "3"], generator: torch.Generator) -> Camera:
     """Draw a camera in the core or around it, which looks across or at the middle."""
 
     def draw(low: float, high: float) -> float:
@@ -217,7 +219,9 @@ def draw_camera(core: Core, up: Float[Tensor, "3"], generator: torch.Generator) 
         forward = core.center + spot * core.radius - center
     else:
         forward = make_direction(up, draw(0.0, 2 * math.pi), -math.asin(draw(-0.15, 0.45)))
-    return make_camera(center, limit_pitch(forward, up), up, NEAR * core.radius)
+    return make_standpoint_camera(
+        center, limit_pitch(forward, up), up, STANDPOINT_NEAR * core.radius
+    )
 
 
 def shift_camera(
@@ -231,7 +235,7 @@ def shift_camera(
     steps = torch.randn((2, 3), generator=generator).to(up)
     center = camera.center + 0.15 * reach * core.radius * steps[0]
     forward = limit_pitch(camera.forward + 0.25 * reach * steps[1], up)
-    return make_camera(center, forward, up, NEAR * core.radius)
+    return make_standpoint_camera(center, forward, up, STANDPOINT_NEAR * core.radius)
 
 
 def limit_pitch(forward: Float[Tensor, "3"], up: Float[Tensor, "3"]) -> Float[Tensor, "3"]:
@@ -252,11 +256,11 @@ def make_direction(up: Float[Tensor, "3"], azimuth: float, elevation: float) -> 
     return math.cos(elevation) * level + math.sin(elevation) * up
 
 
-def make_camera(
+def make_standpoint_camera(
     center: Float[Tensor, "3"], forward: Float[Tensor, "3"], up: Float[Tensor, "3"], near: float
 ) -> Camera:
     """Make a small camera at a place."""
     c2w = torch.eye(4).to(center)
     c2w[:3, 3] = center
-    K = make_intrinsics(SIDE, math.tan(math.radians(FIELD_OF_VIEW) / 2)).to(center)
-    return look_along(Camera(c2w, K, SIDE, SIDE, near=near), forward, up)
+    K = make_intrinsics(STANDPOINT_SIDE, math.tan(math.radians(FIELD_OF_VIEW) / 2)).to(center)
+    return look_along(Camera(c2w, K, STANDPOINT_SIDE, STANDPOINT_SIDE, near=near), forward, up)

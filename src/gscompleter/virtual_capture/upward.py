@@ -26,19 +26,19 @@ from gscompleter.virtual_capture.kind import is_object
 
 OTHERS: tuple[Direction, ...] = ((0.0, 0.0, 1.0), (0.0, 1.0, 0.0))
 """Up in other files: that of surveys and nerfstudio, and that of modelling programs."""
-UNUSUAL: tuple[Direction, ...] = ((0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
+UNUSUAL_UP: tuple[Direction, ...] = ((0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (-1.0, 0.0, 0.0))
 """Directions that are up in no file. What looks like their floor is a wall or a ceiling."""
-MIN_OPACITY = 0.2
+MIN_FLOOR_OPACITY = 0.2
 """Least opacity of a Gaussian that counts."""
 OUTLIERS = 0.002
 """Share of the lowest, and of the highest, that does not count."""
 SLAB = 0.02
 """Thickness of a layer, in radii of the core; two adjacent ones hold a floor."""
-MAX_BELOW = 0.1
+MAX_SHARE_BELOW = 0.1
 """Largest share of the splat below a floor."""
-MIN_SHARE = 0.15
+MIN_FLOOR_SHARE = 0.15
 """Least share of the splat in a floor. Shares are of area times opacity."""
-CELLS = 8
+FLOOR_CELLS = 8
 """Cells along each side of the extent, in which a floor is looked for."""
 MIN_CELLS = 0.9
 """Least share of the cells that a floor fills; each with a tenth of the mean at least."""
@@ -125,11 +125,11 @@ def find_floor(scene: Gaussians) -> Direction | None:
     share of the rest that is in the lower half. A floor that was seen in part does not fill the
     extent; it counts where no other direction comes near its score.
     """
-    solid = scene[scene.opacities > MIN_OPACITY]
-    if len(solid) < CELLS**2:
+    solid = scene[scene.opacities > MIN_FLOOR_OPACITY]
+    if len(solid) < FLOOR_CELLS**2:
         return None
-    floors = {up: measure_floor(solid, up) for up in (USUAL, *OTHERS, *UNUSUAL)}
-    scores = {up: floors[up].score for up in (USUAL, *OTHERS) if is_whole(floors[up])}
+    floors = {up: measure_floor(solid, up) for up in (USUAL, *OTHERS, *UNUSUAL_UP)}
+    scores = {up: floors[up].score for up in (USUAL, *OTHERS) if is_whole_floor(floors[up])}
     if scores:
         best = max(scores, key=lambda up: scores[up])
         is_better = scores[best] >= MIN_ADVANTAGE * scores.get(USUAL, 0.0)
@@ -139,12 +139,12 @@ def find_floor(scene: Gaussians) -> Direction | None:
     rest = max(floor.score for up, floor in floors.items() if up != best)
     is_clear = floors[best].score >= MIN_ADVANTAGE_IN_PART * rest
     is_seen = floors[best].share >= MIN_SHARE_IN_PART and floors[best].filled >= MIN_CELLS_IN_PART
-    return best if best not in UNUSUAL and is_clear and is_seen else None
+    return best if best not in UNUSUAL_UP and is_clear and is_seen else None
 
 
-def is_whole(floor: Floor) -> bool:
+def is_whole_floor(floor: Floor) -> bool:
     """Tell a floor that was seen as a whole."""
-    return floor.share >= MIN_SHARE and floor.filled >= MIN_CELLS
+    return floor.share >= MIN_FLOOR_SHARE and floor.filled >= MIN_CELLS
 
 
 def measure_floor(scene: Gaussians, up: Direction) -> Floor:
@@ -163,14 +163,14 @@ def measure_floor(scene: Gaussians, up: Direction) -> Floor:
     )
     low, high = heights[order][places.clamp_max(len(heights) - 1)].tolist()
     thickness = SLAB * measure_core(scene.means).radius
-    num_layers = max(CELLS, int((high - low) / thickness))
+    num_layers = max(FLOOR_CELLS, int((high - low) / thickness))
     step = max(high - low, 1e-12) / num_layers
     layers = ((heights - low) / step).long().clamp(0, num_layers - 1)
     shares = sum_by_index(weights, layers, num_layers)
 
     # The share of two adjacent layers, of those with nearly nothing below.
     below = shares.cumsum(0) - shares
-    pairs = (shares[:-1] + shares[1:]).where(below[:-1] <= MAX_BELOW, 0.0)
+    pairs = (shares[:-1] + shares[1:]).where(below[:-1] <= MAX_SHARE_BELOW, 0.0)
     lowest = int(pairs.argmax())
     share = pairs[lowest].item()
     is_floor = (layers == lowest) | (layers == lowest + 1)
@@ -188,12 +188,12 @@ def measure_filled(
     points = scene.means[:, level]
     sample = points[:: max(1, len(points) // 100_000)]
     low, high = sample.quantile(points.new_tensor([0.02, 0.98]), dim=0)
-    cells = ((points - low) / (high - low).clamp_min(1e-12) * CELLS).floor().long()
-    inside = is_floor & ((cells >= 0) & (cells < CELLS)).all(dim=1)
-    numbers = (CELLS * cells[:, 0] + cells[:, 1])[inside]
+    cells = ((points - low) / (high - low).clamp_min(1e-12) * FLOOR_CELLS).floor().long()
+    inside = is_floor & ((cells >= 0) & (cells < FLOOR_CELLS)).all(dim=1)
+    numbers = (FLOOR_CELLS * cells[:, 0] + cells[:, 1])[inside]
     if not len(numbers):
         return 0.0
-    sums = sum_by_index(weights[inside], numbers, CELLS**2)
+    sums = sum_by_index(weights[inside], numbers, FLOOR_CELLS**2)
     return (sums > 0.1 * sums.mean()).float().mean().item()
 
 

@@ -29,13 +29,13 @@ from gscompleter.virtual_capture.standpoints import find_standpoints
 MAX_WITNESSES = 64
 """Most witnesses of a splat; of a file with more cameras, those that are spread most are taken. Of
 40, some of a trained splat that tested saw its rim hidden (26.5 dB), of 64 none (45.8 dB)."""
-MIN_KNOWN = 12
+ENOUGH_KNOWN_CAMERAS = 12
 """Cameras of a file besides the context from which on no further witnesses are found."""
 TESTING = 4
 """Every so many-th witness guards nothing, and tests the result."""
 WIDE = 100.0
 """Field of view of those that guard, in degrees."""
-SIDE = 96
+WITNESS_SIDE = 96
 """Width and height of the images of witnesses that are found, in pixels."""
 FARTHER = 1.6
 """Moves of the camera of a pixel-aligned splat to its witnesses, relative to those to its renders.
@@ -82,10 +82,10 @@ def choose_witnesses(
     """
     if len(others) > MAX_WITNESSES:
         others = [others[index] for index in select_spread_cameras(others, MAX_WITNESSES)]
-    if len(others) < MIN_KNOWN:
+    if len(others) < ENOUGH_KNOWN_CAMERAS:
         # Not where renders are taken: the same splat has the same witnesses, whether its cameras
         # were found or come from the file of an earlier run.
-        small = [resize_camera(camera, SIDE, SIDE) for camera in context]
+        small = [resize_camera(camera, WITNESS_SIDE, WITNESS_SIDE) for camera in context]
         found = find_witnesses(scene, pixel_center, up, renderer)
         others = [*others, *(c for c in found if not any(is_same_camera(c, s) for s in small))]
     return divide_witnesses(others)
@@ -99,8 +99,8 @@ def find_witnesses(
 ) -> list[Camera]:
     """Find cameras from which a splat looks well, by the splat alone."""
     if pixel_center is None:
-        return find_standpoints(scene, up, SIDE, renderer, MAX_WITNESSES)
-    pixel_camera = aim_pixel_camera(scene, pixel_center, up, SIDE)
+        return find_standpoints(scene, up, WITNESS_SIDE, renderer, MAX_WITNESSES)
+    pixel_camera = aim_pixel_camera(scene, pixel_center, up, WITNESS_SIDE)
     seen = renderer.render(scene, add_near_plane(pixel_camera, scene.means)).depth_map()
     if not seen.valid.any():
         return []

@@ -16,7 +16,7 @@ import torch
 from gscompleter import InputError, View
 from gscompleter.numerics.kernels import stereo
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.render.cpu import MAX_SIDE, CpuRenderer, to_arrays
+from gscompleter.render.cpu import MAX_TILED_SIDE, CpuRenderer, to_arrays
 from gscompleter.render.viewpoint import check_lengths
 from paths import SUPPORT
 from scenes import camera_at, random_gaussians, unchecked
@@ -100,7 +100,7 @@ def test_whatever_becomes_an_index_lies_within_the_image(odd):
         assert clipped == np.clip(np.float32(odd), 0, 5)
 
 
-@pytest.mark.parametrize("size", [(0, 5), (-1, 5), (MAX_SIDE + 1, 5), (10**9, 10**9)])
+@pytest.mark.parametrize("size", [(0, 5), (-1, 5), (MAX_TILED_SIDE + 1, 5), (10**9, 10**9)])
 def test_an_image_that_cannot_be_numbered_is_refused(size):
     camera = unchecked(camera_at(size=16), width=size[0], height=size[1])
     with pytest.raises(InputError, match="cannot be rendered"):

@@ -5,7 +5,7 @@ import pytest
 
 from gscompleter.generators.warp_inpaint import compute_likelihood
 from gscompleter.numerics.kernels import patchmatch
-from gscompleter.numerics.kernels.patchmatch import RADIUS, SIDE
+from gscompleter.numerics.kernels.patchmatch import PATCHMATCH_RADIUS, PATCHMATCH_SIDE
 
 H, W = 20, 26
 COSTS = patchmatch.Costs(*map(np.float32, (0.1, 0.3, 0.02, 0.002, 30.0)))
@@ -21,9 +21,12 @@ def matched(seed=0):
     queries = np.argwhere(near)
     query_at = np.full((H, W), -1)
     query_at[near] = np.arange(len(queries))
-    inside = np.pad(np.ones((2, H - 2 * RADIUS, W - 2 * RADIUS), bool), ((0, 0), (3, 3), (3, 3)))
-    padded = np.pad(weight, RADIUS)
-    total = [padded[y : y + SIDE, x : x + SIDE].sum() for y, x in queries]
+    inside = np.pad(
+        np.ones((2, H - 2 * PATCHMATCH_RADIUS, W - 2 * PATCHMATCH_RADIUS), bool),
+        ((0, 0), (3, 3), (3, 3)),
+    )
+    padded = np.pad(weight, PATCHMATCH_RADIUS)
+    total = [padded[y : y + PATCHMATCH_SIDE, x : x + PATCHMATCH_SIDE].sum() for y, x in queries]
     sources = rng.random((2, H, W, 3), np.float32)
     return image, patchmatch.PatchProblem(
         patchmatch.pad_border(image),
@@ -49,8 +52,12 @@ def plain_cost(found, number, match):
     """Compute the cost of a match and its shift, pixel by pixel in float64."""
     y, x = found.queries[number]
     s, sy, sx = match
-    here = np.s_[y : y + SIDE, x : x + SIDE]
-    there = np.s_[s, sy - RADIUS : sy + RADIUS + 1, sx - RADIUS : sx + RADIUS + 1]
+    here = np.s_[y : y + PATCHMATCH_SIDE, x : x + PATCHMATCH_SIDE]
+    there = np.s_[
+        s,
+        sy - PATCHMATCH_RADIUS : sy + PATCHMATCH_RADIUS + 1,
+        sx - PATCHMATCH_RADIUS : sx + PATCHMATCH_RADIUS + 1,
+    ]
     weight = found.weight[here].astype(float)
     error = found.image[here].astype(float) - found.sources[there]
     mean = (weight * error).sum(axis=(0, 1)) / weight[..., 0].sum()
@@ -88,7 +95,9 @@ def test_a_patch_that_lies_in_a_source_is_found():
     sources[1, :, :W] = image
     found = found._replace(sources=sources)
     field = at_random(found)
-    inner = (found.queries >= RADIUS).all(axis=1) & (found.queries[:, 1] < W - RADIUS)
+    inner = (found.queries >= PATCHMATCH_RADIUS).all(axis=1) & (
+        found.queries[:, 1] < W - PATCHMATCH_RADIUS
+    )
     for seed in range(12):
         patchmatch.search(found, COSTS, field, 26, seed)
     same = (field[:, 0] == 1) & (field[:, 1:] == found.queries).all(axis=1)
@@ -103,8 +112,8 @@ def test_a_pixel_is_the_mean_of_what_all_patches_over_it_say():
     shift = rng.random((len(field), 3), np.float32)
     colours, totals = np.zeros((H, W, 3)), np.zeros((H, W))
     for (y, x), (s, sy, sx), a, b in zip(found.queries, field, trust, shift, strict=True):
-        for dy in range(-RADIUS, RADIUS + 1):
-            for dx in range(-RADIUS, RADIUS + 1):
+        for dy in range(-PATCHMATCH_RADIUS, PATCHMATCH_RADIUS + 1):
+            for dx in range(-PATCHMATCH_RADIUS, PATCHMATCH_RADIUS + 1):
                 if 0 <= y + dy < H and 0 <= x + dx < W:
                     colours[y + dy, x + dx] += a * (found.sources[s, sy + dy, sx + dx] + b)
                     totals[y + dy, x + dx] += a
@@ -118,7 +127,9 @@ def test_a_pixel_is_the_mean_of_what_all_patches_over_it_say():
 def test_what_only_costly_patches_tell_of_is_still_their_mean():
     _, found = matched()
     field, shift = at_random(found), np.zeros((len(found.queries), 3), np.float32)
-    corner = (found.queries[:, 0] <= RADIUS) & (found.queries[:, 1] >= W - 1 - RADIUS)
+    corner = (found.queries[:, 0] <= PATCHMATCH_RADIUS) & (
+        found.queries[:, 1] >= W - 1 - PATCHMATCH_RADIUS
+    )
     votes = compute_likelihood(np.where(corner, np.float32(1), np.float32(1e-4)))
     colours = patchmatch.vote(found.query_at, votes, found.sources, field, shift)[0]
     alike = patchmatch.vote(found.query_at, np.ones_like(votes), found.sources, field, shift)[0]

@@ -8,7 +8,7 @@ from torch.nn.functional import normalize
 
 from gscompleter.config import TrustConfig
 from gscompleter.numerics.geometry import compute_z_depths
-from gscompleter.numerics.kernels.support import BLOCK, MIN_ANGLE_WEIGHT
+from gscompleter.numerics.kernels.support import MIN_ANGLE_WEIGHT, SUPPORT_BLOCK
 from gscompleter.render.cpu import CpuRenderer
 from gscompleter.trust.photometric import (
     FULL_TRUST_FRACTION,
@@ -43,7 +43,7 @@ def expected_support(evidence, means, sums, camera, config):
     return torch.where(sums > 0, mean * share.clamp_max(1.0), 1.0).float()
 
 
-@pytest.mark.parametrize("n", [0, 1, BLOCK - 1, 3 * BLOCK + 7])
+@pytest.mark.parametrize("n", [0, 1, SUPPORT_BLOCK - 1, 3 * SUPPORT_BLOCK + 7])
 @pytest.mark.parametrize("max_turn", [20.0, 180.0])
 def test_support_is_a_mean_by_direction_times_what_is_shown(n, max_turn):
     evidence, means, sums = some_evidence(n, 5)

@@ -25,9 +25,9 @@ from gscompleter.system.jobs.jobs import Job
 
 FOLDER = "folder"
 """Column of the scene folder."""
-NAME = "name"
+NAME_COLUMN = "name"
 """Column of the job name."""
-PATHS = (FOLDER, "scene", "cameras", "weights", "depth_weights", "images", "ignore")
+PATH_COLUMNS = (FOLDER, "scene", "cameras", "weights", "depth_weights", "images", "ignore")
 """Options that are paths."""
 MARKERS = ("batch.json", "run.json")
 """Files that mark the output folders of `batch` and `evaluate`."""
@@ -38,7 +38,7 @@ LONGEST_FILE = 2 * 10**9
 LONGEST_NAME = 120
 """Maximum number of characters of a job name."""
 
-Options = dict[str, Any]
+OptionValues = dict[str, Any]
 """Options of `complete` by name."""
 
 
@@ -63,18 +63,18 @@ def read_manifest(manifest: Path, common: Mapping[str, Any], out: Path | None = 
             f"Two jobs have the name {quote_value(name)}; give each row a name of its own."
         )
     return [
-        Job(name, {key: value for key, value in row.items() if key != NAME})
+        Job(name, {key: value for key, value in row.items() if key != NAME_COLUMN})
         for name, row in zip(names, rows, strict=True)
     ]
 
 
-def resolve_paths(row: Mapping[str, Any], base: Path) -> Options:
+def resolve_paths(row: Mapping[str, Any], base: Path) -> OptionValues:
     """Make the paths of a row absolute; invalid values stay."""
 
     def join(value: Any) -> Any:
         return os.path.join(base, value) if isinstance(value, str) and value else value
 
-    result = {key: join(value) if key in PATHS else value for key, value in row.items()}
+    result = {key: join(value) if key in PATH_COLUMNS else value for key, value in row.items()}
     target = result.get("target")
     config = result.get("config")
     # A text is the path of a file of cameras, or else numbers and names of photographs.
@@ -89,7 +89,7 @@ def resolve_paths(row: Mapping[str, Any], base: Path) -> Options:
     return result
 
 
-def read_manifest_rows(manifest: Path, out: Path | None = None) -> list[Options]:
+def read_manifest_rows(manifest: Path, out: Path | None = None) -> list[OptionValues]:
     """Read the rows of a manifest as they are."""
     if os.path.isdir(manifest):
         results = list_results(manifest, out)
@@ -132,7 +132,7 @@ def is_result(folder: Path, out: Path | None) -> bool:
     return has_marker or read_command(folder) in COMPLETING
 
 
-def parse_csv(text: str) -> Iterator[Options]:
+def parse_csv(text: str) -> Iterator[OptionValues]:
     """Parse the rows of a CSV file with a header."""
     for row in csv.DictReader(io.StringIO(text, newline=""), strict=True):
         options = {k: v.strip() for k, v in row.items() if isinstance(v, str) and v.strip()}
@@ -143,7 +143,7 @@ def parse_csv(text: str) -> Iterator[Options]:
         yield options
 
 
-def parse_json_lines(text: str) -> Iterator[Options]:
+def parse_json_lines(text: str) -> Iterator[OptionValues]:
     """Parse JSON lines."""
     for number, line in enumerate(text.splitlines(), start=1):
         if line.strip():
@@ -156,7 +156,7 @@ def parse_json_lines(text: str) -> Iterator[Options]:
             yield row
 
 
-def make_job_name(row: Options) -> str:
+def make_job_name(row: OptionValues) -> str:
     """Turn the name of a row, or that of its scene folder, into a valid file name."""
-    name = str(row[NAME]) if NAME in row else Path(str(row.get(FOLDER, ""))).name
+    name = str(row[NAME_COLUMN]) if NAME_COLUMN in row else Path(str(row.get(FOLDER, ""))).name
     return make_valid_name(name.strip(".")[:LONGEST_NAME]) or "job"

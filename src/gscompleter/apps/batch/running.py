@@ -14,7 +14,7 @@ from typing import Any
 from rich.console import Console
 
 from gscompleter.apps.batch.engine import make_engine
-from gscompleter.apps.batch.manifest import PATHS, list_results, read_manifest
+from gscompleter.apps.batch.manifest import PATH_COLUMNS, list_results, read_manifest
 from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.command_line.exit_codes import choose_exit_code
 from gscompleter.apps.requests.batch import BatchRequest
@@ -57,7 +57,7 @@ def complete_batch(request: BatchRequest, decide_row: DecideRow) -> int:
 
             # The results may not lie in what the rows read.
             # A row whose path is no text, as JSON allows, fails by itself.
-            cells = [job.options.get(name) for job in jobs for name in PATHS]
+            cells = [job.options.get(name) for job in jobs for name in PATH_COLUMNS]
             paths = dict.fromkeys(cell for cell in cells if isinstance(cell, str) and cell)
             inputs = [Path(path) for path in paths]
             refuse_overlap(request.out, inputs)

@@ -21,7 +21,7 @@ from tyro.constructors import (
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.config.settings import Settings, apply_changes
 
-NAME = "config"
+CONFIG_OPTION = "config"
 """The option that names a config; its settings have this word before them."""
 
 
@@ -42,14 +42,14 @@ class ChosenConfig(Settings):
     ) -> CompleterConfig:
         """Load the config for an input, adapt it to what is done, and apply the changes."""
         config = adapt(load_config(self.name, is_splat, has_photographs))
-        where = f"{NAME}."
+        where = f"{CONFIG_OPTION}."
         return apply_changes(config, self.changes, where, where) if self.changes else config
 
 
 def make_parsing_rule() -> Callable[[StructTypeInfo], StructConstructorSpec | None]:
     """Return a rule by which tyro parses `--config NAME` and the settings that are typed alone."""
     settings = make_changes_type(CompleterConfig)
-    named = Annotated[str, tyro.conf.arg(name=NAME, prefix_name=False)]
+    named = Annotated[str, tyro.conf.arg(name=CONFIG_OPTION, prefix_name=False)]
 
     def rule(info: StructTypeInfo) -> StructConstructorSpec | None:
         if info.type is not ChosenConfig:

@@ -44,7 +44,7 @@ def explain_failure(error: BaseException) -> Failure | None:
     seen: list[BaseException] = []
     cause: BaseException | None = error
     while cause is not None and cause not in seen:
-        sentence, code = _explain(cause)
+        sentence, code = _explain_failure(cause)
         if sentence:
             return Failure(sentence, code)
         seen.append(cause)
@@ -52,7 +52,7 @@ def explain_failure(error: BaseException) -> Failure | None:
     return None
 
 
-def _explain(error: BaseException) -> tuple[str, int]:
+def _explain_failure(error: BaseException) -> tuple[str, int]:
     """Return the sentence and exit code for an error alone; an empty sentence for a defect."""
     # torch has its own error for the memory of a GPU; torch is not imported to name it.
     if type(error).__name__ == "OutOfMemoryError":

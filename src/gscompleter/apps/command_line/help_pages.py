@@ -45,7 +45,7 @@ class Group:
 
 
 # fmt: off
-GROUPS = (
+HELP_GROUPS = (
     Group("input", "What is given, and how it is read.", (
         "scene", "cameras", "up", "photos", "context", "format", "frames", "resolution", "near",
         "far", "no_given_depth", "no_refine_poses", "no_masks", "ignore", "invert_masks",
@@ -95,7 +95,7 @@ def make_help_rule(show_all: bool) -> Rule:
 
 
 def group_fields(fields: Sequence[StructFieldSpec]) -> list[StructFieldSpec]:
-    """Put the fields of a command into the boxes of `GROUPS`.
+    """Put the fields of a command into the boxes of `HELP_GROUPS`.
 
     Settings within the options, such as those of the method, have boxes already and come last.
     """
@@ -103,7 +103,7 @@ def group_fields(fields: Sequence[StructFieldSpec]) -> list[StructFieldSpec]:
     first = [field for field in fields if is_positional(field)]
     left = {field.name: field for field in fields if field not in (*structures, *first)}
     boxes = []
-    for group in GROUPS:
+    for group in HELP_GROUPS:
         inside = tuple(left.pop(name) for name in group.options if name in left)
         if not inside:
             continue

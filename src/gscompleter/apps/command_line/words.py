@@ -13,7 +13,7 @@ import tyro
 from tyro.constructors import ConstructorRegistry
 
 from gscompleter.apps.command_line.chosen_config import (
-    NAME,
+    CONFIG_OPTION,
     ChosenConfig,
     make_parsing_rule,
     make_showing_rule,
@@ -28,7 +28,7 @@ from gscompleter.apps.command_line.help_pages import (
     make_program,
 )
 from gscompleter.apps.command_line.old_spellings import refuse_old_spellings
-from gscompleter.apps.requests.completion import NUM_TARGETS
+from gscompleter.apps.requests.completion import DEFAULT_NUM_TARGETS
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.system.errors import InputError, join_names, quote_value
 
@@ -39,10 +39,10 @@ CONFIGURED = ("complete", "live", "update", "remove", "repair")
 MAX_NAMED_COMMANDS = 3
 """Most commands that a sentence names as those with an option."""
 
-NEAREST = "the nearest is"
+NEAREST_WORD = "the nearest is"
 SURPLUS = "Unrecognized options: "
 """Beginning of tyro's message on words that nothing takes."""
-HINTS = {"Argument helptext:": "give", "Perhaps you meant:": NEAREST}
+HINTS = {"Argument helptext:": "give", "Perhaps you meant:": NEAREST_WORD}
 """Titles in tyro's messages before the option that is meant."""
 
 
@@ -100,7 +100,7 @@ def parse_words(words: Sequence[str], kinds: Mapping[str, type]) -> Any:
 
 def check_config(options: Any) -> None:
     """Refuse a config that there is not, and settings out of range, whatever the input is."""
-    chosen = getattr(options, NAME, None)
+    chosen = getattr(options, CONFIG_OPTION, None)
     if isinstance(chosen, ChosenConfig):
         chosen.decide(is_splat=False, has_photographs=True)
 
@@ -143,7 +143,7 @@ def list_options(kind: Any, prefix: str = "") -> set[str]:
         inner: Any = get_args(hint)[0] if marks else hint
         name = f"{prefix}{field.replace('_', '-')}"
         if inner is ChosenConfig:
-            options |= list_options(CompleterConfig, f"{NAME}.")
+            options |= list_options(CompleterConfig, f"{CONFIG_OPTION}.")
         elif is_dataclass(inner):
             is_flat = tyro.conf.OmitArgPrefixes in marks
             options |= list_options(inner, "" if is_flat else f"{name}.")
@@ -200,7 +200,7 @@ def insert_auto_count(words: Sequence[str]) -> list[str]:
     if "--auto" in counted:
         place = counted.index("--auto") + 1
         if not counted[place:] or not counted[place].isdecimal():
-            counted.insert(place, str(NUM_TARGETS))
+            counted.insert(place, str(DEFAULT_NUM_TARGETS))
     return counted
 
 
@@ -221,7 +221,7 @@ def show_config(words: Sequence[str]) -> tuple[CompleterConfig, list[str]]:
     left = iter(words)
     for word in left:
         option, sign, value = word.partition("=")
-        if option != f"--{NAME}":
+        if option != f"--{CONFIG_OPTION}":
             others.append(word)
         else:
             name = value if sign else next(left, name)
@@ -258,6 +258,6 @@ def extract_sentence(box: str, own: Collection[str]) -> str:
         if title in lines:
             option = lines[lines.index(title) + 1].strip()
             name = option.partition(" ")[0].removeprefix("--")
-            if words != NEAREST or name in own:
+            if words != NEAREST_WORD or name in own:
                 hint = f"; {words} {option}"
     return f"{quote_value(sentence, 200).removesuffix('.')}{hint}"

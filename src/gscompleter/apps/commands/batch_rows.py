@@ -31,18 +31,18 @@ FALSE = ("false", "no", "0", "")
 
 def decide_row(row: Mapping[str, Any], out: Path) -> FillingRequest:
     """Decide what the row of a manifest asks for, or raise InputError."""
-    options = parse_row(row, out)
+    options = parse_batch_row(row, out)
     try:
         request = decide_completion(options)
     except InputError as error:
         # Only the sentence is kept in the row of a failed job, so it names the option itself.
         raise InputError(format_error(error)) from error
-    # `parse_row` lets neither an export nor a dry run through.
+    # `parse_batch_row` lets neither an export nor a dry run through.
     assert not isinstance(request, ExportRequest | PlanRequest | UpdateRequest)
     return request
 
 
-def parse_row(row: Mapping[str, Any], out: Path) -> CompleteOptions:
+def parse_batch_row(row: Mapping[str, Any], out: Path) -> CompleteOptions:
     """Parse a row, or raise InputError; `out` is the output folder."""
     if not isinstance(row.get(FOLDER), str):
         raise InputError("The row has no folder; give it the folder of a scene.")

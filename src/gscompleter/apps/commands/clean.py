@@ -21,7 +21,7 @@ from gscompleter.config import CleaningConfig
 from gscompleter.system.errors import InputError
 from gscompleter.system.process import import_without_collection
 
-PHOTOGRAPH_OPTIONS = (
+CHECKED_OPTIONS = (
     *("context", "format", "frames", "resolution", "near", "far", "no_given_depth"),
     "no_refine_poses",
     *("no_masks", "invert_masks", "large_masks", "ignore", "forget_edits"),
@@ -69,7 +69,7 @@ def decide_cleaning(options: CleanOptions) -> CleaningRequest:
     check_context(options.context)
     if options.folder is None:
         defaults = {field.name: field.default for field in fields(options)}
-        for name in PHOTOGRAPH_OPTIONS:
+        for name in CHECKED_OPTIONS:
             if getattr(options, name) != defaults[name]:
                 raise InputError(
                     "There are no photographs to apply this to; name their SCENE.", name

@@ -19,7 +19,7 @@ from gscompleter.apps.commands.shared_decisions import (
 )
 from gscompleter.apps.commands.shared_options import CompletingOptions, list_inputs
 from gscompleter.apps.requests.completion import (
-    NUM_TARGETS,
+    DEFAULT_NUM_TARGETS,
     CompletionRequest,
     ExportRequest,
     FillingRequest,
@@ -138,7 +138,7 @@ def decide_holes(
         check_painted(options)
         named, context = decide_painted(options, options.images)
         synthesis = PaintedOptions(generator_painter=options.painter)
-    max_found = NUM_TARGETS if options.auto is None else options.auto
+    max_found = DEFAULT_NUM_TARGETS if options.auto is None else options.auto
     results = replace(decide_results(options), suffix=options.save_as, has_video=options.video)
     return decide_filling(
         options,

@@ -16,7 +16,7 @@ from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.overlap import refuse_input_file
 from gscompleter.system.process import import_without_collection
 
-Level = Annotated[int, Interval(ge=0, le=100)]
+CompressionLevel = Annotated[int, Interval(ge=0, le=100)]
 Degrees = Annotated[float, Interval(ge=-36_000, le=36_000)]
 Offset = Annotated[float, Interval(ge=-1e9, le=1e9)]
 Factor = Annotated[float, Interval(ge=1e-9, le=1e9)]
@@ -39,7 +39,7 @@ class ConvertOptions(WritingOptions):
     """File to read, or the folder of a .sog."""
     out: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="B")]
     """File to write."""
-    level: Level | None = None
+    level: CompressionLevel | None = None
     """Level of detail to read of a streamed .sog (its folder or lod-meta.json); 0 is the finest."""
     merge: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="FILE [FILE ...]")] = ()
     """Splats to add to A, in its coordinates; their labels of what is generated follow its own."""

@@ -51,7 +51,7 @@ AUTO = "auto"
 """Generator of the preset, or else the default one."""
 
 
-WEIGHTS = "generator_weights"
+WEIGHTS_SETTING = "generator_weights"
 """Setting that belongs to one generator."""
 
 
@@ -87,7 +87,7 @@ class PresetGeneratorOptions(GeneratorOptions):
                     f"None of the generators {', '.join(kinds)} has this setting; leave it out.",
                     setting,
                 )
-            if setting == WEIGHTS and len(having) > 1:
+            if setting == WEIGHTS_SETTING and len(having) > 1:
                 raise InputError(
                     f"These weights would be taken by {' and '.join(having)}; compare them without "
                     "weights of your own, or one after the other.",

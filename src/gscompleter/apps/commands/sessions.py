@@ -27,8 +27,8 @@ from gscompleter.apps.commands.shared_options import (
 )
 from gscompleter.apps.live.opening import SessionRequest
 from gscompleter.apps.live.strokes import (
-    ADVICE,
     OF_STROKES,
+    STROKES_ADVICE,
     StrokesFile,
     find_strokes_file,
     read_steps,
@@ -106,7 +106,7 @@ def decide_replay(options: CompletingOptions, strokes: Path) -> SessionRequest:
     path = find_strokes_file(strokes)
     saved = read_strokes(path)
     if not saved.frames:
-        raise InputError(f"{quote_value(path)} has no steps; {ADVICE}.", "strokes")
+        raise InputError(f"{quote_value(path)} has no steps; {STROKES_ADVICE}.", "strokes")
     steps = read_steps(saved.frames, path.parent)
     return replace(begin_with(add_saved_options(options, saved)), steps=steps)
 
@@ -220,10 +220,10 @@ def restore_options(options: Known, saved: StrokesFile, path: Path) -> Known:
     own = {field.name for field in fields(kind)}
     own -= {field.name for field in fields(CompletingOptions)} - set(OF_MACHINE)
     shown = quote_value(path)
-    config = validate_typed(CompleterConfig, known.get("config", {}), shown, ADVICE)
+    config = validate_typed(CompleterConfig, known.get("config", {}), shown, STROKES_ADVICE)
     changed = ChosenConfig(changes=asdict(config))
     values = {**known, **{name: getattr(options, name) for name in own}, "config": changed}
-    restored = validate_typed(kind, values, shown, ADVICE)
+    restored = validate_typed(kind, values, shown, STROKES_ADVICE)
     for name in NAMES_SCENE:
         scene = getattr(restored, name)
         if scene is not None and not scene.exists():

@@ -26,15 +26,15 @@ from gscompleter.apps.completing.printing import (
     answer_plan,
 )
 from gscompleter.apps.completing.remove import prepare_removal
-from gscompleter.apps.completing.run_info import describe_run, read_held_out, refuse_results
+from gscompleter.apps.completing.run_info import describe_run_values, read_held_out, refuse_results
 from gscompleter.apps.completing.update import prepare_update
 from gscompleter.apps.inputs.describing import describe_task, print_lines
 from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.apps.report.completion import write_report
 from gscompleter.apps.report.film import write_comparison_video
 from gscompleter.apps.report.page import write_completion_page
-from gscompleter.apps.report.pictures import IMAGES, write_images
-from gscompleter.apps.report.results import COMMAND, RESULTS
+from gscompleter.apps.report.pictures import IMAGES_FOLDER, write_images
+from gscompleter.apps.report.results import COMPLETE_COMMAND, COMPLETION_RESULTS
 from gscompleter.apps.report.schema import read_summary
 from gscompleter.apps.requests.completion import (
     ExportRequest,
@@ -128,11 +128,13 @@ def complete_folder(
     console = make_console(stderr=True, quiet=results.answer.quiet)
     with (
         show_progress(console),
-        reserve_output(results.out, results.overwrite, COMMAND, RESULTS, takes_over) as output,
+        reserve_output(
+            results.out, results.overwrite, COMPLETE_COMMAND, COMPLETION_RESULTS, takes_over
+        ) as output,
     ):
         print_lines(console, *output.describe_others())
         ready = prepare(request, console)
-        print_lines(console, *describe_work(ready))
+        print_lines(console, *describe_completion_plan(ready))
         with output.write() as folder:
             return write_completion(folder, ready)
 
@@ -169,12 +171,14 @@ def plan_targets(request: PlanRequest) -> int:
     console = make_console(stderr=True, quiet=results.answer.quiet)
     with (
         show_progress(console),
-        reserve_output(results.out, results.overwrite, COMMAND, RESULTS) as output,
+        reserve_output(
+            results.out, results.overwrite, COMPLETE_COMMAND, COMPLETION_RESULTS
+        ) as output,
     ):
         refuse_results(results.out)
         print_lines(console, *output.describe_others())
         ready = prepare(request.filling, console)
-        print_lines(console, *describe_work(ready))
+        print_lines(console, *describe_completion_plan(ready))
         with output.write() as folder:
             begun = ready.begin()
             targets = ready.task.target_cameras
@@ -188,7 +192,7 @@ def plan_targets(request: PlanRequest) -> int:
             write_targets(folder, ready.task)
             write_chosen_cameras(folder, ready.opened, ready.task)
             if ready.task.targets:
-                write_plan_pictures(folder / IMAGES, ready, begun)
+                write_plan_pictures(folder / IMAGES_FOLDER, ready, begun)
     answer_plan(results, ready.opened, ready.task.targets, holes)
     return DONE
 
@@ -202,7 +206,7 @@ def export_holes(request: ExportRequest) -> int:
     console = make_console(stderr=True, quiet=results.answer.quiet)
     with (
         show_progress(console),
-        reserve_output(request.folder, results.overwrite, COMMAND, EXPORTED) as output,
+        reserve_output(request.folder, results.overwrite, COMPLETE_COMMAND, EXPORTED) as output,
     ):
         print_lines(console, *output.describe_others())
         ready = prepare(request.filling, console)
@@ -234,7 +238,7 @@ def write_plan_pictures(folder: Path, ready: Prepared, begun: Completion) -> Non
             write_images(folder, f"target{number}", {"beside": beside.image})
 
 
-def describe_work(ready: Prepared) -> list[str]:
+def describe_completion_plan(ready: Prepared) -> list[str]:
     """Write the lines before a completion."""
     models = ready.work.models
     settings = models.generator_settings
@@ -278,7 +282,7 @@ def write_done(
     # They are rendered while the files are written.
     cameras = tuple(ready.cameras.values())
     aside = sample_held_out_cameras(cameras, seed)
-    facts = describe_run(
+    facts = describe_run_values(
         ready.source,
         ready.work.splat,
         ready.opened,

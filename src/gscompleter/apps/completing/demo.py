@@ -24,10 +24,10 @@ from gscompleter.system.files.image import read_image, write_image
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.files.writing import SUMMARY_FILE, TARGETS_FILE
 
-PICTURE_FILE = "before_after.png"
+BEFORE_AFTER_FILE = "before_after.png"
 RESOLUTION = (250, 370)
-COMMAND = "demo"
-RESULTS = ("scene/**/*", "completion/**/*", PICTURE_FILE, SUMMARY_FILE)
+DEMO_COMMAND = "demo"
+DEMO_FILES = ("scene/**/*", "completion/**/*", BEFORE_AFTER_FILE, SUMMARY_FILE)
 """Globs of the files that it may write."""
 
 
@@ -43,7 +43,7 @@ def complete_demo(models: ModelRequest, results: ResultsRequest) -> None:
     answer = results.answer
     out = results.out
     with (
-        reserve_output(out, results.overwrite, COMMAND, RESULTS) as output,
+        reserve_output(out, results.overwrite, DEMO_COMMAND, DEMO_FILES) as output,
         output.write() as folder,
     ):
         print_lines(make_console(stderr=True, quiet=answer.quiet), *output.describe_others())
@@ -66,10 +66,10 @@ def complete_demo(models: ModelRequest, results: ResultsRequest) -> None:
         images = inside.out / "images"
         names = [f"target{n}_{when}" for n in (1, 2) for when in ("before", "after")]
         picture = join_images([read_image(images / f"{name}.png") for name in names])
-        write_image(folder / PICTURE_FILE, picture)
+        write_image(folder / BEFORE_AFTER_FILE, picture)
 
     # `output.write` has moved the results from its temporary folder to OUT by now.
     done = ResultsRequest(out=out / "completion", answer=answer)
-    answer_completion(done, {"before_after": str(out / PICTURE_FILE)})
+    answer_completion(done, {"before_after": str(out / BEFORE_AFTER_FILE)})
     if not answer.quiet and not answer.json:
-        print(f"Before and after, beyond either camera: {out / PICTURE_FILE}")
+        print(f"Before and after, beyond either camera: {out / BEFORE_AFTER_FILE}")

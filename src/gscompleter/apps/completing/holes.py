@@ -28,7 +28,7 @@ from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import write_depth, write_image
 from gscompleter.system.files.reading import hash_file
-from gscompleter.system.files.result_format import MARK
+from gscompleter.system.files.result_format import RESULT_MARK
 from gscompleter.system.progress import track
 from gscompleter.types import Camera
 
@@ -110,7 +110,7 @@ def write_holes(folder: Path, ready: Prepared, begun: Completion, has_path: bool
     # Cameras that were found around the targets are found again.
     frames = ready.task.context_frames if ready.opened.has_numbered_frames else ()
     content = {
-        **MARK,
+        **RESULT_MARK,
         "version": __version__,
         "camera_model": "PINHOLE",
         "depth_unit_scale_factor": unit,
@@ -154,10 +154,6 @@ def write_hole(folder: Path, hole: ExportedHole, unit: float, ready: Prepared) -
         f"{name}_warped.png": shown.warped,
         f"{name}_reference.png": shown.reference.image,
     }
-    mosaic = None
-    if shown.mosaic is not None:
-        mosaic = f"{name}_mosaic.png"
-        pictures[mosaic] = shown.mosaic
     for file, picture in pictures.items():
         write_image(folder / file, picture)
     write_depth(folder / f"{name}_depth.png", hole.depth, unit)
@@ -180,7 +176,6 @@ def write_hole(folder: Path, hole: ExportedHole, unit: float, ready: Prepared) -
         "title": ready.opened.name_target(target),
         "depth_file_path": f"{name}_depth.png",
         "warped_path": f"{name}_warped.png",
-        "mosaic_path": mosaic,
         "reference_path": f"{name}_reference.png",
         "reference_frame": shown.reference.frame,
         "reference_file": files.get(shown.reference.frame),

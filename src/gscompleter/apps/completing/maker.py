@@ -24,14 +24,14 @@ def describe_maker(models: ModelRequest, task: CompletionTask, completion: Compl
     weights = getattr(models.generator_settings, "weights", None)
     return make_run_record(
         completion,
-        describe_model(models.reconstructor, models.weights),
-        None if models.depth == "none" else describe_model(models.depth, models.depth_weights),
-        describe_model(models.generator, weights),
+        record_model(models.reconstructor, models.weights),
+        None if models.depth == "none" else record_model(models.depth, models.depth_weights),
+        record_model(models.generator, weights),
         None if task.splat_file is None else task.splat_file.path,
     )
 
 
-def describe_model(name: str, weights: Path | str | None) -> ModelRecord:
+def record_model(name: str, weights: Path | str | None) -> ModelRecord:
     """Describe Ψ or Φ by its name on the command line, with weights that the user named."""
     if weights is not None:
         # The path of a file or folder tells about the machine, and its name no licence.

@@ -39,7 +39,7 @@ from gscompleter.types import Camera
 
 PATH_VIDEO = "path.mp4"
 PATH_MASK = "path_mask.mp4"
-STEP = 4
+FRAME_STEP = 4
 """Video models take 4 n + 1 frames, since their encoders join four frames."""
 
 
@@ -64,7 +64,7 @@ def plan_path(
     nearest = min(context, key=lambda camera: measure_baseline(camera, first))
     stops = [replace(lens, c2w=camera.c2w.to(lens.c2w)) for camera in (nearest, *targets)]
     seconds = max(ONE_WAY_SECONDS / len(targets), MIN_LEG_SECONDS)
-    count = STEP * round(FRAMES_PER_SECOND * seconds / STEP)
+    count = FRAME_STEP * round(FRAMES_PER_SECOND * seconds / FRAME_STEP)
     cameras = plan_camera_path(stops, thin_evenly(photographs, MAX_PHOTOGRAPHS), count)
     frames = [
         count * number if has_same_lens(target, first) else None

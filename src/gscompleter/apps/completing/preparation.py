@@ -19,7 +19,7 @@ from gscompleter.apps.inputs.depth_range import (
     apply_scene_range,
     apply_splat_range,
 )
-from gscompleter.apps.inputs.describing import list_missing as list_missing_photographs
+from gscompleter.apps.inputs.describing import list_missing_photographs as list_missing_photographs
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.inputs.memory import check_scene
 from gscompleter.apps.inputs.named_photographs import check_target_files
@@ -41,7 +41,7 @@ from gscompleter.apps.requests.completion import (
 from gscompleter.apps.requests.models import ModelRequest
 from gscompleter.apps.requests.scene import AloneRequest, PhotographsRequest
 from gscompleter.apps.requests.splat import Selection, SplatRequest
-from gscompleter.apps.warmup import SPLAT_PART, compile_beside, compile_kernels, list_missing
+from gscompleter.apps.warmup import SPLAT_PART, compile_beside, compile_kernels, list_uncompiled
 from gscompleter.completer import GSCompleter
 from gscompleter.config import CompleterConfig
 from gscompleter.data.local_origin import compute_frame_from_photographs
@@ -229,7 +229,7 @@ def make_prepared(
 def check_models(work: WorkRequest) -> None:
     """Refuse what is wrong with a model before kernels are compiled, which takes minutes."""
     # Where there are kernels, it is told soon enough when the photographs are read.
-    if list_missing(list_parts(work)):
+    if list_uncompiled(list_parts(work)):
         load_completer(work.models, work.config, ())
 
 

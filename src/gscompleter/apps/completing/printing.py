@@ -16,7 +16,7 @@ from gscompleter.apps.inputs.holes_file import HOLES_FILE, read_holes
 from gscompleter.apps.inputs.task import Opened, Target
 from gscompleter.apps.report.film import VIDEO_FILE
 from gscompleter.apps.report.page import REPORT_FILE
-from gscompleter.apps.report.pictures import IMAGES
+from gscompleter.apps.report.pictures import IMAGES_FOLDER
 from gscompleter.apps.report.plain_words import group_target_warnings, list_warnings
 from gscompleter.apps.report.schema import CompletionSummary, find_completed, read_summary
 from gscompleter.apps.requests.answer import AnswerRequest
@@ -53,7 +53,7 @@ def print_completion(results: ResultsRequest) -> None:
             if len(numbers) == 1:
                 name = summary.targets[numbers[0] - 1].name
                 sentences.append(f"{name}: {' '.join(warnings)}")
-    sentences += describe_result(summary, results)
+    sentences += describe_completion(summary, results)
     for sentence in sentences:
         console.print(sentence, soft_wrap=True)
 
@@ -80,7 +80,7 @@ def make_score_table(summary: CompletionSummary) -> Table:
     return table
 
 
-def describe_result(summary: CompletionSummary, results: ResultsRequest) -> Iterator[str]:
+def describe_completion(summary: CompletionSummary, results: ResultsRequest) -> Iterator[str]:
     """Write the sentences below the table."""
     counts = summary.gaussians
     seconds = summary.seconds["total"]
@@ -134,7 +134,8 @@ def print_plan(
     console.print(f"Edit the cameras in {quote_value(out / TARGETS_FILE)}.", soft_wrap=True)
     # New photographs from there are the best help, and `update` adds what they show.
     console.print(
-        f"What each camera sees now, and the photograph beside it: {quote_value(out / IMAGES)}",
+        "What each camera sees now, and the photograph beside it: "
+        f"{quote_value(out / IMAGES_FOLDER)}",
         soft_wrap=True,
     )
 

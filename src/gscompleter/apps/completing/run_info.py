@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.apps.inputs.describing import describe_missing
+from gscompleter.apps.inputs.describing import describe_missing_photographs
 from gscompleter.apps.inputs.selection import select_closest
 from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.apps.report.schema import find_completed
@@ -32,7 +32,7 @@ from gscompleter.types import Camera, View
 MAX_HELD_OUT = 8
 
 
-def describe_run(
+def describe_run_values(
     source: PhotographsRequest | AloneRequest,
     given: SplatRequest | None,
     opened: Opened,
@@ -83,7 +83,7 @@ def describe_run(
             "refined_poses": opened.refinement and asdict(opened.refinement),
             "notes": [
                 *opened.photographs.notes,
-                *describe_missing(opened.photographs),
+                *describe_missing_photographs(opened.photographs),
                 *(f"Not used: {phrase}." for phrase in opened.photographs.unused),
             ],
         },

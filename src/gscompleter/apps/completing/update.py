@@ -39,9 +39,9 @@ from gscompleter.config import CompleterConfig
 from gscompleter.data.formats import find_format
 from gscompleter.data.sfm.placing import place_photographs
 from gscompleter.splats.alignment.similarity import transform_view
-from gscompleter.stages.add_observed import MIN_SHARE, find_lacks
+from gscompleter.stages.add_observed import MIN_ADDED_SHARE, find_lacks
 from gscompleter.system.errors import InputError
-from gscompleter.system.files.output_folder import POSES, refuse_link
+from gscompleter.system.files.output_folder import FOUND_POSES_FOLDER, refuse_link
 from gscompleter.system.progress import show_preparation, track
 
 MAX_LACKING = 16
@@ -88,7 +88,7 @@ def add_new_photographs(
     photos: Path, results: ResultsRequest, opened: Opened, console: Console
 ) -> Opened:
     """Place new photographs among those of the scene, and add them."""
-    kept = results.out / POSES
+    kept = results.out / FOUND_POSES_FOLDER
     refuse_link(kept)
     photographs, placed = place_photographs(
         photos, opened.photographs, kept, results.overwrite, opened.request.masks
@@ -137,7 +137,7 @@ def choose_evidence(
     frames.update(frame for frame in new if frame not in opened.held_out)
     if context is None:
         shares = measure_lacks(loaded)
-        lacking = [frame for frame, share in shares.items() if share >= MIN_SHARE]
+        lacking = [frame for frame, share in shares.items() if share >= MIN_ADDED_SHARE]
         lacking.sort(key=lambda frame: -shares[frame])
         frames.update(lacking[:MAX_LACKING])
     if frames == set(task.context_frames):

@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.console import Console
 
 from gscompleter.apps.requests.evaluation import CasesRequest
-from gscompleter.apps.requests.scene import LONG_SIDE, parse_resolution
+from gscompleter.apps.requests.scene import DEFAULT_LONG_SIDE, parse_resolution
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.limits import check_planes
 from gscompleter.data.mask_checks import read_masks_as_asked
@@ -117,8 +117,8 @@ def iterate_tasks(
     rules = [protocols.parse_protocol(text) for text in request.protocol]
 
     # With a preset, images are cropped and scenes left out as by its authors' code (decision 047).
-    loader = find_loader(request)
-    resolution = LONG_SIDE if request.resolution is None else request.resolution
+    loader = find_authors_loader(request)
+    resolution = DEFAULT_LONG_SIDE if request.resolution is None else request.resolution
     size: Resolution
     if loader is not None and isinstance(resolution, tuple):
         height, width = resolution
@@ -165,7 +165,7 @@ def iterate_tasks(
                 yield from tasks[:1] if request.one_per_scene else tasks
 
 
-def find_loader(request: CasesRequest) -> AuthorsLoader | None:
+def find_authors_loader(request: CasesRequest) -> AuthorsLoader | None:
     """Find the loader to follow; none without a preset, or at another size than the preset's."""
     preset = get_data_set(request.preset)
     return preset.loader if request.resolution == preset.resolution else None

@@ -18,7 +18,7 @@ from gscompleter.apps.requests.evaluation import (
     ReproductionRequest,
 )
 from gscompleter.config.generators import GeneratorOptions
-from gscompleter.evaluation.claims import HEAD, tabulate_claims
+from gscompleter.evaluation.claims import CLAIM_COLUMNS, tabulate_claims
 from gscompleter.evaluation.figures import draw_figure
 from gscompleter.evaluation.measured_code import find_commit
 from gscompleter.evaluation.methods import expand_methods
@@ -45,7 +45,7 @@ from gscompleter.system.files.writing import encode_text, replace_file
 from gscompleter.system.jobs.jobs import make_folder
 from gscompleter.system.machine import describe_machine
 
-UNUSUAL = ("stress", "sequence")
+SEPARATE_KINDS = ("stress", "sequence")
 """Kinds of the protocols that only tables of their own use."""
 TABLES = "tables"
 """Folder of the tables in OUT."""
@@ -66,7 +66,7 @@ COMPARED_COLUMNS = {
 """Columns of the table that compares models of a kind."""
 COMPARED_TITLES = {"depth": "depth", "generator": "Φ"}
 """Title of the column that names them."""
-RESULTS = "results.md"
+RESULTS_PAGE = "results.md"
 """Page in OUT with all tables, claims and figures."""
 
 
@@ -151,7 +151,7 @@ def collect_outputs(out: Path) -> dict[str, Any]:
     """Collect the tables by name, with the paths of the page and of the figures."""
     tables = sorted((out / TABLES).glob("*.json"))
     return {
-        "results": str(out / RESULTS),
+        "results": str(out / RESULTS_PAGE),
         "tables": {path.stem: json.loads(path.read_bytes()) for path in tables},
         "figures": [str(path) for path in sorted((out / FIGURES).glob("*"))],
     }
@@ -229,7 +229,7 @@ def choose_protocols(cases: CasesRequest, spec: Requirements) -> tuple[str, ...]
         return suitable or spec.protocol
 
     # A table without a kind of its own takes a given protocol, or that of the data set.
-    usual = [name for name in cases.protocol if get_kind(name) not in UNUSUAL]
+    usual = [name for name in cases.protocol if get_kind(name) not in SEPARATE_KINDS]
     return tuple(usual[:1]) or get_data_set(cases.preset).protocol or ("",)
 
 
@@ -277,13 +277,13 @@ def write_results(out: Path, device: str) -> str:
     # Tables and figures of earlier calls in the same folder are on the page, too.
     tables = [out / TABLES / f"{name}.md" for name in paper.tables]
     parts += [path.read_text("utf-8") for path in tables if path.is_file()]
-    judged = format_markdown(HEAD, tabulate_claims(out / TABLES, paper.claims))
+    judged = format_markdown(CLAIM_COLUMNS, tabulate_claims(out / TABLES, paper.claims))
     parts.append(f"## Claims of the paper\n\n{judged}")
     for name, figure in paper.figures.items():
         if (out / FIGURES / f"{name}.png").is_file():
             parts.append(f"## {figure.title}\n\n![{figure.title}]({FIGURES}/{name}.png)\n")
 
     text = "\n".join(parts)
-    with replace_file(out / RESULTS) as file:
+    with replace_file(out / RESULTS_PAGE) as file:
         file.write(encode_text(text))
     return text

@@ -12,10 +12,10 @@ from gscompleter.apps.batch.engine import make_engine
 from gscompleter.apps.batch.running import print_failures
 from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.command_line.exit_codes import choose_exit_code
-from gscompleter.apps.evaluating.cases import collect_tasks, find_loader, print_skipped
+from gscompleter.apps.evaluating.cases import collect_tasks, find_authors_loader, print_skipped
 from gscompleter.apps.evaluating.tables import write_and_print_tables
 from gscompleter.apps.requests.evaluation import CasesRequest, EvaluationRequest
-from gscompleter.apps.requests.scene import LONG_SIDE, parse_resolution
+from gscompleter.apps.requests.scene import DEFAULT_LONG_SIDE, parse_resolution
 from gscompleter.apps.warmup import compile_kernels
 from gscompleter.data.photographs import check_resolution
 from gscompleter.evaluation.apart import record_uses
@@ -28,7 +28,7 @@ from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError
 from gscompleter.system.progress import show_preparation, show_progress
 
-MAX_NAMED = 5
+MAX_NAMED_CASES = 5
 """Most cases of which a line says what Ψ said about their photographs."""
 
 
@@ -122,11 +122,11 @@ def will_score(tasks: Sequence[Task], methods: Sequence[str], request: Evaluatio
 
 def print_context_notes(notes: Mapping[str, str], console: Console) -> None:
     """Print what Ψ said about the photographs of the first cases, and the number of the others."""
-    for name, note in list(notes.items())[:MAX_NAMED]:
+    for name, note in list(notes.items())[:MAX_NAMED_CASES]:
         console.print(f"{name}: {note}", soft_wrap=True)
-    if len(notes) > MAX_NAMED:
+    if len(notes) > MAX_NAMED_CASES:
         console.print(
-            f"... and of {len(notes) - MAX_NAMED} more cases (`context_notes` of their rows)."
+            f"... and of {len(notes) - MAX_NAMED_CASES} more cases (`context_notes` of their rows)."
         )
 
 
@@ -138,8 +138,8 @@ def describe_source(cases: CasesRequest, tasks: Sequence[Task]) -> dict[str, Any
     has_masks = any(task.has_masks for task in tasks)
     num_apart = sum(task.apart_by is not None for task in tasks)
     # A cases.json has the resolution of each case; scenes of a protocol have none.
-    size = LONG_SIDE if cases.resolution is None and cases.protocol else cases.resolution
-    loader = find_loader(cases)
+    size = DEFAULT_LONG_SIDE if cases.resolution is None and cases.protocol else cases.resolution
+    loader = find_authors_loader(cases)
     return {
         "paths": [path.resolve().name for path in cases.paths],
         "protocols": list(cases.protocol),

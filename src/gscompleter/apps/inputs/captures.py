@@ -13,10 +13,10 @@ from torch import Tensor
 
 from gscompleter.apps.inputs.named_photographs import PhotographNames
 from gscompleter.apps.inputs.removal import select_gaussians
-from gscompleter.apps.requests.scene import LONG_SIDE, SceneRequest
+from gscompleter.apps.requests.scene import DEFAULT_LONG_SIDE, SceneRequest
 from gscompleter.apps.requests.splat import Selection
 from gscompleter.config import HoleConfig
-from gscompleter.data.camera_files import NAME, has_camera_list
+from gscompleter.data.camera_files import INRIA_CAMERAS_FILE, has_camera_list
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photograph_names import name_render
 from gscompleter.data.photographs import (
@@ -28,7 +28,7 @@ from gscompleter.numerics.geometry import add_near_plane, is_same_camera
 from gscompleter.render.protocols import Renderer
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.types import Camera, Gaussians
-from gscompleter.virtual_capture.around_target import NUM_CAMERAS, choose_cameras_around
+from gscompleter.virtual_capture.around_target import MAX_CHOSEN_CAMERAS, choose_cameras_around
 from gscompleter.virtual_capture.pixel_aligned import aim_pixel_camera, move_beside
 from gscompleter.virtual_capture.standpoints import choose_cameras_around_place, find_standpoints
 from gscompleter.virtual_capture.upward import Upward, find_upward
@@ -106,7 +106,11 @@ def find_cameras_beside(splat: Path) -> Path | None:
     folders = [folder]
     if folder.parent.name == "point_cloud":
         folders.append(folder.parents[TRAINER_LEVELS - 1])
-    found = [place / NAME for place in folders if has_camera_list(place / NAME)]
+    found = [
+        place / INRIA_CAMERAS_FILE
+        for place in folders
+        if has_camera_list(place / INRIA_CAMERAS_FILE)
+    ]
     return found[0] if found else None
 
 
@@ -200,7 +204,7 @@ def choose_side(resolution: Resolution) -> int:
     """Choose the width and height of cameras that are found by the splat alone."""
     if isinstance(resolution, (tuple, list)):
         return max(resolution)
-    return resolution if isinstance(resolution, int) else LONG_SIDE
+    return resolution if isinstance(resolution, int) else DEFAULT_LONG_SIDE
 
 
 def search_around(
@@ -211,7 +215,7 @@ def search_around(
 ) -> Capture:
     """Search for cameras around the holes of all targets."""
     # Fewer around each of many targets.
-    count = max(1, min(NUM_CAMERAS, MAX_AROUND // max(len(targets), 1)))
+    count = max(1, min(MAX_CHOSEN_CAMERAS, MAX_AROUND // max(len(targets), 1)))
     cameras: list[Camera] = []
     for target, hole in zip(targets, holes, strict=True):
         for camera in choose_cameras_around(scene, target, renderer, hole, count):

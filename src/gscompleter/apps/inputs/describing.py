@@ -15,7 +15,7 @@ from gscompleter.splats.formats import describe_oddities
 from gscompleter.system.errors import join_names, quote_value
 from gscompleter.system.memory import format_whole_gigabytes, read_memory_bytes
 
-MAX_NAMED = 8
+MAX_LISTED_PHOTOGRAPHS = 8
 """Most photographs that a line names."""
 MAX_PHRASE = 120
 """Longest phrase of the line, in characters."""
@@ -37,8 +37,10 @@ def describe_task(
     files = opened.files
     context = [name_photograph(frame, files.get(frame)) for frame in task.context_frames]
     images = "photographs" if opened.renders_from is None else "renders"
-    goal = f"{doing} from {images} {join_names(context, MAX_NAMED)}"
-    targets = join_names([opened.name_target(target) for target in task.targets], MAX_NAMED)
+    goal = f"{doing} from {images} {join_names(context, MAX_LISTED_PHOTOGRAPHS)}"
+    targets = join_names(
+        [opened.name_target(target) for target in task.targets], MAX_LISTED_PHOTOGRAPHS
+    )
     if targets:
         goal += f" for {targets}"
     elif max_targets == 1:
@@ -46,7 +48,8 @@ def describe_task(
     elif max_targets > 1:
         goal += f" for up to {max_targets} cameras that are found"
     else:
-        goal = f"add what photographs {join_names(context, MAX_NAMED)} show and the splat lacks"
+        named = join_names(context, MAX_LISTED_PHOTOGRAPHS)
+        goal = f"add what photographs {named} show and the splat lacks"
 
     # On a GPU the splat is in its memory, not in that of the machine.
     needed = estimate_memory(task, task.scene if task.device.type == "cpu" else None)
@@ -64,7 +67,7 @@ def describe_opening(opened: Opened, task: CompletionTask) -> list[str]:
     scene = task.scene
     camera = task.views[0].camera
     photographs = opened.photographs
-    used = len(photographs.posed) - len(list_missing(photographs))
+    used = len(photographs.posed) - len(list_missing_photographs(photographs))
     splat = ""
     if scene is not None:
         mode = "antialiased " if scene.is_antialiased else ""
@@ -76,33 +79,35 @@ def describe_opening(opened: Opened, task: CompletionTask) -> list[str]:
     if opened.renders_from is not None:
         source = f"{splat.removeprefix('; ')}; no photographs"
     if photographs.unused:
-        source += f"; not used: {join_names(photographs.unused, MAX_NAMED, MAX_PHRASE)}"
+        source += (
+            f"; not used: {join_names(photographs.unused, MAX_LISTED_PHOTOGRAPHS, MAX_PHRASE)}"
+        )
     return [
         f"Opened: {source}.",
         f"Found: {task.frame_description.rstrip('.')}; depths from {camera.near:.3g} to "
         f"{camera.far:.3g}; worked at {camera.width} x {camera.height} (--resolution changes it).",
-        *describe_missing(photographs),
+        *describe_missing_photographs(photographs),
         *describe_masks(photographs, task),
         *([] if task.splat_file is None else describe_oddities(task.splat_file.path)),
         *task.depth_notes,
     ]
 
 
-def list_missing(photographs: Photographs) -> list[str]:
+def list_missing_photographs(photographs: Photographs) -> list[str]:
     """List the names of photographs that cameras name and that are not there."""
     posed = [photographs.frame(number) for number in photographs.posed]
     named = [frame for frame in posed if frame.image is not None]
     return [frame.name for frame in named if not frame.has_photograph()]
 
 
-def describe_missing(photographs: Photographs) -> list[str]:
+def describe_missing_photographs(photographs: Photographs) -> list[str]:
     """Say which cameras have no photograph; such a camera stays, because it can be a target."""
-    missing = list_missing(photographs)
+    missing = list_missing_photographs(photographs)
     if not missing:
         return []
     return [
         f"{len(missing)} of {len(photographs)} photographs are missing, and their cameras can only "
-        f"be targets: {join_names(missing, MAX_NAMED)}."
+        f"be targets: {join_names(missing, MAX_LISTED_PHOTOGRAPHS)}."
     ]
 
 

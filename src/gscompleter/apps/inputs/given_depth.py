@@ -26,11 +26,11 @@ from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.types import View
 
 WAY_OUT = "--no-given-depth leaves it out"
-MAX_DEVIATION = 0.03
+MAX_DEPTH_DEVIATION = 0.03
 """Largest median deviation of predicted depth from triangulated points that counts as measured.
 Stereo of photographs is about as exact, so that a worse map only helps where stereo measures
 nothing (decision 088)."""
-MAX_NAMED = 3
+MAX_OFF_PHOTOGRAPHS = 3
 """Photographs that a sentence names."""
 
 
@@ -86,7 +86,7 @@ class PredictedDepth:
 
         def name(frames: Mapping[int, object]) -> str:
             files = [photographs.frame(frame).file_name for frame in frames]
-            return join_names([quote_value(file) for file in files], MAX_NAMED)
+            return join_names([quote_value(file) for file in files], MAX_OFF_PHOTOGRAPHS)
 
         def format_worst(frames: Mapping[int, object]) -> str:
             return f"{100 * max(self.deviations.get(frame, 0.0) for frame in frames):.1f} %"
@@ -136,7 +136,7 @@ def sort_predicted(
     agreeing = {
         frame: depth
         for frame, depth in maps.items()
-        if deviations.get(frame, np.inf) <= MAX_DEVIATION
+        if deviations.get(frame, np.inf) <= MAX_DEPTH_DEVIATION
     }
     others = {frame: depth for frame, depth in maps.items() if frame not in agreeing}
     return PredictedDepth(agreeing, others, deviations)

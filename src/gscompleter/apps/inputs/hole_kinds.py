@@ -30,7 +30,7 @@ HoleKind = Literal["all", "enclosed"]
 
 
 @dataclass(frozen=True)
-class SplatKind:
+class SplatAloneKind:
     """What a splat without photographs is, which is decided once from its Gaussians."""
 
     is_lifted: bool
@@ -39,11 +39,11 @@ class SplatKind:
     """What a hole of it is."""
 
 
-OPAQUE = (
+OPAQUE_ADVICE = (
     "The splat is opaque everywhere in the image of the target, and nothing in it tells what is "
     "wrong; mark that with --mask, or name the photographs of the scene as SCENE."
 )
-NOTHING_ENCLOSED = (
+NOTHING_ENCLOSED_ADVICE = (
     "The splat is an object on nothing, and its only hole there is the space around it, which "
     "stays empty; mark what is wrong with --mask, or fill all that is empty with --holes all."
 )
@@ -83,11 +83,11 @@ def find_target_holes(
         reason = explain_little_covered(covered, config)
         empty = compute_hole_mask(render.alpha, config)
         if reason is None and not empty.any():
-            reason = OPAQUE
+            reason = OPAQUE_ADVICE
         if config.kind == "enclosed":
             empty = keep_enclosed(empty, render, ranged, partial(renderer.render, scene))
         if reason is None and not empty.any():
-            reason = NOTHING_ENCLOSED
+            reason = NOTHING_ENCLOSED_ADVICE
         reasons.append(reason)
         holes.append(empty)
     # One target that can be completed is enough; the report says why others were not.

@@ -15,7 +15,7 @@ from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.typed_json import read_typed_json
 
 HOLES_FILE = "holes.json"
-ADVICE = "export the holes again"
+HOLES_ADVICE = "export the holes again"
 
 
 @dataclass(frozen=True)
@@ -73,27 +73,27 @@ def has_holes(folder: Path) -> bool:
 def read_holes(folder: Path) -> HolesFile:
     """Read and validate the `holes.json` of a folder."""
     path = folder / HOLES_FILE
-    holes = read_typed_json(HolesFile, path, ADVICE)
+    holes = read_typed_json(HolesFile, path, HOLES_ADVICE)
     if not holes.frames:
-        raise InputError(f"{quote_value(path)} lists no frames; {ADVICE}.")
+        raise InputError(f"{quote_value(path)} lists no frames; {HOLES_ADVICE}.")
     # What is read lies in the folder itself, whatever the file says.
-    for name in list_names(holes):
+    for name in list_hole_files(holes):
         if name != os.path.basename(name) or name in ("", ".", ".."):
             raise InputError(
                 f"{quote_value(path)} names the file '{quote_value(name)}', and only files beside "
-                f"it are read; {ADVICE}."
+                f"it are read; {HOLES_ADVICE}."
             )
     num_frames = 0 if holes.path is None else holes.path.num_frames
     for row in holes.frames:
         if row.path_frame is not None and row.path_frame not in range(num_frames):
             raise InputError(
                 f"{quote_value(path)} names frame {row.path_frame} of a video with {num_frames}; "
-                f"{ADVICE}."
+                f"{HOLES_ADVICE}."
             )
     return holes
 
 
-def list_names(holes: HolesFile) -> Iterator[str]:
+def list_hole_files(holes: HolesFile) -> Iterator[str]:
     """List the files that are read."""
     for row in holes.frames:
         yield from (row.image_path, row.hole_mask_path)

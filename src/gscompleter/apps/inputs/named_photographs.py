@@ -13,7 +13,7 @@ from gscompleter.data.camera_files import is_in_splat_frame
 from gscompleter.data.panorama import has_panoramas
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.data.scene import load_cameras
-from gscompleter.data.sfm.poses import ENDINGS, list_photograph_files
+from gscompleter.data.sfm.poses import PHOTOGRAPH_ENDINGS, list_photograph_files
 from gscompleter.data.video import is_video
 from gscompleter.system.errors import InputError, quote_value
 
@@ -108,7 +108,7 @@ def read_targets(
 
 def is_image(path: str) -> bool:
     """Return True if a path names a photograph, not a file of cameras."""
-    return path.lower().endswith(ENDINGS)
+    return path.lower().endswith(PHOTOGRAPH_ENDINGS)
 
 
 def add_photograph(target: Target, photographs: Photographs, resolution: Resolution) -> Target:

@@ -14,7 +14,7 @@ from gscompleter.apps.inputs.named_photographs import check_frame_numbers
 from gscompleter.apps.inputs.removal import check_removal_masks
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.inputs.task import Opened
-from gscompleter.apps.requests.scene import LONG_SIDE, PosesRequest, SceneRequest
+from gscompleter.apps.requests.scene import DEFAULT_LONG_SIDE, PosesRequest, SceneRequest
 from gscompleter.data.camera_files import refuse_other_exports
 from gscompleter.data.formats import find_format, open_photographs, refuse_scenes_below
 from gscompleter.data.frame import FOLDERS
@@ -35,7 +35,7 @@ from gscompleter.splats.alignment.training_size import find_training_size
 from gscompleter.splats.foreign import holds_splat_alone
 from gscompleter.splats.formats import has_splat_extension
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.output_folder import POSES, refuse_link
+from gscompleter.system.files.output_folder import FOUND_POSES_FOLDER, refuse_link
 from gscompleter.system.files.writing import SUMMARY_FILE
 
 NUM_SIZE_PHOTOGRAPHS = 8
@@ -94,7 +94,7 @@ def open_scene(
             check_ignoring_masks(reading.folder, folder)
         check()
         # A folder of poses with a summary was written by us, and may be continued or replaced.
-        kept = search.out / POSES
+        kept = search.out / FOUND_POSES_FOLDER
         refuse_link(kept)
         is_ours = search.overwrite or os.path.isfile(kept / SUMMARY_FILE)
         # Masks that are not used hide nothing, whatever they are.
@@ -158,14 +158,14 @@ def choose_working_size(opened: Opened, splat: Path, console: Console) -> Opened
     """
     photographs = opened.photographs
     numbers = photographs.posed[:NUM_SIZE_PHOTOGRAPHS]
-    usable = collect_usable_cameras(photographs, numbers, LONG_SIDE)
+    usable = collect_usable_cameras(photographs, numbers, DEFAULT_LONG_SIDE)
     trained = find_training_size(splat, opened.request.folder, photographs, list(usable))
     if trained is None:
         return opened
-    side = LONG_SIDE
+    side = DEFAULT_LONG_SIDE
     sentence = f"{quote_value(splat)} was trained at {trained.long_side} px"
     sentence += f" ({quote_value(trained.source)})"
-    if trained.long_side <= LONG_SIDE:
+    if trained.long_side <= DEFAULT_LONG_SIDE:
         side = trained.long_side
         sentence += ", which is the working size; --resolution changes it."
     else:

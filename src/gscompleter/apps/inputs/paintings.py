@@ -35,7 +35,7 @@ from gscompleter.system.files.reading import hash_file
 from gscompleter.system.files.video import read_video
 from gscompleter.types import Camera
 
-ENDINGS = (".png", ".jpg", ".jpeg", ".webp")
+PAINTING_ENDINGS = (".png", ".jpg", ".jpeg", ".webp")
 """Endings of painted images."""
 VIDEO_ENDINGS = (".mp4", ".mov", ".mkv", ".webm")
 """Endings of repaired videos."""
@@ -55,7 +55,7 @@ def check_paintings(folder: Path, num_targets: int) -> None:
         # Which of them named targets need is known when the cameras are.
         for row in holes.frames if num_targets == 0 else ():
             source = find_painted(folder, row.image_path, row, holes.path)
-            if source.suffix.lower() in ENDINGS:
+            if source.suffix.lower() in PAINTING_ENDINGS:
                 read_colors_and_alpha(source)
     elif num_targets == 0:
         raise InputError(
@@ -97,7 +97,7 @@ def read_paintings(
     stills = read_video_frames(sources, rows, holes.path)
     return [
         replace(
-            name_target(target, row, photographs, resolution),
+            add_exported_photograph(target, row, photographs, resolution),
             painting=read_painting(source, target.camera, row, still),
         )
         for target, row, source, still in zip(targets, rows, sources, stills, strict=True)
@@ -141,7 +141,7 @@ def find_row(camera: Camera, rows: Sequence[HoleRow], cameras: Sequence[Camera])
     return next(same, None)
 
 
-def name_target(
+def add_exported_photograph(
     target: Target, row: HoleRow, photographs: Photographs, resolution: Resolution
 ) -> Target:
     """Add the photograph that a target is, or was derived from, as the export knew it."""
@@ -166,14 +166,14 @@ def find_painted(
 
     What was exported is not painted; what is may lie beside it, with another ending.
     """
-    painted = find_by_stem(folder, name, ENDINGS, None if row is None else row.sha256)
+    painted = find_by_stem(folder, name, PAINTING_ENDINGS, None if row is None else row.sha256)
     if painted is not None:
         return painted
     if path is not None and row is not None and row.path_frame is not None:
         video = find_by_stem(folder, path.video_path, VIDEO_ENDINGS, path.sha256)
         if video is not None:
             return video
-    if row is not None and find_by_stem(folder, name, ENDINGS) is not None:
+    if row is not None and find_by_stem(folder, name, PAINTING_ENDINGS) is not None:
         raise InputError(
             f"{quote_value(folder / name)} is as it was exported; paint what "
             f"{quote_value(row.hole_mask_path)} shows white, or take its entry out of "

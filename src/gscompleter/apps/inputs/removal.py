@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.apps.requests.splat import Selection
-from gscompleter.data.frame import ENDINGS, find_file
+from gscompleter.data.frame import TRIED_ENDINGS, find_file
 from gscompleter.data.mask_checks import check_selected_share, check_selecting_masks
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.masks import load_mask
@@ -218,7 +218,9 @@ def find_masks(folder: Path, names: Sequence[str]) -> dict[int, Path]:
     for number, name in enumerate(map(Path, names)):
         # Of a/b.jpg: a/b.jpg.png, a/b.png, b.jpg.png or b.png, as annotation programs name masks.
         stems = (name, name.with_suffix(""), Path(name.name), Path(name.stem))
-        path = find_file([folder], [f"{stem}{ending}" for stem in stems for ending in ENDINGS])
+        path = find_file(
+            [folder], [f"{stem}{ending}" for stem in stems for ending in TRIED_ENDINGS]
+        )
         if path is not None:
             masks[number] = path
     if not masks:

@@ -25,7 +25,7 @@ from gscompleter.apps.inputs.captures import (
 from gscompleter.apps.inputs.hole_kinds import (
     OBJECT_NOTE,
     HoleKind,
-    SplatKind,
+    SplatAloneKind,
     choose_kind,
     find_target_holes,
     pair_masks,
@@ -60,9 +60,9 @@ from gscompleter.virtual_capture.rendered_photograph import RenderedPhotograph
 from gscompleter.virtual_capture.upward import estimate_axis_up, require_direction
 from gscompleter.virtual_capture.witnesses import choose_witnesses
 
-FORMAT = "renders"
+RENDERS_FORMAT = "renders"
 """Format of photographs that are renders of the splat."""
-MAX_POINTS = 10_000
+MAX_SURFACE_POINTS = 10_000
 """Gaussians that stand for the surfaces of the scene where cameras are compared."""
 MIN_POINT_OPACITY = 0.5
 """Least opacity of such a Gaussian."""
@@ -74,7 +74,7 @@ def open_renders(
     scene: Gaussians,
     renderer: Renderer,
     device: str,
-) -> tuple[Opened, CompletionTask, SplatKind]:
+) -> tuple[Opened, CompletionTask, SplatAloneKind]:
     """Choose cameras, and render the splat there in place of photographs.
 
     Also returns what kind of splat it is.
@@ -112,7 +112,7 @@ def open_renders(
     photographs = replace(
         known,
         frames=tuple(make_frames(capture, scene, renderer, origin)),
-        format=FORMAT,
+        format=RENDERS_FORMAT,
         sparse=partial(sample_surface_points, scene, origin),
     )
     chosen = find_context(photographs, request.context)
@@ -135,11 +135,11 @@ def open_renders(
     else:
         up = capture.upward.direction
     witnesses = choose_witnesses(scene, pixel_center, list(cameras.values()), others, up, renderer)
-    check_images([*cameras.values(), *(target.camera for target in targets)])
+    check_capture_images([*cameras.values(), *(target.camera for target in targets)])
     opened = Opened(
         reading,
         replace(photographs, notes=tuple(notes)),
-        FORMAT,
+        RENDERS_FORMAT,
         len(photographs),
         renders_from=capture.source,
     )
@@ -148,13 +148,13 @@ def open_renders(
         targets,
         compute_frame_from_photographs(origin),
         origin,
-        find_depth_sources(reading),
+        find_capture_depth_sources(reading),
         scene=scene,
         splat_file=replace(splat_file, origin=origin),
         frame_description="the frame of the splat",
         witnesses=witnesses,
     )
-    return opened, task, SplatKind(pixel_center is not None, kind)
+    return opened, task, SplatAloneKind(pixel_center is not None, kind)
 
 
 def choose_capture(
@@ -195,7 +195,7 @@ def choose_capture(
     return capture, kind, find_target_holes(target_cameras, scene, renderer, config)
 
 
-def check_images(cameras: Sequence[Camera]) -> None:
+def check_capture_images(cameras: Sequence[Camera]) -> None:
     """Refuse images that are too small, or too many for the memory."""
     check_sizes(cameras)
     check_memory(max(camera.width * camera.height for camera in cameras), len(cameras))
@@ -257,7 +257,7 @@ def sample_surface_points(
 ) -> Float[np.ndarray, "n 3"]:
     """Sample the means of opaque Gaussians, in the coordinates of the file."""
     means = scene.means[scene.opacities >= MIN_POINT_OPACITY]
-    step = max(1, len(means) // MAX_POINTS)
+    step = max(1, len(means) // MAX_SURFACE_POINTS)
     return means[::step].double().cpu().numpy() + origin
 
 
@@ -276,7 +276,7 @@ def make_frames(
     return frames
 
 
-def find_depth_sources(reading: SceneRequest) -> dict[str, str]:
+def find_capture_depth_sources(reading: SceneRequest) -> dict[str, str]:
     """Find the sources of `near` and `far`: the user, or renders of the splat."""
     planes = {"near": reading.near, "far": reading.far}
     return {name: "splat" if plane is None else "given" for name, plane in planes.items()}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from gscompleter.apps.live.session import Session, Step
+from gscompleter.apps.live.session import Session, SessionStep
 from gscompleter.apps.live.strokes import (
     Began,
     digest_steps,
@@ -24,7 +24,11 @@ class Journal:
     """Keeps `strokes.json` and its masks in the output folder of a session."""
 
     def __init__(
-        self, folder: Path, began: Began, saved: str | None = None, known: tuple[Step, ...] = ()
+        self,
+        folder: Path,
+        began: Began,
+        saved: str | None = None,
+        known: tuple[SessionStep, ...] = (),
     ) -> None:
         """Begin with the steps that the folder has already, and the digest of those saved there."""
         self.folder = folder
@@ -72,7 +76,7 @@ class Journal:
             file.write(content)
 
 
-def count_same(before: tuple[Step, ...], after: tuple[Step, ...]) -> int:
+def count_same(before: tuple[SessionStep, ...], after: tuple[SessionStep, ...]) -> int:
     """Count the steps at the beginning that are the same values in both."""
     pairs = zip(before, after, strict=False)
     different = (index for index, (one, other) in enumerate(pairs) if one is not other)

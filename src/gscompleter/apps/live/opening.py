@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gscompleter.apps.live.session import Step
+from gscompleter.apps.live.session import SessionStep
 from gscompleter.apps.requests.completion import CompletionRequest
 from gscompleter.apps.requests.scene import Size
 
@@ -22,8 +22,8 @@ class SessionRequest:
     """Options that the session began with, as `strokes.json` keeps them."""
     resolution: Size | None = None
     """Working size as it was asked for; None for the default of `complete`."""
-    steps: tuple[Step, ...] = ()
-    undone: tuple[Step, ...] = ()
+    steps: tuple[SessionStep, ...] = ()
+    undone: tuple[SessionStep, ...] = ()
     """Steps that were undone, the next to be done again first."""
     saved: str | None = None
     """Digest of the steps that the completed scene in the output folder has."""

@@ -19,7 +19,7 @@ from gscompleter.apps.live.request import BusyError, PageRequest, parse_request
 from gscompleter.apps.live.session import (
     PERFORM,
     Session,
-    Step,
+    SessionStep,
     apply_step,
     redo_step,
     save_camera,
@@ -130,7 +130,7 @@ class LivePage:
         self.tell(f"{name} …")
         try:
             with notify_of_stages(lambda stage: self.tell(f"{name}: {stage} …")):
-                outcome = run_request(lambda: self._actions[request.action](request))
+                outcome = run_page_request(lambda: self._actions[request.action](request))
         finally:
             self._busy.release()
         self.tell(outcome.text, False, outcome.camera, request.client)
@@ -145,7 +145,7 @@ class LivePage:
             box = tuple((np.array(box) + np.tile(origin, 2)).tolist())
         camera = save_camera(self.session, request.read_camera())
         action: Any = request.action  # one of `PERFORM`
-        step = Step(action, camera, request.read_mask(), box, request.box_rotation)
+        step = SessionStep(action, camera, request.read_mask(), box, request.box_rotation)
         session, text = apply_step(self.session, step)
         return Outcome(self._change_session(session, text))
 
@@ -210,7 +210,7 @@ class LivePage:
         self.difference = json.dumps({"revision": self._revision, **difference}).encode()
 
 
-def run_request(request: Callable[[], Outcome]) -> Outcome:
+def run_page_request(request: Callable[[], Outcome]) -> Outcome:
     """Run a request and return what came of it, or the sentence of its error."""
     try:
         return request()

@@ -16,8 +16,8 @@ from gscompleter.apps.live.saving import (
     prepare_session,
     write_session,
 )
-from gscompleter.apps.live.session import Session, Step, apply_step, undo_step
-from gscompleter.apps.report.results import COMMAND
+from gscompleter.apps.live.session import Session, SessionStep, apply_step, undo_step
+from gscompleter.apps.report.results import COMPLETE_COMMAND
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.output_folder import reserve_output
@@ -30,7 +30,7 @@ def replay_session(request: SessionRequest) -> int:
     console = make_console(stderr=True, quiet=results.answer.quiet)
     with (
         show_progress(console),
-        reserve_output(results.out, results.overwrite, COMMAND, LIVE_RESULTS) as output,
+        reserve_output(results.out, results.overwrite, COMPLETE_COMMAND, LIVE_RESULTS) as output,
     ):
         print_lines(console, *output.describe_others())
         prepared = prepare_session(request, console)
@@ -44,7 +44,7 @@ def replay_session(request: SessionRequest) -> int:
 
 
 def replay_steps(
-    session: Session, steps: Sequence[Step], undone: Sequence[Step], console: Console
+    session: Session, steps: Sequence[SessionStep], undone: Sequence[SessionStep], console: Console
 ) -> Session:
     """Do steps again, and those that were undone, which can then be done again."""
     for number, step in enumerate(track([*steps, *undone], "steps"), start=1):
@@ -56,7 +56,7 @@ def replay_steps(
     return session
 
 
-def replay_step(session: Session, step: Step, number: int, console: Console) -> Session:
+def replay_step(session: Session, step: SessionStep, number: int, console: Console) -> Session:
     """Do one step again; what is wrong with it is told with its number, from 1."""
     try:
         changed, text = apply_step(session, step)

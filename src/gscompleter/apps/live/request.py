@@ -14,7 +14,7 @@ from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.typed_json import parse_typed_json
 from gscompleter.types import Camera
 
-ADVICE = "load the page again"
+PAGE_ADVICE = "load the page again"
 
 
 class BusyError(Exception):
@@ -55,20 +55,20 @@ class PageRequest:
         try:
             return None if self.mask is None else b64decode(self.mask, validate=True)
         except Base64Error as error:
-            raise InputError(f"The mask is no base64 ({error}); {ADVICE}.") from error
+            raise InputError(f"The mask is no base64 ({error}); {PAGE_ADVICE}.") from error
 
     def read_camera(self) -> Camera:
         """Read where the page stands, as a file with this camera would be read."""
         if self.camera is None:
-            raise InputError(f"The request has no camera; {ADVICE}.")
+            raise InputError(f"The request has no camera; {PAGE_ADVICE}.")
         if len(self.camera.frames) != 1:
-            raise InputError(f"The request has {len(self.camera.frames)} cameras; {ADVICE}.")
+            raise InputError(f"The request has {len(self.camera.frames)} cameras; {PAGE_ADVICE}.")
         return replace(parse_camera(self.camera.frames[0], "the camera"), near=None, far=None)
 
 
 def parse_request(body: bytes, actions: tuple[str, ...]) -> PageRequest:
     """Parse and validate a request; `actions` are those that there are."""
-    request = parse_typed_json(PageRequest, body, "The request", ADVICE)
+    request = parse_typed_json(PageRequest, body, "The request", PAGE_ADVICE)
     if request.action not in actions:
-        raise InputError(f"There is no action '{quote_value(request.action)}'; {ADVICE}.")
+        raise InputError(f"There is no action '{quote_value(request.action)}'; {PAGE_ADVICE}.")
     return request

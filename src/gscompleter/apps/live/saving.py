@@ -15,7 +15,7 @@ from gscompleter.apps.inputs.task import Target
 from gscompleter.apps.live.opening import SessionRequest
 from gscompleter.apps.live.session import Session
 from gscompleter.apps.live.strokes import STROKES, Began, write_strokes
-from gscompleter.apps.report.results import COMMAND, RESULTS
+from gscompleter.apps.report.results import COMPLETE_COMMAND, COMPLETION_RESULTS
 from gscompleter.apps.requests.completion import TargetRequest
 from gscompleter.data.scene import write_cameras
 from gscompleter.system.errors import InputError, quote_value
@@ -23,7 +23,7 @@ from gscompleter.system.files.output_folder import check_output, open_output_fol
 from gscompleter.system.files.reading import hash_file
 from gscompleter.system.files.writing import TARGETS_FILE
 
-LIVE_RESULTS = (*RESULTS, *STROKES)
+LIVE_RESULTS = (*COMPLETION_RESULTS, *STROKES)
 """Globs of the files that a session may write."""
 
 
@@ -90,7 +90,7 @@ def save_session(prepared: PreparedSession, session: Session) -> str:
         raise InputError("There is nothing to save; complete or repair something first.")
     out = prepared.request.out
     # Whether it may be replaced was decided when the session began.
-    with open_output_folder(out, overwrite=True, command=COMMAND) as folder:
+    with open_output_folder(out, overwrite=True, command=COMPLETE_COMMAND) as folder:
         summary = write_session(folder, prepared, session)
     return f"Saved in {quote_value(out)}. {summary['outcome']['headline']}"
 

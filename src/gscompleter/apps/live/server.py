@@ -32,12 +32,12 @@ from gscompleter.apps.live.request import BusyError
 from gscompleter.apps.viewer.http import HTML, TEXT, PageHandler, PageServer
 from gscompleter.system.errors import InputError
 
-JSON = "application/json"
+JSON_TYPE = "application/json"
 EVENTS = "text/event-stream"
-BYTES = "application/octet-stream"
+BYTES_TYPE = "application/octet-stream"
 MAX_REQUEST = 16_000_000
 """Most bytes of a request. Its mask is a PNG of few colours: a hundredth of that is usual."""
-MAX_DIGITS = 12
+MAX_LENGTH_DIGITS = 12
 """Most digits of a length; Python refuses to read thousands."""
 CHUNKS = "/chunks/"
 TOKEN_BYTES = 16
@@ -120,7 +120,7 @@ class LiveHandler(PageHandler):
         elif path == "/":
             self.send_content(page.content, HTML)
         elif path == "/difference":
-            self.send_content(page.difference, JSON)
+            self.send_content(page.difference, JSON_TYPE)
         elif path == "/events":
             self._send_events(page.channel)
         else:
@@ -129,7 +129,7 @@ class LiveHandler(PageHandler):
             if chunk is None:
                 self.send_error(404)
             else:
-                self.send_content(chunk, BYTES)
+                self.send_content(chunk, BYTES_TYPE)
 
     def do_POST(self) -> None:
         """Accept a request of the page."""
@@ -144,13 +144,13 @@ class LiveHandler(PageHandler):
         elif path != "/do":
             self.send_error(404)
         # A form of another site cannot have this type.
-        elif self.headers.get_content_type() != JSON:
+        elif self.headers.get_content_type() != JSON_TYPE:
             self.send_error(415, "A request is JSON")
         elif not length:
             self.send_error(411)
         elif not is_length:
             self.send_error(400, "The length is no number")
-        elif len(length) > MAX_DIGITS or int(length) > MAX_REQUEST:
+        elif len(length) > MAX_LENGTH_DIGITS or int(length) > MAX_REQUEST:
             self.send_error(413)
         else:
             body = self.read_body(int(length))
@@ -168,7 +168,7 @@ class LiveHandler(PageHandler):
         except BusyError as error:
             answer["text"] = str(error)
             status = 409
-        self.send_content(json.dumps(answer).encode(), JSON, status)
+        self.send_content(json.dumps(answer).encode(), JSON_TYPE, status)
 
     def _is_from_page(self) -> bool:
         """Refuse requests of other sites, in whose browsers the page may be open, too."""

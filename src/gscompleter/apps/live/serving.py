@@ -28,7 +28,7 @@ from gscompleter.apps.live.saving import (
 from gscompleter.apps.live.server import LiveServer
 from gscompleter.apps.live.session import Session
 from gscompleter.apps.live.strokes import list_steps
-from gscompleter.apps.report.results import COMMAND
+from gscompleter.apps.report.results import COMPLETE_COMMAND
 from gscompleter.apps.viewer import packages
 from gscompleter.apps.viewer.exhibit import ViewerCamera, ViewerContent, shrink_image
 from gscompleter.apps.viewer.packages import Libraries
@@ -51,7 +51,7 @@ def serve_live(request: LiveRequest) -> None:
     libraries = packages.load_libraries()
     asked = request.session
     results = asked.completion.results
-    with reserve_output(results.out, results.overwrite, COMMAND, LIVE_RESULTS) as output:
+    with reserve_output(results.out, results.overwrite, COMPLETE_COMMAND, LIVE_RESULTS) as output:
         console = make_console(stderr=True, quiet=results.answer.quiet)
         print_lines(console, *asked.notes, *output.describe_others())
         with show_progress(console):

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from gscompleter.apps.inputs.hole_kinds import read_marks
 from gscompleter.apps.live.steps import (
-    Numbers,
+    BoxNumbers,
     complete_at,
     fill_marked,
     remove_in_box,
@@ -39,7 +39,7 @@ UNMARKED = "Nothing is marked: choose Brush or Lasso, and paint over what is mea
 
 
 @dataclass(frozen=True)
-class Step:
+class SessionStep:
     """One thing that a person did: where the camera stood, and what was marked."""
 
     action: Action
@@ -47,10 +47,10 @@ class Step:
     """In the frame of the photographs, as it is saved."""
     mask: bytes | None = None
     """PNG of the marks at the camera, white there; None without marks."""
-    box: Numbers | None = None
+    box: BoxNumbers | None = None
     """Smallest x, y and z, then largest, in the coordinates of the splat's file, of a box that is
     removed; None without one."""
-    box_rotation: Numbers = UPRIGHT
+    box_rotation: BoxNumbers = UPRIGHT
     """Rotation of the box about its centre, as a quaternion wxyz."""
 
 
@@ -66,11 +66,11 @@ class Session:
     origin: Float[np.ndarray, "3"]
     """Local origin of the coordinates, in the frame of the photographs."""
     resolution: Resolution = None
-    steps: tuple[Step, ...] = ()
+    steps: tuple[SessionStep, ...] = ()
     """The steps, one for each completion but the first."""
     splat_origin: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     """Origin of the result in the coordinates of the splat's file."""
-    undone: tuple[tuple[Completion, Step], ...] = field(default=(), compare=False)
+    undone: tuple[tuple[Completion, SessionStep], ...] = field(default=(), compare=False)
     """Steps that were undone, the last one to be done again first of all at the end."""
 
     @property
@@ -89,7 +89,7 @@ class Session:
             if after > before
         )
 
-    def extended(self, completion: Completion, step: Step) -> Session:
+    def extended(self, completion: Completion, step: SessionStep) -> Session:
         """Return the session after one more step; what was undone cannot be done again."""
         return replace(
             self,
@@ -104,14 +104,14 @@ def save_camera(session: Session, camera: Camera) -> Camera:
     return transform_camera_exactly(camera, np.linalg.inv(session.transform))
 
 
-def apply_step(session: Session, step: Step) -> tuple[Session, str]:
+def apply_step(session: Session, step: SessionStep) -> tuple[Session, str]:
     """Do one step, and describe it; the same session if nothing was changed.
 
     The camera is first read as from a file, so that the saved one gives the very same result.
     """
     check_step(step)
     start = time.perf_counter()
-    camera = place_camera(session, step.camera)
+    camera = place_saved_camera(session, step.camera)
     completion, text = PERFORM[step.action](session, step, camera)
     seconds = time.perf_counter() - start
     if completion is session.latest:
@@ -119,7 +119,7 @@ def apply_step(session: Session, step: Step) -> tuple[Session, str]:
     return session.extended(completion, step), f"Done in {seconds:.1f} s: {text}"
 
 
-def check_step(step: Step) -> None:
+def check_step(step: SessionStep) -> None:
     """Refuse a box or a mask that the action would ignore."""
     if step.box is not None and step.action != "remove":
         raise InputError(f"Only Remove takes a box, and {step.action} has one; leave it out.")
@@ -127,7 +127,7 @@ def check_step(step: Step) -> None:
         raise InputError("A step with a box, or that completes all holes, takes no mask.")
 
 
-def complete_step(session: Session, step: Step, camera: Camera) -> tuple[Completion, str]:
+def complete_step(session: Session, step: SessionStep, camera: Camera) -> tuple[Completion, str]:
     """Complete all holes that the camera sees."""
     first = session.completions[0].config
     completion = complete_at(session.completer, first, session.latest, camera)
@@ -137,13 +137,13 @@ def complete_step(session: Session, step: Step, camera: Camera) -> tuple[Complet
     return changed, text
 
 
-def fill_step(session: Session, step: Step, camera: Camera) -> tuple[Completion, str]:
+def fill_step(session: Session, step: SessionStep, camera: Camera) -> tuple[Completion, str]:
     """Fill the holes that the marks touch."""
     marked = read_step_marks(step, camera)
     return keep_change(session, fill_marked(session.completer, session.latest, camera, marked))
 
 
-def remove_step(session: Session, step: Step, camera: Camera) -> tuple[Completion, str]:
+def remove_step(session: Session, step: SessionStep, camera: Camera) -> tuple[Completion, str]:
     """Remove what the box contains, or else what is marked."""
     completer = session.completer
     if step.box is None:
@@ -162,7 +162,7 @@ def remove_step(session: Session, step: Step, camera: Camera) -> tuple[Completio
     )
 
 
-def repair_step(session: Session, step: Step, camera: Camera) -> tuple[Completion, str]:
+def repair_step(session: Session, step: SessionStep, camera: Camera) -> tuple[Completion, str]:
     """Remove what is marked, and fill its place."""
     marked = read_step_marks(step, camera)
     changed, count = remove_marked(session.completer, session.latest, camera, marked)
@@ -171,7 +171,7 @@ def repair_step(session: Session, step: Step, camera: Camera) -> tuple[Completio
     return completion, f"{count:,} Gaussians are removed. {text}"
 
 
-PERFORM: dict[Action, Callable[[Session, Step, Camera], tuple[Completion, str]]] = {
+PERFORM: dict[Action, Callable[[Session, SessionStep, Camera], tuple[Completion, str]]] = {
     "complete": complete_step,
     "fill": fill_step,
     "remove": remove_step,
@@ -198,7 +198,7 @@ def describe_outcome(result: TargetResult) -> str:
     return "\n".join((text, *result.notes))
 
 
-def place_camera(session: Session, saved: Camera) -> Camera:
+def place_saved_camera(session: Session, saved: Camera) -> Camera:
     """Move a saved camera to the frame of the result, as `--target` reads it from a file."""
     described = describe_camera(saved)
     read = parse_camera(described, "the camera", session.resolution, session.origin.tolist())
@@ -206,7 +206,7 @@ def place_camera(session: Session, saved: Camera) -> Camera:
     return camera.to(session.latest.views[0].image.device)
 
 
-def read_step_marks(step: Step, camera: Camera) -> Bool[Tensor, "h w"]:
+def read_step_marks(step: SessionStep, camera: Camera) -> Bool[Tensor, "h w"]:
     """Read the marks of a step at the size of its camera."""
     if step.mask is None:
         raise InputError(UNMARKED)

@@ -34,7 +34,7 @@ from gscompleter.types import Camera, merge
 NOTHING_MARKED = "The marks show no Gaussian; paint over what the picture shows."
 EMPTY_BOX = "The box contains nothing; drag it, or make it larger."
 
-Numbers = tuple[float, ...]
+BoxNumbers = tuple[float, ...]
 
 
 def complete_at(
@@ -118,8 +118,8 @@ def remove_marked(
 def remove_in_box(
     completer: GSCompleter,
     state: Completion,
-    corners: Numbers,
-    rotation: Numbers,
+    corners: BoxNumbers,
+    rotation: BoxNumbers,
     origin: Float[np.ndarray, "3"],
 ) -> tuple[Completion, int]:
     """Remove all Gaussians in a box, as `remove` does, and count them.

@@ -22,7 +22,7 @@ import torch
 
 from gscompleter import __version__
 from gscompleter.apps.inputs.removal import check_selection
-from gscompleter.apps.live.session import UPRIGHT, Action, Session, Step
+from gscompleter.apps.live.session import UPRIGHT, Action, Session, SessionStep
 from gscompleter.apps.requests.scene import Size
 from gscompleter.apps.requests.splat import Selection
 from gscompleter.data.scene import describe_camera
@@ -30,18 +30,18 @@ from gscompleter.data.transforms import OPENCV_FROM_OPENGL
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import STROKES_FOLDER
 from gscompleter.system.files.reading import read_bytes
-from gscompleter.system.files.result_format import MARK
+from gscompleter.system.files.result_format import RESULT_MARK
 from gscompleter.system.files.typed_json import read_typed_json
 from gscompleter.system.files.writing import STROKES_FILE
 from gscompleter.types import Camera
 
 STROKES = (STROKES_FILE, f"{STROKES_FOLDER}/stroke*.png")
 """Globs of the files that are written."""
-ADVICE = "save the session again"
+STROKES_ADVICE = "save the session again"
 OF_STROKES = ("resolution", "near", "far", "context")
 """Options that `repair --strokes` reads, too, which are entries of their own."""
 
-Row = tuple[float, float, float, float]
+FourNumbers = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -55,12 +55,12 @@ class StrokeRow:
     fl_y: float
     cx: float
     cy: float
-    transform_matrix: tuple[Row, Row, Row, Row]
+    transform_matrix: tuple[FourNumbers, FourNumbers, FourNumbers, FourNumbers]
     mask_path: str | None = None
     """Image beside the file, white where something is marked; None without marks."""
     box: tuple[float, float, float, float, float, float] | None = None
     """Box of a removal, as `remove --box` takes it; None without one."""
-    box_rotation: Row = UPRIGHT
+    box_rotation: FourNumbers = UPRIGHT
 
     def make_camera(self) -> Camera:
         """Make the camera in float64, as it was written; InputError if there is no such camera."""
@@ -115,12 +115,12 @@ def write_strokes(folder: Path, session: Session, began: Began) -> None:
     (folder / STROKES_FILE).write_bytes(content)
 
 
-def list_steps(session: Session) -> tuple[Step, ...]:
+def list_steps(session: Session) -> tuple[SessionStep, ...]:
     """List the steps of a session, then those that were undone, the next to be done again first."""
     return (*session.steps, *(step for _, step in reversed(session.undone)))
 
 
-def write_masks(folder: Path, steps: Sequence[Step], first: int = 0) -> None:
+def write_masks(folder: Path, steps: Sequence[SessionStep], first: int = 0) -> None:
     """Write the masks of steps, from the step at the index `first` on."""
     for index, step in enumerate(steps):
         if index >= first and step.mask is not None:
@@ -146,7 +146,7 @@ def encode_strokes(
         for index, step in enumerate(steps)
     ]
     content = {
-        **MARK,
+        **RESULT_MARK,
         "version": __version__,
         "resolution": began.resolution,
         "near": began.near,
@@ -162,7 +162,7 @@ def encode_strokes(
     return (json.dumps(content, indent=1) + "\n").encode()
 
 
-def describe_step(step: Step, mask_path: str | None) -> dict[str, Any]:
+def describe_step(step: SessionStep, mask_path: str | None) -> dict[str, Any]:
     """Describe a step as a row of `strokes.json`."""
     return {
         "action": step.action,
@@ -173,7 +173,7 @@ def describe_step(step: Step, mask_path: str | None) -> dict[str, Any]:
     }
 
 
-def digest_steps(steps: Sequence[Step]) -> str:
+def digest_steps(steps: Sequence[SessionStep]) -> str:
     """Return a digest of steps, by which those of a saved scene are known again."""
     digest = sha256()
     for step in steps:
@@ -189,23 +189,23 @@ def find_strokes_file(path: Path) -> Path:
 
 def read_strokes(path: Path) -> StrokesFile:
     """Read and validate a `strokes.json`, without its masks."""
-    strokes = read_typed_json(StrokesFile, path, ADVICE)
+    strokes = read_typed_json(StrokesFile, path, STROKES_ADVICE)
     for row in (*strokes.frames, *strokes.undone):
         # What is read lies beside the file, whatever it says.
         if row.mask_path is not None and not is_beside(row.mask_path):
             raise InputError(
                 f"{quote_value(path)} names the mask '{quote_value(row.mask_path)}', and only "
-                f"files beside it are read; {ADVICE}."
+                f"files beside it are read; {STROKES_ADVICE}."
             )
         if row.box is not None:
             check_selection(Selection(row.box, row.box_rotation))
     return strokes
 
 
-def read_steps(rows: Sequence[StrokeRow], folder: Path) -> tuple[Step, ...]:
+def read_steps(rows: Sequence[StrokeRow], folder: Path) -> tuple[SessionStep, ...]:
     """Make the steps of rows, with cameras in the frame of the file; read masks from `folder`."""
     return tuple(
-        Step(
+        SessionStep(
             row.action,
             row.make_camera(),
             None if row.mask_path is None else read_bytes(folder / row.mask_path),

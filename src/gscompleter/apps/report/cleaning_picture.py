@@ -17,12 +17,12 @@ from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
 from gscompleter.types import Camera, Gaussians, merge
 
-PICTURE_FILE = "removed.png"
+REMOVED_PICTURE_FILE = "removed.png"
 NUM_ROWS = 2
 """Cameras that the picture shows, those that see most of what goes."""
-SIDE = 384
+PICTURE_SIDE = 384
 """Width and height of an image from outside, in pixels."""
-ZOOM = 1.5
+OUTSIDE_ZOOM = 1.5
 """Factor on the focal length of these images: they show 1.3 times the extent of what stays."""
 PREVIEW_SIDE = 64
 """Width and height of the images in which cameras from outside are compared."""
@@ -30,7 +30,7 @@ CUT = 0.25
 """Place of the section through a splat that is seen from outside, before its middle, in radii."""
 GAP = 4
 """Pixels between rows."""
-RED = (1.0, 0.1, 0.1)
+REMOVED_COLOR = (1.0, 0.1, 0.1)
 DIMMING = 0.5
 """Brightness of what stays beside what goes."""
 
@@ -100,10 +100,12 @@ def choose_cameras(seen: Sequence[RemovalSeen]) -> list[Camera]:
 
 
 def enlarge(camera: Camera) -> Camera:
-    """Enlarge the images of a camera from outside to `SIDE`, with less of what is around."""
-    K = camera.K * camera.K.new_tensor([[SIDE / PREVIEW_SIDE], [SIDE / PREVIEW_SIDE], [1.0]])
-    K = K * K.new_tensor([[ZOOM, 1.0, 1.0], [1.0, ZOOM, 1.0], [1.0, 1.0, 1.0]])
-    return replace(camera, K=K, width=SIDE, height=SIDE)
+    """Enlarge the images of an outside camera to `PICTURE_SIDE`, with less of what is around."""
+    K = camera.K * camera.K.new_tensor(
+        [[PICTURE_SIDE / PREVIEW_SIDE], [PICTURE_SIDE / PREVIEW_SIDE], [1.0]]
+    )
+    K = K * K.new_tensor([[OUTSIDE_ZOOM, 1.0, 1.0], [1.0, OUTSIDE_ZOOM, 1.0], [1.0, 1.0, 1.0]])
+    return replace(camera, K=K, width=PICTURE_SIDE, height=PICTURE_SIDE)
 
 
 def draw_removal_rows(
@@ -120,7 +122,7 @@ def draw_removal_rows(
         # The root, so that what is faint is seen.
         weights = frozen.splat(goes).clamp(0, 1).sqrt()[..., None]
         grey = DIMMING * before.mean(dim=2, keepdim=True)
-        marked = grey * (1 - weights) + weights * torch.tensor(RED).to(grey)
+        marked = grey * (1 - weights) + weights * torch.tensor(REMOVED_COLOR).to(grey)
         after = renderer.render(kept, camera).image
         rows.append(join_images([before, marked, after]))
     # Photographs may have several sizes.

@@ -11,7 +11,12 @@ from typing import Any
 
 from gscompleter import __version__
 from gscompleter.apps.inputs.task import InputSplatFile, Target
-from gscompleter.apps.report.pictures import IMAGES, write_images, write_photographs, write_pictures
+from gscompleter.apps.report.pictures import (
+    IMAGES_FOLDER,
+    write_images,
+    write_photographs,
+    write_pictures,
+)
 from gscompleter.apps.report.record import MAX_PHOTOGRAPHS, make_record, thin_evenly
 from gscompleter.apps.report.removal_pictures import draw_removal
 from gscompleter.apps.report.scenes import write_scenes
@@ -28,7 +33,7 @@ from gscompleter.splats.edits import EditDraft
 from gscompleter.splats.provenance import RunRecord
 from gscompleter.state import Completion
 from gscompleter.system.files.image import write_pixels
-from gscompleter.system.files.result_format import MARK
+from gscompleter.system.files.result_format import RESULT_MARK
 from gscompleter.system.files.writing import (
     SUMMARY_FILE,
 )
@@ -74,15 +79,17 @@ def write_report(
     write_scenes(folder, completion, input_splat, run, edit or EditDraft("complete"))
     around = render_around()
     name_view = "ignored" if run_info.get("scene", {}).get("renders_from") is None else "render"
-    write_pictures(folder / IMAGES, completion, targets, at_targets, name_view)
+    write_pictures(folder / IMAGES_FOLDER, completion, targets, at_targets, name_view)
     for number, found in enumerate(gaps, start=1):
-        write_pixels(folder / IMAGES / f"target{number}_gaps.png", draw_gap(found.worst))
-    write_photographs(folder / IMAGES, completion, shown, renderer)
+        write_pixels(folder / IMAGES_FOLDER / f"target{number}_gaps.png", draw_gap(found.worst))
+    write_photographs(folder / IMAGES_FOLDER, completion, shown, renderer)
     removal = draw_removal(completion, renderer, files)
     if removal is not None:
-        write_images(folder / IMAGES, "removal", removal.name_images())
+        write_images(folder / IMAGES_FOLDER, "removal", removal.name_images())
     record = make_record(completion, thin_evenly(photographs, MAX_PHOTOGRAPHS))
-    (folder / RECORD_FILE).write_bytes(json.dumps({**MARK, **asdict(record)}).encode() + b"\n")
+    (folder / RECORD_FILE).write_bytes(
+        json.dumps({**RESULT_MARK, **asdict(record)}).encode() + b"\n"
+    )
     coverage = {"coverage": asdict(compute_coverage(around))} if around else {}
     left = {} if removal is None else {"removal": asdict(removal.row)}
     kept = measure_kept(completion, testing, renderer)

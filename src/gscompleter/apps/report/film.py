@@ -37,10 +37,10 @@ FRAMES_PER_SECOND = 24
 ONE_WAY_SECONDS = 3.0
 MIN_LEG_SECONDS = 0.75
 MAX_TARGETS = 6
-MAX_SIDE = 640
-"""Longer side of one half in pixels, unless `MIN_WIDTH` needs more."""
+MAX_FILM_SIDE = 640
+"""Longer side of one half in pixels, unless `MIN_FILM_WIDTH` needs more."""
 GAP_PIXELS = 4
-MIN_WIDTH = 720
+MIN_FILM_WIDTH = 720
 
 
 def write_comparison_video(
@@ -73,8 +73,8 @@ def choose_stops(completion: Completion) -> list[Camera]:
 
 def fit_to_video(camera: Camera) -> Camera:
     """Resize the image to one half of the video, with an even width and height."""
-    small = shrink_camera(camera, MAX_SIDE)
-    factor = max((MIN_WIDTH - GAP_PIXELS) / 2 / small.width, 1.0)
+    small = shrink_camera(camera, MAX_FILM_SIDE)
+    factor = max((MIN_FILM_WIDTH - GAP_PIXELS) / 2 / small.width, 1.0)
     lens = resize_camera(small, math.ceil(factor * small.width), math.ceil(factor * small.height))
     return replace(lens, width=lens.width // 2 * 2, height=lens.height // 2 * 2)
 
@@ -160,10 +160,10 @@ def follow_path(way: Sequence[Camera], count: int) -> list[Camera]:
     smooth = BSpline(knots, poses, degree)
     shares = np.linspace(0, 1, count + 1)
     eased = shares**2 * (3 - 2 * shares)  # zero speed at both ends
-    return [make_camera(way[0], *pose.T) for pose in smooth(eased)]
+    return [make_path_camera(way[0], *pose.T) for pose in smooth(eased)]
 
 
-def make_camera(
+def make_path_camera(
     lens: Camera,
     right: Float[np.ndarray, "3"],
     forward: Float[np.ndarray, "3"],

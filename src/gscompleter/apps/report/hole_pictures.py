@@ -8,7 +8,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.apps.report.surface_mosaic import draw_mosaic
 from gscompleter.generators.warp import BORDER_WIDTH, complete_warp
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.stages.select_anchor import find_nearest_view
@@ -31,8 +30,6 @@ class HolePictures:
     """z-depth of the scene in its unit, 0 in holes."""
     reference: View
     """The nearest photograph of the context."""
-    mosaic: Float[Tensor, "s s 3"] | None
-    """After a removal, the plane around the hole, head-on; None if there is no plane."""
 
 
 def draw_hole(view: TargetView) -> HolePictures:
@@ -47,5 +44,4 @@ def draw_hole(view: TargetView) -> HolePictures:
         warped=complete_warp(nearest, camera, context).image,
         depth=torch.where(depth.valid, depth.depth, 0.0),
         reference=nearest,
-        mosaic=draw_mosaic(view) if len(view.state.source.removed) else None,
     )

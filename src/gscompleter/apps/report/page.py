@@ -40,7 +40,12 @@ from gscompleter.evaluation.verdict.numbers import (
     format_percent,
 )
 from gscompleter.evaluation.verdict.rows import ScoreRow
-from gscompleter.system.files.image import encode_jpeg, read_image_size, read_pixels
+from gscompleter.system.files.image import (
+    SHOWN_JPEG_QUALITY,
+    encode_jpeg,
+    read_image_size,
+    read_pixels,
+)
 from gscompleter.system.files.output_folder import refuse_foreign_file
 from gscompleter.system.files.writing import encode_text, replace_file
 from gscompleter.system.jobs.jobs import JOBS, Job, read_row
@@ -63,7 +68,6 @@ TABLE_COLUMNS = (
     *("seconds", "cpu_seconds", "result_bytes", "peak_bytes"),
 )
 SETTINGS = ("version", "device", "seed", "depth_range", "settings")
-JPEG_QUALITY = 85
 MAX_PAGE_PIXELS = 12_000_000
 """Largest sum of image pixels in a page (about 5 MB); more are scaled down."""
 
@@ -92,7 +96,7 @@ class Gallery:
             width = max(1, round(self.scale * image.width))
             height = max(1, round(self.scale * image.height))
             image = image.resize((width, height), Image.Resampling.LANCZOS)
-        content = base64.b64encode(encode_jpeg(image, JPEG_QUALITY)).decode()
+        content = base64.b64encode(encode_jpeg(image, SHOWN_JPEG_QUALITY)).decode()
         return Picture(alt, *image.size, f"data:image/jpeg;base64,{content}")
 
     def has(self, name: str) -> bool:

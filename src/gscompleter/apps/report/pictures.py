@@ -21,7 +21,7 @@ from gscompleter.system.files.image import write_image
 from gscompleter.target_result import TargetResult
 from gscompleter.types import View
 
-IMAGES = "images"
+IMAGES_FOLDER = "images"
 """Folder of the pictures of a completion."""
 
 

@@ -14,7 +14,7 @@ from gscompleter.apps.report.schema import (
     TargetRow,
     UnfilledRow,
 )
-from gscompleter.data.depth_beside_colmap import KINDS
+from gscompleter.data.depth_beside_colmap import DEPTH_KINDS
 from gscompleter.evaluation.verdict.kept import KeptRow
 from gscompleter.evaluation.verdict.numbers import format_number, format_percent
 
@@ -93,12 +93,12 @@ def list_facts(summary: CompletionSummary) -> list[tuple[str, str]]:
     if summary.outcome.status != "nothing-gained":
         for number, row in enumerate(summary.targets, start=1):
             own = [text for text in row.notes if text not in row.warnings]
-            own += describe_losses(row.unfilled)
+            own += describe_empty_part(row.unfilled)
             facts += [(f"target {number}", text) for text in own]
     return facts
 
 
-def describe_losses(unfilled: UnfilledRow) -> list[str]:
+def describe_empty_part(unfilled: UnfilledRow) -> list[str]:
     """Describe what stays empty of the hole of a target, and the steps that left it so."""
     if not unfilled.lost_by:
         return []
@@ -237,7 +237,7 @@ def list_photograph_notes(summary: CompletionSummary) -> Iterator[Note]:
 
 def describe_given_depth(share: float, summary: CompletionSummary) -> str:
     """Describe the largest share of a photograph whose depth is known without stereo."""
-    has_maps = any(kind in note for kind in KINDS for note in summary.scene.notes)
+    has_maps = any(kind in note for kind in DEPTH_KINDS for note in summary.scene.notes)
     has_only_points = summary.scene.format in POINT_FORMATS and not has_maps
     is_predicted = len(summary.context) == 1 and summary.settings.get("depth") != "none"
     if has_only_points and not is_predicted:

@@ -53,7 +53,7 @@ def make_record(completion: Completion, photographs: Sequence[Camera]) -> Comple
     frame = fit_frame([*others, *context, *targets])
 
     def draw(cameras: Sequence[Camera]) -> tuple[str, ...]:
-        return tuple(draw_camera(camera, frame) for camera in cameras)
+        return tuple(draw_camera_lines(camera, frame) for camera in cameras)
 
     rows = []
     for result in completion.targets:
@@ -77,7 +77,7 @@ def fit_frame(cameras: Sequence[Camera]) -> DrawingFrame:
     return DrawingFrame(middle, torch.stack([torch.linalg.cross(up, back), up, back]), radius)
 
 
-def draw_camera(camera: Camera, frame: DrawingFrame) -> str:
+def draw_camera_lines(camera: Camera, frame: DrawingFrame) -> str:
     """Write the corners of one line along the edges of a camera pyramid, centre first."""
     # Half the image over the focal length at z = 1, with the longer side always as long.
     size = torch.tensor([camera.width, camera.height]) / camera.K.diagonal()[:2]

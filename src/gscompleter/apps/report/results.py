@@ -34,7 +34,7 @@ from gscompleter.evaluation.metrics.coverage import (
     sample_held_out_cameras,
 )
 from gscompleter.evaluation.verdict.held_out import HeldOut, render_before_after
-from gscompleter.evaluation.verdict.judge import hold_out
+from gscompleter.evaluation.verdict.judge import prepare_held_out
 from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
@@ -56,8 +56,8 @@ from gscompleter.system.progress import show_in_notebook, stage
 from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import Camera, View
 
-COMMAND = "complete"
-RESULTS = (
+COMPLETE_COMMAND = "complete"
+COMPLETION_RESULTS = (
     *(*COMPLETED_FILES, *(f"{name}.generated.json" for name in COMPLETED_FILES[1:])),
     *(CONTEXT_FILE, GENERATED_FILE, REMOVED_FILE, TARGETS_FILE),
     RENDERS_FILE,
@@ -66,7 +66,7 @@ RESULTS = (
     *EDITS,
 )
 """Globs of the files that a completion may write."""
-FORMAT = "python"
+VALUES_FORMAT = "python"
 """Format of a scene whose photographs were given as values."""
 
 
@@ -88,7 +88,7 @@ class Judged:
 
 def prepare_judged(completion: Completion, unused_views: Sequence[View]) -> Judged:
     """Finish a removal, and tell photographs of targets from others; raises as `judge`."""
-    held_out = hold_out(completion, unused_views)
+    held_out = prepare_held_out(completion, unused_views)
     renderer = load_renderer(completion.context.means.device.type)
     # After a removal, photographs must look as before where they do not show what was removed.
     # Without one this returns the completion as it is.
@@ -138,7 +138,7 @@ def save_result(
     out = require_path(out)
     splat_file = None if splat is None else find_splat_file(require_path(splat), completion)
     judged = prepare_judged(completion, unused_views)
-    with stage("report"), open_output_folder(out, overwrite, COMMAND) as folder:
+    with stage("report"), open_output_folder(out, overwrite, COMPLETE_COMMAND) as folder:
         write_result(folder, judged, splat_file)
     return out
 
@@ -169,7 +169,7 @@ def write_result(folder: Path, judged: Judged, splat_file: InputSplatFile | None
         completion,
         judged.targets,
         judged.renderer,
-        describe_values(judged, splat_file),
+        describe_judged(judged, splat_file),
         splat_file,
         judged.cameras,
         partial(render_pairs, completion, aside, judged.renderer),
@@ -182,8 +182,8 @@ def write_result(folder: Path, judged: Judged, splat_file: InputSplatFile | None
     write_completion_page(folder)
 
 
-def describe_values(judged: Judged, splat_file: InputSplatFile | None) -> Mapping[str, Any]:
-    """Describe the input and the settings for `summary.json`, as `describe_run` does."""
+def describe_judged(judged: Judged, splat_file: InputSplatFile | None) -> Mapping[str, Any]:
+    """Describe the input and the settings for `summary.json`, as `describe_run_values` does."""
     completion = judged.completion
     camera = completion.views[0].camera
     origin = np.array(completion.context.origin or (0.0, 0.0, 0.0))
@@ -200,7 +200,7 @@ def describe_values(judged: Judged, splat_file: InputSplatFile | None) -> Mappin
         },
         "device": completion.context.means.device.type,
         "scene": {
-            "format": FORMAT,
+            "format": VALUES_FORMAT,
             "photographs": len(judged.cameras),
             "used": len(completion.views),
             "splat": splat,

@@ -47,14 +47,14 @@ def describe_python_run(completion: Completion, given: Path | None) -> RunRecord
     names = completion.models
     return make_run_record(
         completion,
-        name_model(names.get("reconstructor")),
-        name_model(names.get("depth")),
-        name_model(names.get("generator")),
+        record_model_by_name(names.get("reconstructor")),
+        record_model_by_name(names.get("depth")),
+        record_model_by_name(names.get("generator")),
         given,
     )
 
 
-def name_model(name: str | None) -> ModelRecord | None:
+def record_model_by_name(name: str | None) -> ModelRecord | None:
     """Record a model by its name; None if there is none."""
     if not name:
         return None

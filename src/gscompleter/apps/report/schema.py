@@ -21,7 +21,7 @@ from gscompleter.system.files.typed_json import read_typed_json
 from gscompleter.system.files.writing import COMPLETED_FILES, SUMMARY_FILE
 
 RECORD_FILE = "report.json"
-ADVICE = "complete the scene again"
+SUMMARY_ADVICE = "complete the scene again"
 MAX_FRAME_NUMBER = 1e12
 """Largest number of the transform and the origin, in scene units: its square is finite."""
 
@@ -39,7 +39,7 @@ SCORES = ("psnr_before", "psnr_after", "ssim_before", "ssim_after")
 
 T = TypeVar("T")
 Vector = tuple[float, float, float]
-Row = tuple[float, float, float, float]
+MatrixRow = tuple[float, float, float, float]
 
 
 @dataclass(frozen=True)
@@ -146,7 +146,7 @@ class ResultFrame:
     """Transform from the photographs to the .ply."""
 
     method: str
-    transform: tuple[Row, Row, Row, Row]
+    transform: tuple[MatrixRow, MatrixRow, MatrixRow, MatrixRow]
     origin: Vector
 
 
@@ -161,7 +161,7 @@ class PosesRow:
 
 
 @dataclass(frozen=True)
-class SceneRow:
+class OpenedSceneRow:
     """The opened scene."""
 
     format: str
@@ -193,7 +193,7 @@ class CompletionSummary:
     settings: Mapping[str, Any]
     seed: int
     device: str
-    scene: SceneRow
+    scene: OpenedSceneRow
     outcome: OutcomeRow
     frame: ResultFrame
     depth_range: Mapping[str, Any]
@@ -270,7 +270,8 @@ def read_summary(folder: Path) -> CompletionSummary:
     # A determinant of 0 has no inverse, and a negative one is a mirror.
     if not is_bounded or not np.linalg.det(transform[:3, :3]) > 0:
         raise InputError(
-            f"{quote_value(path)} is damaged (frame: no similarity of photographs); {ADVICE}."
+            f"{quote_value(path)} is damaged (frame: no similarity of photographs); "
+            f"{SUMMARY_ADVICE}."
         )
     return summary
 
@@ -282,7 +283,9 @@ def read_record(folder: Path, summary: CompletionSummary) -> CompletionRecord:
     # Each part of the page belongs to a row of the summary.
     sizes = len(record.pairs), len(record.targets), len(record.context)
     if sizes != (len(summary.targets), len(summary.targets), len(summary.context)):
-        raise InputError(f"{quote_value(path)} does not fit {SUMMARY_FILE} beside it; {ADVICE}.")
+        raise InputError(
+            f"{quote_value(path)} does not fit {SUMMARY_FILE} beside it; {SUMMARY_ADVICE}."
+        )
     return record
 
 
@@ -296,4 +299,4 @@ def read_result(kind: type[T], path: Path, early: Mapping[str, Any] = MappingPro
             f"{quote_value(path.parent)} has no {path.name}; name the output folder of a "
             "completion."
         )
-    return read_typed_json(kind, path, ADVICE, early)
+    return read_typed_json(kind, path, SUMMARY_ADVICE, early)

@@ -41,7 +41,7 @@ from gscompleter.types import View, merge
 MIN_POSED = 3
 """Fewest photographs whose poses are compared."""
 
-Scores = dict[str, Any]
+ScoreValues = dict[str, Any]
 """PSNR and SSIM before and after by name, or None without a photograph."""
 
 
@@ -101,9 +101,9 @@ def make_score_rows(
     return {"outcome": asdict(outcome), **scores}
 
 
-def compute_scores(pair: RenderPair, photograph: View | None) -> Scores:
+def compute_scores(pair: RenderPair, photograph: View | None) -> ScoreValues:
     """Compute PSNR (dB) and SSIM over the valid pixels, or None without a photograph."""
-    scores: Scores = dict.fromkeys(SCORES)
+    scores: ScoreValues = dict.fromkeys(SCORES)
     if photograph is not None:
         truth = photograph.image
         valid = photograph.valid_mask
@@ -113,10 +113,12 @@ def compute_scores(pair: RenderPair, photograph: View | None) -> Scores:
     return scores
 
 
-def score_views(completion: Completion, views: Sequence[View], renderer: Renderer) -> list[Scores]:
+def score_views(
+    completion: Completion, views: Sequence[View], renderer: Renderer
+) -> list[ScoreValues]:
     """Score the scene before and after at photographs, except where they show what was removed."""
 
-    def score(view: View) -> Scores:
+    def score(view: View) -> ScoreValues:
         shown = hide_removed(view, completion.source, renderer)
         return compute_scores(render_before_after(completion, view.camera, renderer), shown)
 
@@ -191,7 +193,11 @@ def measure_gaps(completion: Completion, renderer: Renderer) -> list[TargetGaps]
 
 
 def make_target_row(
-    completion: Completion, target: Target, result: TargetResult, scores: Scores, gaps: TargetGaps
+    completion: Completion,
+    target: Target,
+    result: TargetResult,
+    scores: ScoreValues,
+    gaps: TargetGaps,
 ) -> TargetRow:
     """Make the row of a target."""
     fit = result.affine

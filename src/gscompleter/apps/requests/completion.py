@@ -17,7 +17,7 @@ from gscompleter.apps.requests.splat import Selection, SplatRequest
 from gscompleter.config import CompleterConfig
 from gscompleter.data.mask_reading import MaskReading
 
-NUM_TARGETS = 4
+DEFAULT_NUM_TARGETS = 4
 """Most targets that are searched for, unless a number is given."""
 
 
@@ -38,7 +38,7 @@ class TargetRequest:
 
     named: tuple[str, ...] = ()
     """Files of cameras, and numbers and names of photographs, in order."""
-    max_found: int = NUM_TARGETS
+    max_found: int = DEFAULT_NUM_TARGETS
     """Most cameras to search for if none is named."""
     images: Path | None = None
     """Folder of images that were painted for them, in place of a generator."""

@@ -8,7 +8,7 @@ from typing import Literal
 
 from gscompleter.data.mask_reading import MaskReading
 
-LONG_SIDE = 640
+DEFAULT_LONG_SIDE = 640
 """Default length of a photograph's longer side, in pixels."""
 NUM_VIDEO_FRAMES = 40
 """Default number of frames that are taken of a video as photographs, at most."""
@@ -27,7 +27,7 @@ class SceneRequest:
     """Folder of the photographs, or a video."""
     format: str | None = None
     """Format of the folder; None to detect it."""
-    resolution: tuple[int, int] | int | None = LONG_SIDE
+    resolution: tuple[int, int] | int | None = DEFAULT_LONG_SIDE
     """Height and width, or the longest side; None for the photographs' own size."""
     follows_training: bool = False
     """True to work at the size at which the splat was trained if that is smaller."""
@@ -92,5 +92,5 @@ class AloneRequest:
 
 def parse_resolution(given: Size | None) -> tuple[int, int] | int | None:
     """Return a size as the readers of photographs take it; the default one if none is given."""
-    size = LONG_SIDE if given is None else given
+    size = DEFAULT_LONG_SIDE if given is None else given
     return None if size == "full" else size

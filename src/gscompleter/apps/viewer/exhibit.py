@@ -26,7 +26,7 @@ from gscompleter.splats.alignment.similarity import transform_camera
 from gscompleter.splats.formats import load_splat
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import encode_jpeg, read_pixels, turn_upright
-from gscompleter.system.files.output_folder import POSES
+from gscompleter.system.files.output_folder import FOUND_POSES_FOLDER
 from gscompleter.system.files.writing import (
     CONTEXT_FILE,
     RENDERS_FILE,
@@ -148,7 +148,7 @@ def load_known_cameras(
         )
     source = Path(str(summary.settings.get("folder")))
     if summary.scene.format == "photographs":
-        source = folder / POSES
+        source = folder / FOUND_POSES_FOLDER
     try:
         photographs = load_context_cameras(source, summary, content)
     except InputError:

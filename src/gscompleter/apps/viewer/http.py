@@ -26,8 +26,8 @@ HEADERS = {
 REQUEST_SECONDS = 20.0
 """Time in which a request has to arrive as a whole."""
 ANSWER_SECONDS = 60.0
-"""Time in which each `PIECE` of an answer has to be taken."""
-PIECE = 2**20
+"""Time in which each `ANSWER_PIECE` of an answer has to be taken."""
+ANSWER_PIECE = 2**20
 """Bytes of an answer that are sent at once."""
 MAX_CLIENTS = 64
 """Most connections that are served at once; every page that is open keeps one."""
@@ -70,8 +70,8 @@ class PageHandler(BaseHTTPRequestHandler):
         self.send_header("Content-Length", str(len(content)))
         self.end_headers()
         # The time limit of the connection is that of one write.
-        for start in range(0, len(content), PIECE):
-            self.wfile.write(content[start : start + PIECE])
+        for start in range(0, len(content), ANSWER_PIECE):
+            self.wfile.write(content[start : start + ANSWER_PIECE])
 
     def end_headers(self) -> None:
         """End the headers of any answer, errors included, with those of all."""

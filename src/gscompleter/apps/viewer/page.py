@@ -25,21 +25,21 @@ from torch.nn.functional import normalize
 from gscompleter.apps.viewer.exhibit import ViewerCamera, ViewerContent
 from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.numerics.geometry import embed_cameras, is_inside, look_along, project
-from gscompleter.splats.spz import BLOCK, encode_spz_blocks
+from gscompleter.splats.spz import ENCODED_BLOCK, encode_spz_blocks
 from gscompleter.splats.upward import USUAL, Direction
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import encode_text
 from gscompleter.types import Camera, Gaussians
 
 ASSETS = Path(__file__).with_name("assets")
-PROGRAM = (
+PAGE_PARTS = (
     *("state", "libraries", "pictures", "camera", "path", "marks", "saving", "box", "connection"),
     *("controls", "texts", "start"),
 )
 """Files of the page's program in their order: each uses only names of those before it at once."""
 PAGE_EXTENT = 4.0
 """Median distance of Gaussians from the centre, within a factor of 2, in page units."""
-MAX_DISTANCE = 4096.0
+MAX_PAGE_DISTANCE = 4096.0
 """Largest distance of a Gaussian from the centre, in page units; leaves ten fractional bits."""
 PART = 48_000_000
 """Bytes of Gaussians per script element, below the longest string of any browser."""
@@ -93,9 +93,9 @@ def is_within_page(gaussians: Gaussians, frame: PageFrame) -> Bool[Tensor, "n"]:
     # .spz has fixed-point positions: what lies beyond their range cannot be written. In float64
     # positions take much memory, and so are moved some at a time.
     is_within = torch.empty_like(gaussians.opacities, dtype=torch.bool)
-    for start in range(0, len(gaussians), BLOCK):
-        block = slice(start, start + BLOCK)
-        is_within[block] = frame.normalize(gaussians[block]).means.norm(dim=1) <= MAX_DISTANCE
+    for start in range(0, len(gaussians), ENCODED_BLOCK):
+        block = slice(start, start + ENCODED_BLOCK)
+        is_within[block] = frame.normalize(gaussians[block]).means.norm(dim=1) <= MAX_PAGE_DISTANCE
     return is_within
 
 
@@ -150,10 +150,10 @@ def make_page_parts(
         "counts": {name: len(part) for name, part in shown.items()},
         "layers": layer_sources,
         "antialiased": {name: scene.is_antialiased for name, scene in scenes.items()},
-        "path": plan_path([camera.camera for camera in cameras]),
+        "path": plan_tour([camera.camera for camera in cameras]),
         "live": is_live,
         "up": None if up is None else turn_to_page(up),
-        "shots": [describe_camera(camera, frame, landmarks) for camera in cameras],
+        "shots": [describe_page_camera(camera, frame, landmarks) for camera in cameras],
         **vars(libraries),
     }
     omitted = sum(len(layers[name]) - len(shown[name]) for name in ("observed", "generated"))
@@ -177,7 +177,7 @@ def encode_layer(name: str, scene: Gaussians, rows: Int64[Tensor, "m"], frame: P
     """Encode rows of a scene as a .spz in the frame of the page, some at a time."""
 
     def make_blocks() -> Iterator[Gaussians]:
-        for block in rows.split(BLOCK):
+        for block in rows.split(ENCODED_BLOCK):
             yield frame.normalize(scene[block.to(scene.means.device)]).to("cpu")
 
     return encode_spz_blocks(Path(name), make_blocks)
@@ -220,7 +220,7 @@ def turn_to_page(direction: Direction) -> list[float]:
     return [x, -y, -z]
 
 
-def describe_camera(
+def describe_page_camera(
     view_camera: ViewerCamera, frame: PageFrame, landmarks: Float[Tensor, "n 3"]
 ) -> dict[str, Any]:
     """Describe a camera as the page reads it, focused on landmarks in page unit and scene axes."""
@@ -243,7 +243,7 @@ def describe_camera(
     }
 
 
-def plan_path(cameras: Sequence[Camera]) -> list[tuple[int, float]]:
+def plan_tour(cameras: Sequence[Camera]) -> list[tuple[int, float]]:
     """Plan a path from the first camera, each time to the nearest one left: indices and seconds."""
     where = embed_cameras([camera.to("cpu") for camera in cameras]).double()
     apart = torch.cdist(where, where)
@@ -278,7 +278,7 @@ def fill_template(content: Mapping[str, Any], scripts: str) -> str:
 
 def read_program() -> str:
     """Read the page's program: its files, one after the other, share their names."""
-    return "".join(read_asset(f"{name}.js") for name in PROGRAM)
+    return "".join(read_asset(f"{name}.js") for name in PAGE_PARTS)
 
 
 def read_asset(name: str) -> str:

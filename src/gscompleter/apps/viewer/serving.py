@@ -33,8 +33,8 @@ from gscompleter.system.files.output_file import reserve_file
 from gscompleter.system.files.writing import SUMMARY_FILE, replace_file
 from gscompleter.virtual_capture.upward import find_upward, require_direction
 
-ADDRESS = "127.0.0.1"
-HOST_NAMES = (ADDRESS, "localhost")
+LOCAL_ADDRESS = "127.0.0.1"
+HOST_NAMES = (LOCAL_ADDRESS, "localhost")
 """Accepted host names; any other one may be a DNS rebinding attack by a website."""
 
 
@@ -52,7 +52,7 @@ def show_scenes(request: ViewRequest) -> None:
 
     parts, notes = load_page(request)
     with make_page_server(b"".join(parts), request.port) as server, suppress(KeyboardInterrupt):
-        address = f"http://{ADDRESS}:{server.server_address[1]}/"
+        address = f"http://{LOCAL_ADDRESS}:{server.server_address[1]}/"
         # Printed once the server listens.
         if request.answer.json:
             print_json({"url": address, "notes": list(notes)})
@@ -125,9 +125,10 @@ def make_page_server(page: bytes, port: int = 0) -> ThreadingHTTPServer:
                 self.send_content(page, HTML)
 
     try:
-        return PageServer((ADDRESS, port), Handler)
+        return PageServer((LOCAL_ADDRESS, port), Handler)
     except OSError as error:
         raise InputError(
-            f"Port {port} of {ADDRESS} is not available ({error.strerror}); name another one.",
+            f"Port {port} of {LOCAL_ADDRESS} is not available ({error.strerror}); "
+            "name another one.",
             "port",
         ) from error

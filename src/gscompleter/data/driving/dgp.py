@@ -26,7 +26,7 @@ from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_head, read_json
 
-ADVICE = "download the scene again"
+DGP_ADVICE = "download the scene again"
 MAX_SNIFFED = 1 << 26
 """Bytes read from a file to detect a scene."""
 
@@ -38,19 +38,19 @@ def open_dgp(path: Path) -> Iterator[Photographs]:
     first camera by name, in DDAD CAMERA_01, is the front camera.
     """
     file = list_scene_files(path)[0]
-    content = read_json(file, ADVICE)
+    content = read_json(file, DGP_ADVICE)
     cameras = _read_calibrations(file, content)
     sweeps = _map_sweeps(content)
     # A datum is a reading of one sensor: an image, or a point cloud.
     images = [d for d in get_part(content, "data", list) if "image" in get_part(d, "datum", dict)]
-    frames = [_parse_frame(datum, cameras, sweeps, file) for datum in images]
+    frames = [_parse_datum(datum, cameras, sweeps, file) for datum in images]
     frames.sort(key=lambda frame: frame.name)
     require(frames, f"{quote_value(file)} lists no images; name a scene with cameras.")
     front = min(frame.sensor or "" for frame in frames)
     yield build_photographs(file.resolve().parent.name, str(file), frames, front=front)
 
 
-def _parse_frame(
+def _parse_datum(
     datum: Any, cameras: Mapping[str, Intrinsics], sweeps: Mapping[str, Any], file: Path
 ) -> Frame:
     image = datum["datum"]["image"]
@@ -58,11 +58,11 @@ def _parse_frame(
     camera = "" if sensor is None else str(sensor)
     name = get_text(image, "filename", str(file)) or ""
     title = f"image {quote_value(name)} of {quote_value(file)}"
-    require(name, f"The {title} has no `filename`; {ADVICE}.")
-    require(camera, f"The {title} does not say which camera took it (`id.name`); {ADVICE}.")
+    require(name, f"The {title} has no `filename`; {DGP_ADVICE}.")
+    require(camera, f"The {title} does not say which camera took it (`id.name`); {DGP_ADVICE}.")
     require(
         camera in cameras,
-        f"The camera {quote_value(camera)} of {title} is not in the calibration; {ADVICE}.",
+        f"The camera {quote_value(camera)} of {title} is not in the calibration; {DGP_ADVICE}.",
     )
     intrinsics = replace(cameras[camera], size=get_size(image, title))
 
@@ -71,7 +71,7 @@ def _parse_frame(
     read_points = None
     points = get_text(sweep, "filename", str(file))
     if points is not None and os.path.isfile(file.parent / points):
-        read_points = partial(_read_points, file.parent / points, _get_pose(sweep, str(file)))
+        read_points = partial(_read_sweep_points, file.parent / points, _get_pose(sweep, str(file)))
     c2w = _get_pose(image, title)
     place = file.parent / name
     return Frame(name, title, c2w, intrinsics, place, sensor=camera, laser_points=read_points)
@@ -96,7 +96,7 @@ def _map_sweeps(content: Any) -> dict[str, Any]:
     return sweeps
 
 
-def _read_points(
+def _read_sweep_points(
     path: Path, world_from_laser: Float[np.ndarray, "4 4"]
 ) -> Float[np.ndarray, "n 3"]:
     """Read the points of a sweep in the world frame: the first three columns of `data`."""
@@ -104,7 +104,7 @@ def _read_points(
         points = np.load(path)["data"][:, :3].astype(np.float64, casting="same_kind")
         return transform_points(points, world_from_laser)
     except Exception as error:  # damaged archives and arrays raise anything
-        raise InputError(f"{quote_value(path)} is no point cloud of DGP; {ADVICE}.") from error
+        raise InputError(f"{quote_value(path)} is no point cloud of DGP; {DGP_ADVICE}.") from error
 
 
 def _read_calibrations(scene: Path, content: Any) -> dict[str, Intrinsics]:
@@ -118,13 +118,13 @@ def _read_calibrations(scene: Path, content: Any) -> dict[str, Intrinsics]:
     if file is None and key is None:
         raise InputError(
             f"{quote_value(scene)} does not name its calibration (`calibration_key` of its first "
-            f"sample); {ADVICE}."
+            f"sample); {DGP_ADVICE}."
         )
     if file is None:
         raise InputError(
             f"The calibration of {quote_value(scene)} is missing; put it at {quote_value(keyed)}."
         )
-    calibration = read_json(file, ADVICE)
+    calibration = read_json(file, DGP_ADVICE)
     names = get_part(calibration, "names", list)
     entries = get_part(calibration, "intrinsics", list)
     # Entries of other sensors are zeros.

@@ -26,9 +26,16 @@ from gscompleter.data.photographs import Photographs, build_drive, build_photogr
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.reading import MAX_LINE, read_head, read_lines
 
-POSES = "poses.txt"
+KITTI_POSES_FILE = "poses.txt"
 CALIBRATION = "calib.txt"
-CAMERAS = {"image_2": 2, "image_0": 0, "image_3": 3, "image_1": 1, "image_l": 0, "image_r": 1}
+CAMERA_NUMBERS = {
+    "image_2": 2,
+    "image_0": 0,
+    "image_3": 3,
+    "image_1": 1,
+    "image_l": 0,
+    "image_r": 1,
+}
 """Folders of photographs of a sequence in search order, and their camera numbers."""
 RAW_CAMERAS = ("02", "03", "00", "01")
 """Cameras of a drive in order of preference: colour left, colour right, then grey."""
@@ -36,8 +43,8 @@ EARTH_RADIUS = 6_378_137.0  # metres
 MAX_LATITUDE = 89.0
 """Largest latitude in degrees; Mercator's map has no poles."""
 
-Numbers = Float[np.ndarray, "_"]
-Pose = Float[np.ndarray, "4 4"]
+LineNumbers = Float[np.ndarray, "_"]
+HomogeneousMatrix = Float[np.ndarray, "4 4"]
 
 
 def has_kitti(path: Path) -> bool:
@@ -66,8 +73,8 @@ def open_kitti(path: Path) -> Iterator[Photographs]:
 
     # calib.txt labels the projections P0 to P3; some copies omit the labels, one camera a line.
     entries = _read_entries(calibration)
-    images = next((name for name in CAMERAS if os.path.isdir(folder / name)), "image_2")
-    camera = CAMERAS[images]
+    images = next((name for name in CAMERA_NUMBERS if os.path.isdir(folder / name)), "image_2")
+    camera = CAMERA_NUMBERS[images]
     label = f"P{camera}" if f"P{camera}" in entries else str(camera)
     projection = _get_matrix(entries, label, calibration)
     intrinsics, first_from_camera = _split_projection(projection, calibration)
@@ -118,11 +125,15 @@ def open_kitti_raw(path: Path) -> Iterator[Photographs]:
     yield build_drive(path.resolve().name, str(path), frames)
 
 
-def _find_sweep(path: Path, world_from_laser: Pose) -> partial[Float[np.ndarray, "n 3"]] | None:
+def _find_sweep(
+    path: Path, world_from_laser: HomogeneousMatrix
+) -> partial[Float[np.ndarray, "n 3"]] | None:
     return partial(read_sweep, path, world_from_laser) if os.path.isfile(path) else None
 
 
-def _read_raw_camera(date: Path, camera: str) -> tuple[Intrinsics, Pose, Pose]:
+def _read_raw_camera(
+    date: Path, camera: str
+) -> tuple[Intrinsics, HomogeneousMatrix, HomogeneousMatrix]:
     """Read the intrinsics of a camera, and the transforms from it and the laser to camera 0."""
     path = date / "calib_cam_to_cam.txt"
     entries = _read_entries(path)
@@ -134,7 +145,9 @@ def _read_raw_camera(date: Path, camera: str) -> tuple[Intrinsics, Pose, Pose]:
     return *_split_projection(projection, path), first_from_laser
 
 
-def _split_projection(projection: Pose, path: Path) -> tuple[Intrinsics, Pose]:
+def _split_projection(
+    projection: HomogeneousMatrix, path: Path
+) -> tuple[Intrinsics, HomogeneousMatrix]:
     """Split the projection of a rectified camera into intrinsics and the transform to camera 0."""
     K = projection[:3, :3]
     # Rectified cameras are all turned alike, so the left part is K alone.
@@ -150,7 +163,7 @@ def _split_projection(projection: Pose, path: Path) -> tuple[Intrinsics, Pose]:
     return Intrinsics(None, (fx, fy), (cx, cy)), transform
 
 
-def _compute_imu_pose(reading: Numbers, scale: float) -> Pose:
+def _compute_imu_pose(reading: LineNumbers, scale: float) -> HomogeneousMatrix:
     """Compute the pose of the inertial sensor in map axes (east, north, up), in metres."""
     latitude, longitude, altitude, roll, pitch, yaw = reading.tolist()
     # Mercator's projection, as in KITTI's development kit (`convertOxtsToPose`).
@@ -159,7 +172,7 @@ def _compute_imu_pose(reading: Numbers, scale: float) -> Pose:
     return build_poses(np.array([roll, pitch, yaw, east, north, altitude]))
 
 
-def _read_oxts(path: Path) -> Numbers:
+def _read_oxts(path: Path) -> LineNumbers:
     """Read latitude, longitude (degrees), altitude (metres), roll, pitch and yaw (radians)."""
     numbers = _read_entries(path).get("0", np.zeros(0))[:6]
     fits = len(numbers) == 6 and abs(numbers[0]) <= MAX_LATITUDE
@@ -167,7 +180,7 @@ def _read_oxts(path: Path) -> Numbers:
     return numbers
 
 
-def _read_rigid(path: Path) -> Pose:
+def _read_rigid(path: Path) -> HomogeneousMatrix:
     """Read a rigid transform from the lines R and T."""
     entries = _read_entries(path)
     rotation = _get_entry(entries, "R", 9, path).reshape(3, 3)
@@ -175,7 +188,7 @@ def _read_rigid(path: Path) -> Pose:
     return _complete(np.column_stack([rotation, translation]))
 
 
-def _read_entries(path: Path) -> dict[str, Numbers]:
+def _read_entries(path: Path) -> dict[str, LineNumbers]:
     """Read the numbers of each line by its label, or by the number of the line without one."""
     entries = {}
     for number, line in enumerate(line for line in read_lines(path) if line.strip()):
@@ -187,7 +200,9 @@ def _read_entries(path: Path) -> dict[str, Numbers]:
     return entries
 
 
-def _get_entry(entries: Mapping[str, Numbers], label: str, count: int, path: Path) -> Numbers:
+def _get_entry(
+    entries: Mapping[str, LineNumbers], label: str, count: int, path: Path
+) -> LineNumbers:
     numbers = entries.get(label, np.zeros(0))
     require(
         len(numbers) == count,
@@ -196,16 +211,16 @@ def _get_entry(entries: Mapping[str, Numbers], label: str, count: int, path: Pat
     return numbers
 
 
-def _get_matrix(entries: Mapping[str, Numbers], label: str, path: Path) -> Pose:
+def _get_matrix(entries: Mapping[str, LineNumbers], label: str, path: Path) -> HomogeneousMatrix:
     return _complete(_get_entry(entries, label, 12, path))
 
 
-def _complete(numbers: Numbers | Float[np.ndarray, "3 4"]) -> Pose:
+def _complete(numbers: LineNumbers | Float[np.ndarray, "3 4"]) -> HomogeneousMatrix:
     """Complete the upper 3×4 of a matrix."""
     return np.vstack([numbers.reshape(3, 4), [0, 0, 0, 1]])
 
 
-def _parse_numbers(text: str) -> Numbers:
+def _parse_numbers(text: str) -> LineNumbers:
     """Parse the numbers of a line; none if a word is no number."""
     try:
         numbers = np.array([float(word) for word in text.split()])
@@ -219,7 +234,10 @@ def _list_poses(path: Path) -> list[Path]:
     if not os.path.isdir(path):
         return [path]
     sequence = path.resolve()
-    candidates = (path / POSES, sequence.parent.parent / "poses" / f"{sequence.name}.txt")
+    candidates = (
+        path / KITTI_POSES_FILE,
+        sequence.parent.parent / "poses" / f"{sequence.name}.txt",
+    )
     return [file for file in candidates if os.path.isfile(file)]
 
 

@@ -30,15 +30,15 @@ from gscompleter.system.damage import DamagedError, describe_damage
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import check_plain, read_bytes
 
-ADVICE = "write the infos again with mmdetection3d 1.1"
-FRONT = "CAM_FRONT"
+INFOS_ADVICE = "write the infos again with mmdetection3d 1.1"
+FRONT_CAMERA_KEY = "CAM_FRONT"
 NEEDED = ("img_path", "cam2img", "lidar2cam")
 """Entries of an image that has a file and a pose."""
 MAX_GAP = 1.5
 """Largest gap between samples of a scene, in seconds; nuScenes has 0.5."""
 MICROSECONDS = 1e12
 """Smallest time that is in microseconds."""
-MAX_BYTES = 1 << 30
+MAX_PICKLE_BYTES = 1 << 30
 """Largest pickle in bytes."""
 MAX_REPEATS = 4
 """Most values per byte of a pickle, as a bound on self-repetition."""
@@ -66,7 +66,7 @@ def open_infos(path: Path) -> Iterator[Photographs]:
     beside the pickle and below it.
     """
     content = get_part(load_plain(path), "data_list", list)
-    require(content, f"{quote_value(path)} holds no infos with a `data_list`; {ADVICE}.")
+    require(content, f"{quote_value(path)} holds no infos with a `data_list`; {INFOS_ADVICE}.")
     shots = [shot for sample in content for shot in _parse_sample(sample, path)]
     shots.sort(key=lambda shot: shot[:2])
     return (_build_scene(path, scene) for scene in _split_scenes(shots))
@@ -79,7 +79,7 @@ def _parse_sample(sample: Any, path: Path) -> list[Shot]:
         for name, image in get_part(sample, "images", dict).items()
         if isinstance(image, dict) and all(image.get(key) is not None for key in NEEDED)
     }
-    require(images, f"The images of {title} have no file or no pose; {ADVICE}.")
+    require(images, f"The images of {title} have no file or no pose; {INFOS_ADVICE}.")
     # Infos of nuScenes are in seconds, those of Waymo in microseconds.
     time = get_number(sample, "timestamp", title, 0.0, 1e6 * MICROSECONDS)
     time = time * 1e-6 if time >= MICROSECONDS else time
@@ -90,13 +90,15 @@ def _parse_sample(sample: Any, path: Path) -> list[Shot]:
     world_from_laser = world_from_vehicle @ get_array(lidar, "lidar2ego", title, (4, 4))
     things = get_part(sample, "instances", list)
     things = [t for t in things if isinstance(t, dict) and "velocity" in t]  # none in Waymo's infos
-    boxes = partial(_read_boxes, things, world_from_laser, path) if things else None
+    boxes = partial(_read_infos_boxes, things, world_from_laser, path) if things else None
 
     # nuScenes begins its file names with the drive, "n015-2018-07-24-11-22-45+0800__CAM_FRONT__…".
-    first = images.get(FRONT, next(iter(images.values())))
+    first = images.get(FRONT_CAMERA_KEY, next(iter(images.values())))
     file = os.path.basename(get_text(first, "img_path", title) or "")
     drive = get_text(sample, "context_name", title) or file.split("__")[0]
-    frames = (_make_frame(path, n, time, image, world_from_laser) for n, image in images.items())
+    frames = (
+        _make_infos_frame(path, n, time, image, world_from_laser) for n, image in images.items()
+    )
     return [(drive, time, replace(frame, boxes=boxes)) for frame in frames]
 
 
@@ -114,11 +116,13 @@ def _split_scenes(shots: list[Shot]) -> Iterator[list[Shot]]:
 def _build_scene(path: Path, shots: list[Shot]) -> Photographs:
     (drive, time, _), *_ = shots
     frames = [frame for _, _, frame in shots]
-    frames.sort(key=lambda frame: (frame.sensor != FRONT, frame.sensor))
+    frames.sort(key=lambda frame: (frame.sensor != FRONT_CAMERA_KEY, frame.sensor))
     return build_drive(f"{drive}_{time:.3f}", str(path), frames, front=frames[0].sensor)
 
 
-def _make_frame(path: Path, camera: str, time: float, image: Any, world_from_laser: Pose) -> Frame:
+def _make_infos_frame(
+    path: Path, camera: str, time: float, image: Any, world_from_laser: Pose
+) -> Frame:
     title = f"the photograph of {camera} at {time:.3f} in {quote_value(path)}"
     file = get_text(image, "img_path", title) or ""
     camera_from_laser = get_array(image, "lidar2cam", title, (4, 4))
@@ -144,7 +148,7 @@ def _find_image(folder: Path, file: str, camera: str) -> Path:
     return next((place for place in places if os.path.isfile(place)), places[0])
 
 
-def _read_boxes(
+def _read_infos_boxes(
     things: list[Any], world_from_laser: Pose, path: Path
 ) -> Float[np.ndarray, "n 8 3"]:
     """Read the boxes of moving objects; in the infos they are in the laser frame."""
@@ -167,7 +171,7 @@ class _PlainUnpickler(pickle._Unpickler):  # that in C allocates whatever a few 
 
 def load_plain(path: Path) -> Any:
     """Load the plain value in a pickle; refuses anything else."""
-    data = read_bytes(path, MAX_BYTES)
+    data = read_bytes(path, MAX_PICKLE_BYTES)
     try:
         value = _PlainUnpickler(io.BytesIO(data)).load()
     except Exception as error:  # damaged pickles raise anything

@@ -17,31 +17,31 @@ from gscompleter.data.photographs import Photographs, build_drive
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.reading import read_json
 
-FRONT = "front_camera"
-POSES = "poses.json"
-ADVICE = "copy the sequence again"
+FRONT_CAMERA_FOLDER = "front_camera"
+PANDASET_POSES_FILE = "poses.json"
+PANDASET_ADVICE = "copy the sequence again"
 
 
 def has_pandaset(path: Path) -> bool:
     """Check whether `path` is the folder of a sequence."""
-    return os.path.isfile(path / "camera" / FRONT / POSES)
+    return os.path.isfile(path / "camera" / FRONT_CAMERA_FOLDER / PANDASET_POSES_FILE)
 
 
 def open_pandaset(path: Path) -> Iterator[Photographs]:
     """Open a sequence; frames are numbered by camera, the front camera first, and time."""
-    files = (path / "camera").glob(f"*/{POSES}")
-    cameras = sorted(files, key=lambda file: (file.parent.name != FRONT, file))
+    files = (path / "camera").glob(f"*/{PANDASET_POSES_FILE}")
+    cameras = sorted(files, key=lambda file: (file.parent.name != FRONT_CAMERA_FOLDER, file))
     frames = [frame for file in cameras for frame in _read_frames(file)]
-    require(frames, f"There are no poses in {quote_value(path)}; {ADVICE}.")
-    yield build_drive(path.resolve().name, str(path), frames, front=FRONT)
+    require(frames, f"There are no poses in {quote_value(path)}; {PANDASET_ADVICE}.")
+    yield build_drive(path.resolve().name, str(path), frames, front=FRONT_CAMERA_FOLDER)
 
 
 def _read_frames(file: Path) -> Iterator[Frame]:
     camera = file.parent
-    poses = read_json(file, ADVICE)
+    poses = read_json(file, PANDASET_ADVICE)
     lens = file.with_name("intrinsics.json")
-    require(isinstance(poses, list), f"{quote_value(file)} is no list of poses; {ADVICE}.")
-    intrinsics = get_intrinsics(read_json(lens, ADVICE), quote_value(lens))
+    require(isinstance(poses, list), f"{quote_value(file)} is no list of poses; {PANDASET_ADVICE}.")
+    intrinsics = get_intrinsics(read_json(lens, PANDASET_ADVICE), quote_value(lens))
     for number, pose in enumerate(poses):
         title = f"pose {number} of {quote_value(file)}"
         c2w = get_pose(pose, "position", "heading", "wxyz", title)

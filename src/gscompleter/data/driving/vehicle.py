@@ -16,7 +16,7 @@ POINT_BYTES = 16
 """Size of a point of KITTI: x, y, z and reflectance as float32."""
 MIN_SPEED = 0.5
 """Smallest speed of a moving object, in metres per second."""
-MARGIN = 0.1
+BOX_MARGIN = 0.1
 """Relative enlargement of a box, for shadows, mirrors and time offsets."""
 
 
@@ -67,4 +67,4 @@ def compute_moving_boxes(
     poses = vehicle @ build_poses(np.concatenate([level, headings, centers], axis=1))
     # Signs of the eight corners, from the centre of a box of side 1.
     signs = np.array(list(product((-0.5, 0.5), repeat=3)))
-    return transform_points((1 + MARGIN) * sides[:, None] * signs, poses[:, None])
+    return transform_points((1 + BOX_MARGIN) * sides[:, None] * signs, poses[:, None])

@@ -28,14 +28,14 @@ from gscompleter.data.photographs import Photographs, build_drive
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import check_file
 
-ADVICE = "download it again"
-IMAGES = "camera_image"
+WAYMO_ADVICE = "download it again"
+IMAGE_COMPONENT = "camera_image"
 TIME = "key.frame_timestamp_micros"
 CAMERA = "key.camera_name"
 LASER = "key.laser_name"
 INTRINSICS = ("f_u", "f_v", "c_u", "c_v", "k1", "k2", "k3", "p1", "p2")
-LENS = ("width", "height", *(f"intrinsic.{name}" for name in INTRINSICS))
-CAMERAS = {1: "FRONT", 2: "FRONT_LEFT", 3: "FRONT_RIGHT", 4: "SIDE_LEFT", 5: "SIDE_RIGHT"}
+LENS_COLUMNS = ("width", "height", *(f"intrinsic.{name}" for name in INTRINSICS))
+CAMERA_NAMES = {1: "FRONT", 2: "FRONT_LEFT", 3: "FRONT_RIGHT", 4: "SIDE_LEFT", 5: "SIDE_RIGHT"}
 """Camera names by their numbers in the tables."""
 SIGN = 3
 """Box type of signs, which never move."""
@@ -55,20 +55,20 @@ def open_waymo(path: Path) -> Iterator[Photographs]:
 
 def list_segments(path: Path) -> list[Path]:
     """List the photograph files of the segments in a folder, or the given one."""
-    files = sorted((path / IMAGES).glob("*.parquet")) if os.path.isdir(path) else [path]
-    return [f for f in files if f.match(f"{IMAGES}/*.parquet") and os.path.isfile(f)]
+    files = sorted((path / IMAGE_COMPONENT).glob("*.parquet")) if os.path.isdir(path) else [path]
+    return [f for f in files if f.match(f"{IMAGE_COMPONENT}/*.parquet") and os.path.isfile(f)]
 
 
-def _locate(segment: Path, component: str) -> Path:
+def _locate_component(segment: Path, component: str) -> Path:
     """Return the file of a component; `segment` is that of the photographs."""
     return segment.parent.parent / component / segment.name
 
 
 def _has_components(segment: Path, *components: str) -> bool:
-    return all(os.path.isfile(_locate(segment, component)) for component in components)
+    return all(os.path.isfile(_locate_component(segment, component)) for component in components)
 
 
-def _read_rows(
+def _read_table_rows(
     path: Path, columns: Sequence[str], where: Mapping[str, int] | None = None
 ) -> list[tuple[Any, ...]]:
     """Read columns of a file, named without their prefix, as rows of plain values.
@@ -92,41 +92,41 @@ def _read_rows(
         names = [stored.get(column, column) for column in columns]
         table = parquet.read_table(path, columns=names, filters=filters, partitioning=None)
     except (pyarrow.ArrowException, OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{quote_value(path)} cannot be read; {ADVICE}.") from error
+        raise InputError(f"{quote_value(path)} cannot be read; {WAYMO_ADVICE}.") from error
     return [tuple(row[name] for name in names) for row in table.to_pylist()]
 
 
 def _read_value(path: Path, column: str, where: Mapping[str, int]) -> Any:
     """Read the value of a column in the only row where other columns have these values."""
-    values = [value for (value,) in _read_rows(path, (column,), where) if value]
-    require(len(values) == 1, f"{quote_value(path)} lacks a {column} of a frame; {ADVICE}.")
+    values = [value for (value,) in _read_table_rows(path, (column,), where) if value]
+    require(len(values) == 1, f"{quote_value(path)} lacks a {column} of a frame; {WAYMO_ADVICE}.")
     return values[0]
 
 
 def _open_segment(segment: Path) -> Photographs:
-    cameras = _read_cameras(_locate(segment, "camera_calibration"))
-    rows = _read_rows(segment, (CAMERA, TIME, "pose.transform"))
-    shown = sorted((row for row in rows if row[0] in CAMERAS), key=lambda row: row[:2])
-    require(shown, f"{quote_value(segment)} holds no photographs; {ADVICE}.")
-    frames = [_make_frame(segment, cameras, *row) for row in shown]
-    return build_drive(segment.stem, str(segment), frames, front=CAMERAS[1])
+    cameras = _read_cameras(_locate_component(segment, "camera_calibration"))
+    rows = _read_table_rows(segment, (CAMERA, TIME, "pose.transform"))
+    shown = sorted((row for row in rows if row[0] in CAMERA_NAMES), key=lambda row: row[:2])
+    require(shown, f"{quote_value(segment)} holds no photographs; {WAYMO_ADVICE}.")
+    frames = [_make_waymo_frame(segment, cameras, *row) for row in shown]
+    return build_drive(segment.stem, str(segment), frames, front=CAMERA_NAMES[1])
 
 
-def _make_frame(
+def _make_waymo_frame(
     segment: Path, cameras: dict[int, PosedLens], camera: int, time: int, pose: Any
 ) -> Frame:
-    name = CAMERAS[camera]
+    name = CAMERA_NAMES[camera]
     title = f"the photograph of {name} at {time} in {quote_value(segment)}"
-    require(camera in cameras, f"The camera of {title} has no calibration; {ADVICE}.")
+    require(camera in cameras, f"The camera of {title} has no calibration; {WAYMO_ADVICE}.")
     intrinsics, vehicle_from_camera = cameras[camera]
 
     # Components are downloaded one by one, and only the first two are needed.
     laser_points = None
     if _has_components(segment, "lidar", "lidar_calibration", "vehicle_pose"):
-        laser_points = partial(_read_points, segment, time)
+        laser_points = partial(_read_segment_points, segment, time)
     boxes = None
     if _has_components(segment, "lidar_box", "vehicle_pose"):
-        boxes = partial(_read_boxes, segment, time)
+        boxes = partial(_read_segment_boxes, segment, time)
     return Frame(
         f"{name}/{time}",
         title,
@@ -144,11 +144,13 @@ def _make_frame(
 def _read_cameras(path: Path) -> dict[int, PosedLens]:
     title = quote_value(path)
     cameras = {}
-    for camera, pose, *numbers in _read_rows(path, (CAMERA, "extrinsic.transform", *LENS)):
+    for camera, pose, *numbers in _read_table_rows(
+        path, (CAMERA, "extrinsic.transform", *LENS_COLUMNS)
+    ):
         lens = np.array(numbers, dtype=np.float64)  # null becomes NaN
         require(
             np.isfinite(lens).all() and (lens[:2] >= 1).all(),
-            f"Camera {camera} in {title} has no size or no intrinsics; {ADVICE}.",
+            f"Camera {camera} in {title} has no size or no intrinsics; {WAYMO_ADVICE}.",
         )
         width, height, f_u, f_v, c_u, c_v, *radial, p1, p2 = lens.tolist()
         distortion = Distortion(radial=tuple(radial), tangential=(p1, p2))
@@ -159,23 +161,23 @@ def _read_cameras(path: Path) -> dict[int, PosedLens]:
 
 
 @lru_cache(maxsize=2)
-def _read_points(segment: Path, time: int) -> Float[np.ndarray, "n 3"]:
+def _read_segment_points(segment: Path, time: int) -> Float[np.ndarray, "n 3"]:
     """Read the first laser returns in the world frame, in metres.
 
     The roof laser rotates while the vehicle drives; `lidar_pose` has the vehicle pose per pixel.
     """
     vehicle = _read_vehicle_pose(segment, time)
     # Of each laser its pose on the vehicle, its beams, and their lower and upper end.
-    calibration = _locate(segment, "lidar_calibration")
+    calibration = _locate_component(segment, "lidar_calibration")
     beams = (f"beam_inclination.{name}" for name in ("values", "min", "max"))
-    rows = _read_rows(calibration, (LASER, "extrinsic.transform", *beams))
+    rows = _read_table_rows(calibration, (LASER, "extrinsic.transform", *beams))
     lasers = {
         laser: (_parse_matrix(pose, quote_value(calibration)), *inclinations)
         for laser, pose, *inclinations in rows
     }
 
-    measured = _locate(segment, "lidar")
-    turning = _locate(segment, "lidar_pose")
+    measured = _locate_component(segment, "lidar")
+    turning = _locate_component(segment, "lidar_pose")
     poses = _read_range_images(turning, time) if os.path.isfile(turning) else {}
     points = [np.zeros((0, 3))]
     for laser, image in _read_range_images(measured, time).items():
@@ -183,7 +185,7 @@ def _read_points(segment: Path, time: int) -> Float[np.ndarray, "n 3"]:
         ranges = image[..., 0]
         moving = poses.get(laser)
         fits = laser in lasers and (moving is None or moving.shape == (*ranges.shape, 6))
-        require(fits, f"The {title} does not fit its calibration or its poses; {ADVICE}.")
+        require(fits, f"The {title} does not fit its calibration or its poses; {WAYMO_ADVICE}.")
         # A range of 0 or below is a beam that did not return.
         hit = np.isfinite(ranges) & (ranges > 0)
         local = _compute_points(title, ranges, *lasers[laser])[hit]
@@ -212,7 +214,7 @@ def _compute_points(
     rising = np.array(beams, dtype=np.float64)
     if beams is None and low is not None and high is not None:
         rising = low + (np.arange(height) + 0.5) / height * (high - low)
-    require(rising.size == height, f"The {title} does not fit its calibration; {ADVICE}.")
+    require(rising.size == height, f"The {title} does not fit its calibration; {WAYMO_ADVICE}.")
     # As in Waymo's `range_image_utils`: azimuths count from behind, in the frame of the vehicle, so
     # the yaw of the laser is taken off.
     yaw = np.arctan2(extrinsic[1, 0], extrinsic[0, 0])
@@ -224,7 +226,7 @@ def _compute_points(
 
 
 def _read_vehicle_pose(segment: Path, time: int) -> Float[np.ndarray, "4 4"]:
-    path = _locate(segment, "vehicle_pose")
+    path = _locate_component(segment, "vehicle_pose")
     values = _read_value(path, "world_from_vehicle.transform", {TIME: time})
     return _parse_matrix(values, quote_value(path))
 
@@ -233,22 +235,22 @@ def _read_range_images(path: Path, time: int) -> dict[int, Float[np.ndarray, "h 
     """Read the range image of the first returns, or the poses of its pixels, by laser."""
     columns = (LASER, "range_image_return1.values", "range_image_return1.shape")
     images = {}
-    for laser, values, shape in _read_rows(path, columns, {TIME: time}):
+    for laser, values, shape in _read_table_rows(path, columns, {TIME: time}):
         if values is not None and shape is not None:
             fits = len(shape) == 3 and min(shape) > 0 and len(values) == np.prod(shape)
-            require(fits, f"A range image in {quote_value(path)} is damaged; {ADVICE}.")
+            require(fits, f"A range image in {quote_value(path)} is damaged; {WAYMO_ADVICE}.")
             images[laser] = np.asarray(values, dtype=np.float64).reshape(shape)
     return images
 
 
-def _read_boxes(segment: Path, time: int) -> Float[np.ndarray, "n 8 3"]:
+def _read_segment_boxes(segment: Path, time: int) -> Float[np.ndarray, "n 8 3"]:
     """Read the boxes of moving objects around the vehicle, except signs."""
     vehicle = _read_vehicle_pose(segment, time)
     center = [f"box.center.{axis}" for axis in "xyz"]
     size = [f"box.size.{axis}" for axis in "xyz"]
     speed = [f"speed.{axis}" for axis in "xyz"]
     columns = ["type", *center, *size, "box.heading", *speed]
-    rows = _read_rows(_locate(segment, "lidar_box"), columns, {TIME: time})
+    rows = _read_table_rows(_locate_component(segment, "lidar_box"), columns, {TIME: time})
     objects = [numbers for kind, *numbers in rows if kind != SIGN]
     return compute_moving_boxes(vehicle, np.array(objects, dtype=np.float64).reshape(-1, 10))
 
@@ -256,5 +258,5 @@ def _read_boxes(segment: Path, time: int) -> Float[np.ndarray, "n 8 3"]:
 def _parse_matrix(values: Any, title: str) -> Float[np.ndarray, "4 4"]:
     matrix = np.array(values, dtype=np.float64)  # null becomes NaN
     fits = matrix.size == 16 and np.isfinite(matrix).all()
-    require(fits, f"A transform in {title} is damaged; {ADVICE}.")
+    require(fits, f"A transform in {title} is damaged; {WAYMO_ADVICE}.")
     return matrix.reshape(4, 4)

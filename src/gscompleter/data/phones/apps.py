@@ -23,7 +23,13 @@ from jaxtyping import Shaped
 from gscompleter.data.cameras import Intrinsics, compute_rotation
 from gscompleter.data.json_fields import get_array, get_intrinsics, get_number, get_part, get_size
 from gscompleter.data.limits import require
-from gscompleter.data.phones.export import ADVICE, Files, PoseAndLens, build_recording, find_files
+from gscompleter.data.phones.export import (
+    PHONE_EXPORT_ADVICE,
+    Files,
+    PoseAndLens,
+    build_recording,
+    find_files,
+)
 from gscompleter.data.phones.lzfse import measure_unpacked
 from gscompleter.data.photographs import Photographs
 from gscompleter.system.damage import DamagedError, describe_damage
@@ -66,7 +72,9 @@ class KeyframeFormat:
         parsed = {}
         for name in sorted(cameras.keys() & files[0]):
             title = f"frame {name} of {quote_value(path)}"
-            parsed[name] = self.parse(parse_json(cameras[name](), title, ADVICE), title)
+            parsed[name] = self.parse(
+                parse_json(cameras[name](), title, PHONE_EXPORT_ADVICE), title
+            )
         yield build_recording(path, parsed, files)
 
 
@@ -86,9 +94,9 @@ def parse_scanner_app(entry: Any, title: str) -> PoseAndLens:
     return c2w, Intrinsics(None, (fx, fy), (cx + 0.5, cy + 0.5))
 
 
-DEPTH = (f"{HOME}/depth/*.png", f"{HOME}/confidence/*.png")
-CORRECTED = (f"{HOME}/corrected_cameras/*.json", f"{HOME}/corrected_images/*.*", *DEPTH)
-ORIGINAL = (f"{HOME}/cameras/*.json", f"{HOME}/images/*.*", *DEPTH)
+DEPTH_GLOBS = (f"{HOME}/depth/*.png", f"{HOME}/confidence/*.png")
+CORRECTED = (f"{HOME}/corrected_cameras/*.json", f"{HOME}/corrected_images/*.*", *DEPTH_GLOBS)
+ORIGINAL = (f"{HOME}/cameras/*.json", f"{HOME}/images/*.*", *DEPTH_GLOBS)
 POLYCAM = KeyframeFormat(b'"t_00"', parse_polycam, (CORRECTED, ORIGINAL))
 SCANNED = ("frame_*.json", "frame_*.jpg", "depth_*.png", "conf_*.png")
 SCANNER_APP = KeyframeFormat(b'"cameraPoseARFrame"', parse_scanner_app, (SCANNED,))
@@ -103,14 +111,14 @@ def open_recording(path: Path) -> Iterator[Photographs]:
     """Open a recording of Record3D; frames are numbered by time."""
     title = quote_value(path)
     metadata = find_files(path, METADATA)
-    require(metadata, f"There is no `{METADATA}` in {title}; {ADVICE}.")
-    content = parse_json(metadata[METADATA](), f"`{METADATA}` of {title}", ADVICE)
+    require(metadata, f"There is no `{METADATA}` in {title}; {PHONE_EXPORT_ADVICE}.")
+    content = parse_json(metadata[METADATA](), f"`{METADATA}` of {title}", PHONE_EXPORT_ADVICE)
     size = get_size(content, title, "w", "h")
     depths = find_files(path, "rgbd/*.depth")
     confidences = find_files(path, "rgbd/*.conf")
     notes = (NOTE,) if depths and find_spec("liblzfse") is None else ()
     files = find_recording(path), {} if notes else depths, confidences
-    decoders = partial(_unpack, "<f4", size), partial(_unpack, "u1", size)
+    decoders = partial(_unpack_map, "<f4", size), partial(_unpack_map, "u1", size)
     scene = build_recording(path, _parse_recorded(content, size, title), files, decoders)
     yield replace(scene, notes=notes)
 
@@ -132,7 +140,9 @@ def _parse_recorded(content: Any, size: tuple[int, int], title: str) -> dict[str
     return cameras
 
 
-def _unpack(kind: str, size: tuple[int, int], data: bytes, title: str) -> Shaped[np.ndarray, "h w"]:
+def _unpack_map(
+    kind: str, size: tuple[int, int], data: bytes, title: str
+) -> Shaped[np.ndarray, "h w"]:
     """Unpack a map with the aspect ratio of the photographs, and at most as many pixels."""
     from liblzfse import decompress
 
@@ -146,5 +156,6 @@ def _unpack(kind: str, size: tuple[int, int], data: bytes, title: str) -> Shaped
         return values.reshape(round(math.sqrt(len(values) * size[1] / size[0])), -1)
     except Exception as error:  # damaged bytes raise anything
         raise InputError(
-            f"The depth of {title} cannot be read ({describe_damage(error)}); {ADVICE}."
+            f"The depth of {title} cannot be read ({describe_damage(error)}); "
+            f"{PHONE_EXPORT_ADVICE}."
         ) from error

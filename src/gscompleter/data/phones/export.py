@@ -28,7 +28,7 @@ from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import open_image
 from gscompleter.system.files.reading import check_file, read_bytes, read_zip_entry
 
-ADVICE = "export the recording again"
+PHONE_EXPORT_ADVICE = "export the recording again"
 MAX_ENTRY = 1 << 28
 """Largest file in an archive, in bytes."""
 
@@ -53,7 +53,7 @@ def find_files(export: Path, pattern: str) -> Files:
             entries = [PurePosixPath(name) for name in archive.namelist()]
             # `match` compares from the right, so that a folder around the export does not matter.
             paths = [entry for entry in entries if entry.match(pattern)]
-        read = partial(_read_entry, export)
+        read = partial(_read_archive_entry, export)
     # macOS adds "._x.jpg" for each "x.jpg" to an archive.
     paths = sorted(path for path in paths if not path.name.startswith("."))
     require(
@@ -63,7 +63,7 @@ def find_files(export: Path, pattern: str) -> Files:
     return {path.stem.rpartition("_")[2]: partial(read, path) for path in paths}
 
 
-def _read_entry(export: Path, path: PurePosixPath) -> bytes:
+def _read_archive_entry(export: Path, path: PurePosixPath) -> bytes:
     with _open_archive(export) as archive:
         return read_zip_entry(archive, str(path), MAX_ENTRY)
 
@@ -75,7 +75,7 @@ def _open_archive(path: Path) -> Iterator[ZipFile]:
         yield _keep_open(path, path.stat().st_mtime_ns)
     except Exception as error:  # damaged archives raise anything
         raise InputError(
-            f"{quote_value(path)} cannot be read ({describe_damage(error)}); {ADVICE}."
+            f"{quote_value(path)} cannot be read ({describe_damage(error)}); {PHONE_EXPORT_ADVICE}."
         ) from error
 
 
@@ -113,7 +113,7 @@ def build_recording(
         stored = StoredPhotograph(images[name], capitalize(title))
         frame = Frame(name, title, c2w @ OPENCV_FROM_OPENGL, lens, stored, depth)
         frames.append(frame.with_rigid_pose())
-    require(frames, f"No photograph of {quote_value(path)} has a camera; {ADVICE}.")
+    require(frames, f"No photograph of {quote_value(path)} has a camera; {PHONE_EXPORT_ADVICE}.")
     return build_photographs(path.resolve().stem, str(path), frames)
 
 
@@ -127,7 +127,7 @@ def _read_depth(
     require(
         stored.ndim == 2 and stored.dtype.itemsize > 1 and stored.shape == sure.shape,
         f"The depth of {title} and its confidence are {stored.dtype} of shape {stored.shape} and "
-        f"{sure.dtype} of shape {sure.shape}; {ADVICE}.",
+        f"{sure.dtype} of shape {sure.shape}; {PHONE_EXPORT_ADVICE}.",
     )
     known = (sure > 0) & (stored > 0) & np.isfinite(stored)
     unit = 1.0 if stored.dtype.kind == "f" else 1e-3  # whole numbers are millimetres

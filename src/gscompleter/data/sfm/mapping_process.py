@@ -19,7 +19,7 @@ import pycolmap
 
 from gscompleter.data.panorama import VIEWS, compute_view_rotation
 from gscompleter.data.sfm.matching import (
-    SEED,
+    MATCHING_SEED,
     ColmapJob,
     extract_features,
     match,
@@ -28,7 +28,7 @@ from gscompleter.data.sfm.matching import (
 )
 from gscompleter.data.sfm.poses import MIN_PHOTOGRAPHS, UprightCopy
 
-LENS = "SIMPLE_RADIAL"
+LENS_MODEL = "SIMPLE_RADIAL"
 """COLMAP's camera model: one focal length, one distortion coefficient."""
 GUESSED_FOCAL = 1.2
 """Focal length in longer image sides, if EXIF lacks it."""
@@ -40,11 +40,11 @@ MAX_OFF_CENTRE = 0.1
 """Largest plausible distance of the principal point from the centre, in longer sides."""
 FOV = 10.0, 150.0
 """Plausible range of the field of view along the longer side, in degrees."""
-MAX_SHIFT = 0.5
+MAX_DISTORTION_SHIFT = 0.5
 """Largest plausible shift of an image corner by distortion, relative to its radius."""
 FIXED_FOVS = (75.0, 60.0, 90.0, 45.0)
 """Fields of view along the longer side, in degrees, to fix the focal length at, in order."""
-ROUNDS = 2
+MAPPING_ROUNDS = 2
 """Rounds of mapping with a fixed focal length, the second at the value that the first fitted."""
 
 
@@ -81,7 +81,9 @@ def find_features(job: MappingJob) -> None:
     with pycolmap.Database.open(job.database) as database:
         for key, one in cameras.items():
             focal = one.focal or GUESSED_FOCAL * max(one.width, one.height)
-            camera = pycolmap.Camera.create_from_model_name(1, LENS, focal, one.width, one.height)
+            camera = pycolmap.Camera.create_from_model_name(
+                1, LENS_MODEL, focal, one.width, one.height
+            )
             camera.has_prior_focal_length = one.focal is not None
             numbers[key] = int(database.write_camera(camera))
 
@@ -161,7 +163,7 @@ def map_with_fixed_focals(job: MappingJob, fov: float) -> pycolmap.Reconstructio
     """
     focals = dict[int, float]()
     model: pycolmap.Reconstruction | None = None
-    for _ in range(ROUNDS):
+    for _ in range(MAPPING_ROUNDS):
         _fix_focals(job, focals, fov)
         mapped = map_largest(job, is_focal_fixed=True)
         if mapped is None:
@@ -181,7 +183,7 @@ def _fix_focals(job: MappingJob, focals: dict[int, float], fov: float) -> None:
             number = camera.camera_id
             focal = max(width, height) / 2 / math.tan(math.radians(fov / 2))
             known = pycolmap.Camera.create_from_model_name(
-                number, LENS, focals.get(number, focal), width, height
+                number, LENS_MODEL, focals.get(number, focal), width, height
             )
             known.has_prior_focal_length = True
             database.update_camera(known)
@@ -191,7 +193,7 @@ def map_largest(job: MappingJob, is_focal_fixed: bool = False) -> pycolmap.Recon
     """Map the scene; return the model with most photographs, or None if there is none."""
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=job.threads,
-        random_seed=SEED,
+        random_seed=MATCHING_SEED,
         min_model_size=MIN_PHOTOGRAPHS,
         ba_refine_focal_length=not is_focal_fixed,
         ba_refine_extra_params=not is_focal_fixed,
@@ -229,7 +231,7 @@ def is_plausible(camera: pycolmap.Camera) -> bool:
     off = math.hypot(
         camera.principal_point_x - camera.width / 2, camera.principal_point_y - camera.height / 2
     )
-    is_bent = bool(abs(shift) > MAX_SHIFT)
+    is_bent = bool(abs(shift) > MAX_DISTORTION_SHIFT)
     return FOV[0] <= fov <= FOV[1] and not is_bent and off <= MAX_OFF_CENTRE * side
 
 

@@ -18,7 +18,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float
 
-SEED = 0
+MATCHING_SEED = 0
 MAX_FEATURES = 4096
 """Most features in a photograph."""
 MAX_EXHAUSTIVE = 60
@@ -29,7 +29,7 @@ NUM_SIMILAR = 20
 """Most similar photographs to match each one with."""
 NUM_LARGEST_FEATURES = 256
 """Largest-scale features that decide similarity."""
-MIN_SHARED = 4
+MIN_SHARED_MATCHES = 4
 """Fewest matches among these for a pair."""
 MIN_COSINE = 0.85
 """Smallest cosine between descriptors of matching features."""
@@ -61,7 +61,7 @@ class ColmapJob:
 def prepare_colmap() -> None:
     """Let COLMAP print errors only, and choose its random numbers."""
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
-    pycolmap.set_random_seed(SEED)
+    pycolmap.set_random_seed(MATCHING_SEED)
 
 
 def extract_features(job: ColmapJob, name: str, camera: int, is_masked: bool) -> None:
@@ -109,7 +109,7 @@ def match(job: ColmapJob, names: Sequence[str], pairs: Pairs) -> None:
     listed.match_list_path.write_bytes(lines.encode())
     matching = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
     verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = SEED
+    verification.ransac.random_seed = MATCHING_SEED
     pycolmap.match_image_pairs(job.database, matching, listed, verification, pycolmap.Device.cpu)
 
 
@@ -141,7 +141,7 @@ def pair_similar(features: Sequence[Float[np.ndarray, "_ 128"]]) -> Pairs:
     order = np.argsort(-shared, axis=1, kind="stable")[:, :NUM_SIMILAR]
     pairs: Pairs = set()
     for i, row in enumerate(order.tolist()):
-        pairs.update((min(i, j), max(i, j)) for j in row if shared[i, j] >= MIN_SHARED)
+        pairs.update((min(i, j), max(i, j)) for j in row if shared[i, j] >= MIN_SHARED_MATCHES)
     return pairs
 
 

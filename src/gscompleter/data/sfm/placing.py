@@ -31,10 +31,10 @@ from gscompleter.data.masks import GivenPhotograph, find_given
 from gscompleter.data.photograph import StoredPhotograph
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.sfm.poses import (
-    COMMAND,
-    IMAGES,
-    MAX_SIDE,
-    RESULTS,
+    COPIES_FOLDER,
+    MAX_COPY_SIDE,
+    POSES_COMMAND,
+    POSES_FILES,
     SEPARATORS,
     identify_files,
     list_all_photographs,
@@ -52,18 +52,18 @@ from gscompleter.types import View
 
 MAX_KNOWN = 200
 """Most photographs with known cameras that new ones are compared with; of more, those far apart."""
-MIN_MATCHES = 30
+MIN_PLACING_MATCHES = 30
 """Features that COLMAP needs in common with the points of the scene."""
-MAX_NAMED = 5
+MAX_UNPLACED_PHOTOGRAPHS = 5
 """Most photographs that a sentence names."""
-KNOWN = "known"
+KNOWN_FOLDER = "known"
 """Folder of the copies with known cameras, among those that COLMAP reads."""
 NEW = "new"
-PROCESS = "gscompleter.data.sfm.placing_process"
+PLACING_PROCESS = "gscompleter.data.sfm.placing_process"
 
 LensKey = tuple[int, int, str]
 """Width and height of upright photographs, and the key of camera, lens and zoom from EXIF."""
-Pinhole = tuple[float, float, float, float]
+PinholeNumbers = tuple[float, float, float, float]
 """Focal lengths and principal point in pixels: fx, fy, cx, cy."""
 
 
@@ -75,7 +75,7 @@ class KnownCopy:
     """File, relative to the folder that COLMAP reads."""
     width: int
     height: int
-    pinhole: Pinhole
+    pinhole: PinholeNumbers
     viewmat: list[list[float]]
     """World to camera, as the rows of a 3 × 4 matrix."""
     is_masked: bool
@@ -93,7 +93,7 @@ class NewCopy:
     """Key of camera, lens and zoom from EXIF."""
     focal: float | None
     """Focal length in pixels from EXIF, or None."""
-    pinhole: Pinhole | None
+    pinhole: PinholeNumbers | None
     """Intrinsics of the undistorted copy, if a known photograph was taken by the same lens."""
     is_masked: bool
 
@@ -117,7 +117,7 @@ class Placed:
         count = self.total - len(self.failures)
         notes = [f"{count} of {self.total} new photographs were placed among those of the scene."]
         if self.failures:
-            listed = list(self.failures.items())[:MAX_NAMED]
+            listed = list(self.failures.items())[:MAX_UNPLACED_PHOTOGRAPHS]
             reasons = "; ".join(f"{quote_value(name)} ({reason})" for name, reason in listed)
             more = len(self.failures) - len(listed)
             rest = f"; and {more} more" if more else ""
@@ -164,7 +164,10 @@ def place_photographs(
         placed = replace(Placed(**earlier), reused=True)
     else:
         require_pycolmap()
-        with reserve_output(out, overwrite, COMMAND, RESULTS) as output, output.write() as draft:
+        with (
+            reserve_output(out, overwrite, POSES_COMMAND, POSES_FILES) as output,
+            output.write() as draft,
+        ):
             placed = place_copies(folder, new, photographs, draft, reading)
             content = {"placed": asdict(placed), "photographs": identity}
             (draft / SUMMARY_FILE).write_bytes(json.dumps(content, indent=1).encode())
@@ -209,14 +212,14 @@ def place_copies(
         known, sources = write_known(photographs, home)
         new = write_new(given, photographs, home, reading)
         job = {
-            "images": str(home / IMAGES),
+            "images": str(home / COPIES_FOLDER),
             "masks": str(home / MASKS),
             "model": str(draft / "sparse" / "0"),
             "known": [asdict(copy) for copy in known],
             "new": [asdict(copy) for copy in new],
             "origin": photographs.origin.tolist(),
         }
-        result = run_colmap(PROCESS, job, home, "Placing photographs")
+        result = run_colmap(PLACING_PROCESS, job, home, "Placing photographs")
         failures = {
             photograph.name: explain_unplaced(row, sources)
             for photograph, row in zip(given, result["new"], strict=True)
@@ -241,8 +244,8 @@ def explain_unplaced(row: Mapping[str, Any], sources: Mapping[str, str]) -> str:
     if matches == 0:
         return "it shares no features with a photograph of SCENE"
     like = quote_value(sources[row["like"]])
-    if matches < MIN_MATCHES:
-        return f"{matches} features in common with {like}, and {MIN_MATCHES} are needed"
+    if matches < MIN_PLACING_MATCHES:
+        return f"{matches} features in common with {like}, and {MIN_PLACING_MATCHES} are needed"
     return f"{matches} features in common with {like} fit no single camera"
 
 
@@ -252,8 +255,8 @@ def write_known(photographs: Photographs, home: Path) -> tuple[list[KnownCopy], 
     copies = []
     sources = {}
     for number in track(frames, "Reading photographs"):
-        (view,) = photographs.views([number], MAX_SIDE)
-        name = f"{KNOWN}/{number:05d}.png"
+        (view,) = photographs.views([number], MAX_COPY_SIDE)
+        name = f"{KNOWN_FOLDER}/{number:05d}.png"
         is_masked = write_view(view, home, name)
         camera = view.camera
         viewmat = np.linalg.inv(camera.c2w.double().numpy())[:3]
@@ -275,13 +278,13 @@ def choose_known(photographs: Photographs) -> list[int]:
     ]
     if len(frames) <= MAX_KNOWN:
         return frames
-    cameras = [photographs.camera(number, MAX_SIDE) for number in frames]
+    cameras = [photographs.camera(number, MAX_COPY_SIDE) for number in frames]
     return sorted(frames[index] for index in select_spread_cameras(cameras, MAX_KNOWN))
 
 
 def write_view(view: View, home: Path, name: str) -> bool:
     """Write the photograph of a view, and its mask if it has one (True)."""
-    save_pixels(home / IMAGES / name, convert_to_pixels(view.image))
+    save_pixels(home / COPIES_FOLDER / name, convert_to_pixels(view.image))
     if view.ignore_mask is None or not bool(view.ignore_mask.any()):
         return False
     # COLMAP's masks are black where no features are wanted, and named after the whole file.
@@ -295,7 +298,7 @@ def save_pixels(path: Path, pixels: np.ndarray) -> None:
     Image.fromarray(pixels).save(path, compress_level=1)
 
 
-def read_pinhole(view: View) -> Pinhole:
+def read_pinhole(view: View) -> PinholeNumbers:
     """Return the intrinsics of a view."""
     K = view.camera.K.tolist()
     return K[0][0], K[1][1], K[0][2], K[1][2]
@@ -346,14 +349,14 @@ def write_copy(
         mask=given.mask,
         has_inverted_mask=reading.ignores_white,
     )
-    (view,) = build_photographs(given.name, title, [frame]).views([0], MAX_SIDE)
+    (view,) = build_photographs(given.name, title, [frame]).views([0], MAX_COPY_SIDE)
 
     # Two photographs may differ in their endings alone.
     plain = re.sub(SEPARATORS, "_", given.name)
     copy = f"{NEW}/{Path(plain).with_suffix('.png').as_posix()}"
-    if (home / IMAGES / copy).exists():
+    if (home / COPIES_FOLDER / copy).exists():
         copy = f"{NEW}/{plain}.png"
-    if (home / IMAGES / copy).exists():
+    if (home / COPIES_FOLDER / copy).exists():
         raise InputError(f"Two photographs would be called {quote_value(copy)}; rename one.")
     is_masked = write_view(view, home, copy)
     camera = view.camera
@@ -367,7 +370,7 @@ def write_copy(
 def keep_copy(home: Path, draft: Path, copy: NewCopy) -> None:
     """Move the copy of a placed photograph, and its mask, to their place in `draft`."""
     name = copy.name.partition("/")[2]
-    moves = [(home / IMAGES / copy.name, draft / IMAGES / name)]
+    moves = [(home / COPIES_FOLDER / copy.name, draft / COPIES_FOLDER / name)]
     if copy.is_masked:
         moves.append((home / MASKS / f"{copy.name}.png", draft / MASKS / f"{name}.png"))
     for source, target in moves:

@@ -17,16 +17,16 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float
 
-from gscompleter.data.sfm.mapping_process import GUESSED_FOCAL, LENS, is_plausible
+from gscompleter.data.sfm.mapping_process import GUESSED_FOCAL, LENS_MODEL, is_plausible
 from gscompleter.data.sfm.matching import (
-    SEED,
+    MATCHING_SEED,
     ColmapJob,
     extract_features,
     match,
     prepare_colmap,
     select_pairs,
 )
-from gscompleter.data.sfm.placing import KnownCopy, NewCopy, Pinhole
+from gscompleter.data.sfm.placing import KnownCopy, NewCopy, PinholeNumbers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -56,7 +56,7 @@ def main() -> None:
     new = [NewCopy(**one) for one in task.pop("new")]
     job = PlacingJob(known=known, new=new, **task)
     prepare_colmap()
-    cameras = extract_all_features(job)
+    cameras = extract_placing_features(job)
     match(job, job.names, select_pairs(job, job.names))
     model = register_new(job, cameras)
     placed = find_placed(job, model)
@@ -64,7 +64,7 @@ def main() -> None:
     print(json.dumps(describe_placed(job, model, placed)))
 
 
-def extract_all_features(job: PlacingJob) -> dict[str, int]:
+def extract_placing_features(job: PlacingJob) -> dict[str, int]:
     """Extract the features of all copies, and return the number of the camera of each."""
     cameras: dict[str, int] = {}
     with pycolmap.Database.open(job.database) as database:
@@ -84,7 +84,7 @@ def extract_all_features(job: PlacingJob) -> dict[str, int]:
     return cameras
 
 
-def make_known_camera(pinhole: Pinhole, copy: KnownCopy | NewCopy) -> pycolmap.Camera:
+def make_known_camera(pinhole: PinholeNumbers, copy: KnownCopy | NewCopy) -> pycolmap.Camera:
     """Make the camera of an undistorted copy with known intrinsics."""
     camera = pycolmap.Camera(
         model="PINHOLE", width=copy.width, height=copy.height, params=list(pinhole)
@@ -98,7 +98,7 @@ def make_new_camera(copy: NewCopy) -> pycolmap.Camera:
     if copy.pinhole is not None:
         return make_known_camera(copy.pinhole, copy)
     focal = copy.focal or GUESSED_FOCAL * max(copy.width, copy.height)
-    camera = pycolmap.Camera.create_from_model_name(1, LENS, focal, copy.width, copy.height)
+    camera = pycolmap.Camera.create_from_model_name(1, LENS_MODEL, focal, copy.width, copy.height)
     camera.has_prior_focal_length = copy.focal is not None
     return camera
 
@@ -125,7 +125,7 @@ def register_new(job: PlacingJob, cameras: dict[str, int]) -> pycolmap.Reconstru
     known.write(triangulated)
     options = pycolmap.IncrementalPipelineOptions(
         num_threads=job.threads,
-        random_seed=SEED,
+        random_seed=MATCHING_SEED,
         multiple_models=False,
         fix_existing_frames=True,
         constant_cameras={cameras[copy.name] for copy in job.known},

@@ -62,7 +62,7 @@ from gscompleter.system.files.writing import SUMMARY_FILE
 from gscompleter.system.progress import stage, track
 from gscompleter.system.threads import get_thread_count
 
-ENDINGS = PHOTOGRAPHS
+PHOTOGRAPH_ENDINGS = PHOTOGRAPHS
 """Endings of photographs, in any case."""
 NO_PHOTOGRAPHS = (
     *(*MASK_FOLDERS, *DEPTH_FOLDERS, *OTHER_FOLDERS),
@@ -76,27 +76,27 @@ MAX_INDEX = 1 << 26
 SEPARATORS = r"[\s#]"
 """Characters that names of copies do not have: in COLMAP's lists a space ends a name, and # begins
 a comment."""
-IMAGES = "images"
+COPIES_FOLDER = "images"
 """Folder of the copies."""
 MAX_FOLDERS = 10_000
 """Most folders below one that are searched for photographs."""
 MIN_PHOTOGRAPHS = 3
 """Fewest photographs; two determine neither a focal length nor a wrong match."""
-MIN_SHARE = 0.25
+MIN_MODEL_SHARE = 0.25
 """Smallest share of the photographs in a usable model."""
-MIN_POINTS = 30
+MIN_MODEL_POINTS = 30
 """Fewest points of a model; COLMAP needs as many in common with one photograph."""
-MAX_SIDE = 1600
+MAX_COPY_SIDE = 1600
 """Longest side of a copy in pixels; SIFT finds no better features in larger ones."""
-QUALITY = 95
+COPY_JPEG_QUALITY = 95
 """JPEG quality of rotated or shrunk copies."""
 MAX_THREADS = 4
-MAX_NAMED = 5
+MAX_LEFT_OUT_PHOTOGRAPHS = 5
 """Most photographs that a note names."""
-COMMAND = "poses"
-RESULTS = ("images/**/*", "sparse/0/*", SUMMARY_FILE)
+POSES_COMMAND = "poses"
+POSES_FILES = ("images/**/*", "sparse/0/*", SUMMARY_FILE)
 """Globs of the files that it may write. A foreign photograph would count as one of the copies."""
-PROCESS = "gscompleter.data.sfm.mapping_process"
+MAPPING_PROCESS = "gscompleter.data.sfm.mapping_process"
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ class FoundPoses:
                 f"length of {self.focal:.0f} px, assumed at first and refined with them."
             )
         if self.missing:
-            names = join_names(self.missing, MAX_NAMED)
+            names = join_names(self.missing, MAX_LEFT_OUT_PHOTOGRAPHS)
             notes.append(
                 f"No camera was found for {names}; they are not used, and the others keep their "
                 "numbers."
@@ -191,7 +191,7 @@ def find_poses(
         return replace(FoundPoses(**earlier), reused=True)
     require_pycolmap()
     with (
-        reserve_output(out, overwrite, COMMAND, RESULTS) as output,
+        reserve_output(out, overwrite, POSES_COMMAND, POSES_FILES) as output,
         output.write() as folder,
         _open_images(photographs, num_frames, folder) as images,
     ):
@@ -262,7 +262,7 @@ def list_unplaced(scene: Photographs, path: Path) -> list[Frame]:
     the folder that the user gave.
     """
     content = {}
-    if os.path.isfile(path / SUMMARY_FILE) and os.path.isdir(path / IMAGES):
+    if os.path.isfile(path / SUMMARY_FILE) and os.path.isdir(path / COPIES_FOLDER):
         content = read_json(path / SUMMARY_FILE, "name another folder")
     if not isinstance(content, dict) or "poses" not in content:
         return []
@@ -274,11 +274,11 @@ def list_unplaced(scene: Photographs, path: Path) -> list[Frame]:
             name=name,
             title=f"image {quote_value(name)} of {quote_value(path)}",
             c2w=np.full((4, 4), np.nan),
-            image=path / IMAGES / name,
+            image=path / COPIES_FOLDER / name,
             seen_points=None,
             lack="COLMAP found no camera for it",
         )
-        for name in list_all_photographs(path / IMAGES)
+        for name in list_all_photographs(path / COPIES_FOLDER)
         if name not in placed
     ]
 
@@ -302,8 +302,9 @@ def _check_few(folder: Path, names: Sequence[str]) -> None:
     is_panoramic = has_panoramas([folder / name for name in names])
     require(
         is_panoramic,
-        f"There are {len(names)} photographs ({', '.join(ENDINGS)}) in {quote_value(folder)}, and "
-        f"at least {MIN_PHOTOGRAPHS} are needed to find their cameras; add more.",
+        f"There are {len(names)} photographs ({', '.join(PHOTOGRAPH_ENDINGS)}) in "
+        f"{quote_value(folder)}, and at least {MIN_PHOTOGRAPHS} are needed to find their cameras; "
+        "add more.",
     )
     require(
         len(names) > 1,
@@ -336,7 +337,7 @@ def iterate_photographs(folder: Path) -> Iterator[Path]:
         images = [
             name
             for name in files
-            if not name.startswith(".") and Path(name).suffix.lower() in ENDINGS
+            if not name.startswith(".") and Path(name).suffix.lower() in PHOTOGRAPH_ENDINGS
         ]
         images = [name for name in images if not is_depth_map(Path(home, name))]
         yield from (Path(home, name) for name in leave_out_masks(images))
@@ -383,8 +384,8 @@ def _run(photographs: Path, folder: Path, given: Path, reading: MaskReading) -> 
     )
 
     # Few photographs, few points or an odd lens: the mapper found a coincidence, not the scene.
-    enough = max(MIN_PHOTOGRAPHS, MIN_SHARE * len(copies))
-    is_large = poses.num_registered >= enough and poses.points >= MIN_POINTS
+    enough = max(MIN_PHOTOGRAPHS, MIN_MODEL_SHARE * len(copies))
+    is_large = poses.num_registered >= enough and poses.points >= MIN_MODEL_POINTS
     if not (is_large and result["is_plausible"]):
         lens = "" if result["is_plausible"] else " and an implausible lens"
         raise InputError(
@@ -424,8 +425,8 @@ def write_copies(
     for number, (pixels, shade) in enumerate(split_panorama(given.path, hidden)):
         kind = f"view_{number}"
         name = Path(re.sub(SEPARATORS, "_", given.name)).with_suffix(".jpg")
-        target = _prepare_target(folder / IMAGES / kind / name, given.path)
-        Image.fromarray(pixels).save(target, quality=QUALITY, subsampling=0)
+        target = _prepare_target(folder / COPIES_FOLDER / kind / name, given.path)
+        Image.fromarray(pixels).save(target, quality=COPY_JPEG_QUALITY, subsampling=0)
         side = len(pixels)
         place = f"{kind}/{name.as_posix()}"
         is_masked = shade is not None and _write_mask(folder, place, shade, (side, side))
@@ -452,23 +453,23 @@ def write_upright(
         # A phone's JPEG with further pictures behind it, such as a map of gains for HDR.
         kind = "JPEG" if image.format == "MPO" else image.format
         is_known = kind in ("JPEG", "PNG")
-        is_upright = exif.get(ORIENTATION, 1) == 1 and max(image.size) <= MAX_SIDE
+        is_upright = exif.get(ORIENTATION, 1) == 1 and max(image.size) <= MAX_COPY_SIDE
         is_ready = is_known and is_upright and image.mode in ("RGB", "L")
         if not is_ready:  # decodes a JPEG at half or a quarter of its size if that is enough
-            image.draft("RGB", (MAX_SIDE, MAX_SIDE))
+            image.draft("RGB", (MAX_COPY_SIDE, MAX_COPY_SIDE))
         copy = ImageOps.exif_transpose(image).convert("RGB")
         focal = read_focal(exif)
         lens = read_lens(exif)
 
-    copy.thumbnail((MAX_SIDE, MAX_SIDE), Image.Resampling.LANCZOS)
+    copy.thumbnail((MAX_COPY_SIDE, MAX_COPY_SIDE), Image.Resampling.LANCZOS)
     name = re.sub(SEPARATORS, "_", source) + ("" if is_known else ".png")
-    target = _prepare_target(folder / IMAGES / name, path)
+    target = _prepare_target(folder / COPIES_FOLDER / name, path)
     if is_ready:
         shutil.copyfile(path, target)
     else:
         copy.info.clear()  # removes the orientation, which is applied already
         written = "JPEG" if kind == "JPEG" else "PNG"
-        copy.save(target, format=written, quality=QUALITY, subsampling=0)
+        copy.save(target, format=written, quality=COPY_JPEG_QUALITY, subsampling=0)
 
     hidden = read_hidden(path, mask, has_inverted_mask)
     is_masked = hidden is not None and _write_mask(folder, name, hidden, copy.size)
@@ -523,13 +524,13 @@ def _prepare_target(target: Path, source: Path) -> Path:
 def _map(copies: Sequence[UprightCopy], folder: Path, is_panoramic: bool) -> dict[str, Any]:
     """Run `mapping_process` on the copies in `folder/images`; return its result."""
     job = {
-        "images": str(folder / IMAGES),
+        "images": str(folder / COPIES_FOLDER),
         "masks": str(folder / MASKS),
         "model": str(folder / "sparse" / "0"),
         "photographs": [asdict(copy) for copy in copies],
         "is_panoramic": is_panoramic,
     }
-    return run_colmap(PROCESS, job, folder, "Finding cameras")
+    return run_colmap(MAPPING_PROCESS, job, folder, "Finding cameras")
 
 
 def run_colmap(process: str, job: Mapping[str, Any], folder: Path, title: str) -> dict[str, Any]:

@@ -19,11 +19,11 @@ from gscompleter.data.cameras import find_pose_defect
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.result_format import MARK
+from gscompleter.system.files.result_format import RESULT_MARK
 from gscompleter.system.files.typed_json import read_typed_json
 from gscompleter.system.files.writing import replace_file
 
-ADVICE = "take it from its folder again, or move it away to use the given poses"
+REFINED_POSES_ADVICE = "take it from its folder again, or move it away to use the given poses"
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ def write_refined(path: Path, given: Photographs, refined: Photographs) -> None:
         size = {"w": camera.width, "h": camera.height}
         frames.append({**asdict(row), **size, "fl_x": fl_x, "fl_y": fl_y, "cx": cx, "cy": cy})
     content = {
-        **MARK,
+        **RESULT_MARK,
         "camera_model": "PINHOLE",
         "given": hash_poses(given),
         "frames": frames,
@@ -68,7 +68,7 @@ def write_refined(path: Path, given: Photographs, refined: Photographs) -> None:
 
 def take_refined(photographs: Photographs, path: Path) -> Photographs | None:
     """Return photographs with the poses of a file; None if it is of others, or of other poses."""
-    content = read_typed_json(RefinedFile, path, ADVICE)
+    content = read_typed_json(RefinedFile, path, REFINED_POSES_ADVICE)
     if content.given != hash_poses(photographs):
         return None
     poses = {}
@@ -77,7 +77,7 @@ def take_refined(photographs: Photographs, path: Path) -> Photographs | None:
         if c2w.shape != (4, 4) or find_pose_defect(c2w) is not None:
             raise InputError(
                 f"{quote_value(path)} is damaged: it has no pose of {quote_value(row.file_path)}; "
-                f"{ADVICE}."
+                f"{REFINED_POSES_ADVICE}."
             )
         poses[row.file_path] = c2w @ OPENCV_FROM_OPENGL
     frames = [

@@ -18,6 +18,7 @@ import numpy as np
 import torch
 from jaxtyping import Float
 
+from gscompleter.data.cameras import Poses
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.sfm.placing import write_known
 from gscompleter.data.sfm.poses import require_pycolmap, run_colmap
@@ -25,7 +26,7 @@ from gscompleter.numerics.geometry import compute_spacing
 from gscompleter.numerics.two_views import ERROR_SIDE, find_near_pairs
 from gscompleter.types import Camera
 
-PROCESS = "gscompleter.data.sfm.refining_process"
+REFINING_PROCESS = "gscompleter.data.sfm.refining_process"
 MIN_REFINED = 3
 """Fewest photographs that are refined: two cannot hold the frame of the scene."""
 NUM_MATCHED = 8
@@ -34,9 +35,6 @@ POSITION_SIGMA = 0.1
 """Standard deviation of a given camera centre, in steps between cameras."""
 MAX_ERROR_SHARE = 0.8
 """Largest error of the matches that were kept back, of that of the given poses, to accept."""
-
-Poses = Float[np.ndarray, "n 4 4"]
-"""Camera-to-world matrices."""
 
 
 @dataclass(frozen=True)
@@ -93,15 +91,15 @@ def refine_poses(photographs: Photographs) -> tuple[Photographs, PoseRefinement 
             "pairs": pair_near(cameras),
             "position_sigma": POSITION_SIGMA * step,
         }
-        result = run_colmap(PROCESS, job, home, "Refining poses")
+        result = run_colmap(REFINING_PROCESS, job, home, "Refining poses")
 
-    given = np.stack([invert_viewmat(copy.viewmat) for copy in copies])
+    given = np.stack([invert_pose_rows(copy.viewmat) for copy in copies])
     found = [row is not None for row in result["viewmats"]]
     if sum(found) < MIN_REFINED:
         return photographs, None
     refined = given.copy()
     refined[found] = bring_back(
-        np.stack([invert_viewmat(row) for row in result["viewmats"] if row is not None]),
+        np.stack([invert_pose_rows(row) for row in result["viewmats"] if row is not None]),
         given[found],
     )
     scale = ERROR_SIDE / min(copies[0].width, copies[0].height)
@@ -133,7 +131,7 @@ def pair_near(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
     return find_near_pairs(centers, forward, NUM_MATCHED)
 
 
-def invert_viewmat(viewmat: Sequence[Sequence[float]]) -> Float[np.ndarray, "4 4"]:
+def invert_pose_rows(viewmat: Sequence[Sequence[float]]) -> Float[np.ndarray, "4 4"]:
     """Return the camera-to-world matrix of the rows of a world-to-camera matrix [3, 4]."""
     return np.linalg.inv(np.vstack([viewmat, [0.0, 0.0, 0.0, 1.0]]))
 

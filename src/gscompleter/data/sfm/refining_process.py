@@ -21,19 +21,19 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from gscompleter.data.sfm.matching import ColmapJob, extract_features, match, prepare_colmap
-from gscompleter.data.sfm.placing import KnownCopy, Pinhole
+from gscompleter.data.sfm.placing import KnownCopy, PinholeNumbers
 from gscompleter.data.sfm.placing_process import make_known_camera, read_image_number
 from gscompleter.numerics.two_views import compute_sampson_distances
 
-ROUNDS = 3
+REFINING_ROUNDS = 3
 """Rounds of triangulation and adjustment; better cameras find more points."""
 KEPT_BACK = 5
 """One track of features in so many is kept back."""
 LOSS_SCALE = 1.0
 """Residual in pixels from which a feature counts less (soft L1): some matches are false."""
-MIN_POINTS = 30
+MIN_CAMERA_POINTS = 30
 """Fewest points that determine a camera; one with fewer keeps its pose."""
-Matches = dict[tuple[int, int], Int[np.ndarray, "_ 2"]]
+NumberedMatches = dict[tuple[int, int], Int[np.ndarray, "_ 2"]]
 """Numbers of the matching features of two images, by the numbers of the images."""
 
 
@@ -55,7 +55,7 @@ def main() -> None:
     pairs = [(i, j) for i, j in task.pop("pairs")]
     job = RefiningJob(copies=copies, pairs=pairs, **task)
     prepare_colmap()
-    cameras = extract_all_features(job)
+    cameras = extract_refining_features(job)
     names = [copy.name for copy in job.copies]
     match(job, names, set(job.pairs))
 
@@ -65,7 +65,9 @@ def main() -> None:
         keypoints = {number: database.read_keypoints(number)[:, :2] for number in numbers}
     model = adjust_bundle(job, cameras, numbers)
     given = {n: make_pose(copy) for n, copy in zip(numbers, job.copies, strict=True)}
-    seen = {image.image_id for image in model.images.values() if image.num_points3D >= MIN_POINTS}
+    seen = {
+        image.image_id for image in model.images.values() if image.num_points3D >= MIN_CAMERA_POINTS
+    }
     refined = {number: model.images[number].cam_from_world() for number in seen}
     rows = [refined[n].matrix().tolist() if n in refined else None for n in numbers]
     intrinsics = {n: copy.pinhole for n, copy in zip(numbers, job.copies, strict=True)}
@@ -76,7 +78,7 @@ def main() -> None:
     print(json.dumps({"viewmats": rows, **errors}))
 
 
-def extract_all_features(job: RefiningJob) -> list[int]:
+def extract_refining_features(job: RefiningJob) -> list[int]:
     """Extract the features of all copies, and return the number of the camera of each."""
     cameras = []
     with pycolmap.Database.open(job.database) as database:
@@ -93,7 +95,7 @@ def make_pose(copy: KnownCopy) -> pycolmap.Rigid3d:
     return pycolmap.Rigid3d(pycolmap.Rotation3d(viewmat[:, :3]), viewmat[:, 3])
 
 
-def keep_back_tracks(database: pycolmap.Database, numbers: list[int]) -> Matches:
+def keep_back_tracks(database: pycolmap.Database, numbers: list[int]) -> NumberedMatches:
     """Take the matches of one track in `KEPT_BACK` out of the database, and return them.
 
     A track is a connected component of matches: a feature that any photograph contributes to a
@@ -117,7 +119,7 @@ def keep_back_tracks(database: pycolmap.Database, numbers: list[int]) -> Matches
     _, track_of = connected_components(graph, directed=False)
     is_kept_back = np.random.default_rng(0).random(track_of.max(initial=0) + 1) < 1 / KEPT_BACK
 
-    kept: Matches = {}
+    kept: NumberedMatches = {}
     for (pair, geometry), rows in zip(found.items(), ends, strict=True):
         chosen: Bool[np.ndarray, "n"] = is_kept_back[track_of[rows[:, 0]]]
         matches = geometry.inlier_matches
@@ -131,7 +133,7 @@ def keep_back_tracks(database: pycolmap.Database, numbers: list[int]) -> Matches
 def adjust_bundle(
     job: RefiningJob, cameras: list[int], numbers: list[int]
 ) -> pycolmap.Reconstruction:
-    """Triangulate points, and adjust cameras and points, `ROUNDS` times."""
+    """Triangulate points, and adjust cameras and points, `REFINING_ROUNDS` times."""
     model = pycolmap.Reconstruction()
     with pycolmap.Database.open(job.database) as database:
         for copy, camera, number in zip(job.copies, cameras, numbers, strict=True):
@@ -139,7 +141,7 @@ def adjust_bundle(
             image = pycolmap.Image(name=copy.name, camera_id=camera, image_id=number)
             model.add_image_with_trivial_frame(image, make_pose(copy))
     priors = make_position_priors(job, numbers, model)
-    for number in range(ROUNDS):
+    for number in range(REFINING_ROUNDS):
         folder = Path(job.work) / f"triangulated{number}"
         folder.mkdir()
         model = pycolmap.triangulate_points(
@@ -194,10 +196,10 @@ def adjust_once(
 
 
 def measure_epipolar_distances(
-    matches: Matches,
+    matches: NumberedMatches,
     keypoints: dict[int, Float[np.ndarray, "_ 2"]],
     poses: dict[int, pycolmap.Rigid3d],
-    intrinsics: dict[int, Pinhole],
+    intrinsics: dict[int, PinholeNumbers],
 ) -> Float[np.ndarray, "n"]:
     """Measure the distances of all matches from their epipolar lines, in pixels."""
     rays = {}

@@ -26,14 +26,14 @@ POSITION_RATE = 1.6e-4
 # Step sizes of the other parameters, in their own units.
 ROTATION_RATE = 1e-3
 SCALE_RATE = 5e-3
-OPACITY_RATE = 0.05
+OPTIMIZED_OPACITY_RATE = 0.05
 COLOR_RATE = 2.5e-3
 
 DSSIM_WEIGHT = 0.2
 """Weight of 1 - SSIM in the loss; the rest is L1."""
 DENSE_SHARE = 0.01
 """Largest size of a cloned Gaussian, in camera extents; larger ones are split."""
-MIN_OPACITY = 0.005
+PRUNED_OPACITY = 0.005
 """Opacity below which Gaussians are pruned."""
 
 
@@ -58,7 +58,7 @@ def optimize(
     """Fit all attributes of `scene` to `views`; `seed` sets their order and the splitting."""
     random = torch.Generator().manual_seed(seed)
     extent = compute_extent([view.camera for view in views])
-    state = Parameters(scene, extent)
+    state = SceneParameters(scene, extent)
     # Sum of the image gradients of each Gaussian since the last round, and of its views.
     gradients = torch.zeros_like(scene.opacities)
     counts = torch.zeros_like(scene.opacities)
@@ -85,14 +85,14 @@ def optimize(
         if number in rounds:
             crowded = gradients / counts.clamp_min(1) >= config.gradient_threshold
             dense = control_density(state.make_gaussians(), crowded, extent, random)
-            state = Parameters(dense, extent)
+            state = SceneParameters(dense, extent)
             gradients = torch.zeros_like(dense.opacities)
             counts = torch.zeros_like(dense.opacities)
     with torch.no_grad():  # so that the result is detached from the parameters
         return state.make_gaussians()[:]
 
 
-class Parameters:
+class SceneParameters:
     """Optimized parameters of 3DGS: means, quats, log-scales, opacity logits and SH.
 
     Adam restarts with each round of density control.
@@ -102,7 +102,13 @@ class Parameters:
         self.scene = scene
         log_scales = scene.scales.clamp_min(1e-12).log()
         values = (scene.means, scene.quats, log_scales, scene.opacities.logit(eps=1e-4), scene.sh)
-        rates = (POSITION_RATE * extent, ROTATION_RATE, SCALE_RATE, OPACITY_RATE, COLOR_RATE)
+        rates = (
+            POSITION_RATE * extent,
+            ROTATION_RATE,
+            SCALE_RATE,
+            OPTIMIZED_OPACITY_RATE,
+            COLOR_RATE,
+        )
         self.leaves = [value.detach().clone().requires_grad_() for value in values]
         both = zip(self.leaves, rates, strict=True)
         groups = [{"params": [leaf], "lr": rate} for leaf, rate in both]
@@ -163,4 +169,4 @@ def control_density(
             moved = parents.means + (quats_to_rotations(parents.quats) @ offset[..., None])[..., 0]
             children.append(replace(parents, means=moved, scales=parents.scales / 1.6))
         dense = merge([kept, clones, *children])
-        return dense[dense.opacities >= MIN_OPACITY]
+        return dense[dense.opacities >= PRUNED_OPACITY]

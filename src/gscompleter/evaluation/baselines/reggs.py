@@ -26,9 +26,9 @@ EPSILON = 0.1
 """Entropic regularization, in squared units of length."""
 MAX_ITERATIONS = 100
 """Largest number of updates of both potentials."""
-TOLERANCE = 1e-5
+POTENTIAL_TOLERANCE = 1e-5
 """Largest change of a converged potential."""
-RATES = (1e-3, 2e-4, 2e-3)
+REGGS_RATES = (1e-3, 2e-4, 2e-3)
 """Step sizes of scale, rotation, and translation (in scene units), as in RegGS."""
 DEPTH_WEIGHT = 0.1
 """Weight of the depths in the loss, relative to the colours."""
@@ -89,7 +89,7 @@ def register_by_similarity(
     quaternion = scale.detach().new_tensor([1.0, 0.0, 0.0, 0.0]).requires_grad_()
     translation = torch.zeros(3, device=scale.device, requires_grad=True)
     parameters = (scale, quaternion, translation)
-    groups = [{"params": [p], "lr": rate} for p, rate in zip(parameters, RATES, strict=True)]
+    groups = [{"params": [p], "lr": rate} for p, rate in zip(parameters, REGGS_RATES, strict=True)]
     optimizer = torch.optim.Adam(groups, amsgrad=True)
 
     # The distance of mixtures takes time and memory of n × m 3×3 matrices: clusters instead of all.
@@ -265,7 +265,7 @@ def compute_mixture_wasserstein(a: Mixture, b: Mixture) -> Float[Tensor, ""]:
         log_u = log_a - torch.logsumexp(log_kernel + log_v[None], dim=1)
         before = log_v
         log_v = log_b - torch.logsumexp(log_kernel + log_u[:, None], dim=0)
-        if (log_v - before).abs().max() < TOLERANCE:
+        if (log_v - before).abs().max() < POTENTIAL_TOLERANCE:
             break
     log_plan = log_u[:, None] + log_kernel + log_v[None]
     return ((log_plan - log_plan.max()).exp() * cost).sum()

@@ -29,8 +29,8 @@ from gscompleter.trust import Trust
 from gscompleter.trust.photometric import PhotometricTrust
 from gscompleter.types import Camera, Render, merge
 
-NUM_CAMERAS = 32
-SIDE = 96
+NUM_COVERAGE_CAMERAS = 32
+COVERAGE_SIDE = 96
 """Longer side of the rendered images, in pixels."""
 TURN_DEGREES = 5.0
 """Standard deviation of yaw and pitch, in degrees."""
@@ -85,7 +85,9 @@ def render_pairs(
         )
 
     return list(
-        get_view_map(new.means)(render_pair, [shrink_camera(camera, SIDE) for camera in cameras])
+        get_view_map(new.means)(
+            render_pair, [shrink_camera(camera, COVERAGE_SIDE) for camera in cameras]
+        )
     )
 
 
@@ -107,7 +109,7 @@ def compute_covered_share(renders: Sequence[Render]) -> float:
 
 
 def sample_held_out_cameras(
-    cameras: Sequence[Camera], seed: int, count: int = NUM_CAMERAS
+    cameras: Sequence[Camera], seed: int, count: int = NUM_COVERAGE_CAMERAS
 ) -> list[Camera]:
     """Sample cameras around the path of `cameras`; the same seed gives the same cameras."""
     generator = torch.Generator().manual_seed(seed)

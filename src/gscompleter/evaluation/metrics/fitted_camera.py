@@ -28,11 +28,11 @@ from gscompleter.types import Camera, Gaussians, Render, View
 
 MAX_MOVE = 4.0
 """Largest rotation and shift along each axis, in pixels: poses are not searched for, but mended."""
-STEP = 0.25
+DERIVATIVE_STEP = 0.25
 """Difference of each number for the derivatives, in pixels."""
 MIN_STEP = 0.05
 """Largest change in pixels at which the fit has converged."""
-ROUNDS = 10
+MAX_NEWTON_STEPS = 10
 """Most steps of Gauss and Newton for each blur."""
 BLURS = (6.0, 1.5)
 """Standard deviations of the blur in pixels, one after the other, so that edges that lie beside
@@ -41,12 +41,12 @@ SHARES = (1.0, 0.5, 0.25)
 """Shares of a step that are tried until one helps."""
 ROBUST = 0.03
 """Error of a colour from which on it pulls no more than linearly."""
-MARGIN = 2
+HOLE_MARGIN = 2
 """Pixels around holes that do not count, since holes move with the camera."""
-MIN_PIXELS = 500
+MIN_POSE_PIXELS = 500
 """Fewest pixels that determine a pose."""
 
-Pixels = Float[np.ndarray, "h w 3"]
+PixelValues = Float[np.ndarray, "h w 3"]
 Move = Float[np.ndarray, "6"]
 """Rotation about x, y, z and shift along them, in camera axes and pixels."""
 
@@ -70,18 +70,18 @@ def measure_fitted(
 ) -> FittedQuality | None:
     """Fit the camera and the exposure of a target to its photograph, and score the scene there.
 
-    `holes` is where the scene was empty before it was completed. None if fewer than `MIN_PIXELS`
-    lie outside.
+    `holes` is where the scene was empty before it was completed. None if fewer than
+    `MIN_POSE_PIXELS` lie outside.
     """
-    observed = ~dilate(holes, MARGIN) & target.valid_mask
-    if observed.sum() < MIN_PIXELS:
+    observed = ~dilate(holes, HOLE_MARGIN) & target.valid_mask
+    if observed.sum() < MIN_POSE_PIXELS:
         return None
     truth = target.image.cpu().numpy()
     counted = observed.cpu().numpy()
     start = renderer.render(scene, target.camera)
     unit = measure_depth(start, observed) / float(target.camera.K[0, 0])
 
-    def draw(move: Move) -> Pixels:
+    def draw(move: Move) -> PixelValues:
         camera = move_camera_by(target.camera, move, unit)
         image = renderer.render(scene, camera).image
         return np.asarray(image.clamp(0, 1).cpu().numpy(), np.float64)
@@ -117,7 +117,7 @@ def move_camera_by(camera: Camera, move: Move, unit: float) -> Camera:
 
 
 def fit_move(
-    draw: Callable[[Move], Pixels], truth: Pixels, counted: Bool[np.ndarray, "h w"]
+    draw: Callable[[Move], PixelValues], truth: PixelValues, counted: Bool[np.ndarray, "h w"]
 ) -> Move:
     """Fit the move, from wide to narrow blur; zero if the picture is no nearer to the truth."""
     still = np.zeros(6)
@@ -129,26 +129,28 @@ def fit_move(
 
 
 def fit_blurred(
-    draw: Callable[[Move], Pixels],
+    draw: Callable[[Move], PixelValues],
     start: Move,
-    truth: Pixels,
+    truth: PixelValues,
     counted: Bool[np.ndarray, "h w"],
     sigma: float,
 ) -> Move:
     """Fit the move to blurred images, by steps of Gauss and Newton with robust weights."""
     wanted = blur(truth, sigma)
 
-    def compute_residuals(image: Pixels, gains: Float[np.ndarray, "3"]) -> Float[np.ndarray, "n"]:
+    def compute_residuals(
+        image: PixelValues, gains: Float[np.ndarray, "3"]
+    ) -> Float[np.ndarray, "n"]:
         return (blur(image, sigma) * gains - wanted)[counted].ravel()
 
     move = start
     image = draw(move)
-    for _ in range(ROUNDS):
+    for _ in range(MAX_NEWTON_STEPS):
         gains = fit_gains(image, truth, counted)
         residuals = compute_residuals(image, gains)
-        steps = STEP * np.eye(6)
+        steps = DERIVATIVE_STEP * np.eye(6)
         drawn = [compute_residuals(draw(move + step), gains) for step in steps]
-        slopes = np.stack([(one - residuals) / STEP for one in drawn], axis=1)
+        slopes = np.stack([(one - residuals) / DERIVATIVE_STEP for one in drawn], axis=1)
         weighted = slopes / np.maximum(np.abs(residuals), ROBUST)[:, None]
         # A little damping, where two of the numbers act alike, as a turn and a shift do.
         normal = weighted.T @ slopes
@@ -171,14 +173,14 @@ def fit_blurred(
     return move
 
 
-def measure_loss(image: Pixels, truth: Pixels, counted: Bool[np.ndarray, "h w"]) -> float:
+def measure_loss(image: PixelValues, truth: PixelValues, counted: Bool[np.ndarray, "h w"]) -> float:
     """Measure the squared error outside of holes after the best gains."""
     gains = fit_gains(image, truth, counted)
     return float(np.square(image * gains - truth)[counted].mean())
 
 
 def fit_gains(
-    image: Pixels, truth: Pixels, counted: Bool[np.ndarray, "h w"]
+    image: PixelValues, truth: PixelValues, counted: Bool[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "3"]:
     """Fit the gain of each channel by least squares; 1 for a black one."""
     seen = image[counted]
@@ -187,6 +189,6 @@ def fit_gains(
     return np.where(energy > 0, products / np.maximum(energy, 1e-12), 1.0)
 
 
-def blur(image: Pixels, sigma: float) -> Pixels:
+def blur(image: PixelValues, sigma: float) -> PixelValues:
     """Blur an image."""
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.float64)

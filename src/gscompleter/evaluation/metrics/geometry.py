@@ -20,7 +20,7 @@ from gscompleter.render.protocols import Renderer
 from gscompleter.stages.filter_holes import select_in_mask
 from gscompleter.types import Camera, DepthMap, Gaussians
 
-MIN_OPACITY = 1 / 255
+MIN_SCORED_OPACITY = 1 / 255
 """Opacity below which renderers drop a Gaussian."""
 
 MATCH_DISTANCE = 0.05
@@ -156,4 +156,4 @@ def compare_clouds(
 
 def drop_transparent(gaussians: Gaussians) -> Gaussians:
     """Drop Gaussians that no renderer shows."""
-    return gaussians[gaussians.opacities >= MIN_OPACITY]
+    return gaussians[gaussians.opacities >= MIN_SCORED_OPACITY]

@@ -10,16 +10,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gscompleter.numerics.image_ops import SSIM_RADIUS, SSIM_SIGMA
+
 MAX_PSNR = 100.0
 """PSNR in dB of equal images."""
 
 LUMINANCE = (0.299, 0.587, 0.114)
 """Weights of red, green and blue (ITU-R BT.601)."""
-
-RADIUS = 5
-"""Radius of SSIM's Gaussian window, in pixels."""
-SIGMA = 1.5
-"""Standard deviation of that window, in pixels."""
 
 
 def psnr(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
@@ -40,7 +37,7 @@ def ssim(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
     a = image.clamp(0, 1).cpu().numpy()
     b = truth.cpu().numpy()
     # Window pixels beyond the border are unknown; scikit-image leaves out the border likewise.
-    inner = compute_ssim_map(a, b)[RADIUS:-RADIUS, RADIUS:-RADIUS]
+    inner = compute_ssim_map(a, b)[SSIM_RADIUS:-SSIM_RADIUS, SSIM_RADIUS:-SSIM_RADIUS]
     if inner.size == 0:
         raise ValueError(f"SSIM needs 11 x 11 pixels, got {a.shape[1]} x {a.shape[0]}")
     # In the precision of the images, as scikit-image rounds the mean of the channels.
@@ -56,7 +53,7 @@ def compute_masked_ssim(
     Elsewhere the image is taken as right, so that what lies beside a pixel does not count.
     """
     shown = torch.where(where[..., None], image.clamp(0, 1), truth)
-    inner = slice(RADIUS, -RADIUS)
+    inner = slice(SSIM_RADIUS, -SSIM_RADIUS)
     counted = where.cpu().numpy()[inner, inner]
     similar = compute_ssim_map(shown.cpu().numpy(), truth.cpu().numpy())[inner, inner]
     return float(similar[counted].mean(dtype=np.float64)) if counted.any() else None
@@ -67,7 +64,7 @@ def compute_ssim_map(
 ) -> Float[np.ndarray, "h w 3"]:
     """Compute the structural similarity (Wang et al. 2004) at each pixel."""
     # Sample instead of population covariances: n / (n - 1) for the n pixels of the window.
-    unbiased = (2 * RADIUS + 1) ** 2 / ((2 * RADIUS + 1) ** 2 - 1)
+    unbiased = (2 * SSIM_RADIUS + 1) ** 2 / ((2 * SSIM_RADIUS + 1) ** 2 - 1)
     mean_a = blur_in_window(a)
     mean_b = blur_in_window(b)
     var_a = unbiased * (blur_in_window(a * a) - mean_a * mean_a)
@@ -82,7 +79,7 @@ def compute_ssim_map(
 
 def blur_in_window(values: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w 3"]:
     """Blur with a Gaussian window, summed in float64 and rounded after each direction."""
-    weights = np.exp(-0.5 / SIGMA**2 * np.arange(-RADIUS, RADIUS + 1) ** 2)
+    weights = np.exp(-0.5 / SSIM_SIGMA**2 * np.arange(-SSIM_RADIUS, SSIM_RADIUS + 1) ** 2)
     line = weights / weights.sum()
     point = np.ones(1)
     down = cv2.sepFilter2D(values, cv2.CV_64F, point, line).astype(values.dtype)

@@ -20,7 +20,7 @@ from gscompleter.system.errors import InputError
 
 Image = Float[Tensor, "h w 3"]
 
-C = 30.0
+GMSD_CONSTANT = 30.0
 """Constant of the similarity, in units of 8-bit colours; fitted by the authors."""
 ALPHA = 4.2
 """Steepness of the logistic function; fitted by the authors."""
@@ -28,7 +28,7 @@ YIQ = ((0.299, 0.587, 0.114), (0.5959, -0.2746, -0.3213), (0.2115, -0.5227, 0.31
 """Conversion from RGB to luminance and two chrominances."""
 MISSING = (ImportError, OSError, RuntimeError)
 """Errors without a package, without weights, and with a torchvision for another torch."""
-ADVICE = "run `pip install gscompleter[evaluation]`, and the first time with a connection."
+LPIPS_ADVICE = "run `pip install gscompleter[evaluation]`, and the first time with a connection."
 
 
 def haarpsi(image: Image, truth: Image, where: Bool[Tensor, "h w"]) -> float | None:
@@ -73,7 +73,7 @@ def compute_similarities(
 
 def compare_values(a: Float[Tensor, "*n"], b: Float[Tensor, "*n"]) -> Float[Tensor, "*n"]:
     """Compute (2 a b + c) / (a² + b² + c), which is 1 for equal values."""
-    return (2 * a * b + C) / (a**2 + b**2 + C)
+    return (2 * a * b + GMSD_CONSTANT) / (a**2 + b**2 + GMSD_CONSTANT)
 
 
 def compute_wavelets(luminance: Float[Tensor, "h w"], scale: int) -> Float[Tensor, "2 h w"]:
@@ -137,7 +137,7 @@ def compute_fid(images: Sequence[Image], truths: Sequence[Image]) -> float:
 
         metric = FrechetInceptionDistance(feature=2048, normalize=True)
     except MISSING as error:
-        raise InputError(f"FID is not available ({error}); {ADVICE}") from error
+        raise InputError(f"FID is not available ({error}); {LPIPS_ADVICE}") from error
     for side, group in (("photographs", truths), ("rendered images", images)):
         if len(group) < 2:
             raise InputError(f"FID needs at least two {side}, got {len(group)}.")

@@ -22,7 +22,12 @@ from gscompleter.evaluation.metrics.image import (
     compute_masked_psnr,
     ssim,
 )
-from gscompleter.evaluation.metrics.perceptual import compute_flip_map, compute_lpips, haarpsi
+from gscompleter.evaluation.metrics.perceptual import (
+    Image,
+    compute_flip_map,
+    compute_lpips,
+    haarpsi,
+)
 from gscompleter.evaluation.metrics.st_lpips import compute_st_lpips
 from gscompleter.evaluation.metrics.thin_gaps import (
     AT_TARGET,
@@ -36,9 +41,7 @@ from gscompleter.render.protocols import Renderer
 from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.types import Camera, DepthMap, Gaussians, Render, View
 
-Image = Float[Tensor, "h w 3"]
-
-MIN_PIXELS = 50
+MIN_DEPTH_PIXELS = 50
 """Minimum number of pixels for a median of depths."""
 
 
@@ -275,8 +278,8 @@ def compute_depth_scale(
 
 
 def compute_median(values: Float[Tensor, "h w"], where: Bool[Tensor, "h w"]) -> float | None:
-    """Compute the median over the pixels of `where`; None for fewer than `MIN_PIXELS`."""
-    return None if where.sum() < MIN_PIXELS else values[where].median().item()
+    """Compute the median over the pixels of `where`; None for fewer than `MIN_DEPTH_PIXELS`."""
+    return None if where.sum() < MIN_DEPTH_PIXELS else values[where].median().item()
 
 
 def compare_views(

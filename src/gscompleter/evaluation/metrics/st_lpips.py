@@ -17,8 +17,8 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d, normalize, pad
 
-PACKAGE = "stlpips_pytorch"
-WEIGHTS = Path("weights", "vST0.0", "alex_shift_tolerant.pth")
+ST_LPIPS_PACKAGE = "stlpips_pytorch"
+ST_LPIPS_WEIGHTS = Path("weights", "vST0.0", "alex_shift_tolerant.pth")
 """File of the weights in the package."""
 LAYERS = (
     ("slice1.0", 2, "before"),
@@ -29,7 +29,7 @@ LAYERS = (
 )
 """Name and padding of each convolution, and where it is halved: between it and its rectifier, or
 before it, after a maximum over 3 x 3 pixels."""
-MIN_SIDE = 21
+MIN_NETWORK_SIDE = 21
 """Shortest side of an image of which the third layer can still be halved, in pixels."""
 
 Weights = Mapping[str, Tensor]
@@ -39,10 +39,10 @@ Weights = Mapping[str, Tensor]
 def compute_st_lpips(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float | None:
     """Compute ST-LPIPS (AlexNet) of two images, clipped to [0, 1]; 0 is best.
 
-    None without the package, and for images with a side below `MIN_SIDE`.
+    None without the package, and for images with a side below `MIN_NETWORK_SIDE`.
     """
     weights = load_weights()
-    if weights is None or min(image.shape[:2]) < MIN_SIDE:
+    if weights is None or min(image.shape[:2]) < MIN_NETWORK_SIDE:
         return None
     pair = torch.stack([image, truth]).clamp(0, 1).movedim(-1, 1).float().cpu()
     total = 0.0
@@ -82,9 +82,9 @@ def halve_smoothly(values: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c half_
 @cache
 def load_weights() -> Weights | None:
     """Load the weights of the package, without importing it; None if it is not installed."""
-    found = find_spec(PACKAGE)
+    found = find_spec(ST_LPIPS_PACKAGE)
     for folder in (found and found.submodule_search_locations) or ():
-        if (path := Path(folder) / WEIGHTS).is_file():
+        if (path := Path(folder) / ST_LPIPS_WEIGHTS).is_file():
             weights: Weights = torch.load(path, map_location="cpu", weights_only=True)
             return weights
     return None

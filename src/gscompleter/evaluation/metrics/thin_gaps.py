@@ -21,7 +21,7 @@ from gscompleter.planning.candidates import interpolate_camera
 from gscompleter.render.protocols import Renderer
 from gscompleter.types import Camera, Gaussians, Render
 
-OPAQUE = 0.85
+OPAQUE_ALPHA = 0.85
 """Alpha below which black is seen through a surface."""
 FLIGHT_SHARES = (0.2, 0.4, 0.6, 0.8)
 """Places of the cameras of a flight, as shares of the way to the target."""
@@ -59,8 +59,8 @@ class WorstGap:
 
 
 def find_thin_gaps(alpha: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """Find the pixels below `OPAQUE` in structures thinner than 5 pixels."""
-    return keep_thin(alpha < OPAQUE)
+    """Find the pixels below `OPAQUE_ALPHA` in structures thinner than 5 pixels."""
+    return keep_thin(alpha < OPAQUE_ALPHA)
 
 
 def measure_thin_gaps(alpha: Float[Tensor, "h w"]) -> float:

@@ -21,7 +21,7 @@ from gscompleter.numerics.geometry import shrink_camera
 from gscompleter.splats.alignment.fit import convert_to_psnr, match_render
 from gscompleter.types import Render, View
 
-LONG_SIDE = 160
+JUDGED_SIDE = 160
 """Longer side of the compared images, in pixels: what is off by a pixel or two of the full size,
 as by the noise of good poses, still agrees, and a wrong pose is off by many."""
 MIN_COVERED = 0.2
@@ -41,7 +41,7 @@ class Likeness:
     """PSNR above that of the best photograph that was used, which stays as it is."""
 
 
-def shrink_view(view: View, side: int = LONG_SIDE) -> View:
+def shrink_view(view: View, side: int = JUDGED_SIDE) -> View:
     """Shrink a photograph and its camera to `side` pixels, by areas; a smaller one stays."""
     camera = shrink_camera(view.camera, side)
     size = camera.width, camera.height

@@ -19,7 +19,7 @@ from gscompleter.render.view_map import get_view_map
 from gscompleter.state import Completion
 from gscompleter.types import Camera, View
 
-BLOCK = 1_000_000
+COPIED_BLOCK = 1_000_000
 """Gaussians of a changed context that are copied at a time."""
 
 
@@ -41,7 +41,7 @@ def render_before_after(completion: Completion, camera: Camera, renderer: Render
         # colours alone change no depth and no opacity, and the frozen scene is painted over.
         if completion.source.gone_mask.any():
             frozen = renderer.freeze(completion.context[:0], camera)
-            for part in completion.iterate_kept(BLOCK):
+            for part in completion.iterate_kept(COPIED_BLOCK):
                 frozen = frozen.extend(part)
         elif len(completion.recolored) > 0:
             rows = completion.recolored_mask.nonzero()[:, 0]

@@ -34,14 +34,14 @@ def judge(completion: Completion, unused_views: Sequence[View] = ()) -> OutcomeR
         InputError: An unused view is none, or is a part of the context.
     """
     check_state(completion)
-    held_out = hold_out(completion, unused_views)
+    held_out = prepare_held_out(completion, unused_views)
     renderer = load_renderer(completion.views[0].image.device.type)
     rows = score_held_out(completion, held_out, renderer)
     context = score_context(completion, renderer) if completion.is_given else []
     return judge_completion(completion, rows, context=context)
 
 
-def hold_out(completion: Completion, unused_views: Sequence[View]) -> list[HeldOut]:
+def prepare_held_out(completion: Completion, unused_views: Sequence[View]) -> list[HeldOut]:
     """Check photographs that score a completion, and give them its depth range; as in `judge`."""
     check_views(unused_views, "unused")
     device = completion.views[0].image.device

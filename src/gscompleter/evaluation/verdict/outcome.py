@@ -44,14 +44,14 @@ MIN_CONSISTENT = 0.3
 On the same scenes it is 0.49 to 1.00 with true poses. With wrong ones it is below 0.3 only where
 the cameras differ much, so that this notices about half of them.
 """
-MIN_MATCHES = 20
+MIN_DECIDING_MATCHES = 20
 """Fewest matched features that decide: by chance, few wrong ones may fit."""
-MIN_GAIN = 0.5
+MIN_BETTER_GAIN = 0.5
 """Gain of PSNR in dB from which a photograph of the context counts as better than before."""
 MIN_LOSS = 0.05
 """Loss of PSNR in dB from which the headline mentions it; smaller ones cannot be seen."""
 
-ADVICE = (
+WORSE_ADVICE = (
     "Usual reasons: wrong poses or focal lengths of the cameras, things that moved, or photographs "
     "with too little in common."
 )
@@ -109,11 +109,11 @@ def explain_unreconstructed(completion: Completion, held_out: Sequence[HeldOutRo
         return None if is_like(compared) else describe_mismatch(compared)
     # In small images, in which poses that are a little off still fit.
     matches = count_consistent_matches([shrink_view(view) for view in completion.views])
-    if matches.total < MIN_MATCHES or matches.share >= MIN_CONSISTENT:
+    if matches.total < MIN_DECIDING_MATCHES or matches.share >= MIN_CONSISTENT:
         return None
     return (
         f"The scene did not reconstruct: of {matches.total} details that two photographs share, "
-        f"only {format_percent(matches.share, 0)} lie where the cameras see them. {ADVICE}"
+        f"only {format_percent(matches.share, 0)} lie where the cameras see them. {WORSE_ADVICE}"
     )
 
 
@@ -133,7 +133,7 @@ def describe_mismatch(compared: Sequence[HeldOutRow]) -> str:
     return (
         f"The scene did not reconstruct: seen from {name_unused(compared)}, it shows something "
         f"else ({psnr} dB{measured}; holding up one of its own photographs would be as good). "
-        f"{ADVICE}"
+        f"{WORSE_ADVICE}"
     )
 
 
@@ -199,12 +199,12 @@ def describe_gain(
     Unused photographs tell it best, then those of the `context` of a given scene that gained.
     """
     scored = [row for row in held_out if row.psnr_after is not None]
-    better = [row for row in context if compute_gain(row) >= MIN_GAIN]
+    better = [row for row in context if compute_psnr_gain(row) >= MIN_BETTER_GAIN]
     has_unused = any(not row.is_check for row in scored)
     if not scored or (better and not has_unused):
         if not better:
             return f"{work}; no unused photograph could test it"
-        gains = format_number(average(compute_gain(row) for row in better), 1)
+        gains = format_number(average(compute_psnr_gain(row) for row in better), 1)
         gain = "1 photograph gains" if len(better) == 1 else f"{len(better)} photographs gain"
         return f"{work}: {gain} {gains} dB"
 
@@ -223,7 +223,7 @@ def describe_gain(
     return f"{work}: {name_unused(rows)} {gain} {place} ({scores})"
 
 
-def compute_gain(row: ScoreRow) -> float:
+def compute_psnr_gain(row: ScoreRow) -> float:
     """Return the gain of PSNR of a photograph in dB; none without a score or of an equal image."""
     if row.psnr_before is None or row.psnr_after is None or isinf(row.psnr_before):
         return 0.0

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Float
 
 from gscompleter.numerics.geometry import sample
-from gscompleter.reconstructors.features.depth_range import MIN_MATCHES
+from gscompleter.reconstructors.features.depth_range import MIN_RANGE_MATCHES
 from gscompleter.reconstructors.features.matches import triangulate
 from gscompleter.reconstructors.features.neighbours import find_neighbours
 from gscompleter.reconstructors.features.stereo_image import make_stereo_images
@@ -39,11 +39,11 @@ def estimate_units_per_metre(views: Sequence[View], metres: Sequence[DepthMap]) 
             ratios.append(unit / (inverse[good] * known[good]))
 
     all_ratios = np.concatenate(ratios)
-    if len(all_ratios) < MIN_MATCHES:
+    if len(all_ratios) < MIN_RANGE_MATCHES:
         raise InputError(
             f"The photographs share {len(all_ratios)} features of known depth, and the scale of "
-            f"the scene needs {MIN_MATCHES}; choose another reconstructor, or frames with more "
-            "overlap."
+            f"the scene needs {MIN_RANGE_MATCHES}; choose another reconstructor, or frames with "
+            "more overlap."
         )
     return float(np.median(all_ratios))
 

@@ -40,8 +40,8 @@ def _choose_cache():
     if folder is not None:
         if not wanted or Path(os.path.abspath(wanted)) in Path(os.path.abspath(folder)).parents:
             return KernelCache(folder)
-        return KernelCache(folder, f"{_explain(wanted)}; they are kept in {folder}.")
-    reason = _explain(wanted or "the user's cache, nor the installation")
+        return KernelCache(folder, f"{_explain_no_cache(wanted)}; they are kept in {folder}.")
+    reason = _explain_no_cache(wanted or "the user's cache, nor the installation")
     # Other users must not be able to put compiled code there.
     temporary = _make_private_folder()
     if temporary is not None:
@@ -52,7 +52,7 @@ def _choose_cache():
     return KernelCache(None, f"{reason}; they are compiled again in each run.")
 
 
-def _explain(place):
+def _explain_no_cache(place):
     return f"Compiled kernels cannot be written to {place} (set {VARIABLE} to a folder)"
 
 

@@ -100,7 +100,7 @@ def merge_lists(begin, end, context, new, used, full, tile_start, entries, depth
 
 
 @njit()
-def _locate(tile, height, width):
+def _locate_tile(tile, height, width):
     """Return left and top pixel of a tile, and its rows and columns inside the image."""
     tiles_x = (width + TILE - 1) // TILE
     left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
@@ -151,7 +151,7 @@ def composite(begin, end, tiles, context, new, frame):
     infinity = np.float32(np.inf)
     for index in range(begin, end):
         tile = tiles[index]
-        left, top, rows, columns = _locate(tile, height, width)
+        left, top, rows, columns = _locate_tile(tile, height, width)
         _open_pixels(state, columns)
         last[:] = -1
         row_limit[:] = np.iinfo(np.int32).max
@@ -212,7 +212,7 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
     infinity = np.float32(np.inf)
     for index in range(begin, end):
         tile = tiles[index]
-        left, top, rows, columns = _locate(tile, height, width)
+        left, top, rows, columns = _locate_tile(tile, height, width)
         _open_pixels(state, columns)
         row_limit[:] = 0
         open_rows = rows
@@ -286,7 +286,7 @@ def composite_backward(
         n = n_begin + used[tile, 1]
         if n == n_begin:
             continue
-        left, top, rows, columns = _locate(tile, height, width)
+        left, top, rows, columns = _locate_tile(tile, height, width)
         state[:] = 0
         last[:] = -1
         row_limit[:] = -1

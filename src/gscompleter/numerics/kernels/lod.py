@@ -8,13 +8,13 @@ from gscompleter.numerics.kernels.cache import njit
 from gscompleter.numerics.kernels.project import normalize_quat, rotate_by_quat
 from gscompleter.numerics.kernels.splat_rows import copy_row
 
-BLOCK = 4096
+RUN_BLOCK = 4096
 """Consecutive Gaussians that are cut into runs independently of the others."""
-MAX_OPACITY = np.float32(0.9999)
+MAX_RUN_OPACITY = np.float32(0.9999)
 """Largest opacity, which keeps the logarithm of the transmittance finite."""
 MAX_THICKNESS = np.float32(4.6)
 """Optical thickness (at opacity 0.99) beyond which a Gaussian hardly gets wider."""
-MIN_DIVISOR = np.float32(1e-30)
+MIN_WEIGHT_SUM = np.float32(1e-30)
 
 
 @njit(nogil=True, fastmath={"contract"}, error_model="numpy")
@@ -29,8 +29,8 @@ def mark_run_starts(begin, end, means, scales, generated, centers, focals, reach
         x = np.float32(0)
         y = np.float32(0)
         z = np.float32(0)
-        origin = generated[block * BLOCK]
-        for i in range(block * BLOCK, min((block + 1) * BLOCK, len(means))):
+        origin = generated[block * RUN_BLOCK]
+        for i in range(block * RUN_BLOCK, min((block + 1) * RUN_BLOCK, len(means))):
             dx = means[i, 0] - x
             dy = means[i, 1] - y
             dz = means[i, 2] - z
@@ -72,7 +72,7 @@ def _compute_cross_section(scales, i):
 @njit(fastmath={"contract"})
 def _compute_thickness(opacity):
     """Compute the optical thickness t of an opacity: exp(-t) is the transmittance."""
-    return -math.log(np.float32(1) - min(opacity, MAX_OPACITY))
+    return -math.log(np.float32(1) - min(opacity, MAX_RUN_OPACITY))
 
 
 @njit()
@@ -98,7 +98,7 @@ def _compute_shares(first, last, scales, opacities, shares):
 
 
 @njit(fastmath={"contract"})
-def _compute_mean(first, last, shares, values, mean):
+def _compute_run_mean(first, last, shares, values, mean):
     for column in range(len(mean)):
         begun = values[first, column]
         away = np.float32(0)
@@ -126,7 +126,7 @@ def _compute_variance(first, last, shares, means, quats, scales, mean, axis):
 
 
 @njit(nogil=True, fastmath={"contract"}, error_model="numpy")
-def merge_runs(begin, end, start, gaussians, shares, merged):
+def merge_run_range(begin, end, start, gaussians, shares, merged):
     """Merge each of the runs begin..end into one Gaussian.
 
     It has their joint transmittance, mean position and colour, and variances along the axes of the
@@ -138,8 +138,8 @@ def merge_runs(begin, end, start, gaussians, shares, merged):
         first = start[run]
         last = start[run + 1]
         most, total = _compute_shares(first, last, scales, opacities, shares)
-        _compute_mean(first, last, shares, means, to_means[run])
-        _compute_mean(first, last, shares, sh, to_sh[run])
+        _compute_run_mean(first, last, shares, means, to_means[run])
+        _compute_run_mean(first, last, shares, sh, to_sh[run])
         copy_row(quats, most, to_quats, run)
         if last - first == 1:
             copy_row(scales, first, to_scales, run)
@@ -150,11 +150,11 @@ def merge_runs(begin, end, start, gaussians, shares, merged):
             axis = axes[k], axes[3 + k], axes[6 + k]
             seen = (means, quats, scales, to_means[run], axis)
             to_scales[run, k] = math.sqrt(_compute_variance(first, last, shares, *seen))
-        thickness = total / max(_compute_cross_section(to_scales, run), MIN_DIVISOR)
+        thickness = total / max(_compute_cross_section(to_scales, run), MIN_WEIGHT_SUM)
         before = np.float32(0)
         for i in range(first, last):
             before += shares[i] * _compute_thickness(opacities[i])
         wider = math.sqrt(_compute_fullness(thickness) / _compute_fullness(before))
         for k in range(3):
             to_scales[run, k] *= wider
-        to_opacities[run] = min(-math.expm1(-thickness), MAX_OPACITY)
+        to_opacities[run] = min(-math.expm1(-thickness), MAX_RUN_OPACITY)

@@ -10,9 +10,9 @@ import numpy as np
 from gscompleter.numerics.kernels.cache import njit
 from gscompleter.numerics.kernels.parallel import share
 
-RADIUS = 3
+PATCHMATCH_RADIUS = 3
 """Radius of a patch of 2 * radius + 1 pixels; a compile-time constant for vectorised rows."""
-SIDE = 2 * RADIUS + 1
+PATCHMATCH_SIDE = 2 * PATCHMATCH_RADIUS + 1
 """Side of a patch, in pixels."""
 LANES = 24
 """Values per row of a patch: 3 per pixel, with one pixel of padding to fill whole registers."""
@@ -22,7 +22,7 @@ class PatchProblem(NamedTuple):
     """The image to complete, and the sources of its patches."""
 
     image: np.ndarray
-    """float32 [h + 2 RADIUS, w + 2 RADIUS + 1, 3]: the image, padded by `pad_border`."""
+    """float32 [h + 2 r, w + 2 r + 1, 3], r of `PATCHMATCH_RADIUS`: padded by `pad_border`."""
     weight: np.ndarray
     """float32, same shape: weight of each value."""
     total: np.ndarray
@@ -66,7 +66,14 @@ def _hash(value):
 
 def pad_border(image):
     """Pad `image` [h, w, 3] with zeros for the patches around its corners."""
-    return np.pad(image, ((RADIUS, RADIUS), (RADIUS, RADIUS + 1), (0, 0)))
+    return np.pad(
+        image,
+        (
+            (PATCHMATCH_RADIUS, PATCHMATCH_RADIUS),
+            (PATCHMATCH_RADIUS, PATCHMATCH_RADIUS + 1),
+            (0, 0),
+        ),
+    )
 
 
 def pad_column(images):
@@ -81,7 +88,7 @@ def _copy(image, y, x, patch):
     stride = np.uintp(3 * image.shape[1])
     start = np.uintp(y) * stride + np.uintp(3 * x)
     for lane in range(LANES):
-        for row in range(SIDE):
+        for row in range(PATCHMATCH_SIDE):
             patch[row, lane] = numbers[start + np.uintp(row) * stride + np.uintp(lane)]
 
 
@@ -94,18 +101,18 @@ def _compute_patch_cost(costs, patch, weight, total, sources, s, sy, sx, sums, b
     H, W = sources.shape[1:3]
     # Unsigned, so that no index is checked for negative values.
     stride = np.uintp(3 * W)
-    start = np.uintp(3 * ((s * H + sy - RADIUS) * W + sx - RADIUS))
+    start = np.uintp(3 * ((s * H + sy - PATCHMATCH_RADIUS) * W + sx - PATCHMATCH_RADIUS))
     # Each lane sums its column of the patch over all rows, so that lanes are vectorised.
     for lane in range(LANES):
         square = difference = np.float32(0)
-        for row in range(SIDE):
+        for row in range(PATCHMATCH_SIDE):
             e = patch[row, lane] - numbers[start + np.uintp(row) * stride + np.uintp(lane)]
             weighted = weight[row, lane] * e
             difference += weighted
             square += weighted * e
         sums[0, lane], sums[1, lane] = square, difference
     square = d0 = d1 = d2 = np.float32(0)
-    for column in range(SIDE):
+    for column in range(PATCHMATCH_SIDE):
         square += sums[0, 3 * column] + sums[0, 3 * column + 1] + sums[0, 3 * column + 2]
         d0 += sums[1, 3 * column]
         d1 += sums[1, 3 * column + 1]
@@ -160,8 +167,8 @@ def _improve(begin, end, problem, costs, max_reach, seed, before, field, cost, s
     query_at = problem.query_at
     num_sources, H, W = usable.shape
     h, w = query_at.shape
-    patch = np.empty((SIDE, LANES), np.float32)
-    weight = np.empty((SIDE, LANES), np.float32)
+    patch = np.empty((PATCHMATCH_SIDE, LANES), np.float32)
+    weight = np.empty((PATCHMATCH_SIDE, LANES), np.float32)
     sums = np.empty((2, LANES), np.float32)
     bias = np.empty(3, np.float32)
     for i in range(begin, end):
@@ -230,10 +237,10 @@ def vote(query_at, vote_weight, sources, field, shift):
     """
     h, w = query_at.shape
     # Wider than the image, so that patches over its sides need not be cut.
-    colors = np.zeros((h, w + 2 * RADIUS, 3), np.float32)
-    totals = np.zeros((h, w + 2 * RADIUS), np.float32)
+    colors = np.zeros((h, w + 2 * PATCHMATCH_RADIUS, 3), np.float32)
+    totals = np.zeros((h, w + 2 * PATCHMATCH_RADIUS), np.float32)
     share(_vote, h, query_at, vote_weight, sources, field, shift, colors, totals)
-    inner = np.s_[:, RADIUS:-RADIUS]
+    inner = np.s_[:, PATCHMATCH_RADIUS:-PATCHMATCH_RADIUS]
     return colors[inner] / np.maximum(totals[inner], 1e-12)[..., None], totals[inner]
 
 
@@ -241,7 +248,7 @@ def vote(query_at, vote_weight, sources, field, shift):
 def _vote(begin, end, query_at, vote_weight, sources, field, shift, colors, totals):
     h, w = query_at.shape
     # A thread writes its own rows alone, and reads the patches that reach into them from outside.
-    for y in range(max(begin - RADIUS, 0), min(end + RADIUS, h)):
+    for y in range(max(begin - PATCHMATCH_RADIUS, 0), min(end + PATCHMATCH_RADIUS, h)):
         for x in range(w):
             q = query_at[y, x]
             if q < 0:
@@ -250,11 +257,13 @@ def _vote(begin, end, query_at, vote_weight, sources, field, shift, colors, tota
             s = field[q, 0]
             sy = field[q, 1]
             sx = field[q, 2]
-            for dy in range(max(-RADIUS, begin - y), min(RADIUS, end - 1 - y) + 1):
+            for dy in range(
+                max(-PATCHMATCH_RADIUS, begin - y), min(PATCHMATCH_RADIUS, end - 1 - y) + 1
+            ):
                 source_row = sources[s, sy + dy]
                 sums = colors[y + dy]
-                for column in range(SIDE):
+                for column in range(PATCHMATCH_SIDE):
                     for c in range(3):
-                        color = source_row[sx - RADIUS + column, c] + shift[q, c]
+                        color = source_row[sx - PATCHMATCH_RADIUS + column, c] + shift[q, c]
                         sums[x + column, c] += a * color
                     totals[y + dy, x + column] += a

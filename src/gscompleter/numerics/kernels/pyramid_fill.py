@@ -48,15 +48,15 @@ def _compute_means(begin, end, pyramid, pixels, level, result):
     for p in range(begin, end):
         below = int(level[p])
         above = np.float32(level[p] - below)
-        _compute_mean(pyramid, pixels[p, 0], pixels[p, 1], below, sums, result[p])
+        _compute_known_mean(pyramid, pixels[p, 0], pixels[p, 1], below, sums, result[p])
         if above > 0:
-            _compute_mean(pyramid, pixels[p, 0], pixels[p, 1], below + 1, sums, wider)
+            _compute_known_mean(pyramid, pixels[p, 0], pixels[p, 1], below + 1, sums, wider)
             for c in range(count):
                 result[p, c] = (np.float32(1) - above) * result[p, c] + above * wider[c]
 
 
 @njit(fastmath={"contract"})
-def _compute_mean(pyramid, y, x, number, sums, mean):
+def _compute_known_mean(pyramid, y, x, number, sums, mean):
     count = len(pyramid.global_mean)
     for level in range(number, len(pyramid.starts)):
         _sample(pyramid, y, x, level, sums)
@@ -72,8 +72,8 @@ def _compute_mean(pyramid, y, x, number, sums, mean):
 def _sample(pyramid, y, x, level, sums):
     """Write the sums of a level at a pixel of the image, interpolated bilinearly."""
     start, h, w = pyramid.starts[level], pyramid.sizes[level, 0], pyramid.sizes[level, 1]
-    top, down = _locate(y, h, pyramid.sizes[0, 0])
-    left, along = _locate(x, w, pyramid.sizes[0, 1])
+    top, down = _locate_sample(y, h, pyramid.sizes[0, 0])
+    left, along = _locate_sample(x, w, pyramid.sizes[0, 1])
     bottom, right = min(top + 1, h - 1), min(left + 1, w - 1)
     for c in range(len(sums)):
         a = pyramid.sums[start + top * w + left, c]
@@ -85,7 +85,7 @@ def _sample(pyramid, y, x, level, sums):
 
 
 @njit(inline="always")
-def _locate(pixel, count, total):
+def _locate_sample(pixel, count, total):
     exact = min(max((pixel + 0.5) * count / total - 0.5, 0.0), count - 1.0)
     first = int(exact)
     return first, np.float32(exact - first)

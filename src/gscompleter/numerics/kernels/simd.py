@@ -108,7 +108,7 @@ def _broadcast(builder, scalar, vector_type=_FLOATS):
     return _Lanes(builder, lanes)
 
 
-def _exp_negative(values):
+def _exp_negative_lanes(values):
     """Compute exp(-values) for values >= 0; beyond 80 it is practically 0."""
     builder = values.builder
     power = values * -_LOG2_E
@@ -180,7 +180,7 @@ class _Splat:
         s = self.u_dx + _broadcast(builder, builder.fmul(self.v, dy))
         t = builder.fmul(self.w, dy)
         sigma = s.multiply_add(s, plus=_broadcast(builder, builder.fmul(t, t)))
-        raw = self.opacity * _exp_negative(sigma)
+        raw = self.opacity * _exp_negative_lanes(sigma)
         capped = raw.where(raw.compare("<=", MAX_ALPHA), MAX_ALPHA)
         return dy, raw, capped, raw.compare(">=", MIN_ALPHA)
 

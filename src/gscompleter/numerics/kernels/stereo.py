@@ -18,7 +18,7 @@ TILE_COLUMNS = 64
 """Size of a tile, which is matched at once, within the cache."""
 INFEASIBLE = np.int16(16000)
 """Infeasible cost, half of the largest int16."""
-PATHS = 8
+AGGREGATION_PATHS = 8
 """Number of paths of semi-global aggregation."""
 
 
@@ -404,7 +404,7 @@ def _choose(begin, end, totals, bands, index, margin):
             for k in range(planes):
                 if abs(k - best) > 2:
                     second = min(second, total[k])
-            margin[y, x] = np.float32(second - total[best]) / np.float32(PATHS)
+            margin[y, x] = np.float32(second - total[best]) / np.float32(AGGREGATION_PATHS)
             at = np.float32(bands.low[row, column] + best)
             if 0 < best < planes - 1:
                 # Two lines of opposite gradient: less biased towards whole planes than a parabola.
@@ -476,12 +476,12 @@ def fill_background(values, known):
     Low inverse depths are far away, and one ray may miss a thin object in front.
     """
     filled = values.copy()
-    share(_fill, len(values), values, known, filled)
+    share(_fill_unknown, len(values), values, known, filled)
     return filled
 
 
 @njit(nogil=True)
-def _fill(begin, end, values, known, filled):
+def _fill_unknown(begin, end, values, known, filled):
     h, w = values.shape
     for y in range(begin, end):
         for x in range(w):

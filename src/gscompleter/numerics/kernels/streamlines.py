@@ -5,7 +5,7 @@ import numpy as np
 from gscompleter.numerics.kernels.cache import njit
 from gscompleter.numerics.kernels.parallel import share
 
-NUM_SAMPLES = 3
+NUM_CARRIED_PIXELS = 3
 """Pixels behind the border whose mean a line carries; the outermost one is the least certain."""
 LENGTH_FLOOR = np.float32(0.1)
 """Added to squared lengths, so that no weight is infinite."""
@@ -57,7 +57,7 @@ def _trace_way(image, known, directions, row, column, sign, limit):
     dx, dy = sign * directions[row, column, 0], sign * directions[row, column, 1]
     x, y = np.float32(column) + np.float32(0.5), np.float32(row) + np.float32(0.5)
     r = g = b = length = count = np.float32(0)
-    while length < limit and count < NUM_SAMPLES:
+    while length < limit and count < NUM_CARRIED_PIXELS:
         if known[row, column]:
             r += image[row, column, 0]
             g += image[row, column, 1]

@@ -7,11 +7,11 @@ import numpy as np
 
 from gscompleter.numerics.kernels.cache import njit
 
-BLOCK = 256
+SUPPORT_BLOCK = 256
 """Gaussians per block."""
 MIN_ANGLE_WEIGHT = np.float32(1e-6)
 """Smallest angular weight: opposite photographs count if there are no others."""
-MIN_DIVISOR = np.float32(1e-20)
+MIN_CAP_DIVISOR = np.float32(1e-20)
 
 # Abramowitz and Stegun 4.4.46: acos(x) = sqrt(1 - x) p(x) from 0 to 1, to 2e-8.
 _A0, _A1, _A2, _A3 = map(np.float32, (1.5707963050, -0.2145988016, 0.0889789874, -0.0501743046))
@@ -19,7 +19,7 @@ _A4, _A5, _A6, _A7 = map(np.float32, (0.0308918810, -0.0170881256, 0.0066700901,
 # Least squares polynomial of 2**x on [-1, 0]: relative error 2e-7.
 _E0, _E1, _E2 = map(np.float32, (0.999999923, 0.693142171, 0.240171588))
 _E3, _E4, _E5 = map(np.float32, (0.055278135, 0.00918687438, 0.000938116473))
-_LOG2_E = np.float32(1.4426950408889634)
+_LOG2_E32 = np.float32(1.4426950408889634)
 _PI = np.float32(math.pi)
 
 
@@ -48,7 +48,7 @@ def _acos(x):
 @njit(fastmath={"contract"})
 def _exp_negative(x):
     """Compute exp(-x) for x >= 0; beyond 80 it is practically 0."""
-    power = max(-_LOG2_E * x, np.float32(-120))
+    power = max(-_LOG2_E32 * x, np.float32(-120))
     # 2^power by its whole part, which goes into the exponent of a float32, and a polynomial for the
     # rest, in (-1, 0].
     whole = np.int32(power)
@@ -91,7 +91,7 @@ def _add_agreement(x, y, z, rays, center, turn, areas, agreement, totals):
         dx = x[j] - center_x
         dy = y[j] - center_y
         dz = z[j] - center_z
-        inverse = one / math.sqrt(max(dx * dx + dy * dy + dz * dz, MIN_DIVISOR))
+        inverse = one / math.sqrt(max(dx * dx + dy * dy + dz * dz, MIN_CAP_DIVISOR))
         turned = _acos((dx * ray_x[j] + dy * ray_y[j] + dz * ray_z[j]) * inverse) * turn
         weight = areas[j] * (_exp_negative(turned * turned) + MIN_ANGLE_WEIGHT)
         agreeing[j] += weight * agreement[j]
@@ -112,18 +112,18 @@ def accumulate_trust(
     """
     one = np.float32(1)
     turn = np.float32(1) / max_turn
-    known = np.empty((6, BLOCK), np.float32)
+    known = np.empty((6, SUPPORT_BLOCK), np.float32)
     x, y, z, ray_x, ray_y, ray_z = known
-    agreeing, weights, largest = totals = np.empty((3, BLOCK), np.float32)
-    for start in range(begin, end, BLOCK):
-        count = min(BLOCK, end - start)
+    agreeing, weights, largest = totals = np.empty((3, SUPPORT_BLOCK), np.float32)
+    for start in range(begin, end, SUPPORT_BLOCK):
+        count = min(SUPPORT_BLOCK, end - start)
         totals[:] = 0
         for j in range(count):
             x[j], y[j], z[j] = means[start + j, 0], means[start + j, 1], means[start + j, 2]
             dx = x[j] - place.center[0]
             dy = y[j] - place.center[1]
             dz = z[j] - place.center[2]
-            inverse = one / math.sqrt(max(dx * dx + dy * dy + dz * dz, MIN_DIVISOR))
+            inverse = one / math.sqrt(max(dx * dx + dy * dy + dz * dz, MIN_CAP_DIVISOR))
             ray_x[j], ray_y[j], ray_z[j] = dx * inverse, dy * inverse, dz * inverse
         for k in range(len(centers)):
             center = centers[k, 0], centers[k, 1], centers[k, 2]
@@ -133,7 +133,7 @@ def accumulate_trust(
             )
         for j in range(count):
             i = start + j
-            needed = max(sums[i] * _compute_pixel_area(means, i, place), MIN_DIVISOR)
+            needed = max(sums[i] * _compute_pixel_area(means, i, place), MIN_CAP_DIVISOR)
             share = min(largest[j] / (enough * needed), one)
-            supported = share * agreeing[j] / max(weights[j], MIN_DIVISOR)
+            supported = share * agreeing[j] / max(weights[j], MIN_CAP_DIVISOR)
             values[i] = supported if sums[i] > 0 else one

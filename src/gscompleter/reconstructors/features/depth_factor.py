@@ -24,7 +24,7 @@ MIN_SAMPLES = 24
 """Fewest compared depths from which a factor is estimated."""
 MIN_OWN_SAMPLES = 12
 """Fewest compared depths from which a single photograph is judged."""
-CORE = np.log(1.1)
+RATIO_WINDOW = np.log(1.1)
 """Half the width of the window, in logarithms, that is moved to where most ratios lie."""
 AGREEMENT = np.log(1.25)
 """Largest deviation of a logarithm that agrees with the factor. Stereo is as inexact as the poses:
@@ -35,7 +35,7 @@ MIN_AGREEMENT = 0.5
 same share tells that it has another one, as relative depth has in each."""
 MIN_CORRELATION = -0.3
 """Smallest rank correlation of given and measured depths. Inverted depth comes near -1."""
-NOISE = np.log(1.1)
+POSE_NOISE = np.log(1.1)
 """Largest logarithm that counts as no factor: errors of poses scale all depths of a pair."""
 MAD_TO_SIGMA = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
@@ -139,7 +139,7 @@ def fit_depth_factor(samples: DepthSamples) -> DepthFactor | None:
 
     # A factor within the noise of the poses, or of the ratios themselves, counts as 1.
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(ratios - log_factor)))
-    if abs(log_factor) <= max(NOISE, sigma):
+    if abs(log_factor) <= max(POSE_NOISE, sigma):
         log_factor = 0.0
 
     agreement = compute_agreement(ratios, log_factor)
@@ -152,10 +152,10 @@ def fit_depth_factor(samples: DepthSamples) -> DepthFactor | None:
 def find_densest(ratios: Float[np.ndarray, "n"]) -> float:
     """Find the median of the ratios in the window around one of them that holds the most."""
     ordered = np.sort(ratios)
-    first = np.searchsorted(ordered, ordered - CORE)
-    last = np.searchsorted(ordered, ordered + CORE)
+    first = np.searchsorted(ordered, ordered - RATIO_WINDOW)
+    last = np.searchsorted(ordered, ordered + RATIO_WINDOW)
     center = ordered[(last - first).argmax()]
-    return float(np.median(ratios[np.abs(ratios - center) <= CORE]))
+    return float(np.median(ratios[np.abs(ratios - center) <= RATIO_WINDOW]))
 
 
 def compute_agreement(ratios: Float[np.ndarray, "n"], log_factor: float) -> float:
@@ -173,20 +173,20 @@ def contradicts_factor(samples: DepthSamples, log_factor: float) -> bool:
     ratios = np.log(samples.measured) - np.log(samples.given)
     if compute_agreement(ratios, log_factor) >= MIN_AGREEMENT:
         return False
-    in_core = np.abs(ratios - find_densest(ratios)) <= CORE
+    in_core = np.abs(ratios - find_densest(ratios)) <= RATIO_WINDOW
     return bool(in_core.mean() >= MIN_AGREEMENT) or correlate_ranks(samples) < MIN_CORRELATION
 
 
 def correlate_ranks(samples: DepthSamples) -> float:
     """Compute Spearman's rank correlation of given and measured depths; 0 if one is constant."""
-    given = rank(samples.given)
-    measured = rank(samples.measured)
+    given = rank_values(samples.given)
+    measured = rank_values(samples.measured)
     if np.ptp(given) == 0 or np.ptp(measured) == 0:
         return 0.0
     return float(np.corrcoef(given, measured)[0, 1])
 
 
-def rank(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+def rank_values(values: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
     """Rank values; equal ones share their mean rank.
 
     `scipy.stats.rankdata` gives the same, and its import takes longer than a tenth of a completion.

@@ -13,7 +13,7 @@ from gscompleter.reconstructors.features.stereo_image import StereoImage, make_s
 from gscompleter.system.errors import InputError
 from gscompleter.types import View
 
-MIN_MATCHES = 12
+MIN_RANGE_MATCHES = 12
 """Fewest triangulated features for an estimate."""
 MARGINS = (0.5, 4.0)
 """Near and far over the depths of the nearest and farthest features."""
@@ -64,7 +64,7 @@ def measure_extreme_depths(
             inverses.append(triangulate_valid(images[i], images[j], in_i, in_j))
             inverses.append(triangulate_valid(images[j], images[i], in_j, in_i))
     inverse = np.concatenate(inverses)
-    if len(inverse) < MIN_MATCHES:
+    if len(inverse) < MIN_RANGE_MATCHES:
         return None
     # The nearest depth is the largest inverse depth.
     low, high = np.quantile(inverse, [SHARE_OUTSIDE, 1 - SHARE_OUTSIDE]).tolist()

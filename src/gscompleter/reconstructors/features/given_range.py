@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float
 
 from gscompleter.reconstructors.features.depth_range import (
     MARGINS,
-    MIN_MATCHES,
+    MIN_RANGE_MATCHES,
     SHARE_OUTSIDE,
     get_depth_range,
     measure_feature_depths,
@@ -62,14 +62,14 @@ class SeenDepths:
 
     def find_nearest(self, near: float) -> float | None:
         """Find the depth of the nearest 2 %; None if they do not lie before the near plane."""
-        if len(self.inverse) < MIN_MATCHES:
+        if len(self.inverse) < MIN_RANGE_MATCHES:
             return None
         nearest = 1 / float(np.quantile(self.inverse, 1 - SHARE_OUTSIDE))
         return nearest if nearest < near else None
 
     def find_farthest(self, far: float) -> float | None:
         """Find the depth of the farthest 2 %; None if they do not lie behind the far plane."""
-        if len(self.inverse) < MIN_MATCHES:
+        if len(self.inverse) < MIN_RANGE_MATCHES:
             return None
         farthest = 1 / float(np.quantile(self.inverse, SHARE_OUTSIDE))
         return farthest if farthest > far else None
@@ -90,7 +90,7 @@ def find_depth_range(
     else:
         found = DepthRange(*get_depth_range(views, lambda _: trained))
         if None in known:
-            return replace(found, notes=describe_mismatch(views, found))
+            return replace(found, notes=describe_untrained_range(views, found))
     if known in ((None, None), trained):
         return found
     if not keeps:
@@ -131,7 +131,7 @@ def widen_range(views: Sequence[View], given: DepthRange, outcome: str = "") -> 
     return DepthRange(near, far, notes)
 
 
-def describe_mismatch(views: Sequence[View], trained: DepthRange) -> tuple[str, ...]:
+def describe_untrained_range(views: Sequence[View], trained: DepthRange) -> tuple[str, ...]:
     """Say that the scene's features lie outside of the depths that Ψ was trained on.
 
     Published networks sweep planes between depths that their authors chose. A scene in another

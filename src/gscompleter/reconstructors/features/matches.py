@@ -19,7 +19,7 @@ Pixels = Float[np.ndarray, "m 2"]
 
 CACHE_SIZE = 32
 """Images whose features are cached, because each target matches them again."""
-MAX_ERROR = 3.0
+MAX_EPIPOLAR_DISTANCE = 3.0
 """Largest distance of a match from its epipolar line, in pixels; poses are noisy."""
 MIN_DEPTH = 1e-6
 """Smallest z in the source, per z in the reference, that lies in front of it."""
@@ -90,15 +90,17 @@ def triangulate(
     error = np.linalg.norm(at_depth[:, :2] / scale - matched, axis=1)
     infinite = at_infinity[:, :2] / np.where(ahead, at_infinity[:, 2], 1.0)[:, None]
     parallax = np.linalg.norm(infinite - matched, axis=1)
-    return inverse, ahead & (inverse > 0) & (error < MAX_ERROR) & (parallax > MIN_PARALLAX)
+    return inverse, ahead & (inverse > 0) & (error < MAX_EPIPOLAR_DISTANCE) & (
+        parallax > MIN_PARALLAX
+    )
 
 
 def fit_poses(
     reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
 ) -> Bool[np.ndarray, "n"]:
-    """Find matches that a point in front of both cameras explains up to `MAX_ERROR` pixels."""
+    """Find matches that a point before both cameras explains to `MAX_EPIPOLAR_DISTANCE` px."""
     errors, is_ahead = measure_match_errors(reference, source, pixels, matched)
-    return is_ahead & (errors < MAX_ERROR)
+    return is_ahead & (errors < MAX_EPIPOLAR_DISTANCE)
 
 
 def measure_match_errors(

@@ -28,7 +28,7 @@ from gscompleter.reconstructors.features.stereo_image import StereoImage
 
 NUM_SOURCES = 2
 """Number of best neighbours per photograph."""
-CELLS = 16
+COVERAGE_CELLS = 16
 """Rows and columns of the grid in which matches count as covering a photograph."""
 MIN_ADDED_CELLS = 0.05
 """Share of all covered cells that a neighbour has to add to be taken; 0.15 loses 0.3 dB."""
@@ -36,13 +36,13 @@ MIN_COVERING_MATCHES = 20
 """Fewest matches that fit the poses, of a neighbour that is taken for what it covers."""
 NUM_COMPARED = 6
 """Number of photographs per photograph whose features are compared."""
-BEST_ANGLE = 5.0
+BEST_STEREO_ANGLE = 5.0
 """Best triangulation angle, in degrees."""
 NARROWER_SIGMA = 2.0
 """Standard deviation of the score below that angle, in degrees."""
 WIDER_SIGMA = 10.0
 """Standard deviation of the score above that angle, in degrees."""
-MIN_PAIR_SCORE = 1e-6
+UNMATCHED_SCORE = 1e-6
 """Score of a pair without shared features: better than no neighbour."""
 
 Pair = tuple[int, int]
@@ -78,7 +78,7 @@ def find_neighbours(images: Sequence[StereoImage], count: int = NUM_SOURCES) -> 
     # 0 for pairs that were not compared, which become no neighbours.
     scores = np.zeros((len(images), len(images)))
     for (i, j), (in_i, in_j) in matches.items():
-        score = MIN_PAIR_SCORE + score_pair(images[i], images[j], in_i, in_j)
+        score = UNMATCHED_SCORE + score_pair(images[i], images[j], in_i, in_j)
         scores[i, j] = score
         scores[j, i] = score
     # A stable order: of equal scores the first image wins on every machine.
@@ -115,10 +115,12 @@ def find_covering(
 
 def find_covered_cells(image: StereoImage, pixels: Pixels) -> Bool[np.ndarray, "cells cells"]:
     """Find the cells of an image that matches lie in; none if there are few."""
-    cells = np.zeros((CELLS, CELLS), bool)
+    cells = np.zeros((COVERAGE_CELLS, COVERAGE_CELLS), bool)
     if len(pixels) >= MIN_COVERING_MATCHES:
         height, width = image.size
-        columns, rows = (pixels * CELLS / [width, height]).astype(int).clip(0, CELLS - 1).T
+        columns, rows = (
+            (pixels * COVERAGE_CELLS / [width, height]).astype(int).clip(0, COVERAGE_CELLS - 1).T
+        )
         cells[rows, columns] = True
     return cells
 
@@ -141,6 +143,6 @@ def score_pair(a: StereoImage, b: StereoImage, in_a: Pixels, in_b: Pixels) -> fl
         return 0.0
     # Baseline over depth; half of it is the tangent of half the angle at a point between both.
     ratio = float(np.linalg.norm(a.center - b.center)) * triangulate_valid(a, b, in_a, in_b)
-    excess = np.degrees(2 * np.arctan(ratio / 2)) - BEST_ANGLE
+    excess = np.degrees(2 * np.arctan(ratio / 2)) - BEST_STEREO_ANGLE
     sigma = np.where(excess < 0, NARROWER_SIGMA, WIDER_SIGMA)
     return float(np.exp(-((excess / sigma) ** 2) / 2).sum())

@@ -12,9 +12,9 @@ from jaxtyping import Bool, Float, Float32
 from gscompleter.system.errors import InputError
 from gscompleter.types import View
 
-MIN_SIDE = 8
+MIN_STEREO_SIDE = 8
 """Smallest side of an image that stereo can match, in pixels."""
-NEAREST = np.float32(1e-6)
+MIN_GIVEN_DEPTH = np.float32(1e-6)
 """Smallest given depth, in units of the images; sensors write any number."""
 
 
@@ -51,11 +51,11 @@ def make_stereo_images(views: Sequence[View]) -> tuple[list[StereoImage], float]
             f"Stereo needs at least two views and got {len(views)}; give it another photograph."
         )
     for view in views:
-        if min(view.image.shape[:2]) < MIN_SIDE:
+        if min(view.image.shape[:2]) < MIN_STEREO_SIDE:
             height, width = view.image.shape[:2]
             raise InputError(
                 f"An image of {width} x {height} pixels was given, and stereo needs at least "
-                f"{MIN_SIDE} x {MIN_SIDE}; give a larger one."
+                f"{MIN_STEREO_SIDE} x {MIN_STEREO_SIDE}; give a larger one."
             )
     near = views[0].camera.near
     if is_single and near:
@@ -81,7 +81,7 @@ def _make_stereo_image(view: View, center: Float[np.ndarray, "3"], unit: float) 
     given = np.zeros(view.image.shape[:2], np.float32)
     if view.given_depth is not None:
         depth = view.given_depth.detach().cpu().numpy()
-        inverse = unit / np.maximum(depth, NEAREST * unit)
+        inverse = unit / np.maximum(depth, MIN_GIVEN_DEPTH * unit)
         given = np.where(depth > 0, inverse, 0).astype(np.float32)
     return StereoImage(
         np.ascontiguousarray(view.image.detach().cpu().float().numpy()),

@@ -22,15 +22,15 @@ from gscompleter.types import SH_C0, Camera, DepthMap, Gaussians, View
 
 VIRTUAL_WEIGHT = 0.45
 """Weight of a pixel of a virtual photograph, against one of a photograph."""
-GRADIENT_PENALTY = 1.0
+DIRECTIONAL_PENALTY = 1.0
 """Cost of a squared colour change between middle and photograph, against a squared difference in
 the images."""
-ANGLE = 0.015
+DIRECTIONAL_ANGLE = 0.015
 """Angle in radians, from the middle to the ray of a photograph, at which that cost is doubled."""
-RELAXATIONS = (3.0, 1.0), (2.5, 1.0, 2.5, 1.0)
+DIRECTIONAL_RELAXATIONS = (3.0, 1.0), (2.5, 1.0, 2.5, 1.0)
 """Step sizes of the rounds on the photographs alone, then on all; long and short ones in turn
 converge faster than equal ones (Richardson 1911)."""
-MIN_WEIGHT = 0.05
+DAMPED_BLEND_WEIGHT = 0.05
 """Summed weight up to which colours are damped, as hardly any image shows them."""
 
 Colors = Float[Tensor, "n 3"]
@@ -111,7 +111,7 @@ def fit_directional_colors(
     # the reverse order loses 0.3 to 0.5 dB (decision 043).
     colors = scene.sh[:, 0] * SH_C0 + 0.5
     gradients = torch.zeros_like(colors)
-    for images, relaxations in zip((photographs, all_images), RELAXATIONS, strict=True):
+    for images, relaxations in zip((photographs, all_images), DIRECTIONAL_RELAXATIONS, strict=True):
         for relaxation in relaxations:
             colors, gradients = improve_colors(
                 colors, gradients, images, line.squared_angle, relaxation
@@ -138,8 +138,8 @@ def improve_colors(
     # Normal equations of each Gaussian, for its changes of colour c and gradient g:
     #     [total  cross ] [c]   [pull_color   ]
     #     [cross  square] [g] = [pull_gradient]
-    total = torch.stack(weights).sum(0).clamp_min(MIN_WEIGHT)
-    damping = GRADIENT_PENALTY * total * (1 + ANGLE**2 / squared_angle)
+    total = torch.stack(weights).sum(0).clamp_min(DAMPED_BLEND_WEIGHT)
+    damping = DIRECTIONAL_PENALTY * total * (1 + DIRECTIONAL_ANGLE**2 / squared_angle)
     cross = torch.stack([w * s for w, s in zip(weights, positions, strict=True)]).sum(0)
     square = torch.stack([w * s**2 for w, s in zip(weights, positions, strict=True)]).sum(0)
     square = square + damping

@@ -23,7 +23,7 @@ from gscompleter.types import DepthMap, Gaussians, View
 
 OPACITY_STEPS = 6
 """Adam steps on the opacities of two photographs."""
-OPACITY_RATE = 1.0
+FIT_OPACITY_RATE = 1.0
 """Adam step size of the opacities, in logits."""
 OPACITY_BETAS = 0.7, 0.99
 """Adam decay rates of the opacities, short because there are few steps."""
@@ -32,7 +32,7 @@ REMOVAL_PENALTY = 0.01
 
 STEPS_PER_VIEW = 7
 """Number of steps of the joint fit per photograph."""
-RATES = {"moved": 0.2, "quats": 0.0375, "grown": 0.1875, "logits": 0.75, "sh": 0.1125}
+FIT_RATES = {"moved": 0.2, "quats": 0.0375, "grown": 0.1875, "logits": 0.75, "sh": 0.1125}
 """Initial Adam step sizes; positions are in units of the Gaussian's size."""
 FINAL_RATE = 0.5
 """Final step size relative to the initial one; the decay is linear."""
@@ -54,7 +54,7 @@ def fit_opacities(
     plans = [(renderer.freeze(nothing, v.camera).vary_opacities(gaussians), v.image) for v in views]
 
     logits = gaussians.opacities.logit(eps=1e-4).requires_grad_()
-    optimizer = Adam([(logits, OPACITY_RATE)], OPACITY_BETAS)
+    optimizer = Adam([(logits, FIT_OPACITY_RATE)], OPACITY_BETAS)
     # Each step has the loss of all views, estimated from one of them in turn.
     weight = REMOVAL_PENALTY * len(views) / len(gaussians)
     depths: list[DepthMap] = []
@@ -80,7 +80,7 @@ def fit_jointly(
     views at once and without gradients.
     """
     unknown = init_parameters(gaussians)
-    optimizer = Adam([(unknown[name], rate) for name, rate in RATES.items()], BETAS)
+    optimizer = Adam([(unknown[name], rate) for name, rate in FIT_RATES.items()], BETAS)
     order = shuffle_views(len(views))
     for step, number in enumerate(order):
         view = views[number]
@@ -97,7 +97,7 @@ def fit_jointly(
 
 
 def init_parameters(gaussians: Gaussians) -> dict[str, Tensor]:
-    """Initialize the optimized parameters, with the keys of `RATES`.
+    """Initialize the optimized parameters, with the keys of `FIT_RATES`.
 
     `moved` is an offset in units of the Gaussian's size and `grown` the logarithm of a factor of
     its size, so that one step size suits Gaussians of all sizes and units.

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int
 
+from gscompleter.numerics.image_ops import BRIGHTEST, DARKEST
 from gscompleter.numerics.kernels import stereo
 from gscompleter.reconstructors.features.stereo_image import StereoImage
 from gscompleter.reconstructors.plane_sweep.rig import Transform, Transforms
@@ -23,11 +24,7 @@ MAX_DEPTH_DIFFERENCE = 0.05
 FINER_FOOTPRINT = 0.9
 """Footprint ratio below which another view is finer; otherwise the first view is kept."""
 
-DARKEST = 0.05
-"""Lower bound of usable colours; darker values are noise."""
-BRIGHTEST = 0.95
-"""Upper bound of usable colours; brighter values may be clipped."""
-MIN_SHARED = 0.01
+MIN_SHARED_EXPOSURE = 0.01
 """Fraction of well exposed pixels that two photographs must share to be compared."""
 CORRELATED_SHARE = 0.01
 """Fraction of a photograph's pixels whose errors are correlated."""
@@ -205,7 +202,7 @@ def measure_ratio(
     log = np.zeros(3)
     weight = np.zeros(3)
     exposed = (np.minimum(own, other) > DARKEST) & (np.maximum(own, other) < BRIGHTEST)
-    for channel in np.flatnonzero(exposed.sum(axis=0) > MIN_SHARED * num_sampled):
+    for channel in np.flatnonzero(exposed.sum(axis=0) > MIN_SHARED_EXPOSURE * num_sampled):
         valid = exposed[:, channel]
         logs = np.log(own[valid, channel] / other[valid, channel])
         # Reflections and false surfaces are outliers, so median and median deviation (scaled to a

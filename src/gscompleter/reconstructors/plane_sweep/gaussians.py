@@ -35,17 +35,17 @@ from gscompleter.types import (
     sh_from_rgb,
 )
 
-MIN_ALPHA = 0.7
+CLOSED_ALPHA = 0.7
 """Alpha below which a removed pixel is restored to close a gap."""
-THICKNESS = 0.15
+DISC_THICKNESS = 0.15
 """Standard deviation along the normal, relative to that across the viewing ray."""
-MAX_STRETCH = 6.0
+MAX_DISC_STRETCH = 6.0
 """Largest elongation of a disc on a slanted surface, relative to a frontal one."""
 DISC_SIGMA = 0.55
 """Standard deviation of a disc across the viewing ray, in pixels."""
 OPACITY = 0.98
 """Initial opacity of every disc."""
-COLOR_ROUNDS = 4
+IMAGE_COLOR_ROUNDS = 4
 """Rounds of the colour fit to a synthesized image."""
 
 
@@ -122,7 +122,7 @@ class Splatter:
         """Fit only the colours, to one image."""
         # The Gaussians are drawn alone: the frozen scene that they are added to is empty.
         alone = self.renderer.freeze(gaussians[:0], view.camera)
-        return fit_colors(gaussians, [alone], [view], [RELAXATION] * COLOR_ROUNDS)
+        return fit_colors(gaussians, [alone], [view], [RELAXATION] * IMAGE_COLOR_ROUNDS)
 
     def select_pixels(
         self,
@@ -142,7 +142,7 @@ class Splatter:
         start = 0
         for view, mask in zip(views, free, strict=True):
             alpha = self.renderer.render(gaussians[kept], view.camera).alpha
-            gap = torch.from_numpy(mask) & (alpha < MIN_ALPHA)
+            gap = torch.from_numpy(mask) & (alpha < CLOSED_ALPHA)
             kept[start : start + gap.numel()] |= gap.reshape(-1)
             start += gap.numel()
         return kept
@@ -210,7 +210,7 @@ def make_discs(
     # Normal and direction towards the camera, both in world axes.
     normal = normals.reshape(-1, 3) @ camera.c2w[:3, :3].T
     towards = -torch.nn.functional.normalize(rays, dim=-1).reshape(-1, 3)
-    cosine = (normal * towards).sum(-1, keepdim=True).clamp_min(1 / MAX_STRETCH)
+    cosine = (normal * towards).sum(-1, keepdim=True).clamp_min(1 / MAX_DISC_STRETCH)
 
     # On a slanted surface the disc is elongated by 1 / cosine, so that its projection stays round:
     # its short axis is perpendicular to normal and ray. A frontal disc is round, and its axis only
@@ -223,7 +223,7 @@ def make_discs(
     along = torch.linalg.cross(normal, across)
     axes = torch.stack([across, along, normal], dim=-1)
     sizes = torch.cat(
-        [torch.ones_like(cosine), 1 / cosine, torch.full_like(cosine, THICKNESS)], dim=-1
+        [torch.ones_like(cosine), 1 / cosine, torch.full_like(cosine, DISC_THICKNESS)], dim=-1
     )
     return make_observed(
         means=means,

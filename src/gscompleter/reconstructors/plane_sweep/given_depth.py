@@ -22,7 +22,7 @@ from gscompleter.reconstructors.plane_sweep.sweep import (
 MIN_TESTED_SHARE = 0.1
 """Smallest share of the pixels with given depth that is tested: fewer are points that were
 triangulated from the photographs, or a laser's."""
-MAX_RATIO = 1.2
+MAX_GIVEN_RATIO = 1.2
 """Largest error in hidden blocks of stereo with the given depth, relative to that without it. In 16
 photographs of three scenes it is at most 1.11 with the depth of the sensor, and at least 1.2 in 15
 with that of a small network."""
@@ -42,7 +42,7 @@ def contradicts_stereo(image: StereoImage, stereo: Measurement) -> bool:
         return False
     errors = compare_in_hidden_blocks(image.given, stereo.resize_to(image.size), image.image)
     # Where stereo measures too little, the given depth is believed.
-    return errors is not None and errors.ratio > MAX_RATIO
+    return errors is not None and errors.ratio > MAX_GIVEN_RATIO
 
 
 def add_given(measured: Measurement, image: StereoImage) -> Measurement:

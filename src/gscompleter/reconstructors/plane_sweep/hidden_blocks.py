@@ -17,7 +17,11 @@ from jaxtyping import Float32, Int
 
 from gscompleter.numerics.image_ops import push_pull
 from gscompleter.numerics.robust import fit_line_ransac
-from gscompleter.reconstructors.plane_sweep.surfaces import ITERATIONS, Image, fit_surfaces
+from gscompleter.reconstructors.plane_sweep.surfaces import (
+    SMOOTHING_ITERATIONS,
+    ColorImage,
+    fit_surfaces,
+)
 from gscompleter.reconstructors.plane_sweep.sweep import (
     Map,
     Mask,
@@ -28,12 +32,12 @@ from gscompleter.reconstructors.plane_sweep.sweep import (
 
 MIN_CONFIDENCE = 0.5
 """Confidence from which a measured pixel anchors depth and tests it."""
-MIN_PIXELS = 200
+MIN_HIDDEN_PIXELS = 200
 """Fewest such pixels, for an anchor and for a test."""
 MIN_SURE_SHARE = 0.25
 """Smallest share of such pixels for a test. With less, as in a room of blank walls, a third of what
 stereo is sure of is wrong, and true depth would contradict it."""
-MAX_PIXELS = 8192
+MAX_AFFINE_PIXELS = 8192
 """Most pixels of the affine fit, evenly spaced among all."""
 WEIGHT = np.float32(0.1)
 """Weight of an anchored pixel in the surface fit; a confident measurement has 1."""
@@ -42,7 +46,7 @@ NUM_PARTS = 3
 """Number of parts that blocks are hidden in, one after the other."""
 MIN_BLOCK, MAX_BLOCK = 1 / 8, 1 / 3
 """Smallest and largest side of a block, relative to the shorter side of the image."""
-MAX_ERROR = 0.5
+MAX_LOG_ERROR = 0.5
 """Largest absolute error of a logarithm of depth that counts; a blunder says no more than that."""
 TEST_SIDE = 256
 """Shorter side, in pixels, that a test needs: it takes every n-th pixel of an image n times as
@@ -71,7 +75,7 @@ def anchor_depth(guess: Map, measured: Measurement, anchors: Mask) -> Map | None
     positive scale fits: far things would be near, or nothing would be nearer than anything else.
     """
     places = np.flatnonzero(anchors)
-    sample = places[:: -(-len(places) // MAX_PIXELS)]
+    sample = places[:: -(-len(places) // MAX_AFFINE_PIXELS)]
     inverse = compute_inverse_depth(measured.planes, measured.index)
     x = torch.from_numpy(guess.ravel()[sample]).double()
     y = torch.from_numpy(inverse.ravel()[sample]).double()
@@ -99,7 +103,10 @@ def support(measured: Measurement, inverse: Map, known: Mask) -> Measurement:
 
 
 def compare_in_hidden_blocks(
-    guess: Map, measured: Measurement, image: Image, iterations: int = ITERATIONS // 2
+    guess: Map,
+    measured: Measurement,
+    image: ColorImage,
+    iterations: int = SMOOTHING_ITERATIONS // 2,
 ) -> BlockErrors | None:
     """Compare what inverse depths, 0 where unknown, tell about hidden blocks of stereo.
 
@@ -130,7 +137,7 @@ def compare_in_hidden_blocks(
         hidden = parts == part
         tested = sure & hidden
         anchors = sure & ~hidden
-        if not tested.any() or anchors.sum() < MIN_PIXELS:
+        if not tested.any() or anchors.sum() < MIN_HIDDEN_PIXELS:
             continue
         anchored = anchor_depth(guess, measured, anchors)
         if anchored is None:
@@ -142,8 +149,8 @@ def compare_in_hidden_blocks(
         ):
             index = fit_surfaces(observed.index, observed.weight, image, iterations)
             found = compute_inverse_depth(measured.planes, index)
-            errors.append(np.minimum(np.abs(np.log(found / truth))[tested], MAX_ERROR))
-    if sum(len(errors) for errors in supported) < MIN_PIXELS:
+            errors.append(np.minimum(np.abs(np.log(found / truth))[tested], MAX_LOG_ERROR))
+    if sum(len(errors) for errors in supported) < MIN_HIDDEN_PIXELS:
         return None
     return BlockErrors(
         float(np.concatenate(supported).mean(dtype=np.float64)),

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import normalize
 
 from gscompleter.reconstructors.plane_sweep.directional_colors import (
-    MIN_WEIGHT,
+    DAMPED_BLEND_WEIGHT,
     VIRTUAL_WEIGHT,
 )
 from gscompleter.reconstructors.plane_sweep.virtual_views import make_virtual_views
@@ -26,14 +26,14 @@ from gscompleter.render.spherical_harmonics import SH_C1
 from gscompleter.render.view_map import get_view_map
 from gscompleter.types import SH_C0, DepthMap, Gaussians, View
 
-GRADIENT_PENALTY = 0.1
+LINEAR_PENALTY = 0.1
 """Cost of a squared colour change between the middle and the ray of a photograph, against a squared
 difference in the images. A tenth of that of two photographs, as many rays determine the change."""
-ANGLE = 0.1
+LINEAR_ANGLE = 0.1
 """Angle in radians, from the middle to the ray of a photograph, at which that cost is doubled. It
 is wide, as cheap changes between rays that lie close together lose up to two decibels in cameras
 that stand far off all photographs."""
-RELAXATIONS = (2.0,), (2.5, 1.0)
+LINEAR_RELAXATIONS = (2.0,), (2.5, 1.0)
 """Step sizes of the rounds on the photographs alone, then on all. Twice as many take 1.18 times the
 time of the context of five photographs, and gain 0.03 dB beside them."""
 
@@ -90,8 +90,8 @@ class Moments:
     @property
     def covariance(self) -> Float[Tensor, "n 3 3"]:
         """Covariance of the rays, weighted by how much the images show of the Gaussian."""
-        total = self.total.clamp_min(MIN_WEIGHT)
-        # Up to MIN_WEIGHT hardly any image shows a Gaussian, and the division would blow up.
+        total = self.total.clamp_min(DAMPED_BLEND_WEIGHT)
+        # Up to DAMPED_WEIGHT hardly any image shows a Gaussian, and the division would blow up.
         mean = self.first / total
         return self.second / total[..., None] - multiply_outer(mean, mean)
 
@@ -183,12 +183,12 @@ class ColorEquations:
     @staticmethod
     def build(moments: Moments, spread: Float[Tensor, "n 3 3"]) -> ColorEquations:
         """Build the equations; a colour change as wide as the rays of the photographs costs."""
-        total = moments.total.clamp_min(MIN_WEIGHT)
-        smallest = ANGLE**2 * torch.eye(3)
-        damping = GRADIENT_PENALTY * total[..., None] * (spread + smallest)
+        total = moments.total.clamp_min(DAMPED_BLEND_WEIGHT)
+        smallest = LINEAR_ANGLE**2 * torch.eye(3)
+        damping = LINEAR_PENALTY * total[..., None] * (spread + smallest)
         square = moments.second + damping
         complement = square - multiply_outer(moments.first, moments.first / total)
-        return ColorEquations(total, moments.first, damping, invert_symmetric(complement))
+        return ColorEquations(total, moments.first, damping, invert_3x3(complement))
 
     def solve(
         self,
@@ -224,8 +224,8 @@ def fit_linear_colors(
     constant = scene.sh[:, 0] * SH_C0 + 0.5
     colors = LinearColors(reference, constant, torch.zeros_like(constant)[:, None].repeat(1, 3, 1))
     # Photographs first, then all, as for two (decision 043).
-    colors, spread = fit.improve(colors, photographs, None, RELAXATIONS[0])
-    colors, _ = fit.improve(colors, all_images, spread, RELAXATIONS[1])
+    colors, spread = fit.improve(colors, photographs, None, LINEAR_RELAXATIONS[0])
+    colors, _ = fit.improve(colors, all_images, spread, LINEAR_RELAXATIONS[1])
     return replace(scene, sh=colors.to_sh())
 
 
@@ -234,7 +234,7 @@ def multiply_outer(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Te
     return a[:, :, None] * b[:, None, :]
 
 
-def invert_symmetric(matrices: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
+def invert_3x3(matrices: Float[Tensor, "n 3 3"]) -> Float[Tensor, "n 3 3"]:
     """Invert positive definite matrices by their cofactors, faster than a solver of any size."""
     # The rows of the cofactors are cross products of the rows, and the matrix is symmetric.
     a, b, c = matrices.unbind(dim=1)

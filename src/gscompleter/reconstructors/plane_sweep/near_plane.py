@@ -12,17 +12,16 @@ from collections.abc import Sequence
 import cv2
 import numpy as np
 
+from gscompleter.numerics.image_ops import MIN_CONTRAST
 from gscompleter.reconstructors.features.stereo_image import StereoImage
 from gscompleter.reconstructors.plane_sweep.rig import Rig, build_rig
 from gscompleter.reconstructors.plane_sweep.sweep import MIN_GUIDED_SIDE, Mask, measure_depths
 from gscompleter.types import View
 
-MIN_SHARE = 0.01
+MIN_NEARER_SHARE = 0.01
 """Share of a photograph that has to be measured before the near plane."""
 MAX_STEPS = 3
 """Most times that the distance of the near plane is halved."""
-MIN_CONTRAST = 0.02
-"""Range of brightness in 5 x 5 smoothed pixels that counts as texture; colours are in [0, 1]."""
 
 
 def find_near_plane(views: Sequence[View], near: float, far: float) -> float:
@@ -34,7 +33,7 @@ def find_near_plane(views: Sequence[View], near: float, far: float) -> float:
     while min(min(image.size) for image in rig.images) >= MIN_GUIDED_SIDE:
         rig = rig.halve()
     for _ in range(MAX_STEPS):
-        if measure_share_before(rig, near, far) < MIN_SHARE:
+        if measure_share_before(rig, near, far) < MIN_NEARER_SHARE:
             break
         near /= 2
     return near

@@ -17,11 +17,11 @@ from gscompleter.reconstructors.plane_sweep.hidden_blocks import (
     compare_in_hidden_blocks,
     support,
 )
-from gscompleter.reconstructors.plane_sweep.surfaces import Image
+from gscompleter.reconstructors.plane_sweep.surfaces import ColorImage
 from gscompleter.reconstructors.plane_sweep.sweep import Mask, Measurement
 from gscompleter.types import DepthMap
 
-MAX_RATIO = 0.95
+MAX_PREDICTED_RATIO = 0.95
 """Largest error in hidden blocks with the prediction, relative to that without it."""
 UNTESTED = "stereo measures too little there to test it"
 CONTRADICTED = "continued surfaces tell hidden blocks of stereo as well as it does, or better"
@@ -43,7 +43,7 @@ class Supported:
 
 
 def add_prediction(
-    measured: Measurement, predicted: DepthMap, image: Image, sky: Mask
+    measured: Measurement, predicted: DepthMap, image: ColorImage, sky: Mask
 ) -> Supported:
     """Use predicted depth where stereo measured nothing, if stereo confirms it elsewhere.
 
@@ -59,7 +59,7 @@ def add_prediction(
     errors = compare_in_hidden_blocks(guess, full, image)
     if errors is None:
         return Supported(measured, refusal=UNTESTED)
-    if errors.ratio > MAX_RATIO:
+    if errors.ratio > MAX_PREDICTED_RATIO:
         return Supported(measured, refusal=CONTRADICTED)
     anchored = anchor_depth(guess, full, known & (full.confidence >= MIN_CONFIDENCE))
     if anchored is None:

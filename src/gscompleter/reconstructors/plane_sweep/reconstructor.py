@@ -40,7 +40,7 @@ from gscompleter.reconstructors.plane_sweep.predicted_depth import (
 )
 from gscompleter.reconstructors.plane_sweep.rig import Rig, build_rig
 from gscompleter.reconstructors.plane_sweep.sky_mask import find_skies, find_sky, transfer_sky
-from gscompleter.reconstructors.plane_sweep.surfaces import ITERATIONS, fit_surfaces
+from gscompleter.reconstructors.plane_sweep.surfaces import SMOOTHING_ITERATIONS, fit_surfaces
 from gscompleter.reconstructors.plane_sweep.sweep import (
     Mask,
     Measurement,
@@ -51,14 +51,14 @@ from gscompleter.system.errors import join_names
 from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import DepthMap, Reconstruction, View
 
-LIFT_ITERATIONS = ITERATIONS // 2
+LIFT_ITERATIONS = SMOOTHING_ITERATIONS // 2
 """Iterations of the surfaces of a synthesized image, which registration corrects."""
 MIN_HALVED_LIFT = 320.0
 """Shortest side, in pixels, from which a synthesized image and its anchor are matched at half size,
 which takes an eighth of the time. Photographs never are: of five it would cost 0.4 dB."""
 MAX_LOSS = 0.05
 """Largest loss of a photograph, in dB, that predicted depth may cause."""
-MAX_NAMED = 8
+MAX_LINE_PHOTOGRAPHS = 8
 """Most photographs that a line names."""
 
 
@@ -252,7 +252,7 @@ def name_photographs(views: Sequence[View], numbers: Sequence[int]) -> str:
     named = [
         number if frame is None else frame for number, frame in zip(numbers, frames, strict=True)
     ]
-    return f"photograph{'s' if len(named) > 1 else ''} {join_names(named, MAX_NAMED)}"
+    return f"photograph{'s' if len(named) > 1 else ''} {join_names(named, MAX_LINE_PHOTOGRAPHS)}"
 
 
 def match_views(
@@ -274,7 +274,7 @@ def match_views(
 
 
 def make_layer(
-    image: StereoImage, measured: Measurement, iterations: int = ITERATIONS
+    image: StereoImage, measured: Measurement, iterations: int = SMOOTHING_ITERATIONS
 ) -> DepthLayer:
     """Convert the measured depths of a view to a layer, by surfaces after so many iterations."""
     full = measured.resize_to(image.size)

@@ -24,11 +24,11 @@ from gscompleter.reconstructors.features.stereo_image import (
 )
 from gscompleter.types import View
 
-MIN_MATCHES = 20
+MIN_RIG_MATCHES = 20
 """Fewest matches for a correction; with fewer the pose is kept."""
-MAX_DISTANCE = 8.0
+MAX_RIG_DISTANCE = 8.0
 """Largest distance of a valid match from its epipolar line, in pixels."""
-ITERATIONS = 20
+RIG_ITERATIONS = 20
 """Iterations of reweighted least squares, which suppresses false matches."""
 
 Transform = Float32[np.ndarray, "3 4"]
@@ -111,8 +111,8 @@ def rotate_to_matches(
     Iteratively reweighted least squares for a small rotation vector, in camera axes of the source.
     """
     distance, normal = compute_epipolar_distances(reference, source, pixels, matched)
-    near = np.abs(distance) < MAX_DISTANCE
-    if near.sum() < MIN_MATCHES:
+    near = np.abs(distance) < MAX_RIG_DISTANCE
+    if near.sum() < MIN_RIG_MATCHES:
         return source
     distance = distance[near]
     normal = normal[near]
@@ -123,7 +123,7 @@ def rotate_to_matches(
     along = normal[:, 0, None] * motion[:, 1] - normal[:, 1, None] * motion[:, 0]
 
     turn = np.zeros(3)
-    for _ in range(ITERATIONS):
+    for _ in range(RIG_ITERATIONS):
         # Cauchy weights; the scale is the median deviation, not below 0.05 pixels.
         miss = distance - beside @ turn
         spread = max(1.4826 * float(np.median(np.abs(miss))), 0.05)

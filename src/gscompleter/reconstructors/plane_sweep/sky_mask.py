@@ -28,9 +28,9 @@ MAX_SKY_DIFFERENCE = 0.06
 """Largest colour difference of an edge pixel to the sky beside it."""
 EDGE_RADIUS = 3
 """Distance in pixels at which an edge still raises the gradient of the sky."""
-OUTLINE_WIDTH = 3
+SKY_OUTLINE_WIDTH = 3
 """Width of the outline of a sky, in pixels."""
-MIN_WIDTH = 0.4
+MIN_SKY_WIDTH = 0.4
 """Smallest fraction of the top image row that a sky covers."""
 MIN_HEIGHT = 0.1
 """Smallest mean height of a sky over its columns, as a fraction of the image height."""
@@ -62,7 +62,7 @@ MAX_NEAR_ON_PLANE = 0.9
 """The same limit for the near outline pixels alone."""
 PLANE_TOLERANCE = 2.0
 """Largest distance of a pixel from a plane it lies on, in sweep planes."""
-ROUNDS = 20
+SKY_FIT_ITERATIONS = 20
 """Iterations of reweighted least squares."""
 MIN_SKY_AGREEMENT = 0.5
 """Fraction of a sky that must also be sky in the other views."""
@@ -95,7 +95,7 @@ def is_open(image: StereoImage, measured: Measurement, region: Mask) -> bool:
     """Test the outline of `region` for an open sky."""
     full = measured.resize_to(image.size)
     is_measured = full.confidence > 0
-    outline = dilate_square(region, OUTLINE_WIDTH) & ~region & is_measured
+    outline = dilate_square(region, SKY_OUTLINE_WIDTH) & ~region & is_measured
     if not is_overhead(region) or outline.sum() < MIN_OUTLINE:
         return False
 
@@ -118,7 +118,7 @@ def is_overhead(region: Mask) -> bool:
     """Test if `region` covers a large part of the top of the image."""
     width = region[0].mean()
     area = region.mean()
-    if width < MIN_WIDTH or area < MIN_HEIGHT * width:
+    if width < MIN_SKY_WIDTH or area < MIN_HEIGHT * width:
         return False
     # Unbroken pixels have only pixels of the region above them in their column.
     unbroken = np.logical_and.accumulate(region, axis=0).sum() / region.sum()
@@ -178,7 +178,7 @@ def measure_planarity(outline: Mask, heights: Map) -> float:
     weight = np.ones(len(rows))
     # Weights 1 / |deviation| make least squares minimize the sum of deviations, which outliers do
     # not dominate.
-    for _ in range(ROUNDS):
+    for _ in range(SKY_FIT_ITERATIONS):
         weighted = sites * weight[:, None]
         plane = np.linalg.lstsq(weighted.T @ sites, weighted.T @ values, rcond=None)[0]
         weight = 1 / np.maximum(np.abs(sites @ plane - values), 0.1 * PLANE_TOLERANCE)

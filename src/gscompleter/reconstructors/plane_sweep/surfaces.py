@@ -15,29 +15,34 @@ from gscompleter.numerics.image_ops import fill_smoothly
 from gscompleter.numerics.kernels import tgv
 from gscompleter.reconstructors.features.stereo_image import compute_contrast
 
-Image = Float32[np.ndarray, "h w 3"]
-Map = Float32[np.ndarray, "h w"]
+ColorImage = Float32[np.ndarray, "h w 3"]
+LevelMap = Float32[np.ndarray, "h w"]
 AnyMap = Float32[np.ndarray, "_ _"]
-Level = tuple[AnyMap, AnyMap, Float32[np.ndarray, "_ _ 3"]]
+PyramidLevel = tuple[AnyMap, AnyMap, Float32[np.ndarray, "_ _ 3"]]
 
 # Heights are inverse depths, in planes of the sweep.
 STEP_PENALTY = 3.0
 """Cost of a one-plane step in a uniform area; a measurement costs 1 per missed plane."""
 BEND_PENALTY = 12.0
 """Cost of a gradient change by one plane per pixel."""
-EDGE_CONTRAST = 0.1
+STEP_CONTRAST = 0.1
 """Colour difference at which the cost of a step falls to 1/e."""
 MIN_STEP_SHARE = 0.02
 """Relative cost of a step at the strongest edge."""
-TOLERANCE = 0.15
+MEASUREMENT_TOLERANCE = 0.15
 """Measurement error without cost, in planes."""
 LEVELS = 5
 """Number of pyramid levels; coarse ones carry planes over long distances."""
-ITERATIONS = 100
+SMOOTHING_ITERATIONS = 100
 """Iterations on the finest level, doubled on each coarser one."""
 
 
-def fit_surfaces(measured: Map, confidence: Map, image: Image, iterations: int = ITERATIONS) -> Map:
+def fit_surfaces(
+    measured: LevelMap,
+    confidence: LevelMap,
+    image: ColorImage,
+    iterations: int = SMOOTHING_ITERATIONS,
+) -> LevelMap:
     """Fit inverse depths to measurements with weights in [0, 1].
 
     Without a positive weight or an iteration they stay as measured.
@@ -46,7 +51,7 @@ def fit_surfaces(measured: Map, confidence: Map, image: Image, iterations: int =
         return measured
     # Coarse to fine: an iteration carries heights to neighbouring pixels only, so that coarse
     # levels have to bring planes across large unmeasured areas.
-    levels: list[Level] = [(measured, confidence, image)]
+    levels: list[PyramidLevel] = [(measured, confidence, image)]
     while len(levels) < LEVELS and min(levels[-1][0].shape) > 4:
         levels.append(halve_level(*levels[-1]))
 
@@ -72,17 +77,17 @@ def fit_surfaces(measured: Map, confidence: Map, image: Image, iterations: int =
             across=step_right / np.float32(scale),
             down=step_down / np.float32(scale),
             bend=np.float32(BEND_PENALTY / scale**2),
-            tolerance=np.float32(TOLERANCE),
+            tolerance=np.float32(MEASUREMENT_TOLERANCE),
             iterations=iterations * 2**number,
         )
     return heights
 
 
-def compute_step_costs(image: Image) -> tuple[Map, Map]:
+def compute_step_costs(image: ColorImage) -> tuple[LevelMap, LevelMap]:
     """Compute the cost of a step to the right and lower neighbour; low at edges."""
 
-    def compute_cost(beside: Image) -> Map:
-        share = np.maximum(np.exp(-compute_contrast(image, beside) / EDGE_CONTRAST), MIN_STEP_SHARE)
+    def compute_cost(beside: ColorImage) -> LevelMap:
+        share = np.maximum(np.exp(-compute_contrast(image, beside) / STEP_CONTRAST), MIN_STEP_SHARE)
         return (STEP_PENALTY * share).astype(np.float32)
 
     right = np.append(image[:, 1:], image[:, -1:], 1)
@@ -90,7 +95,7 @@ def compute_step_costs(image: Image) -> tuple[Map, Map]:
     return compute_cost(right), compute_cost(below)
 
 
-def halve_level(data: Map, weight: Map, image: Image) -> Level:
+def halve_level(data: LevelMap, weight: LevelMap, image: ColorImage) -> PyramidLevel:
     """Halve a pyramid level; measurements are averaged by weight.
 
     At the end of an odd side a coarse pixel covers fewer fine ones; its weight is their mean.
@@ -98,7 +103,7 @@ def halve_level(data: Map, weight: Map, image: Image) -> Level:
     h, w = data.shape
     height, width = (h + 1) // 2, (w + 1) // 2
 
-    def sum_pixels(values: Map) -> AnyMap:
+    def sum_pixels(values: LevelMap) -> AnyMap:
         padded = np.pad(values, ((0, height * 2 - h), (0, width * 2 - w)))
         return padded.reshape(height, 2, width, 2).sum(axis=(1, 3))
 

@@ -36,9 +36,9 @@ MAX_RETURN_ERROR = 1.5
 """Largest error, in pixels, of a match that is reprojected to the other view and back."""
 FULL_MARGIN = 40.0
 """Cost gap between the best and the second best plane that gives full confidence."""
-MIN_AREA = 60
+MIN_PATCH_AREA = 60
 """Smallest patch of similar depth that is not a speckle, in pixels."""
-MAX_STEP = 2.0
+MAX_PATCH_STEP = 2.0
 """Largest step between neighbouring pixels of one patch, in planes."""
 UNKNOWN = np.float32(1e-9)
 """Inverse depth of pixels without a confident depth."""
@@ -60,9 +60,9 @@ GUESS_MARGIN = 1
 EXTRA_PLANES = 3
 """Extra planes on both sides of the guessed range."""
 
-RADIUS = 2
+CORRELATION_RADIUS = 2
 """Radius of the correlation window, in pixels."""
-NOISE = np.float32(0.015)
+IMAGE_NOISE = np.float32(0.015)
 """Standard deviation of the image noise; weaker texture does not correlate."""
 PIXEL_WEIGHT = np.float32(0.4)
 """Weight of the per-pixel difference in the cost; the rest is window correlation."""
@@ -84,7 +84,7 @@ SMALL_PENALTY = 25
 """Cost of a change by one plane between neighbouring pixels."""
 LARGE_PENALTY = 300
 """Cost of a larger jump between neighbouring pixels of the same colour."""
-EDGE_CONTRAST = np.float32(0.06)
+JUMP_CONTRAST = np.float32(0.06)
 """Colour difference at which the penalty of a jump is halved."""
 
 
@@ -198,12 +198,12 @@ def compute_confidence(index: Map, margin: Map, confirmed: Mask) -> Map:
 
 
 def remove_speckles(index: Map, mask: Mask) -> Mask:
-    """Remove patches of similar depth smaller than `MIN_AREA` pixels from `mask`."""
+    """Remove patches of similar depth smaller than `MIN_PATCH_AREA` pixels from `mask`."""
     # OpenCV takes 16-bit fixed-point disparities; 0 marks masked pixels. Without the offset by
     # one plane, a pixel of the farthest plane would count as masked.
     scale = min(16.0, 30000.0 / max(float(index.max()), 1.0))
     levels = np.where(mask, index.clip(0) * scale + scale, 0).astype(np.int16)
-    cv2.filterSpeckles(levels, 0, MIN_AREA, MAX_STEP * scale)
+    cv2.filterSpeckles(levels, 0, MIN_PATCH_AREA, MAX_PATCH_STEP * scale)
     return levels > 0
 
 
@@ -358,7 +358,14 @@ def compute_costs(
     """
     costs = [
         stereo.compute_matching_costs(
-            reference.image, source.image, transform, planes, bands, RADIUS, NOISE, PIXEL_WEIGHT
+            reference.image,
+            source.image,
+            transform,
+            planes,
+            bands,
+            CORRELATION_RADIUS,
+            IMAGE_NOISE,
+            PIXEL_WEIGHT,
         )
         for source, transform in sources
     ]
@@ -378,7 +385,7 @@ def aggregate(
     def jump(
         a: Float32[np.ndarray, "r c 3"], b: Float32[np.ndarray, "r c 3"]
     ) -> Int16[np.ndarray, "r c"]:
-        penalty = LARGE_PENALTY / (1 + compute_contrast(a, b) / EDGE_CONTRAST)
+        penalty = LARGE_PENALTY / (1 + compute_contrast(a, b) / JUMP_CONTRAST)
         # Even at the strongest edge a jump is dearer than a change by one plane (P2 > P1).
         return np.rint(np.maximum(penalty, 1.5 * SMALL_PENALTY)).astype(np.int16)
 

@@ -17,7 +17,7 @@ from gscompleter.numerics.geometry import is_inside, project, sample, unproject
 from gscompleter.render.protocols import Renderer
 from gscompleter.types import Camera, DepthMap, Gaussians, View
 
-DEPTH_TOLERANCE = 0.03
+COLOR_DEPTH_TOLERANCE = 0.03
 """Relative depth difference at which the share of a photograph's colour falls to 1/e."""
 
 
@@ -71,7 +71,7 @@ def warp(view: View, own: DepthMap, scene: Gaussians, camera: Camera, renderer: 
     sampled, depth, valid = sample(layers, pixels).split([3, 1, 1], dim=-1)
 
     # A surface that another one hides in the photograph is not sampled: the two depths differ.
-    error = (z - depth[..., 0]) / (DEPTH_TOLERANCE * z.abs().clamp_min(1e-12))
+    error = (z - depth[..., 0]) / (COLOR_DEPTH_TOLERANCE * z.abs().clamp_min(1e-12))
     seen = covered & is_inside(pixels, z, view.camera) & (valid[..., 0] >= 0.5)
     share = torch.exp(-error.square()) * seen
 

@@ -12,6 +12,7 @@ from typing import Literal
 import numpy as np
 import torch
 
+from gscompleter.data.cameras import Poses
 from gscompleter.data.photographs import Photographs
 from gscompleter.reconstructors.features.depth_range import estimate_depth_range
 from gscompleter.render.lod import build_proxy, thin_gaussians
@@ -26,7 +27,6 @@ from gscompleter.splats.alignment.similarity import Matrix, transform_camera, tr
 from gscompleter.splats.alignment.trainer_frames import (
     InputSplat,
     Points,
-    Poses,
     collect_poses,
     compute_trainer_frames,
     read_trainer_frames,
@@ -35,7 +35,7 @@ from gscompleter.system.errors import InputError
 from gscompleter.types import Gaussians, View
 
 NUM_SAMPLE_VIEWS = 8
-LONG_SIDE = 320
+SAMPLE_SIDE = 320
 """Longer side of the samples in pixels: enough for features and for a blur of one pixel."""
 MIN_IMPROVEMENT = 2.0
 """Gain in dB by which a frame must fit better than a simpler one; blur alone can cause 1 dB."""
@@ -64,7 +64,7 @@ class SplatAlignment:
     fit: SplatFit
     given_fit: SplatFit
     """Fit under the identity."""
-    side: int = LONG_SIDE
+    side: int = SAMPLE_SIDE
     """Longer side of the largest image in which it was measured, in pixels."""
 
     def describe(self) -> str:
@@ -120,10 +120,10 @@ def sample_views(photographs: Photographs, frames: Sequence[int]) -> list[View]:
     named = list(frames)[: NUM_SAMPLE_VIEWS // 2]
     spread = np.linspace(0, len(photographs) - 1, NUM_SAMPLE_VIEWS).round().astype(int).tolist()
     others = [frame for frame in dict.fromkeys(spread) if frame not in named]
-    views = photographs.views(named, LONG_SIDE)
+    views = photographs.views(named, SAMPLE_SIDE)
     for frame in others[: NUM_SAMPLE_VIEWS - len(views)]:
         with suppress(InputError):
-            views += photographs.views([frame], LONG_SIDE)
+            views += photographs.views([frame], SAMPLE_SIDE)
     return views
 
 

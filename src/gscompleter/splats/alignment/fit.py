@@ -21,7 +21,7 @@ from gscompleter.types import Camera, Gaussians, Render, View
 
 GAIN_RANGE = (0.5, 2.0)
 """Range of the exposure gain between a render and a photograph."""
-MIN_COVERAGE = 0.05
+MIN_COVERED_SHARE = 0.05
 """Smallest share of covered pixels for a valid score."""
 MIN_MARGIN = 3.0
 """Smallest margin in dB of a match: half of the photograph's variance is explained."""
@@ -37,7 +37,7 @@ MAX_ROUND_TRIP_ERROR = 1.0
 """Largest error of a corner tracked forward and back, in pixels."""
 
 GreyBytes = UInt8[np.ndarray, "h w"]
-Corners = Float[np.ndarray, "n 1 2"]
+FlowCorners = Float[np.ndarray, "n 1 2"]
 
 
 class ImageFit(NamedTuple):
@@ -55,7 +55,7 @@ class ImageFit(NamedTuple):
     def is_match(self) -> bool:
         """True if the splat shows the content of the photograph."""
         flat = self.psnr >= MIN_PSNR and self.coverage >= 0.5
-        return self.coverage >= MIN_COVERAGE and (self.margin >= MIN_MARGIN or flat)
+        return self.coverage >= MIN_COVERED_SHARE and (self.margin >= MIN_MARGIN or flat)
 
 
 class SplatFit(NamedTuple):
@@ -78,7 +78,7 @@ class SplatFit(NamedTuple):
 def summarize_fits(images: Sequence[ImageFit]) -> SplatFit:
     """Summarize the fits to several photographs."""
     # The better half by margin: some photographs may show what the splat does not.
-    seen = [image for image in images if image.coverage >= MIN_COVERAGE]
+    seen = [image for image in images if image.coverage >= MIN_COVERED_SHARE]
     seen.sort(key=lambda image: image.margin, reverse=True)
     better = seen[: math.ceil(len(seen) / 2)] or [ImageFit()]
     # The upper median of each, which may come from different photographs.
@@ -113,7 +113,7 @@ def score_image(render: Render, view: View) -> ImageFit:
     photograph = view.image
     where = (render.alpha >= COVERED) & view.valid_mask
     covered = where.sum().item() / max(int(view.valid_mask.sum()), 1)
-    if covered < MIN_COVERAGE:
+    if covered < MIN_COVERED_SHARE:
         return ImageFit(coverage=covered)
     truth = photograph[where].double()
     rendered = match_render(render.image[where].double(), truth)
@@ -172,8 +172,8 @@ def measure_drift(
 
 
 def track_corners(
-    before: GreyBytes, after: GreyBytes, corners: Corners
-) -> tuple[Corners, Bool[np.ndarray, "n"]]:
+    before: GreyBytes, after: GreyBytes, corners: FlowCorners
+) -> tuple[FlowCorners, Bool[np.ndarray, "n"]]:
     """Track corners by up to about 50 px to another image, and mark those that were found."""
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
         before, after, corners, np.zeros_like(corners), winSize=(15, 15), maxLevel=3

@@ -32,7 +32,7 @@ from gscompleter.splats.alignment.similarity import (
 from gscompleter.splats.alignment.trainer_frames import Points, align_directions
 from gscompleter.types import Camera, Gaussians, View
 
-MIN_INLIERS = 15
+MIN_AGREEING_MATCHES = 15
 """Fewest matches that must agree with a pose."""
 MAX_REPROJECTION_ERROR = 3.0
 """Largest reprojection error of an inlier, in pixels."""
@@ -41,7 +41,7 @@ NUM_DIRECTIONS = 40
 SCALE_FACTORS = (1.0, 0.6, 1.7)
 """Factors on the measured size of the splat, which are all tried, since far Gaussians and floaters
 make it uncertain."""
-NUM_ROUNDS = 2
+NUM_REFINEMENTS = 2
 """Iterations of the refinement, each with renders at the cameras that the previous one found."""
 
 PhotoFeatures = tuple[Camera, Features]
@@ -129,7 +129,7 @@ def refine_similarity(
         return locate_photo(render_features(scene, camera, renderer), photograph)
 
     transform: Matrix | None = start
-    for _ in range(NUM_ROUNDS):
+    for _ in range(NUM_REFINEMENTS):
         if transform is not None:
             cameras = [transform_camera(camera, transform) for camera, _ in photographs]
             located = list(get_view_map(scene.means)(locate, photographs, cameras))
@@ -234,13 +234,13 @@ def locate_photo(rendered: RenderedFeatures, photograph: PhotoFeatures) -> Locat
     known = np.isfinite(points).all(axis=1)
     points = points[known]
     pixels = pixels[known]
-    if len(points) < MIN_INLIERS:
+    if len(points) < MIN_AGREEING_MATCHES:
         return None
     K = camera.K.detach().cpu().double().numpy()
     is_solved, turn, shift, inliers = cv2.solvePnPRansac(
         points, pixels, K, None, iterationsCount=300, reprojectionError=MAX_REPROJECTION_ERROR
     )
-    if not is_solved or inliers is None or len(inliers) < MIN_INLIERS:
+    if not is_solved or inliers is None or len(inliers) < MIN_AGREEING_MATCHES:
         return None
     viewmat = np.eye(4)
     viewmat[:3, :3] = cv2.Rodrigues(turn)[0]

@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from gscompleter.data.camera_files import has_camera_list, read_camera_list
 from gscompleter.data.camera_paths import DATAPARSER_FILE
-from gscompleter.data.cameras import find_pose_defect
+from gscompleter.data.cameras import Poses, find_pose_defect
 from gscompleter.data.local_origin import compute_frame_from_photographs, read_dataparser_transforms
 from gscompleter.data.photographs import Photographs
 from gscompleter.splats.alignment.similarity import (
@@ -34,10 +34,9 @@ CAMERA_LIST_PREFIX = "cameras"
 """Prefix of camera lists; the rest may match the splat: `cameras_2.json` for `splat_2.ply`."""
 ITERATION_PREFIX = "iteration_"
 """Prefix of the folders of Inria's trainer, two levels below its cameras.json."""
-MAX_PAIRS = 200
+MAX_COMPARED_PHOTOGRAPHS = 200
 """Photographs by which two camera lists are compared."""
 
-Poses = Float[np.ndarray, "n 4 4"]
 Points = Float[np.ndarray, "p 3"]
 
 NERFSTUDIO_WORLDS = (
@@ -118,7 +117,7 @@ def find_camera_lists(splat: Path, photographs: Path) -> list[Path]:
 def fit_named_cameras(ours: Mapping[str, Matrix], theirs: Mapping[str, Matrix]) -> Matrix | None:
     """Fit the similarity from `ours` to `theirs` by name; None without two matched positions."""
     pairs = match_names(list(ours), list(theirs))
-    pairs = pairs[:: max(1, len(pairs) // MAX_PAIRS)]
+    pairs = pairs[:: max(1, len(pairs) // MAX_COMPARED_PHOTOGRAPHS)]
     before = [ours[a] for a, _ in pairs]
     after = [theirs[b] for _, b in pairs]
     if not has_baseline(before) or not has_baseline(after):

@@ -32,7 +32,7 @@ INRIA_DIVISORS = (1, 2, 4, 8)
 INRIA_MAX_WIDTH = 1600
 """Width in pixels to which Inria's trainer shrinks wider images by default."""
 MAX_SETTINGS_BYTES = 65536
-TOLERANCE = 0.02
+SIZE_TOLERANCE = 0.02
 """Relative difference of two sizes that rounding explains."""
 
 
@@ -64,7 +64,7 @@ def find_training_size(
         read_listed_scale(splat, folder, photographs, own),
     ]
     for record in records:
-        if record is not None and abs(record[0] - 1) > TOLERANCE:
+        if record is not None and abs(record[0] - 1) > SIZE_TOLERANCE:
             scale, source = record
             return TrainingSize(round(scale * own), source)
     return None

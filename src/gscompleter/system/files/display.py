@@ -9,11 +9,10 @@ from html import escape
 from PIL import Image
 from torch import Tensor
 
-from gscompleter.system.files.image import convert_to_pixels, encode_jpeg
+from gscompleter.system.files.image import SHOWN_JPEG_QUALITY, convert_to_pixels, encode_jpeg
 
-MAX_SIDE = 480
+MAX_NOTEBOOK_SIDE = 480
 """Longer side of a picture in a notebook, in pixels."""
-JPEG_QUALITY = 85
 FIGURE = "display:inline-block;margin:2px 6px 2px 0;font:12px sans-serif"
 
 
@@ -41,8 +40,8 @@ def embed_picture(image: Tensor, caption: str) -> str:
     """Write a picture [h, w, 3] or [h, w] in [0, 1] as HTML that loads nothing."""
     picture = Image.fromarray(convert_to_pixels(image)).convert("RGB")
     # The picture is scaled down in place, and never enlarged.
-    picture.thumbnail((MAX_SIDE, MAX_SIDE))
-    content = base64.b64encode(encode_jpeg(picture, JPEG_QUALITY)).decode()
+    picture.thumbnail((MAX_NOTEBOOK_SIDE, MAX_NOTEBOOK_SIDE))
+    content = base64.b64encode(encode_jpeg(picture, SHOWN_JPEG_QUALITY)).decode()
     text = escape(caption)
     return (
         f'<figure style="{FIGURE}"><img alt="{text}" width="{picture.width}" '

@@ -35,7 +35,7 @@ COMPLETION_FILES = re.compile(
 MODEL_FILES = re.compile(r"sparse/0/(cameras|frames|images|points3D|rigs)\.bin")
 FRAME_FILES = re.compile(r"images/frame_\d{6}\.jpg")
 """Frames of a film, which become its photographs."""
-HOMES = ("", "images", "sparse/0")
+EARLY_FOLDERS = ("", "images", "sparse/0")
 """Folders that such a version wrote to."""
 
 
@@ -57,17 +57,17 @@ def describe_early(folder: Path, content: Mapping[str, Any]) -> EarlyResults | N
         return None
     if counts and entries >= COMPLETION_ENTRIES:
         command = "complete"
-        files = [name for name in _list_files(folder) if COMPLETION_FILES.fullmatch(name)]
+        files = [name for name in _list_early_files(folder) if COMPLETION_FILES.fullmatch(name)]
     elif counts == CLEANING_COUNTS and entries >= CLEANING_ENTRIES:
         command = "clean"
         known = {COMPLETED_FILE, REMOVED_FILE, SUMMARY_FILE}
-        files = [name for name in _list_files(folder) if name in known]
+        files = [name for name in _list_early_files(folder) if name in known]
     elif entries == POSES_ENTRIES and isinstance(content["photographs"], dict):
         command = "poses"
         known = {SUMMARY_FILE, *_name_copies(content["photographs"])}
         files = [
             name
-            for name in _list_files(folder)
+            for name in _list_early_files(folder)
             if name in known or MODEL_FILES.fullmatch(name) or FRAME_FILES.fullmatch(name)
         ]
     else:
@@ -75,9 +75,9 @@ def describe_early(folder: Path, content: Mapping[str, Any]) -> EarlyResults | N
     return EarlyResults(command, files)
 
 
-def _list_files(folder: Path) -> Iterator[str]:
+def _list_early_files(folder: Path) -> Iterator[str]:
     """List the files of the folders that an early version wrote to."""
-    for home in HOMES:
+    for home in EARLY_FOLDERS:
         names = []
         with suppress(OSError):
             names = sorted(os.listdir(folder / home))

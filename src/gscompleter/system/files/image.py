@@ -26,7 +26,9 @@ AVIF_BRANDS = (b"avif", b"avis")
 """Brands in the first box of a file, by which HEIC of phones and AVIF are known. `mif1` and `msf1`
 are the general container, which either may name first."""
 
-MAX_PIXELS = 178_956_970
+SHOWN_JPEG_QUALITY = 85
+"""JPEG quality of pictures to look at, in a page or a notebook."""
+MAX_IMAGE_PIXELS = 178_956_970
 """Largest number of pixels of an image, as in Pillow."""
 
 PNG_COMPRESSION = 3
@@ -245,7 +247,7 @@ def read_brightness(stored: Path | bytes, side: int) -> Float[np.ndarray, "h w"]
 def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
     """Read z-depth from a 16-bit PNG or a `.npy` file, times `unit`; 0 where unknown."""
     if path.suffix == ".npy":
-        values = _read_array(path)
+        values = _read_npy(path)
     else:
         with open_image(path) as image:
             values = np.array(image)
@@ -260,12 +262,12 @@ def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
 
 
-def _read_array(path: Path) -> np.ndarray:
+def _read_npy(path: Path) -> np.ndarray:
     check_file(path)
     try:
         # A memory map cannot exceed the file, whatever size its header claims.
         values = np.lib.format.open_memmap(path, mode="r")
-        if not 0 < values.size <= MAX_PIXELS:
+        if not 0 < values.size <= MAX_IMAGE_PIXELS:
             raise DamagedError(f"it claims {values.size:,} values")
     except Exception as error:  # damaged files raise any kind
         raise InputError(

@@ -31,7 +31,7 @@ from typing import Any
 from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.early_results import describe_early
 from gscompleter.system.files.renaming import rename
-from gscompleter.system.files.result_format import MARK, is_marked, refuse_later
+from gscompleter.system.files.result_format import RESULT_MARK, is_marked, refuse_later
 from gscompleter.system.files.unfinished import (
     REPLACED_SUFFIX,
     UNFINISHED_PREFIX,
@@ -52,12 +52,12 @@ from gscompleter.system.files.writing import (
 
 FILES = "files"
 """Entry of `summary.json`: the files of the run."""
-COMMAND = "command"
+COMMAND_KEY = "command"
 """Entry of `summary.json`: the command that wrote them."""
-COMMANDS = frozenset({"bench", "clean", "complete", "demo", "poses"})
+WRITING_COMMANDS = frozenset({"bench", "clean", "complete", "demo", "poses"})
 """Commands that write an output folder. One of them is named by the summaries of versions before
 formats had numbers, which do not name the program."""
-POSES = "colmap"
+FOUND_POSES_FOLDER = "colmap"
 """Folder of the cameras that a completion found for its photographs; it has its own summary."""
 
 STROKES_FOLDER = "images"
@@ -65,8 +65,8 @@ STROKE_MASK = re.compile(r"stroke\d{1,6}\.png")
 """Name of a mask of a session, in `STROKES_FOLDER`."""
 
 MAX_SUMMARY_BYTES = 10**9
-MAX_NAME_LENGTH = 60
-MAX_NAMED = 5
+MAX_FOREIGN_NAME_LENGTH = 60
+MAX_FOREIGN_FILES = 5
 """Most foreign files that a sentence names."""
 ATTEMPTS = 4
 """Attempts of two runs that reserve a folder at the same moment."""
@@ -117,7 +117,7 @@ class OutputFolder:
         """Write the line on what stays in the folder; none if there is nothing else."""
         if not self.others:
             return []
-        names = join_names(self.others, MAX_NAMED)
+        names = join_names(self.others, MAX_FOREIGN_FILES)
         return [f"Kept: {names} in {quote_value(self.path)}, which no run wrote."]
 
 
@@ -211,7 +211,7 @@ def read_command(folder: Path) -> str | None:
     content = _read_own_summary(folder)
     if content is None or not holds_results(folder):
         return None
-    command = content.get(COMMAND)
+    command = content.get(COMMAND_KEY)
     return command if isinstance(command, str) else None
 
 
@@ -259,11 +259,11 @@ def _read_own_summary(folder: Path) -> dict[str, Any] | None:
     That of an early version, which listed no files, gets the entries of later ones.
     """
     content = _read_summary(folder)
-    command = content.get(COMMAND)
-    if is_marked(content) or (isinstance(command, str) and command in COMMANDS):
+    command = content.get(COMMAND_KEY)
+    if is_marked(content) or (isinstance(command, str) and command in WRITING_COMMANDS):
         return content
     early = describe_early(folder, content)
-    return None if early is None else {**content, COMMAND: early.command, FILES: early.files}
+    return None if early is None else {**content, COMMAND_KEY: early.command, FILES: early.files}
 
 
 @contextmanager
@@ -311,12 +311,12 @@ def _check_free(given: Path, target: Path, overwrite: bool) -> None:
     names = list[str]()
     with suppress(FileNotFoundError):
         names = sorted(name for name in os.listdir(target) if not is_unfinished(name))
-    if names == [POSES] and os.path.isfile(target / POSES / SUMMARY_FILE):
+    if names == [FOUND_POSES_FOLDER] and os.path.isfile(target / FOUND_POSES_FOLDER / SUMMARY_FILE):
         return  # only the cameras that an earlier run found
     if names and not overwrite:
         # What `ls` does not show is named.
         is_hidden = all(name.startswith(".") for name in names)
-        held = f" (it holds {join_names(names, MAX_NAMED)})" if is_hidden else ""
+        held = f" (it holds {join_names(names, MAX_FOREIGN_FILES)})" if is_hidden else ""
         raise InputError(
             f"The output folder {quote_value(given)} is not empty{held}; name another one, or "
             "overwrite the results in it.",
@@ -403,7 +403,7 @@ def _list_others(folder: Path, listed: frozenset[str]) -> Iterator[str]:
                     yield relative
 
 
-def _list_files(folder: Path) -> list[str]:
+def _list_files_below(folder: Path) -> list[str]:
     """List the files below a folder as relative paths."""
     return sorted(
         Path(home, name).relative_to(folder).as_posix()
@@ -416,9 +416,9 @@ def _list_in_summary(draft: Path, command: str) -> None:
     """Add the mark and the names of all files to the summary of a draft, or make one of them."""
     path = draft / SUMMARY_FILE
     content = json.loads(path.read_bytes()) if path.is_file() else {}
-    origin = {COMMAND: command} if command else {}
-    files = sorted({SUMMARY_FILE, *_list_files(draft)})
-    whole = json.dumps({**MARK, **origin, **content, FILES: files}, indent=2)
+    origin = {COMMAND_KEY: command} if command else {}
+    files = sorted({SUMMARY_FILE, *_list_files_below(draft)})
+    whole = json.dumps({**RESULT_MARK, **origin, **content, FILES: files}, indent=2)
     path.write_bytes(whole.encode() + b"\n")
 
 
@@ -429,7 +429,7 @@ def _publish(draft: Path, target: Path) -> None:
         return
     replaced = target / f"{draft.name}{REPLACED_SUFFIX}"
     listed = read_listing(target)
-    new = _list_files(draft)
+    new = _list_files_below(draft)
     _refuse_unlisted(target, target, new, listed)
     for name in listed.intersection(new):
         keep_permissions(target / name, draft / name)
@@ -472,7 +472,7 @@ def _list_old_moves(target: Path, replaced: Path, listed: Iterable[str]) -> list
 
 def _list_new_moves(draft: Path, target: Path) -> list[tuple[Path, Path]]:
     """List the moves of the new files, the summary last."""
-    ordered = sorted(_list_files(draft), key=lambda name: (name == SUMMARY_FILE, name))
+    ordered = sorted(_list_files_below(draft), key=lambda name: (name == SUMMARY_FILE, name))
     return [(draft / name, target / name) for name in ordered]
 
 
@@ -524,7 +524,7 @@ def _finish_interrupted(given: Path, target: Path) -> bool:
                 _refuse_impossible(given, target, draft, entry.path)
                 _finish_moves(draft, target, entry.path)
             is_changed = True
-        elif not os.path.lexists(target / SUMMARY_FILE) and _list_files(entry.path):
+        elif not os.path.lexists(target / SUMMARY_FILE) and _list_files_below(entry.path):
             # A disk failed, and its run could not put these files back.
             raise InputError(
                 f"{quote_value(entry.path)} holds results that a run could not put back; move them "
@@ -563,7 +563,7 @@ def _list_replaced(target: Path, replaced: Path) -> frozenset[str]:
 def _list_left(draft: Path, target: Path, replaced: Path) -> frozenset[str]:
     """List what a killed run was to replace, and what is still in its place."""
     # New files that left the draft have their final name already, and must not be moved away.
-    published = read_listing(draft).difference(_list_files(draft))
+    published = read_listing(draft).difference(_list_files_below(draft))
     waiting = _list_replaced(target, replaced) - published
     # What was replaced by then is a file below real folders.
     moved = {
@@ -580,7 +580,7 @@ def _refuse_impossible(given: Path, target: Path, draft: Path, replaced: Path) -
         _refuse_foreign(folder)
     _refuse_links(draft)
     refuse_later_results(draft)
-    new = _list_files(draft)
+    new = _list_files_below(draft)
     written = read_listing(draft)
     left = _list_left(draft, target, replaced)
     unlisted = [draft / name for name in new if name not in written]
@@ -588,7 +588,8 @@ def _refuse_impossible(given: Path, target: Path, draft: Path, replaced: Path) -
     if unlisted or blocked:
         raise InputError(
             f"{quote_value([*unlisted, *blocked][0])} is nothing that a killed run leaves; delete "
-            f"it, or name another output folder than {quote_value(given, MAX_NAME_LENGTH)}.",
+            "it, or name another output folder than "
+            f"{quote_value(given, MAX_FOREIGN_NAME_LENGTH)}.",
             "out",
         )
     _refuse_unlisted(given, target, new, left)

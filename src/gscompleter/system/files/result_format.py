@@ -14,25 +14,25 @@ from types import MappingProxyType
 
 from gscompleter.system.errors import InputError
 
-FORMAT = "format"
+FORMAT_KEY = "format"
 """Entry with the number of the format."""
 NEWEST = 1
 """Number of the format that is written, and the latest that is read."""
-PROGRAM = "program"
+PROGRAM_KEY = "program"
 """Entry with the name of the program; cameras of other programs may have a `format`, too."""
-NAME = "gscompleter"
-MARK = MappingProxyType({PROGRAM: NAME, FORMAT: NEWEST})
+PROGRAM_NAME = "gscompleter"
+RESULT_MARK = MappingProxyType({PROGRAM_KEY: PROGRAM_NAME, FORMAT_KEY: NEWEST})
 """First entries of every file."""
 
 
 def is_marked(content: object) -> bool:
     """Return True for values of a JSON file that says that this program wrote it."""
-    return isinstance(content, dict) and content.get(PROGRAM) == NAME
+    return isinstance(content, dict) and content.get(PROGRAM_KEY) == PROGRAM_NAME
 
 
 def read_number(content: object) -> int | None:
     """Return the number of the format of a file of ours; None before the first number."""
-    number = content.get(FORMAT) if isinstance(content, dict) else None
+    number = content.get(FORMAT_KEY) if isinstance(content, dict) else None
     return number if isinstance(number, int) and not isinstance(number, bool) else None
 
 
@@ -41,6 +41,6 @@ def refuse_later(content: object, name: str) -> None:
     number = read_number(content)
     if number is not None and number > NEWEST:
         raise InputError(
-            f"{name} was written by a later version of {NAME} (format {number}, this one reads up "
-            f"to {NEWEST}); update it."
+            f"{name} was written by a later version of {PROGRAM_NAME} (format {number}, this one "
+            f"reads up to {NEWEST}); update it."
         )

@@ -44,7 +44,7 @@ MAX_GIVEN_LENGTH = 60
 MAX_ENTRY_LENGTH = 100
 """Longest paths in the sentence about a file: as a whole it would be shortened beyond 300."""
 
-_NAME = re.compile(
+_UNFINISHED_NAME = re.compile(
     re.escape(UNFINISHED_PREFIX)
     + r"(?P<target>[0-9a-f]{8})-(?P<machine>[0-9a-f]{8})-(?P<pid>\d+)-(?P<start>\d+)-[0-9a-f]{8}"
     + rf"(?:{re.escape(REPLACED_SUFFIX)})?"
@@ -124,7 +124,7 @@ def digest_target(name: str) -> str:
 
 def is_unfinished(name: str) -> bool:
     """Return True for the name of an unfinished entry; others that only begin alike are foreign."""
-    return _NAME.fullmatch(name) is not None
+    return _UNFINISHED_NAME.fullmatch(name) is not None
 
 
 def list_unfinished(folder: Path, target: str | None = None) -> list[Unfinished]:
@@ -135,7 +135,7 @@ def list_unfinished(folder: Path, target: str | None = None) -> list[Unfinished]
         return []
     entries = []
     for name in names:
-        match = _NAME.fullmatch(name)
+        match = _UNFINISHED_NAME.fullmatch(name)
         if match is None or (target is not None and match["target"] != digest_target(target)):
             continue
         pid = int(match["pid"])

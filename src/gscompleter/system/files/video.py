@@ -18,7 +18,7 @@ from jaxtyping import UInt8
 from gscompleter.system.errors import InputError, quote_value, refuse_pointer
 from gscompleter.system.threads import get_thread_count
 
-QUALITY = 18
+X264_RATE_FACTOR = 18
 """Constant rate factor of x264: 0 is lossless, 18 is visually lossless."""
 OPTIONS = (
     # The colour space that players assume, stored in the file.
@@ -102,7 +102,17 @@ def write_video(path: Path, frames: Iterable[UInt8[np.ndarray, "h w 3"]], rate: 
     command = [
         *(find_ffmpeg(), "-v", "error", "-y", "-nostdin"),
         *("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", size, "-r", str(rate)),
-        *("-i", "pipe:0", "-an", "-c:v", "libx264", "-preset", "medium", "-crf", str(QUALITY)),
+        *(
+            "-i",
+            "pipe:0",
+            "-an",
+            "-c:v",
+            "libx264",
+            "-preset",
+            "medium",
+            "-crf",
+            str(X264_RATE_FACTOR),
+        ),
         *(*OPTIONS, str(path)),
     ]
     process = subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE)

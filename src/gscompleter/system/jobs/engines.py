@@ -22,13 +22,13 @@ from typing import Any
 from gscompleter.system.children import hide_working_folder
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import handle_stop_signals
-from gscompleter.system.jobs.jobs import Pool, Share
+from gscompleter.system.jobs.jobs import Pool, WorkerShare
 from gscompleter.system.memory import estimate_bytes, read_memory_bytes
 from gscompleter.system.threads import count_available_cores, limit_threads
 
 PIXELS = 640 * 480
 """Pixels per image of a typical completion; its memory limits the default number of workers."""
-IMAGES = 8
+TYPICAL_IMAGES = 8
 """Images of a typical completion."""
 STOP_SECONDS = 10.0
 """Time, in seconds, that stopped workers have to remove what they have not finished."""
@@ -48,7 +48,7 @@ def choose_num_workers() -> int:
     cores = count_available_cores()
     if memory is None:
         return cores
-    return max(1, min(cores, memory // estimate_bytes(PIXELS, IMAGES)))
+    return max(1, min(cores, memory // estimate_bytes(PIXELS, TYPICAL_IMAGES)))
 
 
 def check_processes() -> None:
@@ -74,7 +74,7 @@ def open_local(workers: int) -> Iterator[Pool]:
     futures: dict[ProcessPoolExecutor, Future[Exception | None]] = {}
     spawn = multiprocessing.get_context("spawn")
 
-    def start(share: Share) -> Future[Exception | None]:
+    def start(share: WorkerShare) -> Future[Exception | None]:
         idle = [
             executor
             for executor, future in futures.items()
@@ -148,7 +148,7 @@ def open_ray(
     task = ray.remote(run_task).options(num_cpus=threads, num_gpus=gpus, max_retries=0)
     started: list[Any] = []
 
-    def start(share: Share) -> Any:
+    def start(share: WorkerShare) -> Any:
         # References keep what they refer to: of a million tasks only the running ones are kept.
         if len(started) > MAX_REFERENCES:
             started[:] = ray.wait(started, num_returns=len(started), timeout=0)[1]
@@ -192,7 +192,7 @@ def connect_to_ray(ray: Any, address: str | None, cores: int | None) -> None:
         signal.signal(number, handler)
 
 
-def run_task(share: Share, threads: int, folder: str) -> Exception | None:
+def run_task(share: WorkerShare, threads: int, folder: str) -> Exception | None:
     """Run a share in a Ray task or a SLURM job, on `threads` threads, in a working folder."""
     with contextlib.suppress(OSError):  # a machine elsewhere may not have it
         os.chdir(folder)
@@ -230,7 +230,7 @@ def open_submitit(
         ) from error
     started: list[Any] = []
 
-    def start(share: Share) -> Any:
+    def start(share: WorkerShare) -> Any:
         task = partial(run_task, share, threads, os.getcwd())
         with hide_working_folder():
             started.append(executor.submit(task))

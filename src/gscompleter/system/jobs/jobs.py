@@ -203,7 +203,7 @@ Perform = Callable[[Job], None]
 """Runs a job in any process and writes its row, unless it has one."""
 
 
-Share = Callable[[], Exception | None]
+WorkerShare = Callable[[], Exception | None]
 """Runs the jobs of one worker; returns the error that ends the whole run, such as a full disk."""
 
 
@@ -213,7 +213,7 @@ class Pool:
 
     size: int
     """Number of shares that run simultaneously."""
-    start: Callable[[Share], Any]
+    start: Callable[[WorkerShare], Any]
     """Starts a share; returns its future, with `done()`, `exception()` and `result()`."""
     num_shares: int | None = None
     """Number of shares to divide the jobs into; None makes one of each job."""
@@ -224,7 +224,7 @@ Engine = Callable[[], AbstractContextManager[Pool]]
 
 
 def run_share(perform: Perform, jobs: Sequence[Job]) -> Exception | None:
-    """Run the jobs of a `Share` in order."""
+    """Run the jobs of a `WorkerShare` in order."""
     try:
         for job in jobs:
             perform(job)
