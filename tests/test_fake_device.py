@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-from fake_cuda import CUDA, Counts, FakeCudaTensor
+from fake_cuda import CUDA, Counts, FakeCudaTensor, get_device
 from fake_gsplat import WHEEL, fake_gsplat, find_gsplat
 from gscompleter import CompleterConfig, GSCompleter, load_renderer
 from gscompleter.config import GapConfig
@@ -49,6 +49,12 @@ MOST_WAITS = {
     "paper": {"context": 73, "generate": 44, "lift": 46, "register": 55, "integrate": 7},
 }
 """Waits of the host in each stage of a completion of two photographs (docs/performance.md)."""
+
+
+MOST_BYTES = {"default": 780, "with gaps": 950, "paper": 830}
+"""Bytes that the device holds at most at once, for each Gaussian of the completed scene."""
+BYTES_SHOWN = 4 * (3 + 4 + 3 + 1 + 3) + 1 + 8
+"""Bytes of a Gaussian of degree 0, with its label and its row in the scene."""
 
 
 @pytest.fixture
@@ -212,6 +218,33 @@ def test_two_cameras_are_drawn_with_one_wait(device, name):
     assert_close(*gradients, "gradient", 1e-4)
 
 
+def test_a_frozen_view_holds_what_its_camera_sees_and_holds_it_once(device):
+    """A view of a large scene is what most of the memory of a GPU goes to."""
+    seen = SCENES["harmonics"]
+    beside = replace(seen, means=seen.means + torch.tensor([9.0, 0, 0]))
+    context, camera = merge([seen, beside]).to("cuda"), CAMERA.to("cuda")
+    renderer, memory = CudaRenderer(), get_device().memory
+    renderer.freeze(context, camera)  # what a camera computes once is there from here on
+    before = memory.alive
+    view = renderer.freeze(context, camera)
+    assert 0 < len(view.scene) <= len(seen)
+    assert memory.alive - before == BYTES_SHOWN * len(view.scene)
+    view = view.extend(context)
+    assert memory.alive - before == BYTES_SHOWN * len(view.scene)
+
+
+def test_bytes_of_a_storage_count_until_its_last_tensor_is_gone(device):
+    memory = get_device().memory
+    values = torch.ones(100, device="cuda")
+    part = values[:10]
+    assert memory.alive == 400
+    del values
+    assert memory.alive == 400
+    del part
+    assert memory.alive == 0
+    assert memory.peaks.total() == 400
+
+
 def test_auto_chooses_a_gpu_that_draws(device):
     assert choose_devices("auto") == Devices("cuda", "cuda")
 
@@ -237,6 +270,9 @@ def test_a_completion_stays_on_the_device_and_waits_no_more_than_it_has_to(devic
     for stage in STAGES:
         found = device.count_waits(stage)
         assert found <= MOST_WAITS[name][stage], f"{stage}:\n{device.list_waits(stage)}"
+    memory = get_device().memory
+    stage, peak = memory.peaks.most_common(1)[0]
+    assert peak <= MOST_BYTES[name] * len(done.scene), f"{stage}:\n{memory.largest[stage]}"
 
 
 def test_a_given_splat_is_completed_with_photographs_that_check_it(device):
