@@ -9,8 +9,8 @@ from PIL import Image
 from exact_room import make_cameras, write_colmap
 from gscompleter import InputError
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.given_depth import give_depths
 from inverse_depth import write_dense_depth, write_inverse_depth
+from measured_photographs import give_depths
 
 CAMERAS = make_cameras(4, width=64, height=48, focal=52.0)
 

@@ -9,8 +9,8 @@ from PIL import Image
 
 from gscompleter import InputError
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.given_depth import give_depths
 from gscompleter.data.multi_view_stereo import open_idr
+from measured_photographs import give_depths
 from pose_files import SIZE, VIEWS, idr, mvsnet, replica, scannet
 
 

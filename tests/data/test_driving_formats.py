@@ -21,6 +21,7 @@ from gscompleter.data.formats import open_photographs
 from gscompleter.data.json_fields import get_number
 from gscompleter.evaluation.cases import open_clips
 from gscompleter.numerics.geometry import project
+from measured_photographs import find_moving
 
 
 def real(shared: Path, name: str) -> Path:
@@ -75,7 +76,7 @@ def test_nuscenes_cameras_show_boxes_where_its_own_infos_put_them(shared, tmp_pa
 def test_moving_things_of_nuscenes_are_masked_and_parked_ones_are_not(shared, tmp_path):
     info, sample = nuscenes(shared, tmp_path)
     photographs = open_photographs(info)
-    mask = photographs.find_moving(0)
+    mask = find_moving(photographs, 0)
     assert 0 < mask.float().mean() < 0.2
     speeds = [(t, float(np.hypot(*t["velocity"]))) for t in sample["cam_instances"]["CAM_FRONT"]]
     fast = [t for t, speed in speeds if speed > 1]

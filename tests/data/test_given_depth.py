@@ -14,12 +14,13 @@ from exact_room import make_cameras, write_transforms
 from gscompleter import GSCompleter, InputError
 from gscompleter.apps.report.schema import read_summary
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.given_depth import drop_edges, drop_hidden, give_depths
+from gscompleter.data.given_depth import drop_edges, drop_hidden
 from gscompleter.evaluation.metrics.geometry import compare_depths
 from gscompleter.evaluation.metrics.image import compute_masked_psnr
 from gscompleter.numerics.geometry import project
 from gscompleter.system.files.image import write_image
 from gscompleter.types import Camera
+from measured_photographs import give_depths
 from pose_files import CAMERAS, NAMES, write_colmap_binary, write_colmap_text, write_photographs
 from scenes import Room, camera_at, photographed, view_of
 

@@ -22,6 +22,7 @@ from gscompleter.data.photographs import Photographs
 from gscompleter.evaluation.cases import open_clips
 from gscompleter.evaluation.store import list_row_paths, read_run_file
 from kitti_city_segment import kitti_city_segment
+from measured_photographs import find_moving
 from waymo_segment import (
     SEGMENT,
     Laser,
@@ -199,7 +200,7 @@ def test_poses_of_pixels_that_are_not_those_of_the_laser_are_refused(tmp_path):
 
 def test_boxes_mask_what_moves(tmp_path):
     photographs = open_photographs(segment(tmp_path))
-    mask = photographs.find_moving(0)
+    mask = find_moving(photographs, 0)
     camera = photographs.camera(0)
 
     def shown(center: tuple[float, float, float]) -> bool:
@@ -214,7 +215,7 @@ def test_boxes_mask_what_moves(tmp_path):
     assert not shown((9.0, -3.0, 1.0))
     assert not shown((9.0, 3.0, 2.0))
     assert 0.02 < mask.float().mean() < 0.3
-    halved = photographs.find_moving(0, (HEIGHT // 2, WIDTH // 2))
+    halved = find_moving(photographs, 0, (HEIGHT // 2, WIDTH // 2))
     assert halved.float().mean().item() == pytest.approx(mask.float().mean().item(), rel=0.15)
 
 
@@ -249,7 +250,7 @@ def test_a_segment_without_lasers_has_no_depth(tmp_path):
     photographs = open_photographs(write_segment(tmp_path, bare, CAMERAS))
     (view,) = photographs.views([0])
     assert view.depth is None
-    assert photographs.find_moving(0) is None
+    assert find_moving(photographs, 0) is None
 
 
 def test_without_pyarrow_a_sentence_says_what_to_install(tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ import pytest
 
 from apart import read_used_cases, select_scenes
 from command import run
-from gscompleter.evaluation.apart import APART_HEAD, LEDGER, count_uses, record_uses
+from gscompleter.evaluation.apart import APART_HEAD, LEDGER, record_uses
 from gscompleter.evaluation.case_file import read_case_file, read_scene_file
 from gscompleter.evaluation.cases import ScenePlace, list_places, read_cases
 from gscompleter.system.errors import InputError, OutputError
@@ -31,6 +31,12 @@ def rooms(tmp_path_factory) -> Path:
     write_cases(root / "cases.json", apart=["unseen"])
     (root / "scenes.json").write_text(json.dumps({"scenes": ["seen", "unseen"], "apart": ["seen"]}))
     return root
+
+
+def count_uses(ledger: Path, file: Path) -> int:
+    """Count the lines of a ledger that name a file of cases."""
+    rows = ledger.read_text().splitlines()
+    return sum(line.startswith("| ") and f" | {file.name} | " in line for line in rows)
 
 
 def write_cases(path: Path, **keys: object) -> Path:
@@ -128,15 +134,15 @@ def test_a_use_is_written_down_and_counted_once(tmp_path, rooms, monkeypatch, ca
     for name in ("tables.md", "tables.tex", "timings.md"):
         assert "1 cases that are kept apart were used (apart_uses.md)" in (out / name).read_text()
     assert json.loads((out / "tables.json").read_text())["made_with"]["num_apart"] == 1
-    assert count_uses(cases) == 1
+    assert count_uses(tmp_path / LEDGER, cases) == 1
     row = (tmp_path / LEDGER).read_text().splitlines()[-1]
     assert row.endswith("| apart.json | 1 | evaluate --methods context |")
 
     # Reading the scores of an earlier run is no further use; scoring again is.
     assert run(monkeypatch, *words) == 0
-    assert count_uses(cases) == 1
+    assert count_uses(tmp_path / LEDGER, cases) == 1
     assert run(monkeypatch, *words, "--rerun", "scores") == 0
-    assert count_uses(cases) == 2
+    assert count_uses(tmp_path / LEDGER, cases) == 2
     assert not (folder / LEDGER).exists()
     # What was scored with them is not continued without.
     capsys.readouterr()

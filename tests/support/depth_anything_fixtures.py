@@ -126,9 +126,8 @@ def between(outputs: dict[str, object], network: nn.Module) -> dict[str, Tensor]
         "ref1": "head.scratch.refinenet1",
         "neck": "head.scratch.output_conv1",
         "logits": "head.scratch.output_conv2",
-        "neck_aux": "head.scratch.output_conv1_aux.3",
-        "logits_aux": "head.scratch.output_conv2_aux.3.5",
         "cam_token": "cam_enc",
+        "pose_enc": "cam_dec",
         "merger": "gs_head.images_merger",
         "gsneck": "gs_head.scratch.output_conv1",
     }
@@ -136,20 +135,16 @@ def between(outputs: dict[str, object], network: nn.Module) -> dict[str, Tensor]
 
 
 def through_any_view(network: DepthAnything, case: Case) -> tuple[Prediction, dict[str, Tensor]]:
-    """Run the network; return intermediate values and rays too."""
+    """Run the network; return intermediate values, too."""
     images, poses = images_and_poses(case)
-    size, outputs = tuple(images.shape[3:]), Outputs({})
+    outputs = Outputs({})
     hooks = outputs.watch(network)
     with torch.no_grad():
         predicted = network(images, poses)
-        pyramid = [outputs.of[f"head.resize_layers.{i}"] for i in range(4)]
-        ray, ray_confidence = network.head.predict_rays(pyramid, size)
     for hook in hooks:
         hook.remove()
     found = between(outputs.of, network)
     scenes, views = images.shape[:2]
-    found["ray"] = ray.unflatten(0, (scenes, views))
-    found["ray_conf"] = ray_confidence.unflatten(0, (scenes, views))
     if poses is not None:
         found["ext_norm"] = invert_rigid(poses.c2w)
     if predicted.raw is not None:
@@ -181,6 +176,7 @@ def any_view_errors(network: DepthAnything, case: Case) -> dict[str, float]:
     predicted, found = through_any_view(network, case)
     stride = int(case.values["mid_stride"])
     out = outputs_of(predicted) | {"depth": predicted.depth, "depth_conf": predicted.confidence}
+    out["pose_enc"] = found["pose_enc"]
     errors = errors_of(found, case, "mid", stride) | errors_of(out, case, "out", stride)
     if "out_align_scale" in case.values:
         pairs = zip(
@@ -201,7 +197,6 @@ def outputs_of(predicted: Prediction, scale: float = 1.0) -> dict[str, Tensor]:
     w2c = invert_rigid(predicted.poses.c2w)[:, :, :3].clone()
     w2c[..., 3] *= scale
     return {
-        "pose_enc": predicted.camera_parameters,
         "extrinsics": w2c,
         "intrinsics": predicted.poses.K,
     }
@@ -249,9 +244,14 @@ def metric_errors(network: MetricDepthAnything, case: Case) -> dict[str, float]:
 def nested_errors(network: NestedDepthAnything, case: Case) -> dict[str, float]:
     """Compute the errors of the nested network."""
     images, poses = images_and_poses(case)
+    outputs = Outputs({})
+    hooks = outputs.watch(network)
     with torch.no_grad():
         predicted = network(images, poses)
+    for hook in hooks:
+        hook.remove()
     out = outputs_of(predicted.any_view, predicted.scale) | {
+        "pose_enc": outputs.of["da3.cam_dec"],
         "depth": predicted.depth,
         "depth_conf": predicted.confidence,
         "scale_factor": torch.tensor(predicted.scale, dtype=torch.float64),

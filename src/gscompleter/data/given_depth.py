@@ -5,7 +5,6 @@ Nothing that is scored may be given, so `evaluate` never does this.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
@@ -15,7 +14,6 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.data.frame import Frame
-from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.numerics.geometry import compute_sparse_depth
 from gscompleter.types import View
 
@@ -27,17 +25,6 @@ GAP_SHARE = 1 / 64
 """The same window around a laser point."""
 GAP_RATIO = 1.2
 """Depth ratio from which a nearer laser point hides another."""
-
-
-def give_depths(
-    photographs: Photographs, frames: Sequence[int], resolution: Resolution = None
-) -> list[View]:
-    """Load photographs whose measured depth constrains the reconstruction and scores nothing."""
-    views = photographs.views(frames, resolution)
-    return [
-        give_depth(view, photographs.frame(number), photographs.origin)
-        for view, number in zip(views, frames, strict=True)
-    ]
 
 
 def give_depth(view: View, frame: Frame, origin: Float[np.ndarray, "3"]) -> View:

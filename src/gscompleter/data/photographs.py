@@ -194,13 +194,6 @@ class Photographs:
         hidden = self._load_colors(chosen)[1]
         return hidden is not None and bool(hidden.all())
 
-    def find_moving(self, frame: int, resolution: Resolution = None) -> Bool[Tensor, "h w"] | None:
-        """Return True where a photograph shows a moving box, or None without boxes."""
-        boxes = self.frame(frame).boxes
-        if boxes is None:
-            return None
-        return torch.from_numpy(mask_moving(boxes(), self.camera(frame, resolution), self.origin))
-
     def at_origin(self, origin: Float[np.ndarray, "3"]) -> Photographs:
         """Return the photographs relative to the origin of a splat in their map, if they are there.
 

@@ -97,12 +97,3 @@ def record_uses(items: Sequence[Apartable], used_by: str) -> None:
                 f"The use of {quote_value(file)} cannot be noted in {quote_value(ledger)} "
                 f"({error.strerror}); copy the file to a folder that can be written."
             ) from None
-
-
-def count_uses(file: Path) -> int:
-    """Count the recorded runs that used what `file` keeps apart."""
-    ledger = find_ledger(file)
-    if not ledger.is_file():
-        return 0
-    rows = ledger.read_text("utf-8").splitlines()
-    return sum(line.startswith("| ") and f" | {file.name} | " in line for line in rows)

@@ -43,7 +43,6 @@ ADAM_BETAS = (0.0, 0.8)
 steps (decision 003)."""
 OCCLUSION_TOLERANCE = 0.05
 """Distance behind the context, relative to depth, that still counts as the same surface."""
-
 IN_FRONT = 0.98
 """Depth of what fills a forced hole, relative to what is left in it."""
 
@@ -56,9 +55,14 @@ RenderAlone = Callable[[Gaussians], tuple[Render, Render]]
 def register_along_rays(
     lifted: Lift, affine: DepthAffine, reference: View, anchor: Anchor, view: TargetView
 ) -> Registration:
-    """Align all Gaussians by one affine of depth, then each along its ray.
+    """Align all Gaussians by one affine of depth, then each along its ray, as the config says.
 
-    `reference` is the synthesized image at the target camera.
+    Args:
+        lifted: Gaussians of the reference, each with its pixel if the model tells it.
+        affine: Affine from their z-depths to those of the scene (Eq. 8).
+        reference: The synthesized image at the target camera.
+        anchor: The photograph that depth is compared at, besides the target.
+        view: The scene at the target.
     """
     config = view.state.config.registration
     pixel_index = lifted.pixel_index
@@ -73,20 +77,25 @@ def register_along_rays(
         return Registration(registered, None, losses)
     if config.hole_depth == "scene":
         # A trained splat has its depth from many photographs, which two-view stereo cannot better.
-        # Beside an object there is neither a hole nor a depth.
-        surface = view.render.depth_map(view.state.config.holes.max_alpha)
-        depth = fill_smoothly(surface.depth, ~view.holes & surface.valid)
-        forced = view.masks.edits.forced
-        if forced is not None:
-            # What is left in a forced hole is wrong, and must not hide what fills it.
-            in_front = torch.minimum(depth, IN_FRONT * surface.depth)
-            depth = torch.where(forced & surface.valid, in_front, depth)
-        depth = depth.flatten()[pixel_index]
+        depth = continue_scene_depth(view).flatten()[pixel_index]
         return Registration(move_to_depths(coarse, camera, depth), pixel_index, ())
     if config.extrapolate_into_holes and config.degrees_of_freedom == 1:
         return register_beside_holes(coarse, pixel_index, reference, anchor, view)
     registered, losses = optimize_distances(coarse, reference, anchor, view)
     return Registration(registered, pixel_index, losses)
+
+
+def continue_scene_depth(view: TargetView) -> Float[Tensor, "h w"]:
+    """Compute the z-depth of the scene at the padded target, continued smoothly into its holes."""
+    surface = view.render.depth_map(view.state.config.holes.max_alpha)
+    # Beside an object there is neither a hole nor a depth.
+    depth = fill_smoothly(surface.depth, ~view.holes & surface.valid)
+    forced = view.masks.edits.forced
+    if forced is None:
+        return depth
+    # What is left in a forced hole is wrong, and must not hide what fills it.
+    in_front = torch.minimum(depth, IN_FRONT * surface.depth)
+    return torch.where(forced & surface.valid, in_front, depth)
 
 
 def register_beside_holes(

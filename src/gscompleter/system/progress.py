@@ -36,10 +36,12 @@ class Display:
         self.has_bars = console.is_terminal and not console.is_dumb_terminal
         self._console = console
         self._running = make_bars(console)
+        # The last line of a log and its time: a line is not printed twice, nor steps too often.
         self._line = ""
         self._line_time = time.monotonic()
-        self._ended = threading.Event()
+        # The thread that prints a line where a log is silent for long, and what ends it.
         self._pulse: threading.Thread | None = None
+        self._ended = threading.Event()
 
     def start_pulse(self) -> None:
         """Begin to print a line where a stage is silent for long, unless there are bars."""

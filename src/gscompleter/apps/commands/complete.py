@@ -131,28 +131,35 @@ def decide_holes(
     check_ending(options)
     if options.images is None:
         check_generator(options.synthesis)
-        named = options.target
-        context = options.context
+        cameras = NamedCameras(options.target, options.context)
         synthesis = options.synthesis
     else:
         check_painted(options)
-        named, context = decide_painted(options, options.images)
+        cameras = name_painted_cameras(options, options.images)
         synthesis = PaintedOptions(generator_painter=options.painter)
     max_found = DEFAULT_NUM_TARGETS if options.auto is None else options.auto
     results = replace(decide_results(options), suffix=options.save_as, has_video=options.video)
     return decide_filling(
         options,
-        TargetRequest(named, max_found, options.images),
+        TargetRequest(cameras.targets, max_found, options.images),
         results,
-        context=context,
+        context=cameras.context,
         synthesis=synthesis,
         has_marks=has_marks,
         adapt=adapt,
     )
 
 
-def decide_painted(options: CompleteOptions, folder: Path) -> tuple[tuple[str, ...], Names | None]:
-    """Decide on targets and context of painted images, after reading these.
+@dataclass(frozen=True)
+class NamedCameras:
+    """Targets and context as they are named; none of them are searched for, or chosen."""
+
+    targets: tuple[str, ...]
+    context: Names | None
+
+
+def name_painted_cameras(options: CompleteOptions, folder: Path) -> NamedCameras:
+    """Name the targets and the context of painted images, after reading these.
 
     Where none are named, those of `holes.json` are taken: of another context Ψ makes another scene,
     with other holes.
@@ -161,13 +168,14 @@ def decide_painted(options: CompleteOptions, folder: Path) -> tuple[tuple[str, .
     from gscompleter.apps.inputs.paintings import check_paintings
 
     check_paintings(folder, len(options.target))
-    named = options.target
+    if not has_holes(folder):
+        return NamedCameras(options.target, options.context)
+    targets = options.target or (str(folder / HOLES_FILE),)
     context = options.context
-    if has_holes(folder):
-        named = named or (str(folder / HOLES_FILE),)
+    if context is None:
         # None is listed where renders take the place of photographs, at cameras that are found.
-        context = read_holes(folder).context or None if context is None else context
-    return named, context
+        context = read_holes(folder).context or None
+    return NamedCameras(targets, context)
 
 
 def check_ending(options: CompleteOptions) -> None:

@@ -481,24 +481,24 @@ def read_splat_alone(
     compile_kernels(list_parts(work))
 
     request = RenderRequest(
-        source.scene,
-        source.cameras,
-        targets.named,
-        source.context,
-        marks.masks,
-        marks.reading,
-        work.config.holes,
-        source.holes,
-        source.up,
-        place,
+        reading=source.scene,
+        cameras=source.cameras,
+        targets=targets.named,
+        context=source.context,
+        up=source.up,
+        place=place,
+        masks=marks.masks,
+        mask_reading=marks.reading,
+        kind=source.holes,
+        limits=work.config.holes,
     )
     with show_preparation("choosing cameras"):
         renderer = load_renderer(device)
-        opened, task, kind = open_renders(request, splat_file, gaussians, renderer, device)
+        alone = open_renders(request, splat_file, gaussians, renderer, device)
         if device == "cpu":
-            check_scene(task, gaussians)
-    config = work.config.choose_margin(kind.is_lifted).for_holes(kind.holes)
-    return opened, add_paintings(task, targets, opened), config
+            check_scene(alone.task, gaussians)
+    config = work.config.choose_margin(alone.kind.is_lifted).for_holes(alone.kind.holes)
+    return alone.opened, add_paintings(alone.task, targets, alone.opened), config
 
 
 def load_completer(

@@ -46,31 +46,35 @@ TRAINER_LEVELS = 2
 """Folders between the cameras.json of a trainer and its point_cloud/iteration_N/*.ply."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RenderRequest:
-    """A splat without photographs, and what is known of its cameras."""
+    """A splat without photographs, and what is known of its cameras and its holes."""
 
     reading: SceneRequest
     """Resolution and depth range; its folder is the file of the splat."""
+
+    # Cameras.
     cameras: Path | None = None
     """File of cameras whose renders take the place of photographs, or None to find cameras."""
     targets: tuple[str, ...] = ()
     """Files of cameras, or numbers and names of cameras of `cameras`."""
     context: PhotographNames | None = None
     """Numbers or names of the cameras to use; None to choose."""
+    up: tuple[float, float, float] | None = None
+    """Upward direction of a splat whose cameras are found, in the axes of its file; None to find
+    it."""
+
+    # Holes: what is removed, what masks mark, or else what is empty.
+    place: Selection | None = None
+    """Gaussians to be removed, around which cameras are found; None to complete the splat."""
     masks: tuple[Path, ...] = ()
     """Masks that mark what is wrong at each target, white there."""
     mask_reading: MaskReading = MaskReading()
     """How these are read."""
-    holes: HoleConfig = HoleConfig()
-    """Limits of holes; their kind is chosen by `kind`."""
     kind: Literal["auto", "all", "enclosed"] = "auto"
     """Kind of holes; `auto` takes those that an object encloses, and all in a scene."""
-    up: tuple[float, float, float] | None = None
-    """Upward direction of a splat whose cameras are found, in the axes of its file; None to find
-    it."""
-    place: Selection | None = None
-    """Gaussians to be removed, around which cameras are found; None to complete the splat."""
+    limits: HoleConfig = HoleConfig()
+    """Limits of holes; `kind` chooses their kind in place of its own."""
 
     def find_up(self, scene: Gaussians, renderer: Renderer) -> Upward:
         """Find the upward direction, for which the cameras beside the splat are read as well."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -35,7 +35,7 @@ from gscompleter.apps.inputs.named_photographs import find_context, read_targets
 from gscompleter.apps.inputs.reading import check_sizes
 from gscompleter.apps.inputs.selection import choose_context
 from gscompleter.apps.inputs.splat import place_scene
-from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened, Target
+from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened
 from gscompleter.apps.requests.scene import SceneRequest
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.cameras import Intrinsics
@@ -68,17 +68,31 @@ MIN_POINT_OPACITY = 0.5
 """Least opacity of such a Gaussian."""
 
 
+@dataclass(frozen=True)
+class OpenedAlone:
+    """A splat without photographs, opened, with renders in their place."""
+
+    opened: Opened
+    task: CompletionTask
+    kind: SplatAloneKind
+
+
+@dataclass(frozen=True)
+class ChosenCapture:
+    """Cameras at which a splat is rendered, and what a hole of it is."""
+
+    capture: Capture
+    holes: HoleKind
+
+
 def open_renders(
     request: RenderRequest,
     splat_file: InputSplatFile,
     scene: Gaussians,
     renderer: Renderer,
     device: str,
-) -> tuple[Opened, CompletionTask, SplatAloneKind]:
-    """Choose cameras, and render the splat there in place of photographs.
-
-    Also returns what kind of splat it is.
-    """
+) -> OpenedAlone:
+    """Choose cameras, and render the splat there in place of photographs."""
     reading = request.reading
     check_planes(reading.near, reading.far)
     check_resolution(reading.resolution)
@@ -104,11 +118,9 @@ def open_renders(
 
     # The search for this centre takes a second, and decides several things below.
     pixel_center = find_pixel_center(scene)
-    capture, kind, holes = choose_capture(
-        request, path, known, targets, scene, pixel_center, renderer
-    )
-    if capture is None:
-        capture = search_around([t.camera.to(device) for t in targets], holes, scene, renderer)
+    target_cameras = [target.camera.to(device) for target in targets]
+    decided = choose_capture(request, path, known, target_cameras, scene, pixel_center, renderer)
+    capture = decided.capture
     photographs = replace(
         known,
         frames=tuple(make_frames(capture, scene, renderer, origin)),
@@ -121,7 +133,7 @@ def open_renders(
     chosen = chosen or tuple(range(len(capture.cameras)))
     notes = [describe_capture(capture, len(chosen))]
     notes += [] if capture.upward is None else capture.upward.describe()
-    if kind == "enclosed" and not request.masks:
+    if decided.holes == "enclosed" and not request.masks:
         notes.append(OBJECT_NOTE)
 
     cameras = {number: capture.cameras[number].to(device) for number in chosen}
@@ -130,8 +142,7 @@ def open_renders(
     others = [camera.to(device) for camera in (*unused, *capture.others)]
     if capture.upward is None:
         # Cameras that somebody named stand upright.
-        named = [*cameras.values(), *(target.camera.to(device) for target in targets)]
-        up = estimate_axis_up(named)
+        up = estimate_axis_up([*cameras.values(), *target_cameras])
     else:
         up = capture.upward.direction
     witnesses = choose_witnesses(scene, pixel_center, list(cameras.values()), others, up, renderer)
@@ -154,45 +165,69 @@ def open_renders(
         frame_description="the frame of the splat",
         witnesses=witnesses,
     )
-    return opened, task, SplatAloneKind(pixel_center is not None, kind)
+    return OpenedAlone(opened, task, SplatAloneKind(pixel_center is not None, decided.holes))
 
 
 def choose_capture(
     request: RenderRequest,
     path: Path | None,
     known: Photographs,
-    targets: Sequence[Target],
+    targets: Sequence[Camera],
     scene: Gaussians,
     pixel_center: Float[Tensor, "3"] | None,
     renderer: Renderer,
-) -> tuple[Capture | None, HoleKind, list[Bool[Tensor, "h w"]]]:
-    """Choose cameras, what a hole is, and the holes of the targets.
+) -> ChosenCapture:
+    """Choose the cameras at which the splat is rendered, and what a hole of it is.
 
-    There is no capture yet if cameras are to be found around these holes.
+    Both in one: what a hole is depends on the cameras that somebody named, and where cameras are
+    looked for depends on the holes of the targets.
+
+    Args:
+        request: The splat, and what is known of its cameras and holes.
+        path: The file of cameras, named or found beside the splat; None to find cameras.
+        known: The cameras of that file, with the origin that work is done near.
+        targets: Cameras of the targets; none to plan them later.
+        scene: Gaussians relative to that origin.
+        pixel_center: Centre of the camera that the splat was lifted from; None if it was trained.
+        renderer: Renders the splat where cameras are compared.
     """
-    device = scene.means.device
-    target_cameras = [target.camera.to(device) for target in targets]
-    capture: Capture | None = None
-    if path is not None:
-        capture = take_from_file(path, known, request)
-    elif request.place is not None:
+    # Cameras that are found say nothing of holes: they are chosen for images that the splat fills.
+    from_file = None if path is None else take_from_file(path, known, request)
+    named = [] if from_file is None else from_file.cameras
+    is_lifted = pixel_center is not None
+    kind = choose_kind(request.kind, scene, is_lifted, [*targets, *named], renderer)
+    holes = find_requested_holes(request, kind, targets, scene, renderer)
+    if from_file is not None:
+        return ChosenCapture(from_file, kind)
+    if request.place is not None:
         capture = search_around_place(scene, known.origin, renderer, request)
     elif not targets:
         capture = find_cameras_alone(scene, pixel_center, renderer, request)
-    # Cameras that were found say nothing: they are chosen for images that the splat fills.
-    named = [] if path is None or capture is None else capture.cameras
-    is_lifted = pixel_center is not None
-    kind = choose_kind(request.kind, scene, is_lifted, [*target_cameras, *named], renderer)
+    else:
+        capture = search_around(targets, holes, scene, renderer)
+    return ChosenCapture(capture, kind)
 
-    # What is marked or removed is the hole, and need not be empty yet.
+
+def find_requested_holes(
+    request: RenderRequest,
+    kind: HoleKind,
+    targets: Sequence[Camera],
+    scene: Gaussians,
+    renderer: Renderer,
+) -> list[Bool[Tensor, "h w"]]:
+    """Find the hole of each target: what is marked, or else empty; none where things are removed.
+
+    Raises:
+        InputError: There is another number of masks than of targets, or no target has a hole.
+    """
+    # What is marked is the hole, and need not be empty yet.
     if request.masks:
-        pairs = pair_masks(request.masks, target_cameras)
-        marks = [read_marks(path, camera, request.mask_reading) for path, camera in pairs]
-        return capture, kind, marks
+        pairs = pair_masks(request.masks, targets)
+        return [read_marks(path, camera, request.mask_reading) for path, camera in pairs]
+    # What is removed leaves its hole later.
     if request.place is not None:
-        return capture, kind, []
-    config = replace(request.holes, kind=kind)
-    return capture, kind, find_target_holes(target_cameras, scene, renderer, config)
+        return []
+    return find_target_holes(targets, scene, renderer, replace(request.limits, kind=kind))
 
 
 def check_capture_images(cameras: Sequence[Camera]) -> None:

@@ -89,6 +89,7 @@ def make_score_rows(
             for row in score_targets(completion, targets, at_targets, gaps, renderer)
         ],
     }
+    # Where no target was completed, the photographs that check the splat tell what changed.
     if not completion.targets:
         checks = [photo.view for photo in completion.photos[completion.num_context :]]
         rows["checks"] = score_photographs(completion, checks, [None] * len(checks), renderer)

@@ -29,7 +29,8 @@ class WorkRequest:
     """The splat to complete; None to reconstruct the scene from its photographs."""
     models: ModelRequest = ModelRequest()
     config: CompleterConfig = CompleterConfig()
-    """Of a splat alone, without what is still to be found of its holes."""
+    """Settings. For a splat without photographs, its Gaussians tell later what a hole of it is, and
+    whether images are padded."""
 
 
 @dataclass(frozen=True)

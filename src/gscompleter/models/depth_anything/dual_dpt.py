@@ -1,4 +1,4 @@
-"""The head of the any-view networks for depth and rays."""
+"""The head of the any-view networks for depth."""
 
 from __future__ import annotations
 
@@ -9,13 +9,11 @@ from jaxtyping import Float
 from torch import Tensor, nn
 
 from gscompleter.models.depth_anything.dpt import HIDDEN, Dpt, ImageScratch, add_position_encoding
-from gscompleter.models.feed_forward.dpt import Coarsest, Fusion, fuse_levels
+from gscompleter.models.feed_forward.dpt import Coarsest, Fusion
 from gscompleter.models.feed_forward.resampling import resize_bilinear
 
 NUM_LEVELS = 4
-"""Number of pyramid levels; rays come from the last one."""
-NORM_INDEX = 2
-"""Index of the norm in `RayLayers`."""
+"""Number of pyramid levels."""
 
 Pyramid = Sequence[Float[Tensor, "n _ _ _"]]
 
@@ -43,16 +41,12 @@ class RayLayers(nn.Sequential):
         norm = nn.Identity() if level else ChannelNorm(HIDDEN)
         super().__init__(first, nn.Identity(), norm, nn.Identity(), nn.ReLU(), last)
 
-    def apply_with_norm(
-        self, x: Float[Tensor, "n c h w"], norm: nn.Module
-    ) -> Float[Tensor, "n 7 h w"]:
-        """Apply the layers with the norm of another level."""
-        first, _, _, _, relu, last = self
-        return last(relu(norm(first(x))))
-
 
 class DualScratch(ImageScratch):
-    """Two fusions of the levels, for depth and for rays."""
+    """Two fusions of the levels: for depth, and for rays, which given cameras make needless.
+
+    The layers for rays are there because files of weights hold them.
+    """
 
     def __init__(self, widths: Sequence[int], features: int) -> None:
         super().__init__(widths, features, out=2)
@@ -66,22 +60,9 @@ class DualScratch(ImageScratch):
         last = [RayLayers(features // 2, level) for level in range(NUM_LEVELS)]
         self.output_conv2_aux = nn.ModuleList(last)
 
-    def fuse_rays(self, pyramid: Pyramid, aspect: float) -> Float[Tensor, "n 7 h w"]:
-        """Fuse the maps, finest first, into rays; `aspect` is image width divided by height."""
-        fusions = (self.refinenet1_aux, self.refinenet2_aux, self.refinenet3_aux)
-        x = fuse_levels(self.project_levels(pyramid), *fusions, self.refinenet4_aux)
-        # Of the four levels, only the last one's layers are used; with the norm that the first one
-        # stores.
-        x = add_position_encoding(self.output_conv1_aux[-1](x), aspect)
-        shared = self.output_conv2_aux[0]
-        last = self.output_conv2_aux[-1]
-        assert isinstance(shared, RayLayers)
-        assert isinstance(last, RayLayers)
-        return last.apply_with_norm(x, shared[NORM_INDEX])
-
 
 class DualDpt(Dpt):
-    """Head for depth at image resolution and rays at 4/7 of it."""
+    """Head for depth at image resolution."""
 
     scratch: DualScratch
 
@@ -102,10 +83,3 @@ class DualDpt(Dpt):
         raw = self.scratch.output_conv2(add_position_encoding(x, size[1] / size[0]))
         # Positive depth, and a confidence above 1, as the authors trained them.
         return raw[:, 0].exp(), 1 + raw[:, 1].exp()
-
-    def predict_rays(
-        self, pyramid: Pyramid, size: tuple[int, int]
-    ) -> tuple[Float[Tensor, "n p q 6"], Float[Tensor, "n p q"]]:
-        """Predict direction, origin and confidence of each ray; unused with given cameras."""
-        raw = self.scratch.fuse_rays(pyramid, size[1] / size[0])
-        return raw[:, :6].movedim(1, -1), 1 + raw[:, 6].exp()

@@ -25,8 +25,6 @@ class Prediction:
     depth: Float[Tensor, "b v h w"]
     confidence: Float[Tensor, "b v h w"]
     """Confidence of the z-depth, from 1 upwards."""
-    camera_parameters: Float[Tensor, "b v 9"]
-    """Predicted cameras as from `encode_poses`, with quaternions that are not normalised."""
     poses: Poses
     """Predicted cameras, even if poses were given."""
     raw: Float[Tensor, "b v h w c"] | None
@@ -64,14 +62,14 @@ class DepthAnything(nn.Module):
             # Heads run in float32: depth is an exponential, which half precision resolves badly.
             pyramid = self.head.compute_pyramid(tokens, size[0] // PATCH, size[1] // PATCH)
             depth, confidence = self.head.predict_depth(pyramid, size)
-            # From the camera token of the last output block.
+            # From the camera token of the last output block; as `encode_poses` gives them, with
+            # quaternions that are not normalised.
             numbers = self.cam_dec(tokens[-1].camera)
             raw = None if self.gs_head is None else self.gs_head(tokens, images)
             views = images.shape[:2]
             return Prediction(
                 depth.unflatten(0, views),
                 confidence.unflatten(0, views),
-                numbers,
                 decode_poses(numbers, size),
                 raw,
             )

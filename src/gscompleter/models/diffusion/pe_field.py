@@ -21,18 +21,15 @@ from gscompleter.models.diffusion.loading import load_kontext
 from gscompleter.models.diffusion.position_ids import (
     compute_source_ids,
     compute_target_ids,
-    project_to_target,
 )
 from gscompleter.models.diffusion.source_depth import (
     SourceDepth,
-    compute_context_depth,
     load_source_depth,
 )
-from gscompleter.models.diffusion.splat import splat_forward
 from gscompleter.models.settings import PEFieldSettings
 from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.system.errors import InputError
-from gscompleter.types import Camera, GeneratorInput, Render, View
+from gscompleter.types import GeneratorInput, Render, View
 
 GUIDANCE = 3.5
 """Scale of the distilled guidance."""
@@ -128,23 +125,6 @@ class PEField:
             self.steps,
             GUIDANCE,
         )
-
-
-def preview(
-    nearest: View,
-    target: Camera,
-    context: GeneratorInput,
-    depth: SourceDepth = compute_context_depth,
-) -> Float[Tensor, "h w 3"]:
-    """Splat the photograph to its positions in `target`, over black, for inspection.
-
-    Displaced pixels or torn surfaces indicate wrong depth or cameras; gaps next to the foreground
-    and a smear at the border are correct.
-    """
-    pixels, _ = project_to_target(
-        depth(nearest, find_render(nearest, context)), nearest.camera, target
-    )
-    return splat_forward(nearest.image, pixels, (target.height, target.width))
 
 
 def group_by_size(conditions: Sequence[Condition], max_size: int) -> list[list[int]]:

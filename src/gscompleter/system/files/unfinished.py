@@ -5,8 +5,9 @@
 TARGET stands for the name of the result and MACHINE for this computer since it was started. START
 is the time at which the process began, so that another process of the same PID is noticed. A run
 that is killed leaves such entries behind; the next one removes them once their process is gone.
-Of a process that cannot be seen, because it is or was on another machine, the signs count: its
-owner touches an entry twice a minute.
+Of a process that cannot be seen, signs count: its owner touches an entry twice a minute. That is
+one before a restart, in another container or on another machine, and any on macOS and Windows,
+which do not tell when a process began.
 """
 
 from __future__ import annotations
