@@ -189,7 +189,9 @@ def test_what_a_mask_marks_is_repaired_with_photographs(room, tmp_path, monkeypa
     assert [row["frame"] for row in summary["held_out"]] == [1, 3]
 
 
-@pytest.mark.parametrize("by", ["mask", pytest.param("box", marks=pytest.mark.slow)])
+# A box is removed from a session below.
+@pytest.mark.slow
+@pytest.mark.parametrize("by", ["mask", "box"])
 def test_something_is_removed(room, tmp_path, monkeypatch, by):
     selected = {
         "mask": ("--mask", room / "selection"),
@@ -216,7 +218,12 @@ def test_a_splat_is_cleaned(room, tmp_path, monkeypatch, with_photographs):
 
 
 @pytest.mark.parametrize(
-    "actions", [("repair",), pytest.param(("remove", "complete"), marks=pytest.mark.slow)]
+    "actions",
+    [
+        ("remove",),
+        pytest.param(("repair",), marks=pytest.mark.slow),
+        pytest.param(("remove", "complete"), marks=pytest.mark.slow),
+    ],
 )
 def test_a_session_in_the_browser_is_saved(room, tmp_path, actions):
     options = LiveOptions(

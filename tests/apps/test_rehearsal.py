@@ -112,7 +112,8 @@ def test_the_doctor_says_why_kernels_are_kept_elsewhere(monkeypatch, capsys):
     assert (found.there, found.told) == (False, note)
 
 
-def test_a_rehearsal_meets_every_kernel_of_a_completion():
+@pytest.mark.parametrize("is_short", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_a_rehearsal_meets_every_kernel_of_a_completion(is_short):
     """It runs in a process of its own, because kernels may have run here before."""
     said = """
 import sys
@@ -122,10 +123,10 @@ from kernel_signatures import complete, signatures
 for parts in warmup.split_work(warmup.PARTS, 2):
     warmup.rehearse(parts)
 rehearsed = signatures()
-complete()
+complete(is_short=sys.argv[2] == "True")
 print(len(rehearsed), *sorted(signatures() - rehearsed), sep="\\n")
 """
-    command = [sys.executable, "-c", said, str(TESTS / "support")]
+    command = [sys.executable, "-c", said, str(TESTS / "support"), str(is_short)]
     life = subprocess.run(command, capture_output=True, text=True, check=True)
     number, *others = life.stdout.splitlines()
     assert int(number) > 15

@@ -115,7 +115,10 @@ def test_every_model_of_a_preset_with_authors_has_its_range():
     assert {pair for pair in pairs if pair[1] != "volsplat-re10k"} == set(RANGES)
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize(
+    "preset",
+    [pytest.param(p, marks=pytest.mark.slow) if p == "acid" else p for p in PRESETS],
+)
 def test_drawn_scenes_are_fed_as_by_the_authors(preset, tmp_path, monkeypatch):
     kind = "dl3dv" if preset == "dl3dv" else "re10k"
     recorded = feed(monkeypatch, preset, DRAWN / kind, DRAWN / "index.json", tmp_path)

@@ -175,6 +175,8 @@ def test_geometry_of_few_pixels_is_left_out(finished):
     assert "at least 500 pixels" in " ".join(summary.notes)
 
 
+# `test_steps.py` makes the rows of a sequence again.
+@pytest.mark.slow
 def test_rows_that_are_lost_are_made_again_from_what_is_saved(finished, tasks, tmp_path):
     out = tmp_path / "out"
     shutil.copytree(finished, out)
@@ -367,6 +369,8 @@ class CoarseRegGS(RegGSConfig):
     components: int = 50
 
 
+# `test_baselines.py` runs both on one scene.
+@pytest.mark.slow
 def test_baselines_run(tasks, tmp_path, monkeypatch):
     monkeypatch.setattr(runs_methods, "RegGSConfig", CoarseRegGS)
     out = tmp_path / "out"
@@ -465,6 +469,9 @@ def test_an_index_without_a_case_is_not_written(scenes, tmp_path, monkeypatch, c
     assert os.listdir(tmp_path) == []
 
 
+# `test_the_commands_run_end_to_end` has other data, and
+# `test_a_broken_case_is_a_row_with_its_reason` a broken case.
+@pytest.mark.slow
 def test_chunks_run_end_to_end_and_a_broken_image_costs_its_own_cases(
     tmp_path, monkeypatch, capsys
 ):

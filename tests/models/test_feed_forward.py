@@ -381,12 +381,13 @@ def test_gaussians_move_with_the_cameras(name):
     assert (quats_to_rotations(after.quats) - rotations).abs().quantile(0.99) < 1e-2
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+# A CPU takes minutes for some convolutions of bfloat16.
+@pytest.mark.parametrize("name", [pytest.param("mvsplat", marks=pytest.mark.slow), NETWORKS[1]])
 def test_geometry_stays_exact_where_the_network_runs_in_lower_precision(name):
     """On a CPU, where this can be tried: each Gaussian lies on the ray of its own pixel."""
     cameras = camera_pair()
     with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
-        predicted = network(name)(stereo_images(), cameras)
+        predicted = network(name)(stereo_images()[..., :32, :32], cameras)
     for field in ("depth", "means", "quats", "scales", "opacities", "sh"):
         assert getattr(predicted, field).dtype == torch.float32
         assert getattr(predicted, field).isfinite().all()
@@ -511,7 +512,7 @@ def test_variants_need_the_patches_they_were_trained_with():
     assert DepthConfig("vitb", 2, 4, 8).patch == 64
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize("name", ["mvsplat", pytest.param(NETWORKS[1], marks=pytest.mark.slow)])
 def test_smoke_a_completion_runs_with_random_weights(name):
     """Random weights: this only checks that all stages accept the output."""
     views = [view_of(Room(), camera_at(x, size=64), i) for i, x in enumerate((-0.3, 0.1))]
