@@ -19,6 +19,7 @@ gc.disable()
 import pytest
 from jaxtyping import install_import_hook
 
+import cpu_times
 from paths import DATA, PACKAGE, TESTS
 
 # The whole package except `gscompleter.numerics.kernels`, whose functions numba compiles. The name
@@ -57,6 +58,11 @@ LONGEST = (
 )
 """Files that take longest, in the order in which processes of pytest-xdist begin them: one that
 began a long file last would be waited for."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Name the tests that take long at the end of a run."""
+    config.pluginmanager.register(cpu_times)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

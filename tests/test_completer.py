@@ -249,6 +249,8 @@ def test_a_target_that_is_a_context_view_has_nothing_to_complete():
     assert "nothing to complete" in completion.targets[0].notes[0]
 
 
+# `test_results_in_python.py` has the same bytes as a command.
+@pytest.mark.slow
 def test_with_the_embedded_models_the_same_seed_gives_the_same_bytes():
     views, (_, target) = photographs(), cameras()
     a, b = completed_by_embedded_models(1.0), GSCompleter(seed=3)(views, target)
@@ -357,10 +359,13 @@ def test_a_completer_that_kept_views_of_another_state_gives_the_same_bytes():
     other = camera_at(-0.9, yaw=-12, size=SIZE)
     completer = knowing()
     begun = completer.begin(views)
-    first = completer.advance(begun, target)
-    completer.advance(first, other)
-    for start, camera in ((begun, target), (first, other), (begun, other)):
-        ours, truth = completer.advance(start, camera), knowing().advance(start, camera)
+    first = completer.advance(begun, target)  # without any view that was kept
+    second = completer.advance(first, other)
+    for ours, truth in (
+        (second, knowing().advance(first, other)),
+        (completer.advance(begun, target), first),
+        (completer.advance(begun, other), knowing().advance(begun, other)),
+    ):
         for name, tensor in tensors(truth.scene).items():
             assert torch.equal(tensor, getattr(ours.scene, name)), name
 
@@ -488,7 +493,7 @@ def test_what_was_made_for_classic_rendering_covers_as_much_antialiased():
         assert adapt_to_mode(marked[:0], marked, view.camera) is marked
 
 
-@pytest.mark.parametrize("doubted", [False, True])
+@pytest.mark.parametrize("doubted", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_an_antialiased_scene_is_completed_as_one(tmp_path, doubted):
     """It scores like the classic one of the same room, up to its wider low-pass filter."""
     views, target = photographs(), cameras()[1]
@@ -516,7 +521,9 @@ BEHIND = camera_at(0.0, yaw=180, size=SIZE)
 FAR_AWAY = camera_at(0.0, z=-1000.0, size=SIZE)
 
 
-@pytest.mark.parametrize("config", [CompleterConfig(), CompleterConfig.paper()])
+@pytest.mark.parametrize(
+    "config", [CompleterConfig(), pytest.param(CompleterConfig.paper(), marks=pytest.mark.slow)]
+)
 @pytest.mark.parametrize("target", [BEHIND, FAR_AWAY], ids=["turned away", "far away"])
 def test_a_target_that_sees_nothing_of_the_scene_is_refused(target, config):
     views, (_, beside) = photographs(), cameras()

@@ -28,7 +28,7 @@ import numba.core.event
 sys.path.insert(0, sys.argv[1])
 from kernel_signatures import complete
 with numba.core.event.install_recorder("numba:compile") as found:
-    complete()
+    complete(is_short=False)
 print(len(found.buffer))
 """
 
