@@ -152,6 +152,8 @@ def test_holes_are_exported_and_painted_images_come_back(room, tmp_path, monkeyp
     check_result(out, 10)
 
 
+# `test_fake_device.py` completes there, and the session below removes and fills.
+@pytest.mark.slow
 def test_photographs_update_a_splat_and_others_are_kept_back(room, tmp_path, monkeypatch):
     words = ("update", room, "--scene", room / "cut.ply", "--hold-out", 1, "--far", 20)
     assert run(monkeypatch, *words, *FEW, *COMMON, "--out", tmp_path / "out") == 0

@@ -376,6 +376,9 @@ def same_results(out: Path, other: Path, name: str) -> None:
         assert (one / file).read_bytes() == (two / file).read_bytes(), file
 
 
+# `test_json.py` runs a batch with a broken scene; `test_requests.py` compares a row with its
+# command line.
+@pytest.mark.slow
 def test_a_batch_does_what_complete_does_and_tells_of_what_is_broken(
     manifest, tmp_path, monkeypatch, capsys
 ):

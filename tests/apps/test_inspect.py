@@ -167,8 +167,8 @@ def my_painter(nearest, target, context):
 
 @pytest.mark.parametrize("generator", [pytest.param(None, marks=pytest.mark.slow), my_painter])
 def test_a_completion_in_python_names_its_models(room, tmp_path, generator):
-    views = [gsc.load_views(room)[number] for number in (0, 1)]
-    target = gsc.load_camera(room, frame=2)
+    views = gsc.load_views(room, frames=[0, 1], resolution=(32, 32))
+    target = gsc.load_camera(room, frame=2, resolution=(32, 32))
     named = {} if generator is None else {"generator": generator}
     completion = gsc.GSCompleter(seed=5, **named)(views, target)
     completion.save(tmp_path / "out")

@@ -230,20 +230,30 @@ def test_an_antialiased_splat_is_saved_as_one(room, tmp_path):
         assert load_ply(tmp_path / "out" / name).is_antialiased, name
 
 
-def test_a_splat_alone_is_completed_and_saved(tmp_path, monkeypatch):
-    splat = tmp_path / "splat.ply"
-    save_ply(splat, gaussians_of(view_of(Room(), camera_at(size=SIZE))))
-    monkeypatch.chdir(tmp_path)
+def prepare_alone(folder: Path, monkeypatch) -> PreparedSession:
+    """Prepare a session with a splat of one photograph, in the folder of the splat."""
+    save_ply(folder / "splat.ply", gaussians_of(view_of(Room(), camera_at(size=SIZE))))
+    monkeypatch.chdir(folder)
     words = ["live", "splat.ply", "--out", "out", "--resolution", "64", "64", "--no-open"]
-    ready = prepare(parse_command(words))
+    return prepare(parse_command(words))
+
+
+def test_a_splat_alone_begins_at_the_camera_of_its_pixels(tmp_path, monkeypatch):
+    ready = prepare_alone(tmp_path, monkeypatch)
     assert ready.scene.opened.renders_from == "pixels"
     assert ready.scene.completer.config.trust == "full"
+
+
+# `test_splat_alone.py` completes and saves such a splat.
+@pytest.mark.slow
+def test_a_splat_alone_is_completed_and_saved(tmp_path, monkeypatch):
+    ready = prepare_alone(tmp_path, monkeypatch)
     session, _ = complete_camera(serving.begin_session(ready), HOLES[0])
     assert len(session.latest.added) > 0
     serving.save_session(ready, session)
     assert (tmp_path / "out" / "renders.json").is_file()
     kept = load_ply(tmp_path / "out" / "completed.ply")
-    assert torch.equal(kept[kept.generated == 0].means, load_ply(splat).means)
+    assert torch.equal(kept[kept.generated == 0].means, load_ply(tmp_path / "splat.ply").means)
 
 
 # `tests/virtual_capture/test_standpoints.py` finds such cameras.

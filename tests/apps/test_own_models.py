@@ -35,8 +35,12 @@ def refuse(monkeypatch, capsys, *words: object) -> str:
 @pytest.mark.parametrize(
     ("option", "word"),
     [
-        ("--depth", DEPTH),
-        ("--reconstructor", f"{EXAMPLES / '06_own_depth.py'}:reconstruct"),
+        pytest.param("--depth", DEPTH, marks=pytest.mark.slow),
+        pytest.param(
+            "--reconstructor",
+            f"{EXAMPLES / '06_own_depth.py'}:reconstruct",
+            marks=pytest.mark.slow,
+        ),
         ("--reconstructor", f"{EXAMPLES / '07_own_reconstructor.py'}:Billboards"),
         ("--generator", f"{EXAMPLES / '08_own_generator.py'}:paint"),
     ],
@@ -128,6 +132,8 @@ def test_depths_are_compared_in_one_table(room, tmp_path, monkeypatch, capsys):
     assert "table of their own" in line
 
 
+# The test before compares depths by the same code.
+@pytest.mark.slow
 def test_generators_are_compared_in_one_table(room, tmp_path, monkeypatch, capsys):
     case = {"scene": str(room), "context": [0, 1], "target": 2, "near": 0.5, "far": 20}
     cases = tmp_path / "cases.json"

@@ -68,7 +68,9 @@ print(CACHE.note)
 
 
 @pytest.mark.linux
-@pytest.mark.parametrize("temporary", ["private", "of-others", "missing"])
+@pytest.mark.parametrize(
+    "temporary", ["private", "of-others", pytest.param("missing", marks=pytest.mark.slow)]
+)
 def test_without_a_writable_cache_kernels_are_kept_elsewhere_or_nowhere(tmp_path, temporary):
     """The installation is a read-only copy, and the home and NUMBA_CACHE_DIR are no folders."""
     package = Path(kernels.__file__).parents[2]

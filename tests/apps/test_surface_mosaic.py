@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import pytest
 import torch
 
 from command import run
@@ -77,6 +78,8 @@ def test_surroundings_that_are_no_plane_have_no_mosaic():
     assert draw_mosaic(view_hole(0.3)) is None
 
 
+# The tests above make mosaics, and `test_painters.py` exports holes.
+@pytest.mark.slow
 def test_an_export_of_a_removal_has_it(tmp_path, monkeypatch):
     scene = photographed(tmp_path / "room", CAMERAS, ROOM)
     save_ply(scene / "splat.ply", merge([gaussians_of(view_of(ROOM, c)) for c in CAMERAS]))

@@ -131,7 +131,7 @@ def test_drawn_scenes_are_fed_as_by_the_authors(preset, tmp_path, monkeypatch):
 
 # Drawn scenes, above, are fed to the models of acid as well.
 @pytest.mark.parametrize("preset", ["re10k", pytest.param("acid", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("split", ["", "backward_"])
+@pytest.mark.parametrize("split", ["", pytest.param("backward_", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("chunk", "scene", "stored"),
     [

@@ -65,6 +65,8 @@ def test_a_file_by_its_path_fills_the_network(mvsplat, mvsplat_file):
     assert load_reconstructor("mvsplat-re10k", mvsplat_file) is loaded
 
 
+# `test_weights.py` names the model of a small file.
+@pytest.mark.slow
 def test_the_file_of_another_model_is_named(mvsplat_file, tmp_path):
     with pytest.raises(InputError, match=r"re10k.ckpt does not fit .* are those of mvsplat-re10k"):
         build("volsplat-re10k", mvsplat_file)

@@ -83,6 +83,8 @@ def predict(network: VolSplat) -> VoxelGaussians:
         return network(images, cameras)
 
 
+# `test_feed_forward.py` does so with another network.
+@pytest.mark.slow
 def test_weights_can_be_assigned_to_a_network_that_was_built_without_any():
     given = random_network()
     with torch.device("meta"):

@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -47,6 +48,7 @@ def test_every_room_has_its_floor():
     assert set(floors()) == {room_of(path) for path in files()}
 
 
+@cache
 def list_imports() -> dict[str, set[str]]:
     """List, for every package, the others that its files import."""
     found: dict[str, set[str]] = {}

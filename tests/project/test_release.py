@@ -94,12 +94,17 @@ def test_the_wheel_holds_the_package_the_viewer_and_the_licences(wheel):
 
 
 def test_the_same_sources_give_the_same_bytes_wherever_they_lie(
-    wheel, sdist, unpacked, tmp_path, monkeypatch
+    wheel, unpacked, tmp_path, monkeypatch
 ):
     """An sdist contains the viewer's libraries, and so needs no connection."""
     monkeypatch.setenv("GSCOMPLETER_HOME", str(tmp_path / "nothing"))
     monkeypatch.setenv("https_proxy", "http://127.0.0.1:9")
     assert built("wheel", tmp_path / "wheel", unpacked).read_bytes() == wheel.read_bytes()
+
+
+# The wheel of the unpacked sdist, above, is the same.
+@pytest.mark.slow
+def test_the_same_sources_give_the_same_sdist(sdist, unpacked, tmp_path):
     assert built("sdist", tmp_path / "sdist", unpacked).read_bytes() == sdist.read_bytes()
 
 

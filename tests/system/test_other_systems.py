@@ -240,6 +240,8 @@ def test_signals_that_windows_lacks_are_not_asked_for(monkeypatch):
             signal.signal(number, handler)
 
 
+# `test_children.py` starts workers, which are spawned everywhere.
+@pytest.mark.slow
 def test_workers_begin_without_fork(monkeypatch):
     """Spawned processes import the program anew, as on Windows and macOS."""
     for name in ("fork", "forkpty", "register_at_fork"):

@@ -192,6 +192,9 @@ def test_a_result_is_relative_to_an_origin_where_the_splat_lies_there(
     assert ("relative to a local origin" in capsys.readouterr().out) == any(place)
 
 
+# `test_estimate.py` finds similarities; `test_one_wrong_camera_in_the_list_changes_nothing` is
+# about cameras.
+@pytest.mark.slow
 def test_floaters_kilometres_away_change_nothing(tmp_path):
     """The frame is found in the images, which have to be larger for it."""
     cameras = [camera_at(*place, size=192) for place in PLACES]
