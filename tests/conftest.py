@@ -22,13 +22,16 @@ from jaxtyping import install_import_hook
 import cpu_times
 from paths import DATA, PACKAGE, TESTS
 
-# The whole package except `gscompleter.numerics.kernels`, whose functions numba compiles. The name
-# of a package stands for all modules in it, so those of `numerics` are listed one by one.
+# The whole package except `numerics.kernels`, whose functions numba compiles, and the checks of
+# `system.tensor_checks`: they know no shapes, and are called thousands of times in a completion.
+# The name of a package stands for all modules in it, so those of two are listed one by one.
+LISTED = ("numerics", "system")
 CHECKED = sorted(
     ".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts)
-    for path in [*PACKAGE.iterdir(), *(PACKAGE / "numerics").iterdir()]
+    for folder in (PACKAGE, *(PACKAGE / name for name in LISTED))
+    for path in folder.iterdir()
     if (path.suffix == ".py" or (path / "__init__.py").exists())
-    and path.stem not in ("__init__", "numerics", "kernels")
+    and path.stem not in ("__init__", "kernels", "tensor_checks", *LISTED)
 )
 install_import_hook(CHECKED, "beartype.beartype")
 

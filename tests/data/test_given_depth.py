@@ -163,6 +163,8 @@ def test_an_image_without_a_camera_opens_upright_at_the_focal_length_of_exif(tmp
     assert open_photographs(tmp_path).format == "photograph"
 
 
+# The test before completes a photograph of a synthetic room.
+@pytest.mark.slow
 def test_one_photograph_of_a_real_room_is_completed(shared):
     folder = shared / "data" / "hololens_room"
     if not folder.is_dir():

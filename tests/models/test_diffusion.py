@@ -9,14 +9,15 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("diffusers", reason="needs gscompleter[diffusion]")
-pytest.importorskip("transformers", reason="needs gscompleter[diffusion]")
-pytest.importorskip("accelerate", reason="needs gscompleter[diffusion]")
+# Without an import: each process of pytest-xdist would take seconds for it, and one runs the tests.
+if not all(map(find_spec, ("diffusers", "transformers", "accelerate"))):
+    pytest.skip("needs gscompleter[diffusion]", allow_module_level=True)
 
 from safetensors.torch import load_file, save_file
 

@@ -176,6 +176,8 @@ def test_losses_are_those_of_each_photograph():
     assert PlaneSweep().measure_losses(views, plain, plain) == [0, 0]
 
 
+# `test_own_models.py` reads such a note in the row of an evaluation.
+@pytest.mark.slow
 def test_notes_reach_the_completion_and_its_summary(tmp_path):
     psi = PlaneSweep(
         predict_depth=lambda v: predict(1 / WAVES[: v.camera.height, : v.camera.width])

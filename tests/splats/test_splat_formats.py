@@ -362,7 +362,13 @@ def equal_but_for(*names: str) -> Gaussians:
     return replace(whole, **{name: alike[name] for name in fields if name not in names})
 
 
-@pytest.mark.parametrize("differing", [("means",), ()], ids=["one kind", "one place"])
+@pytest.mark.parametrize(
+    "differing",
+    [
+        pytest.param(("means",), id="one kind"),
+        pytest.param((), id="one place", marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.parametrize(
     "name",
     ["a.sog", "a.spz", "four.spz", "a.compressed.ply", "a.splat", "a.glb", "packed.glb", "a.ply"],

@@ -61,7 +61,16 @@ def test_an_object_on_nothing_is_one(name):
     assert is_object(OBJECTS[name](), RENDERER)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("closed room", "kitchen of three walls", "garden"),
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("room without a ceiling", "corner", "street")
+        ),
+    ],
+)
 def test_a_scene_is_none(name):
     assert not is_object(SCENES[name](), RENDERER)
 
