@@ -637,7 +637,7 @@ def test_a_kill_leaves_no_half_written_scene(scene, tmp_path, written):
 def test_a_target_that_sees_nothing_ends_in_a_sentence(room, tmp_path, monkeypatch, capsys):
     away, out = tmp_path / "away.json", tmp_path / "out"
     write_cameras(away, [camera_at(0.0, yaw=180, size=48)])
-    frames = ("--context", 0, 1, "--near", 0.5, "--far", 20, "--out", out, *SMALL)
+    frames = ("--context", 0, 1, "--out", out, *SMALL)
     assert run(monkeypatch, "complete", room, *frames, "--target", away) == 2
     said = capsys.readouterr().err
     assert "sees surfaces of the scene in 0.0% of its image" in said

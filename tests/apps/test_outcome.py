@@ -69,7 +69,6 @@ def test_the_unused_photographs_nearest_to_the_target_are_held_out(tmp_path):
     cameras = [camera_at(x, size=16) for x in (-0.3, 0.1, *[0.7] * 9, 3.0)]
     folder = photographed(tmp_path / "scene", cameras)
     photographs = open_photographs(folder)
-    (folder / "3.png").write_bytes(b"damaged")
     request = SceneRequest(folder, resolution=None)
     opened = Opened(request, photographs, "nerfstudio", len(cameras))
     task = CompletionTask(
@@ -80,6 +79,7 @@ def test_the_unused_photographs_nearest_to_the_target_are_held_out(tmp_path):
         depths={},
         check_views=photographs.views([5]),
     )
+    (folder / "3.png").write_bytes(b"damaged")
     rows = read_held_out(opened, task, dict(enumerate(cameras)))
     assert [row.view.frame for row in rows] == [4, 5, 6, 7, 8, 9, 10]
     assert [row.is_check for row in rows] == [False, True, *[False] * 5]
