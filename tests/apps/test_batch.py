@@ -157,6 +157,8 @@ class Full:
         raise OutputError("Cannot write it: there is no space left.")
 
 
+# `test_a_full_disk_ends_the_run_and_loses_nothing` has the error in this process.
+@pytest.mark.slow
 def test_an_error_of_a_worker_ends_the_run(tmp_path):
     with pytest.raises(OutputError, match="no space left"):
         list(run_jobs([Job("one")], Full(), lambda job: False, engine_named("local", 1)))

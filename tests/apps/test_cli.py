@@ -196,18 +196,6 @@ def test_cameras_from_a_file_are_completed_without_scores(scene, tmp_path, monke
     assert set(load_ply(out / "completed.ply").generated.tolist()) == {0, 1, 2}
 
 
-def test_a_target_that_is_a_context_frame_says_there_is_nothing_to_complete(
-    scene, tmp_path, monkeypatch, capsys
-):
-    assert run(monkeypatch, *complete(scene, tmp_path / "out", target=(1,))) == 0
-    said = capsys.readouterr().out
-    assert said.startswith(
-        "Nothing was gained, because the scene is known at this camera already.\n"
-    )
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["gaussians"]["added"] == 0
-
-
 @pytest.fixture(scope="module")
 def told_by_the_oracle(scene, tmp_path_factory) -> Path:
     """Return the output of a run with the photograph of the target and a few single settings."""

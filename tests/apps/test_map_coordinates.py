@@ -197,6 +197,8 @@ def test_a_glb_in_a_map_is_completed_as_well(folders, completed, tmp_path, monke
     assert np.abs(written.min(0) - places_of(completed[1] / "completed.ply").min(0)).max() < 1e-3
 
 
+# `tests/splats/test_origin.py` has such a line.
+@pytest.mark.slow
 def test_small_results_say_how_far_they_round(folders, tmp_path, monkeypatch):
     scene = ("--scene", folders[1] / "splat.ply", "--out", tmp_path / "OUT", "--save-as", ".spz")
     assert run(monkeypatch, "complete", folders[1] / "room", *scene, *WORDS) == 0

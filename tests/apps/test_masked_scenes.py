@@ -140,7 +140,13 @@ def test_one_line_says_what_was_found(scenes, tmp_path, monkeypatch, capsys):
     assert "Masks:" not in capsys.readouterr().err
 
 
-# `test_evaluate_reads_masks_unless_told_otherwise` leaves them out, too.
+def test_a_plan_leaves_masks_out_on_request(scenes, tmp_path, monkeypatch, capsys):
+    words = ("--context", 1, 3, "--target", 5, *SIZE, "--dry-run", "--no-masks")
+    assert run(monkeypatch, "complete", scenes["masks"], *words, "--out", tmp_path) == 0
+    assert "Masks:" not in capsys.readouterr().err
+
+
+# The plan before leaves them out, too.
 @pytest.mark.slow
 def test_masks_are_left_out_on_request(scenes, tmp_path, monkeypatch):
     words = ("--context", 1, 3, "--target", 5, *SIZE, "--quiet", "--no-masks", "--out", tmp_path)
@@ -169,6 +175,8 @@ def read_scores(out: Path) -> dict:
     return json.loads(path.read_text())["steps"][0]["scores"]
 
 
+# `test_cases_read_masks` reads them, and the plan above leaves them out.
+@pytest.mark.slow
 def test_evaluate_reads_masks_unless_told_otherwise(scenes, tmp_path, monkeypatch, capsys):
     words = ("--protocol", "n-2", "--limit", 1, "--methods", "context", *SIZE)
     for out, more in (("masked", ()), ("all", ("--no-masks",))):

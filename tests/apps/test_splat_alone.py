@@ -95,10 +95,20 @@ def test_cameras_beside_the_splat_are_found_and_said(folder, tmp_path, monkeypat
     shutil.copy(folder / "splat.ply", tmp_path / "splat.ply")
     write_inria_cameras(tmp_path / "cameras.json", load_cameras(folder / "around.json"))
     words = ("complete", tmp_path / "splat.ply", "--target", folder / "target.json")
-    out = tmp_path / "out"
-    assert run(monkeypatch, *words, "--context", "0", "cam_1", "--out", out) == 0
+    plan = ("--out", tmp_path / "plan", "--dry-run")
+    assert run(monkeypatch, *words, "--context", "0", "cam_1", *plan) == 0
     said = capsys.readouterr().err
     assert "cameras.json, which was found beside the splat, take their place" in said
+
+
+# The plan before takes the same cameras.
+@pytest.mark.slow
+def test_cameras_beside_the_splat_are_named_in_the_summary(folder, tmp_path, monkeypatch):
+    shutil.copy(folder / "splat.ply", tmp_path / "splat.ply")
+    write_inria_cameras(tmp_path / "cameras.json", load_cameras(folder / "around.json"))
+    words = ("complete", tmp_path / "splat.ply", "--target", folder / "target.json")
+    out = tmp_path / "out"
+    assert run(monkeypatch, *words, "--context", "0", "cam_1", "--out", out) == 0
     summary = read_summary(out)
     assert [row["frame"] for row in summary["context"]] == [0, 1]
     assert [row["file"] for row in summary["context"]] == ["cam_0", "cam_1"]

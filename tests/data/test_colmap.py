@@ -467,6 +467,8 @@ def epipolar_error(first: View, second: View) -> float:
     return float(np.median(distances))
 
 
+# `check_room` compares cameras of synthetic scenes.
+@pytest.mark.slow
 def test_features_of_a_real_scene_lie_on_the_epipolar_lines_of_every_file(shared):
     fox = shared / "splats" / "fox"
     if not fox.is_dir():

@@ -101,7 +101,7 @@ def test_the_command_says_that_depth_was_given(tmp_path, monkeypatch):
     assert "measured or predicted depth" in (out / "report.html").read_text()
 
 
-# The next test and `test_given_depth_unit.py` leave the depth out, too.
+# The next test leaves the depth out, too.
 @pytest.mark.slow
 def test_the_command_leaves_given_depth_out_on_request(tmp_path, monkeypatch):
     scene = with_depth(tmp_path / "room", [camera_at(x, size=48) for x in (-0.2, 0.2, 0.5)])

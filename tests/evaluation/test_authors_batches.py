@@ -136,7 +136,12 @@ def test_drawn_scenes_are_fed_as_by_the_authors(preset, tmp_path, monkeypatch):
     ("chunk", "scene", "stored"),
     [
         ("fixtures/batches/re10k", "fountain", "re10k_fountain.npz"),
-        ("formats/re10k/000000.torch", "0d4de33c6888a754", "re10k_room.npz"),
+        pytest.param(
+            "formats/re10k/000000.torch",
+            "0d4de33c6888a754",
+            "re10k_room.npz",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_photographs_of_re10k_are_fed_as_by_the_authors(

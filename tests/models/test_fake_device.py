@@ -65,7 +65,10 @@ NETWORKS = {
 
 @pytest.mark.parametrize(
     "name",
-    [pytest.param(name, marks=[pytest.mark.slow] * (name == "depthsplat")) for name in NETWORKS],
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name in ("depthsplat", "volsplat")))
+        for name in NETWORKS
+    ],
 )
 def test_networks_reconstruct_on_the_device(device, name):
     torch.manual_seed(0)

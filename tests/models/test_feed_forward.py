@@ -88,7 +88,9 @@ def test_mvsplat_equals_the_authors_code(case):
     check(STORED / "mvsplat" / f"{case}.npz", "mvsplat")
 
 
-@pytest.mark.parametrize("name", ["small-s1-u4-l4", "base-s2-u2-l4"])
+@pytest.mark.parametrize(
+    "name", ["small-s1-u4-l4", pytest.param("base-s2-u2-l4", marks=pytest.mark.slow)]
+)
 def test_depthsplat_equals_the_authors_code(name):
     check(STORED / "depthsplat" / f"{name}_v2_64x64.npz", name)
 

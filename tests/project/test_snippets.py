@@ -60,7 +60,7 @@ NEEDS_PHOTOGRAPHS = ("--photos",)
 """Options that name photographs that COLMAP has to place; test_update.py has some."""
 WRITES_OUT = ("complete", "clean", "update", "remove", "repair")
 """Commands after which OUT is theirs."""
-PYTHON_FAST = {"README.md", "complete.md", "models.md", "quickstart.md"}
+PYTHON_FAST = {"README.md", "complete.md", "models.md"}
 """Pages whose Python takes a few seconds; that of the others is slow."""
 PYTHON_NOT_RUN = {"docs/models.md": "needs published weights"}
 """Pages whose Python is only compiled, and why."""
@@ -299,7 +299,7 @@ def test_python_runs(page, sandbox):
     ("script", "prints"),
     [
         ("01_complete_a_scene", "Gaussians joined"),
-        ("04_stage_by_stage", "left"),
+        pytest.param("04_stage_by_stage", "left", marks=pytest.mark.slow),
         pytest.param("02_bring_your_own_models", "joined", marks=pytest.mark.slow),
         pytest.param("03_bring_your_own_generator", "joined", marks=pytest.mark.slow),
     ],

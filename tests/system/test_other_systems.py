@@ -269,8 +269,11 @@ def test_two_servers_do_not_share_a_port(monkeypatch):
 # ------------------------------------------------------------------------------------ locale
 
 
+# `test_systems.py` finds texts in the encoding of the system, and `test_doors.py` has names of
+# bytes.
+@pytest.mark.slow
 @pytest.mark.linux
-@pytest.mark.parametrize("language", ["C", pytest.param("POSIX", marks=pytest.mark.slow)])
+@pytest.mark.parametrize("language", ["C", "POSIX"])
 def test_names_beyond_ascii_are_read_and_written_in_a_plain_locale(
     tmp_path, language, completed_room
 ):
