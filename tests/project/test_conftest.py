@@ -8,6 +8,7 @@ import pytest
 import torch
 from jaxtyping import TypeCheckError
 
+import checked_calls
 import cpu_times
 import gscompleter
 from gscompleter.evaluation.baselines.optimization import ssim_map
@@ -15,22 +16,18 @@ from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.numerics.geometry import quats_to_rotations
 from paths import TESTS
 
-UNCHECKED = {
-    "gscompleter.system.tensor_checks",
-    # Their modules are listed one by one; the packages themselves have no annotation.
-    "gscompleter.numerics",
-    "gscompleter.system",
-}
 MODULES = [
     module.name
     for module in walk_packages(gscompleter.__path__, "gscompleter.", onerror=pytest.fail)
-    if not module.name.startswith("gscompleter.numerics.kernels") and module.name not in UNCHECKED
+    if not module.name.startswith("gscompleter.numerics.kernels")
+    # Its modules are listed one by one; the package itself has no annotation.
+    and module.name != "gscompleter.numerics"
 ]
 
 
 def test_every_module_but_the_compiled_ones_is_loaded_by_the_hook():
     files = Path(gscompleter.__path__[0]).rglob("*.py")
-    assert len(MODULES) == sum("kernels" not in path.parts for path in files) - 1 - len(UNCHECKED)
+    assert len(MODULES) == sum("kernels" not in path.parts for path in files) - 2
     plain = [name for name in MODULES if "jaxtyping" not in type(find_spec(name).loader).__module__]
     assert plain == []
 
@@ -42,6 +39,16 @@ def test_every_module_but_the_compiled_ones_is_loaded_by_the_hook():
 def test_a_wrong_shape_is_refused(function, shapes):
     with pytest.raises(TypeCheckError):
         function(*(torch.zeros(shape) for shape in shapes))
+
+
+def test_functions_are_checked_in_their_first_calls_of_each_test():
+    for _ in range(checked_calls.MOST_CHECKS):
+        quats_to_rotations(torch.ones(5, 4))
+    assert quats_to_rotations in checked_calls.unchecked
+    # As another test begins.
+    checked_calls.pytest_runtest_setup()
+    with pytest.raises(TypeCheckError):
+        quats_to_rotations(torch.zeros(5, 3))
 
 
 def test_long_tests_are_named_at_the_end(pytestconfig, capsys):
