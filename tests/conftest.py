@@ -1,4 +1,4 @@
-"""Every shape in an annotation is checked at run time while the tests run."""
+"""Shapes in annotations are checked at run time while the tests run: see `checked_calls.py`."""
 
 import gc
 import os
@@ -19,6 +19,8 @@ gc.disable()
 import pytest
 from jaxtyping import install_import_hook
 
+import checked_calls
+import cpu_times
 from paths import DATA, PACKAGE, TESTS
 
 # The whole package except `gscompleter.numerics.kernels`, whose functions numba compiles. The name
@@ -29,34 +31,39 @@ CHECKED = sorted(
     if (path.suffix == ".py" or (path / "__init__.py").exists())
     and path.stem not in ("__init__", "numerics", "kernels")
 )
-install_import_hook(CHECKED, "beartype.beartype")
+install_import_hook(CHECKED, "checked_calls.check_first_calls")
 
 
 LONGEST = (
     "apps/test_viewer_browser.py",
     "apps/test_cli.py",
     "test_completer.py",
+    "project/test_snippets.py",
     "apps/test_live.py",
     "models/test_feed_forward.py",
-    "apps/test_painters.py",
-    "evaluation/test_steps.py",
-    "project/test_snippets.py",
-    "models/test_diffusion.py",
-    "test_commands_on_a_device.py",
-    "test_fake_device.py",
-    "apps/test_batch.py",
-    "project/test_release.py",
-    "apps/test_shards.py",
-    "test_devices.py",
+    "apps/test_doors.py",
+    "evaluation/test_runs.py",
     "apps/test_live_browser.py",
+    "apps/test_painters.py",
+    "apps/test_splat_alone.py",
+    "apps/test_remove.py",
+    "data/test_colmap.py",
+    "models/test_diffusion.py",
     "splats/alignment/test_estimate.py",
-    "project/test_fuzz.py",
-    "data/test_video.py",
-    "data/test_poses.py",
-    "models/test_volsplat.py",
+    "data/test_limits.py",
+    "evaluation/test_steps.py",
+    "models/test_published_models.py",
+    "apps/test_rehearsal.py",
+    "test_commands_on_a_device.py",
 )
 """Files that take longest, in the order in which processes of pytest-xdist begin them: one that
 began a long file last would be waited for."""
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Check the first calls of functions in each test, and name long tests at the end of a run."""
+    config.pluginmanager.register(checked_calls)
+    config.pluginmanager.register(cpu_times)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -152,6 +152,7 @@ def test_holes_are_exported_and_painted_images_come_back(room, tmp_path, monkeyp
     check_result(out, 10)
 
 
+# The one command that completes in short; what others do beside it runs on the CPU alone there.
 def test_photographs_update_a_splat_and_others_are_kept_back(room, tmp_path, monkeypatch):
     words = ("update", room, "--scene", room / "cut.ply", "--hold-out", 1, "--far", 20)
     assert run(monkeypatch, *words, *FEW, *COMMON, "--out", tmp_path / "out") == 0
@@ -189,7 +190,9 @@ def test_what_a_mask_marks_is_repaired_with_photographs(room, tmp_path, monkeypa
     assert [row["frame"] for row in summary["held_out"]] == [1, 3]
 
 
-@pytest.mark.parametrize("by", ["mask", pytest.param("box", marks=pytest.mark.slow)])
+# `test_remove.py` removes, and `update`, above, completes on the device.
+@pytest.mark.slow
+@pytest.mark.parametrize("by", ["mask", "box"])
 def test_something_is_removed(room, tmp_path, monkeypatch, by):
     selected = {
         "mask": ("--mask", room / "selection"),
@@ -215,9 +218,9 @@ def test_a_splat_is_cleaned(room, tmp_path, monkeypatch, with_photographs):
         assert read_summary(out)["device"] == "cuda"
 
 
-@pytest.mark.parametrize(
-    "actions", [("repair",), pytest.param(("remove", "complete"), marks=pytest.mark.slow)]
-)
+# `tests/apps/test_live.py` has sessions, and `update`, above, completes on the device.
+@pytest.mark.slow
+@pytest.mark.parametrize("actions", [("repair",), ("remove", "complete")])
 def test_a_session_in_the_browser_is_saved(room, tmp_path, actions):
     options = LiveOptions(
         folder=room,

@@ -147,7 +147,7 @@ def test_networks_reconstruct_where_the_views_lie_and_run_where_they_lie_themsel
     )
 
 
-@pytest.mark.parametrize("gaussians", [False, True])
+@pytest.mark.parametrize("gaussians", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_depth_anything_reconstructs_where_the_views_lie(elsewhere, gaussians):
     torch.manual_seed(0)
     vit = VitConfig(64, 1, 4, (0, 1, 2, 3), 1)
@@ -213,7 +213,13 @@ def test_what_diffusion_is_told_is_made_on_any_device(views):
     check_there(compare_with_observed(views[0].image, views[1].image, known))
 
 
-@pytest.mark.parametrize("name", ["view_index", "pixel_index", "gaussians", "depths"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        "gaussians",
+        *(pytest.param(n, marks=pytest.mark.slow) for n in ("view_index", "pixel_index", "depths")),
+    ],
+)
 def test_a_model_that_leaves_a_tensor_on_the_cpu_is_named_with_it(views, name):
     def careless(given: list[View]) -> Reconstruction:
         whole = SWEEP(given)

@@ -251,7 +251,7 @@ def test_auto_chooses_a_gpu_that_draws(device):
 
 # With gaps, the same stages are bounded as well.
 @pytest.mark.parametrize(
-    "name", [pytest.param("default", marks=pytest.mark.slow), "with gaps", "paper"]
+    "name", ["with gaps", *(pytest.param(n, marks=pytest.mark.slow) for n in ("default", "paper"))]
 )
 def test_a_completion_stays_on_the_device_and_waits_no_more_than_it_has_to(device, name):
     views = make_views()
@@ -275,6 +275,8 @@ def test_a_completion_stays_on_the_device_and_waits_no_more_than_it_has_to(devic
     assert peak <= MOST_BYTES[name] * len(done.scene), f"{stage}:\n{memory.largest[stage]}"
 
 
+# `test_commands_on_a_device.py` updates a splat.
+@pytest.mark.slow
 def test_a_given_splat_is_completed_with_photographs_that_check_it(device):
     views = [view.to("cuda") for view in make_views((-0.3, 0.1, 0.2))]
     scene = merge([gaussians_of(view.to("cpu")) for view in views[:2]]).to("cuda")

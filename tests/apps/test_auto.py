@@ -36,10 +36,10 @@ def scene(tmp_path_factory) -> Path:
 
 @pytest.fixture(scope="module")
 def completed(scene, tmp_path_factory) -> Path:
-    """Return the output without named targets, of which it finds two at most."""
+    """Return the output without named targets, of which it finds one."""
     out = tmp_path_factory.mktemp("runs") / "out"
     with pytest.MonkeyPatch.context() as monkeypatch:
-        assert run(monkeypatch, "complete", scene, "--out", out, "--auto", 2, *QUICK) == 0
+        assert run(monkeypatch, "complete", scene, "--out", out, "--auto", 1, *QUICK) == 0
     return out
 
 
@@ -49,14 +49,14 @@ def summary_of(out: Path) -> dict:
 
 def test_without_a_target_cameras_are_found_and_completed(completed):
     summary = summary_of(completed)
-    assert 1 <= len(summary["targets"]) <= 2
+    assert len(summary["targets"]) == 1
     for target in summary["targets"]:
         assert target["frame"] is None
         assert target["derived_from"] in range(len(PLACES))
         assert target["hole_fraction"] > 0.01
         assert target["psnr_after"] is None
     assert summary["gaussians"]["added"] > 0
-    assert summary["settings"]["auto"] == 2
+    assert summary["settings"]["auto"] == 1
     assert 0 < summary["seconds"]["explore"] < summary["seconds"]["total"]
 
 
@@ -136,6 +136,8 @@ def test_a_scene_that_was_brought_is_explored_with_its_doubts(
     assert "1: near photograph " in shown
 
 
+# The dry run before looks for cameras with doubts; `test_report.py` says such shares.
+@pytest.mark.slow
 def test_of_a_splat_the_trusted_share_is_said_and_written(
     scene, completed, tmp_path, monkeypatch, capsys
 ):

@@ -157,6 +157,8 @@ class Full:
         raise OutputError("Cannot write it: there is no space left.")
 
 
+# `test_a_full_disk_ends_the_run_and_loses_nothing` has the error in this process.
+@pytest.mark.slow
 def test_an_error_of_a_worker_ends_the_run(tmp_path):
     with pytest.raises(OutputError, match="no space left"):
         list(run_jobs([Job("one")], Full(), lambda job: False, engine_named("local", 1)))
@@ -378,6 +380,9 @@ def same_results(out: Path, other: Path, name: str) -> None:
         assert (one / file).read_bytes() == (two / file).read_bytes(), file
 
 
+# `test_json.py` runs a batch with a broken scene; `test_requests.py` compares a row with its
+# command line.
+@pytest.mark.slow
 def test_a_batch_does_what_complete_does_and_tells_of_what_is_broken(
     manifest, tmp_path, monkeypatch, capsys
 ):

@@ -63,6 +63,8 @@ def test_a_failed_job_that_left_a_report_links_to_it(browser, batch):
     assert tab.page.title() == "Attic"
 
 
+# `test_report.py` finds no address in a page.
+@pytest.mark.slow
 def test_no_other_request_is_allowed(browser, batch):
     tab = Tab(browser, batch / "index.html", 1000, 800)
     tab.context.set_offline(False)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -28,6 +29,7 @@ from gscompleter.config.generators import GeneratorSettings
 from gscompleter.data.scene import write_cameras
 from gscompleter.models.settings import DiffusersInpaintSettings, PEFieldSettings
 from gscompleter.numerics.image_ops import dilate
+from gscompleter.splats.formats import read_provenance
 from gscompleter.system.files.image import read_pixels
 from scenes import camera_at
 
@@ -117,6 +119,8 @@ def test_the_summary_has_the_keys_of_the_contract_and_the_numbers_add_up(complet
     assert (whole.generated[len(context) :] == 1).all()
 
 
+# `test_outcome.py` chooses such photographs, and scores fewer of them.
+@pytest.mark.slow
 def test_photographs_that_were_not_used_are_scored(scene, tmp_path, monkeypatch, capsys):
     folder, out = tmp_path / "scene", tmp_path / "out"
     folder.mkdir()
@@ -154,6 +158,8 @@ def test_photographs_that_were_not_used_are_scored(scene, tmp_path, monkeypatch,
     ]
 
 
+# `test_results_in_python.py` compares a result of this command with one of Python.
+@pytest.mark.slow
 def test_the_same_command_gives_the_same_bytes(scene, completed, tmp_path, monkeypatch):
     arguments = complete(scene, tmp_path / "out", "--near", 0.5, "--far", 20, "--quiet")
     assert run(monkeypatch, *arguments) == 0
@@ -170,8 +176,16 @@ def test_a_given_ply_is_kept_bit_for_bit(scene, completed, tmp_path, monkeypatch
     assert len(whole) > len(mine)
     for name in ("means", "quats", "scales", "opacities", "sh", "encoded"):
         assert torch.equal(getattr(whole, name)[: len(mine)], getattr(mine, name)), name
+    # The result knows it by its hash, and gives it back.
+    (made,) = read_provenance(out / "completed.ply").runs
+    assert made.given == hashlib.sha256(given.read_bytes()).hexdigest()
+    back = tmp_path / "back.ply"
+    assert run(monkeypatch, "strip", out / "completed.ply", "--out", back) == 0
+    assert back.read_bytes() == given.read_bytes()
 
 
+# `test_splat_alone.py` completes for a file with a camera.
+@pytest.mark.slow
 def test_cameras_from_a_file_are_completed_without_scores(scene, tmp_path, monkeypatch):
     file = tmp_path / "targets.json"
     write_cameras(file, [camera_at(0.7, yaw=12, size=SIZE), camera_at(-0.9, yaw=-12, size=SIZE)])
@@ -182,21 +196,18 @@ def test_cameras_from_a_file_are_completed_without_scores(scene, tmp_path, monke
     assert set(load_ply(out / "completed.ply").generated.tolist()) == {0, 1, 2}
 
 
-def test_a_target_that_is_a_context_frame_says_there_is_nothing_to_complete(
-    scene, tmp_path, monkeypatch, capsys
-):
-    assert run(monkeypatch, *complete(scene, tmp_path / "out", target=(1,))) == 0
-    said = capsys.readouterr().out
-    assert said.startswith(
-        "Nothing was gained, because the scene is known at this camera already.\n"
-    )
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-    assert summary["gaussians"]["added"] == 0
+@pytest.fixture(scope="module")
+def told_by_the_oracle(scene, tmp_path_factory) -> Path:
+    """Return the output of a run with the photograph of the target and a few single settings."""
+    out = tmp_path_factory.mktemp("oracle") / "out"
+    more = ("--generator", "oracle", "--config", "no-da", "--config.registration.iterations", 3)
+    with pytest.MonkeyPatch.context() as monkeypatch:
+        assert run(monkeypatch, *complete(scene, out, *more, "--quiet")) == 0
+    return out
 
 
-def test_the_oracle_looks_at_the_photograph_and_says_so(scene, tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    assert run(monkeypatch, *complete(scene, out, "--generator", "oracle", "--quiet")) == 0
+def test_the_oracle_looks_at_the_photograph_and_says_so(told_by_the_oracle):
+    out = told_by_the_oracle
     assert json.loads((out / "summary.json").read_text())["settings"]["uses_target_photographs"]
     shown = {
         name: read_pixels(out / "images" / f"target1_{name}.png")
@@ -396,11 +407,8 @@ def test_single_settings_are_applied_over_those_that_are_named(scene, tmp_path, 
     assert config.paper_registration == replace(paper.paper_registration, rgb_weight=0.2)
 
 
-def test_a_single_setting_reaches_the_completion_and_its_summary(scene, tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    more = ("--config", "no-da", "--config.registration.iterations", 3, "--quiet")
-    assert run(monkeypatch, *complete(scene, out, *more)) == 0
-    config = json.loads((out / "summary.json").read_text())["settings"]["config"]
+def test_a_single_setting_reaches_the_completion_and_its_summary(told_by_the_oracle):
+    config = json.loads((told_by_the_oracle / "summary.json").read_text())["settings"]["config"]
     assert config["registration"]["iterations"] == 3
     assert config["alignment"]["align_at"] == "none"
 
@@ -535,6 +543,7 @@ def test_a_damaged_photograph_is_refused(scene, tmp_path, monkeypatch, capsys, c
 def test_a_ply_with_nan_is_refused_with_a_count_unless_they_are_dropped(
     scene, completed, tmp_path, monkeypatch, capsys
 ):
+    """`clean` reads a splat as `complete` does."""
     gaussians = load_ply(completed / "context.ply")
     damaged, out = tmp_path / "damaged.ply", tmp_path / "out"
     content = plyfile.PlyData.read(completed / "context.ply")
@@ -542,28 +551,28 @@ def test_a_ply_with_nan_is_refused_with_a_count_unless_they_are_dropped(
     content.write(damaged)
     arguments = complete(scene, out, *SMALL, "--scene", damaged)
     refused(monkeypatch, capsys, out, arguments, "--drop-nonfinite")
-    assert run(monkeypatch, *arguments, "--drop-nonfinite") == 0
-    assert len(load_ply(out / "context.ply")) == len(gaussians) - 3
+    words = ("clean", "--scene", damaged, "--out", out, "--drop-nonfinite", "--quiet")
+    assert run(monkeypatch, *words) == 0
+    counts = json.loads((out / "summary.json").read_text())["gaussians"]
+    assert counts["kept"] + counts["removed"] == len(gaussians) - 3
 
 
 def test_a_folder_with_something_in_it_is_kept_unless_overwritten(
-    scene, tmp_path, monkeypatch, capsys
+    scene, completed, tmp_path, monkeypatch, capsys
 ):
+    """`clean` writes its results as `complete` does."""
     out = tmp_path / "out"
     out.mkdir()
     (out / "mine.txt").write_text("precious")
     assert run(monkeypatch, *complete(scene, out)) == 2
     assert "--overwrite" in capsys.readouterr().err
     assert [p.name for p in out.iterdir()] == ["mine.txt"]
-    assert run(monkeypatch, *complete(scene, out, "--overwrite", *SMALL)) == 0
+    words = ("clean", "--scene", completed / "context.ply", "--out", out, "--quiet")
+    assert run(monkeypatch, *words) == 2
+    assert [p.name for p in out.iterdir()] == ["mine.txt"]
+    assert run(monkeypatch, *words, "--overwrite") == 0
     assert (out / "completed.ply").exists()
     assert (out / "mine.txt").read_text() == "precious"
-
-
-def test_quiet_is_quiet(scene, tmp_path, monkeypatch, capsys):
-    assert run(monkeypatch, *complete(scene, tmp_path / "out", "--quiet", target=(1,))) == 0
-    captured = capsys.readouterr()
-    assert (captured.out, captured.err) == ("", "")
 
 
 def gscompleter(*arguments) -> subprocess.Popen:
@@ -593,9 +602,11 @@ def num_written(folder: Path) -> int:
     return sum("." in name for _, *names in os.walk(folder) for name in chain(*names))
 
 
+# `tests/system/files/test_output_folder.py` kills smaller processes.
+@pytest.mark.slow
 @pytest.mark.linux
 @pytest.mark.skipif(os.name != "posix", reason="kills with a POSIX signal")
-@pytest.mark.parametrize("written", [2, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("written", [2, 8])
 def test_a_kill_leaves_no_half_written_scene(scene, tmp_path, written):
     """The process is killed after it has begun to write this many files and folders."""
     out = tmp_path / "out"
@@ -611,16 +622,22 @@ def test_a_kill_leaves_no_half_written_scene(scene, tmp_path, written):
         json.loads((out / "summary.json").read_text())
 
 
-def test_a_target_that_sees_nothing_ends_in_a_sentence_and_beside_others_in_the_summary(
-    room, tmp_path, monkeypatch, capsys
-):
+def test_a_target_that_sees_nothing_ends_in_a_sentence(room, tmp_path, monkeypatch, capsys):
     away, out = tmp_path / "away.json", tmp_path / "out"
-    write_cameras(away, [camera_at(0.0, yaw=180, size=64)])
-    frames = ("--context", 0, 1, "--near", 0.5, "--far", 20, "--out", out, "--quiet")
+    write_cameras(away, [camera_at(0.0, yaw=180, size=48)])
+    frames = ("--context", 0, 1, "--out", out, *SMALL)
     assert run(monkeypatch, "complete", room, *frames, "--target", away) == 2
     said = capsys.readouterr().err
     assert "sees surfaces of the scene in 0.0% of its image" in said
     assert not out.exists()
+
+
+# `test_completer.py` completes a target beside one that sees nothing.
+@pytest.mark.slow
+def test_a_target_that_sees_nothing_beside_others_is_in_the_summary(room, tmp_path, monkeypatch):
+    away, out = tmp_path / "away.json", tmp_path / "out"
+    write_cameras(away, [camera_at(0.0, yaw=180, size=64)])
+    frames = ("--context", 0, 1, "--near", 0.5, "--far", 20, "--out", out, "--quiet")
     assert run(monkeypatch, "complete", room, *frames, "--target", 2, away) == 0
     first, second = json.loads((out / "summary.json").read_text())["targets"]
     assert first["refused"] is None

@@ -38,6 +38,9 @@ def read_summary(out: Path) -> dict:
     return json.loads((out / "summary.json").read_text())
 
 
+# `test_update.py` fills from photographs, and `tests/stages/test_add_observed.py` holes beside a
+# target.
+@pytest.mark.slow
 def test_the_generator_invents_only_what_no_photograph_shows(
     room, cut, tmp_path, monkeypatch, capsys
 ):

@@ -142,6 +142,12 @@ def test_the_command_prints_the_factor(tmp_path, monkeypatch, capsys):
     assert run(monkeypatch, *words, "--dry-run") == 0
     captured = capsys.readouterr()
     assert "is 2.5 times what its photographs" in captured.out + captured.err
+
+
+@pytest.mark.slow
+def test_the_command_prints_no_factor_of_depth_that_it_leaves_out(tmp_path, monkeypatch, capsys):
+    scene = make_scene(tmp_path / "room", "png", lambda z, _: 2.5 * z)
+    words = ["complete", scene, "--context", 0, 1, "--target", 2, "--out", tmp_path / "out"]
     assert run(monkeypatch, *words, "--dry-run", "--no-given-depth", "--overwrite") == 0
     captured = capsys.readouterr()
     assert "times what its photographs" not in captured.out + captured.err

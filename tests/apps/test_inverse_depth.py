@@ -47,6 +47,16 @@ def test_inverse_depth_that_deviates_from_points_only_supports_stereo(scene):
     assert "only where stereo measures nothing" in read.notes[1]
 
 
+def test_the_command_says_what_it_thinks_of_the_maps(scene, tmp_path, monkeypatch, capsys):
+    words = ["complete", scene, "--context", 1, 2, "--target", 3, "--resolution", 36, 48]
+    assert run(monkeypatch, *words, "--dry-run", "--out", tmp_path / "out") == 0
+    said = capsys.readouterr()
+    assert "4 of 4 photographs have inverse depth of 3DGS" in said.err
+    assert "photo_001.png agrees with the points of the scene" in said.err
+
+
+# The plan before says the same of the maps, and `test_given_depth.py` completes with depth.
+@pytest.mark.slow
 def test_the_command_uses_the_maps_or_says_why_not(scene, tmp_path, monkeypatch, capsys):
     words = ["complete", scene, "--context", 1, 2, "--target", 3, "--resolution", 72, 96]
     assert run(monkeypatch, *words, "--out", tmp_path / "out") == 0

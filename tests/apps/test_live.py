@@ -230,22 +230,34 @@ def test_an_antialiased_splat_is_saved_as_one(room, tmp_path):
         assert load_ply(tmp_path / "out" / name).is_antialiased, name
 
 
-def test_a_splat_alone_is_completed_and_saved(tmp_path, monkeypatch):
-    splat = tmp_path / "splat.ply"
-    save_ply(splat, gaussians_of(view_of(Room(), camera_at(size=SIZE))))
-    monkeypatch.chdir(tmp_path)
+def prepare_alone(folder: Path, monkeypatch) -> PreparedSession:
+    """Prepare a session with a splat of one photograph, in the folder of the splat."""
+    save_ply(folder / "splat.ply", gaussians_of(view_of(Room(), camera_at(size=SIZE))))
+    monkeypatch.chdir(folder)
     words = ["live", "splat.ply", "--out", "out", "--resolution", "64", "64", "--no-open"]
-    ready = prepare(parse_command(words))
+    return prepare(parse_command(words))
+
+
+def test_a_splat_alone_begins_at_the_camera_of_its_pixels(tmp_path, monkeypatch):
+    ready = prepare_alone(tmp_path, monkeypatch)
     assert ready.scene.opened.renders_from == "pixels"
     assert ready.scene.completer.config.trust == "full"
+
+
+# `test_splat_alone.py` completes and saves such a splat.
+@pytest.mark.slow
+def test_a_splat_alone_is_completed_and_saved(tmp_path, monkeypatch):
+    ready = prepare_alone(tmp_path, monkeypatch)
     session, _ = complete_camera(serving.begin_session(ready), HOLES[0])
     assert len(session.latest.added) > 0
     serving.save_session(ready, session)
     assert (tmp_path / "out" / "renders.json").is_file()
     kept = load_ply(tmp_path / "out" / "completed.ply")
-    assert torch.equal(kept[kept.generated == 0].means, load_ply(splat).means)
+    assert torch.equal(kept[kept.generated == 0].means, load_ply(tmp_path / "splat.ply").means)
 
 
+# `tests/virtual_capture/test_standpoints.py` finds such cameras.
+@pytest.mark.slow
 def test_a_trained_splat_alone_begins_where_it_looks_well(tmp_path, monkeypatch):
     monkeypatch.setattr("gscompleter.virtual_capture.standpoints.NUM_RANDOM", 80)
     monkeypatch.setattr("gscompleter.virtual_capture.standpoints.NUM_IMPROVED", 8)
@@ -309,9 +321,7 @@ def without_crate(splat_begun) -> tuple[Session, str]:
     return remove_box(splat_begun, CRATE)
 
 
-def test_a_box_is_removed_completed_undone_and_saved(
-    splat_ready, splat_begun, without_crate, splat, tmp_path, monkeypatch
-):
+def test_a_box_is_removed_and_undone(splat_begun, without_crate):
     begun, (removed, text) = splat_begun, without_crate
     count = int(removed.latest.source.gone_mask.sum())
     assert count > 100
@@ -319,15 +329,24 @@ def test_a_box_is_removed_completed_undone_and_saved(
     assert "--box -0.6 0.2 2.1 0.4 1.47 3.1 --box-rotation 1 0 0 0" in text
     rest = removed.latest.added  # of what reached out of the box
     assert len(removed.latest.scene) == len(begun.latest.scene) - count + len(rest)
+    assert undo_step(removed) == begun
+    with pytest.raises(InputError, match="contains nothing"):
+        remove_box(removed, (50.0, 50.0, 50.0, 51.0, 51.0, 51.0))
+
+
+# `test_live_opening.py` saves and undoes several steps, and `test_remove.py` strips a removal.
+@pytest.mark.slow
+def test_a_box_is_removed_completed_undone_and_saved(
+    splat_ready, without_crate, splat, tmp_path, monkeypatch
+):
+    removed, _ = without_crate
+    rest = removed.latest.added
     filled, _ = complete_camera(removed, CAMERAS[2])
     assert len(filled.latest.added) > len(rest)
     emptied, _ = remove_box(filled, (-2.0, -1.0, 2.0, 2.0, 2.0, 6.0))
     assert len(emptied.latest.scene) < len(filled.latest.scene)
     assert undo_step(emptied) == filled
     assert undo_step(filled) == removed
-    assert undo_step(removed) == begun
-    with pytest.raises(InputError, match="contains nothing"):
-        remove_box(removed, (50.0, 50.0, 50.0, 51.0, 51.0, 51.0))
     serving.save_session(splat_ready, filled)
     out, restored = splat_ready.request.out, tmp_path / "restored.ply"
     assert json.loads((out / "summary.json").read_text())["gaussians"]["removed"] > 100
@@ -871,6 +890,21 @@ def answer_of(server: LiveServer, name: str, origin: str | None, token: str | No
 # ----------------------------------------------------------------------------- saved and replayed
 
 
+def test_a_stroke_is_replayed_to_the_same_bytes(
+    splat_ready, without_spot, splat, room, tmp_path, monkeypatch
+):
+    serving.save_session(splat_ready, without_spot)
+    saved, other = splat_ready.request.out, tmp_path / "other"
+    strokes = json.loads((saved / "strokes.json").read_text())
+    assert [frame["action"] for frame in strokes["frames"]] == ["remove"]
+    words = ("repair", room, "--scene", splat, "--strokes", saved, "--out", other, "--quiet")
+    assert run(monkeypatch, *words) == 0
+    for name in ("completed.ply", "removed.ply", "images/stroke1.png"):
+        assert (saved / name).read_bytes() == (other / name).read_bytes(), name
+
+
+# `test_a_stroke_is_replayed_to_the_same_bytes` does so with one step.
+@pytest.mark.slow
 def test_a_saved_session_is_replayed_to_the_same_bytes(
     splat_ready, repaired_spot, splat, room, tmp_path, monkeypatch
 ):

@@ -148,6 +148,8 @@ def test_a_box_beside_a_map_is_told_where_the_map_is(folders, tmp_path, monkeypa
     assert "reaches from 499" in capsys.readouterr().err
 
 
+# `test_remove.py` removes a selection, and `tests/splats/test_origin.py` reads origins.
+@pytest.mark.slow
 def test_selected_gaussians_are_found_in_the_map(folders, tmp_path, monkeypatch):
     scene = load_splat(folders[1] / "splat.ply")
     # A selection has a middle of its own, and so another origin.
@@ -183,6 +185,8 @@ def test_clean_keeps_the_rows_of_a_map(folders, tmp_path, monkeypatch):
     assert b"property double x" in (tmp_path / "b" / "completed.ply").read_bytes()[:2000]
 
 
+# `tests/splats/test_origin.py` reads and writes such files.
+@pytest.mark.slow
 def test_a_glb_in_a_map_is_completed_as_well(folders, completed, tmp_path, monkeypatch):
     glb = tmp_path / "splat.glb"
     assert run(monkeypatch, "convert", folders[1] / "splat.ply", glb) == 0
@@ -193,6 +197,8 @@ def test_a_glb_in_a_map_is_completed_as_well(folders, completed, tmp_path, monke
     assert np.abs(written.min(0) - places_of(completed[1] / "completed.ply").min(0)).max() < 1e-3
 
 
+# `tests/splats/test_origin.py` has such a line.
+@pytest.mark.slow
 def test_small_results_say_how_far_they_round(folders, tmp_path, monkeypatch):
     scene = ("--scene", folders[1] / "splat.ply", "--out", tmp_path / "OUT", "--save-as", ".spz")
     assert run(monkeypatch, "complete", folders[1] / "room", *scene, *WORDS) == 0

@@ -9,6 +9,7 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import gscompleter as gsc
@@ -16,10 +17,14 @@ from command import run
 from gscompleter.apps.batch.running import complete_job
 from gscompleter.apps.commands.batch_rows import decide_row
 from gscompleter.apps.completing.printing import print_completion
+from gscompleter.apps.completing.run_info import read_held_out
+from gscompleter.apps.inputs.task import CompletionTask, Opened, Target
 from gscompleter.apps.report.page import render_completion_page
 from gscompleter.apps.report.plain_words import list_facts, list_notes, list_shared_warnings
 from gscompleter.apps.report.schema import read_summary
 from gscompleter.apps.requests.completion import ResultsRequest
+from gscompleter.apps.requests.scene import SceneRequest
+from gscompleter.data.formats import open_photographs
 from gscompleter.evaluation.verdict.outcome import describe_gain, is_like, make_clause, round_count
 from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow, ScoreRow
 from gscompleter.system.errors import InputError
@@ -56,6 +61,31 @@ def complete(scene: Path, out: Path, *more: object, target: tuple[int, ...] = (T
     return [
         *("complete", scene, "--context", *CONTEXT, "--target", *target),
         *("--out", out, *SIZE, *more),
+    ]
+
+
+def test_the_unused_photographs_nearest_to_the_target_are_held_out(tmp_path):
+    """Of twelve, ten stand where the target does, and one of these is damaged."""
+    cameras = [camera_at(x, size=16) for x in (-0.3, 0.1, *[0.7] * 9, 3.0)]
+    folder = photographed(tmp_path / "scene", cameras)
+    photographs = open_photographs(folder)
+    request = SceneRequest(folder, resolution=None)
+    opened = Opened(request, photographs, "nerfstudio", len(cameras))
+    task = CompletionTask(
+        photographs.views([0, 1]),
+        [Target(cameras[2], frame=2)],
+        frame=np.eye(4),
+        origin=np.zeros(3),
+        depths={},
+        check_views=photographs.views([5]),
+    )
+    (folder / "3.png").write_bytes(b"damaged")
+    rows = read_held_out(opened, task, dict(enumerate(cameras)))
+    assert [row.view.frame for row in rows] == [4, 5, 6, 7, 8, 9, 10]
+    assert [row.is_check for row in rows] == [False, True, *[False] * 5]
+    kept_back = replace(opened, held_out=(11,))
+    assert [row.view.frame for row in read_held_out(kept_back, task, dict(enumerate(cameras)))] == [
+        11
     ]
 
 

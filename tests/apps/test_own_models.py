@@ -35,8 +35,12 @@ def refuse(monkeypatch, capsys, *words: object) -> str:
 @pytest.mark.parametrize(
     ("option", "word"),
     [
-        ("--depth", DEPTH),
-        ("--reconstructor", f"{EXAMPLES / '06_own_depth.py'}:reconstruct"),
+        pytest.param("--depth", DEPTH, marks=pytest.mark.slow),
+        pytest.param(
+            "--reconstructor",
+            f"{EXAMPLES / '06_own_depth.py'}:reconstruct",
+            marks=pytest.mark.slow,
+        ),
         ("--reconstructor", f"{EXAMPLES / '07_own_reconstructor.py'}:Billboards"),
         ("--generator", f"{EXAMPLES / '08_own_generator.py'}:paint"),
     ],
@@ -58,8 +62,19 @@ def test_the_guard_of_the_example_drops_what_is_faint(room, tmp_path, monkeypatc
         monkeypatch, room, tmp_path / "out", *margin, "--config.guards", *usual, guard
     )
     assert summary["settings"]["config"]["guards"] == [*usual, guard]
+    added = gsc.load_ply(tmp_path / "out" / "generated.ply")
+    assert added.opacities.min() >= 0.2
+
+
+# The test before shows that the guard of the example decides.
+@pytest.mark.slow
+def test_the_guard_of_the_example_drops_nothing_else(room, tmp_path, monkeypatch):
+    guard = f"{EXAMPLES / '09_own_guard.py'}:DropFaint"
+    usual = ("image-agreement", "psnr")
+    for out, guards in (("out", (*usual, guard)), ("usual", usual)):
+        more = ("--config.margin", 0, "--config.guards", *guards)
+        complete(monkeypatch, room, tmp_path / out, *more)
     # `psnr` fades what makes a photograph worse.
-    complete(monkeypatch, room, tmp_path / "usual", *margin, "--config.guards", *usual)
     added, faded = (gsc.load_ply(tmp_path / out / "generated.ply") for out in ("out", "usual"))
     assert faded.opacities.min() < 0.19
     assert len(added) == int((faded.opacities >= 0.2).sum()) > 0
@@ -99,23 +114,26 @@ def test_depths_are_compared_in_one_table(room, tmp_path, monkeypatch, capsys):
     cases = tmp_path / "cases.json"
     cases.write_text(json.dumps({"resolution": [32, 32], "cases": [case]}))
     out = tmp_path / "out"
-    words = ("evaluate", cases, "--methods", "context", "full", "--out", out, "--device", "cpu")
+    # The depth is of the context already.
+    words = ("evaluate", cases, "--methods", "context", "--out", out, "--device", "cpu")
     assert run(monkeypatch, *words, "--depth", "none", DEPTH) == 0
     table = json.loads((out / "tables" / "depths.json").read_text())
     rows = [(row["model"], row["method"]) for row in table["rows"]]
-    assert rows == [(d, m) for d in ("none", DEPTH) for m in ("context", "full")]
+    assert rows == [(d, "context") for d in ("none", DEPTH)]
     assert table["rows"][0]["cells"]["psnr"]["difference"] is None
-    assert table["rows"][2]["cells"]["psnr"]["difference"]["num_scenes"] == 1
+    assert table["rows"][1]["cells"]["psnr"]["difference"]["num_scenes"] == 1
     assert "| depth | method |" in capsys.readouterr().out
 
     # The rows of an earlier run are read, not computed again.
     assert run(monkeypatch, *words, "--depth", "none", DEPTH) == 0
-    assert "Scored 0, failed 0, done earlier 2" in capsys.readouterr().err
+    assert "Scored 0, failed 0, done earlier 1" in capsys.readouterr().err
     assert "named twice" in refuse(monkeypatch, capsys, *words, "--depth", "none", "none")
     line = refuse(monkeypatch, capsys, *words, "--depth", "none", DEPTH, "--table", "models")
     assert "table of their own" in line
 
 
+# The test before compares depths by the same code.
+@pytest.mark.slow
 def test_generators_are_compared_in_one_table(room, tmp_path, monkeypatch, capsys):
     case = {"scene": str(room), "context": [0, 1], "target": 2, "near": 0.5, "far": 20}
     cases = tmp_path / "cases.json"

@@ -152,6 +152,8 @@ def test_a_painting_of_any_kind_and_size_ends_in_the_splat(
     assert row["painter"] == "an unnamed painter"
 
 
+# The test before names one target of two.
+@pytest.mark.slow
 def test_targets_may_be_some_of_those_that_were_exported(scene, holes, tmp_path, monkeypatch):
     paint(holes, 2, MAGENTA, "target2.JPG")
     named = ("--target", TARGETS[1], "--images", holes)
@@ -161,6 +163,8 @@ def test_targets_may_be_some_of_those_that_were_exported(scene, holes, tmp_path,
     assert row["added"] > 0
 
 
+# Paintings in another folder, and of some targets, are completed below and above.
+@pytest.mark.slow
 def test_a_layer_in_another_folder_needs_the_cameras_alone(scene, holes, tmp_path, monkeypatch):
     """The painting is transparent outside of the mask, and no other file of the export is there."""
     folder = tmp_path / "layers"

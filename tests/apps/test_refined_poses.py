@@ -56,6 +56,14 @@ def correct(photographs: Photographs) -> tuple[Photographs, PoseRefinement]:
     return replace(photographs, frames=tuple(frames)), DONE
 
 
+QUICK = [
+    word
+    for name in ("registration.iterations", "refine.iterations", "refine.color-rounds")
+    for word in (f"--config.{name}", 2)
+]
+"""Few steps of the stages, where the result does not matter."""
+
+
 def complete(monkeypatch, scene: Path, out: Path, *more: object) -> dict:
     """Complete at a photograph, and return the summary."""
     words = ("--context", *CONTEXT, "--target", 6, "--resolution", 96, 96, "--out", out)
@@ -63,6 +71,25 @@ def complete(monkeypatch, scene: Path, out: Path, *more: object) -> dict:
     return json.loads((out / "summary.json").read_text())
 
 
+def test_refined_poses_are_told_and_kept(scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(preparation, "refine_poses", correct)
+    out = tmp_path / "out"
+    assert complete(monkeypatch, scene, out, *QUICK)["scene"]["refined_poses"] == vars(DONE)
+    assert DONE.describe() in capsys.readouterr().err.replace("\n", " ")
+    (row,) = json.loads((out / "refined_poses.json").read_text())["frames"]
+    pose = np.array(row["transform_matrix"]) @ OPENCV_FROM_OPENGL
+    assert np.array_equal(pose, CAMERAS[SHAKEN].c2w.double().numpy())
+
+    # COLMAP is not asked again beside a splat: its poses lie there.
+    monkeypatch.setattr(preparation, "refine_poses", None)
+    capsys.readouterr()
+    splat = ("--scene", out / "completed.ply", "--dry-run")
+    complete(monkeypatch, scene, tmp_path / "again", *QUICK, *splat)
+    assert "are used" in capsys.readouterr().err
+
+
+# `test_refined_poses_are_told_and_kept` begins so.
+@pytest.mark.slow
 def test_contradicted_poses_are_refined_and_the_next_command_takes_them(
     scene, tmp_path, monkeypatch, capsys
 ):
@@ -98,13 +125,13 @@ def test_contradicted_poses_are_refined_and_the_next_command_takes_them(
 def test_poses_that_agree_are_not_refined(tmp_path, monkeypatch):
     monkeypatch.setattr(preparation, "refine_poses", None)
     scene = photographed(tmp_path / "scene", CAMERAS)
-    summary = complete(monkeypatch, scene, tmp_path / "out")
-    assert summary["scene"]["refined_poses"] is None
+    complete(monkeypatch, scene, tmp_path / "out", "--dry-run")
+    assert not (tmp_path / "out" / "refined_poses.json").exists()
 
 
 def test_without_colmap_a_line_says_what_would_help(scene, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(preparation, "has_pycolmap", lambda: False)
-    complete(monkeypatch, scene, tmp_path / "out")
+    complete(monkeypatch, scene, tmp_path / "out", "--dry-run")
     assert "pip install 'gscompleter[poses]' refines them" in capsys.readouterr().err
 
 

@@ -28,7 +28,7 @@ import numba.core.event
 sys.path.insert(0, sys.argv[1])
 from kernel_signatures import complete
 with numba.core.event.install_recorder("numba:compile") as found:
-    complete()
+    complete(is_short=False)
 print(len(found.buffer))
 """
 
@@ -68,7 +68,9 @@ print(CACHE.note)
 
 
 @pytest.mark.linux
-@pytest.mark.parametrize("temporary", ["private", "of-others", "missing"])
+@pytest.mark.parametrize(
+    "temporary", ["private", "of-others", pytest.param("missing", marks=pytest.mark.slow)]
+)
 def test_without_a_writable_cache_kernels_are_kept_elsewhere_or_nowhere(tmp_path, temporary):
     """The installation is a read-only copy, and the home and NUMBA_CACHE_DIR are no folders."""
     package = Path(kernels.__file__).parents[2]
@@ -112,7 +114,8 @@ def test_the_doctor_says_why_kernels_are_kept_elsewhere(monkeypatch, capsys):
     assert (found.there, found.told) == (False, note)
 
 
-def test_a_rehearsal_meets_every_kernel_of_a_completion():
+@pytest.mark.parametrize("is_short", [True, pytest.param(False, marks=pytest.mark.slow)])
+def test_a_rehearsal_meets_every_kernel_of_a_completion(is_short):
     """It runs in a process of its own, because kernels may have run here before."""
     said = """
 import sys
@@ -122,10 +125,10 @@ from kernel_signatures import complete, signatures
 for parts in warmup.split_work(warmup.PARTS, 2):
     warmup.rehearse(parts)
 rehearsed = signatures()
-complete()
+complete(is_short=sys.argv[2] == "True")
 print(len(rehearsed), *sorted(signatures() - rehearsed), sep="\\n")
 """
-    command = [sys.executable, "-c", said, str(TESTS / "support")]
+    command = [sys.executable, "-c", said, str(TESTS / "support"), str(is_short)]
     life = subprocess.run(command, capture_output=True, text=True, check=True)
     number, *others = life.stdout.splitlines()
     assert int(number) > 15

@@ -178,6 +178,8 @@ def test_the_photograph_that_shows_something_whole_is_chosen():
     assert find_largest([empty]) is None
 
 
+# The test before removes a box, and the next one plans a target.
+@pytest.mark.slow
 def test_targets_are_photographs_and_what_shows_the_crate_is_not_scored(
     scene, tmp_path, monkeypatch
 ):

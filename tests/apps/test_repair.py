@@ -79,6 +79,8 @@ def test_what_is_marked_is_filled_with_what_continues_it(folder, repaired, tmp_p
     assert back.read_bytes() == splat.read_bytes()
 
 
+# The test before looks at the result of `repair`.
+@pytest.mark.slow
 def test_it_is_a_completion_of_what_masks_mark(folder, repaired, tmp_path, monkeypatch):
     splat = folder / "splat.ply"
     mask = ("--mask", folder / "first.png", "--quiet")
@@ -88,6 +90,8 @@ def test_it_is_a_completion_of_what_masks_mark(folder, repaired, tmp_path, monke
     assert (repaired / "completed.ply").read_bytes() == (completed / "completed.ply").read_bytes()
 
 
+# The next test has photographs and one mask.
+@pytest.mark.slow
 def test_several_masks_are_repaired_with_photographs(folder, tmp_path, monkeypatch):
     out = tmp_path / "out"
     words = ("repair", folder / "photographs", "--scene", folder / "splat.ply", "--quiet")

@@ -199,6 +199,13 @@ def test_a_missing_or_damaged_image_is_told(out, content):
         render_completion_page(out)
 
 
+def test_of_a_given_splat_the_trusted_share_is_said(out):
+    changed(out / "summary.json", lambda summary: summary["gaussians"].update(recolored=0))
+    coverage = json.loads((out / "summary.json").read_text())["coverage"]
+    shares = f"{100 * coverage['before']:.1f} % before, {100 * coverage['after']:.1f} % after."
+    assert f"Trusted around the photographs: {shares}" in Page(render_completion_page(out)).said()
+
+
 def test_a_completion_without_targets_says_so(out):
     changed(out / "summary.json", lambda summary: summary.update(targets=[]))
     changed(out / "report.json", lambda kept: kept.update(targets=[], pairs=[], photographs=[]))

@@ -82,6 +82,8 @@ def test_a_folder_is_replaced_on_request_only(completion, saved):
         completion.save(saved, completion.views, overwrite=True)
 
 
+# `test_remove.py` strips the result of the command, and `tests/editing` removes in Python.
+@pytest.mark.slow
 def test_a_removal_is_undone_by_strip(completion, room, saved, monkeypatch, tmp_path):
     file = saved / "context.ply"
     splat = gsc.load_splat(file)

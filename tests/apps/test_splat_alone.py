@@ -58,6 +58,8 @@ def test_a_named_target_is_completed_from_renders_around_it(folder, done, tmp_pa
     assert summary["held_out"] == []
     assert 1 <= len(summary["context"]) <= 3
     (target,) = summary["targets"]
+    # Nobody photographed what a camera of a file sees.
+    assert (target["frame"], target["psnr_after"]) == (None, None)
     assert target["added"] > 100
     assert summary["coverage"]["after"] > summary["coverage"]["before"]
 
@@ -78,6 +80,8 @@ def test_a_named_target_is_completed_from_renders_around_it(folder, done, tmp_pa
     assert back.read_bytes() == (folder / "splat.ply").read_bytes()
 
 
+# The next test takes cameras from a file; `done` is a plain completion.
+@pytest.mark.slow
 def test_the_cameras_of_a_run_give_the_same_scene_again(folder, done, tmp_path, monkeypatch):
     words = ("complete", "--scene", folder / "splat.ply", "--target", folder / "target.json")
     cameras = ("--cameras", done / "renders.json")
@@ -91,10 +95,20 @@ def test_cameras_beside_the_splat_are_found_and_said(folder, tmp_path, monkeypat
     shutil.copy(folder / "splat.ply", tmp_path / "splat.ply")
     write_inria_cameras(tmp_path / "cameras.json", load_cameras(folder / "around.json"))
     words = ("complete", tmp_path / "splat.ply", "--target", folder / "target.json")
-    out = tmp_path / "out"
-    assert run(monkeypatch, *words, "--context", "0", "cam_1", "--out", out) == 0
+    plan = ("--out", tmp_path / "plan", "--dry-run")
+    assert run(monkeypatch, *words, "--context", "0", "cam_1", *plan) == 0
     said = capsys.readouterr().err
     assert "cameras.json, which was found beside the splat, take their place" in said
+
+
+# The plan before takes the same cameras.
+@pytest.mark.slow
+def test_cameras_beside_the_splat_are_named_in_the_summary(folder, tmp_path, monkeypatch):
+    shutil.copy(folder / "splat.ply", tmp_path / "splat.ply")
+    write_inria_cameras(tmp_path / "cameras.json", load_cameras(folder / "around.json"))
+    words = ("complete", tmp_path / "splat.ply", "--target", folder / "target.json")
+    out = tmp_path / "out"
+    assert run(monkeypatch, *words, "--context", "0", "cam_1", "--out", out) == 0
     summary = read_summary(out)
     assert [row["frame"] for row in summary["context"]] == [0, 1]
     assert [row["file"] for row in summary["context"]] == ["cam_0", "cam_1"]
@@ -198,6 +212,8 @@ def test_the_splat_is_kept_bit_for_bit(folder, done):
     assert (kept.sh == given.sh).all()
 
 
+# `test_painters.py` completes paintings with photographs.
+@pytest.mark.slow
 def test_a_painted_hole_of_a_splat_alone_is_completed(folder, tmp_path, monkeypatch):
     words = ("complete", folder / "splat.ply", "--quiet", "--overwrite")
     target = ("--target", folder / "target.json")
@@ -249,7 +265,8 @@ def test_whether_a_splat_is_trained_is_decided_once(folder, tmp_path, monkeypatc
     for place in ("apps.inputs.renders.find_pixel_center", "trust.lifted.find_pixel_center"):
         monkeypatch.setattr(f"gscompleter.{place}", search)
     words = ("complete", folder / "splat.ply", "--auto", 1, "--dry-run", "--quiet")
-    assert run(monkeypatch, *words, "--out", tmp_path / "out") == 0
+    small = ("--resolution", 24, 24, "--config.next-best-view.image-size", 24)
+    assert run(monkeypatch, *words, *small, "--out", tmp_path / "out") == 0
     assert len(searches) == 1
 
 

@@ -23,10 +23,10 @@ needs_fox = pytest.mark.skipif(
 )
 
 
+# `test_splat_alone.py` demands the same of a splat of a synthetic room.
+@pytest.mark.slow
 @needs_fox
-@pytest.mark.parametrize(
-    "margin", [(), pytest.param(("--config.margin", 0.25), marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("margin", [(), ("--config.margin", 0.25)])
 def test_photographs_that_nobody_named_see_the_splat_as_before(tmp_path, monkeypatch, margin):
     splat = tmp_path / "splat.ply"
     splat.write_bytes((FOX / "splat.ply").read_bytes())

@@ -72,8 +72,8 @@ def test_clean_refuses_all_of_them(splat, tmp_path, monkeypatch, capsys):
     "words",
     [
         ("complete",),
-        ("live",),
-        ("remove", "--sphere", 0, 0, 0, 1),
+        pytest.param(("live",), marks=pytest.mark.slow),
+        pytest.param(("remove", "--sphere", 0, 0, 0, 1), marks=pytest.mark.slow),
     ],
     ids=lambda words: words[0],
 )

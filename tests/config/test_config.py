@@ -105,13 +105,6 @@ def test_methods_of_an_evaluation_are_the_ablations_by_their_names():
         assert {method, f"paper/{method}"} <= set(METHODS)
 
 
-def test_without_anything_is_without_each():
-    config = get_named_config("none")
-    assert config.anchor.selection == "nearest"
-    assert config.alignment.align_at == "none"
-    assert config.registration.iterations == 0
-
-
 def test_a_yaml_file_names_only_what_differs(tmp_path):
     file = tmp_path / "mine.yaml"
     file.write_text("base: paper\nholes: {dilation: 5}\nalignment: {align_at: none}\n")

@@ -160,12 +160,17 @@ def test_evaluations_ignore_it(clip):
     )
 
 
-def test_nothing_is_matched_or_made_of_it(clip):
-    views = clip.views([2, 3, 4])
-    for image in make_stereo_images(views)[0]:
+def test_nothing_is_matched_of_it(clip):
+    for image in make_stereo_images(clip.views([2, 3, 4]))[0]:
         columns, rows = detect_features(image)[0].astype(int).T
         assert len(rows)
         assert not image.ignore_mask[rows, columns].any()
+
+
+# The next test reconstructs the same photographs.
+@pytest.mark.slow
+def test_nothing_is_made_of_it(clip):
+    views = clip.views([2, 3, 4])
     scene = reconstruct_context(load_reconstructor("plane-sweep"), views).source.gaussians
     plain = reconstruct_context(
         load_reconstructor("plane-sweep"), [replace(view, ignore_mask=None) for view in views]
@@ -209,6 +214,8 @@ def test_it_is_told_and_shown(clip, tmp_path, monkeypatch):
     assert after[0] > after[1]
 
 
+# Synthetic scenes without a vehicle are opened by many tests.
+@pytest.mark.slow
 def test_real_scenes_have_none(shared):
     found = {}
     for folder in sorted((shared / "data").iterdir()):

@@ -275,6 +275,8 @@ def test_a_real_chunk_is_one_scene(shared):
     assert chunk.camera(5, (256, 256)).width == 256
 
 
+# The scene of the test before is near zero as well.
+@pytest.mark.slow
 def test_no_real_scene_is_told_from_a_local_origin(shared):
     for clip in open_clips(shared / "data"):
         assert not clip.origin.any(), clip.name

@@ -175,19 +175,18 @@ def test_a_remote_scene_is_completed_around_a_local_origin(room, tmp_path, monke
     far, out = moved(room, tmp_path / "far", UTM), tmp_path / "out"
     origin = np.array([UTM[0] - 0.3, *UTM[1:]])
     where = ("--context", 0, 1, "--out", out)
-    # Frame 2 of the scene, once by its number and once from a file of cameras in map coordinates.
+    # Frame 2 of the scene, from a file of cameras in map coordinates.
     target = shutil.copy(far / "transforms.json", tmp_path / "target.json")
     cameras = json.loads(target.read_text())
     cameras["frames"] = cameras["frames"][2:]
     target.write_text(json.dumps(cameras))
-    assert run(monkeypatch, "complete", far, *where, "--target", 2, target) == 0
+    assert run(monkeypatch, "complete", far, *where, "--target", target) == 0
     summary = json.loads((out / "summary.json").read_text())
     assert summary["frame"]["method"] == "given"
     assert np.allclose(np.array(summary["frame"]["transform"])[:3, 3], -origin)
-    by_number, from_file = summary["targets"]
-    assert by_number["psnr_after"] > by_number["psnr_before"]
-    # The second one sees what was added for the first.
-    assert from_file["hole_fraction"] < 0.2 * by_number["hole_fraction"]
+    (row,) = summary["targets"]
+    assert 0.05 < row["hole_fraction"] < 0.9
+    assert row["added"] > 0
     (camera,) = load_cameras(target, origin=origin.tolist())
     assert np.allclose(camera.center, load_camera(far, 2).center)
 

@@ -81,6 +81,8 @@ def test_new_photographs_are_placed_and_known_cameras_stay(known, new, tmp_path)
     assert np.array_equal(again.frames[7].c2w, joined.frames[7].c2w)
 
 
+# The test before places photographs near the origin.
+@pytest.mark.slow
 def test_a_far_origin_does_not_matter_and_what_shows_something_else_is_named(known, new, tmp_path):
     pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     Image.new("RGB", (160, 160), "grey").save(new / "wall.png")

@@ -76,6 +76,8 @@ def test_shaken_cameras_come_back_into_the_given_frame(tmp_path):
     assert f"{done.given_error:.2f} px" in done.describe()
 
 
+# `tests/apps/test_refined_poses.py` keeps poses that agree.
+@pytest.mark.slow
 def test_cameras_that_agree_stay_bit_for_bit(tmp_path):
     pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
     true = open_photographs(photographed(tmp_path / "scene", CAMERAS[:5]))

@@ -496,7 +496,7 @@ def test_undistortion_leaves_no_dark_border(tmp_path):
         assert (load_views(scene)[0].image == 1).all()
 
 
-@pytest.mark.parametrize("every", [12, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [40, pytest.param(1, marks=pytest.mark.slow)])
 def test_every_real_scene_loads_completely(shared, every):
     for scene in sorted(path for path in (shared / "data").iterdir() if path.is_dir()):
         frames = range(0, len(open_photographs(scene)), every)

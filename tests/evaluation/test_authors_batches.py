@@ -115,7 +115,10 @@ def test_every_model_of_a_preset_with_authors_has_its_range():
     assert {pair for pair in pairs if pair[1] != "volsplat-re10k"} == set(RANGES)
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize(
+    "preset",
+    [pytest.param(p, marks=pytest.mark.slow) if p == "acid" else p for p in PRESETS],
+)
 def test_drawn_scenes_are_fed_as_by_the_authors(preset, tmp_path, monkeypatch):
     kind = "dl3dv" if preset == "dl3dv" else "re10k"
     recorded = feed(monkeypatch, preset, DRAWN / kind, DRAWN / "index.json", tmp_path)
@@ -128,12 +131,17 @@ def test_drawn_scenes_are_fed_as_by_the_authors(preset, tmp_path, monkeypatch):
 
 # Drawn scenes, above, are fed to the models of acid as well.
 @pytest.mark.parametrize("preset", ["re10k", pytest.param("acid", marks=pytest.mark.slow)])
-@pytest.mark.parametrize("split", ["", "backward_"])
+@pytest.mark.parametrize("split", ["", pytest.param("backward_", marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("chunk", "scene", "stored"),
     [
         ("fixtures/batches/re10k", "fountain", "re10k_fountain.npz"),
-        ("formats/re10k/000000.torch", "0d4de33c6888a754", "re10k_room.npz"),
+        pytest.param(
+            "formats/re10k/000000.torch",
+            "0d4de33c6888a754",
+            "re10k_room.npz",
+            marks=pytest.mark.slow,
+        ),
     ],
 )
 def test_photographs_of_re10k_are_fed_as_by_the_authors(

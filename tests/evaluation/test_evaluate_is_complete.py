@@ -33,9 +33,11 @@ def scene(tmp_path_factory):
     return folder
 
 
+# `test_runs.py` compares the method `full` with a completion in memory.
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("method", "config"),
-    [("full", "default"), pytest.param("paper", "paper", marks=pytest.mark.slow)],
+    [("full", "default"), ("paper", "paper")],
 )
 def test_a_case_gives_the_bytes_of_complete(method, config, scene, tmp_path, monkeypatch):
     out = tmp_path / "out"

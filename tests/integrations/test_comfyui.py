@@ -142,6 +142,8 @@ def test_a_layer_with_the_filling_alone_is_enough(found, tmp_path):
     assert summary["notes"] == []
 
 
+# `tests/trust/test_photometric.py` strips the result of a command.
+@pytest.mark.slow
 def test_a_splat_keeps_its_bytes(scene, tmp_path, monkeypatch):
     seen = [gaussians_of(view_of(Room(), camera)) for camera in CAMERAS[::2]]
     splat = labelled(tmp_path / "splat.ply", gsc.merge(seen))

@@ -120,7 +120,7 @@ def test_a_network_with_gaussians_equals_the_authors_code():
         "small_nopose_v2_56x70",
         "small_nopose_v5_42x56",
         "metric-tiny_v1_56x84",
-        "nested-tiny_v2_56x84",
+        pytest.param("nested-tiny_v2_56x84", marks=pytest.mark.slow),
         "gs-tiny_pose_v2_56x84",
         *(
             pytest.param(name, marks=pytest.mark.slow)

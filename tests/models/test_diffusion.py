@@ -9,14 +9,15 @@ from __future__ import annotations
 import json
 import shutil
 from dataclasses import replace
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("diffusers", reason="needs gscompleter[diffusion]")
-pytest.importorskip("transformers", reason="needs gscompleter[diffusion]")
-pytest.importorskip("accelerate", reason="needs gscompleter[diffusion]")
+# Without an import: each process of pytest-xdist would take seconds for it, and one runs the tests.
+if not all(map(find_spec, ("diffusers", "transformers", "accelerate"))):
+    pytest.skip("needs gscompleter[diffusion]", allow_module_level=True)
 
 from safetensors.torch import load_file, save_file
 
@@ -248,7 +249,13 @@ def test_a_scene_that_the_photograph_does_not_see_is_refused(kontext_folder):
         )
 
 
-@pytest.mark.parametrize("name", tiny_diffusion.INPAINTERS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=() if name.startswith("stable-diffusion") else pytest.mark.slow)
+        for name in tiny_diffusion.INPAINTERS
+    ],
+)
 def test_inpainting_keeps_what_was_warped_and_fills_the_rest(name, tmp_path):
     folder = tiny_diffusion.saved(tiny_diffusion.INPAINTERS[name](), tmp_path)
     context, painter = known_room(), load_painter(str(folder))
@@ -378,7 +385,9 @@ def completed(tmp_path, monkeypatch, *model) -> dict:
     return json.loads((out / "summary.json").read_text())
 
 
-@pytest.mark.parametrize("name", ["pe-field", "diffusers-inpaint"])
+@pytest.mark.parametrize(
+    "name", [pytest.param("pe-field", marks=pytest.mark.slow), "diffusers-inpaint"]
+)
 def test_a_smoke_test_of_a_whole_completion_with_random_weights(
     name, kontext_folder, inpaint_folder, tmp_path, monkeypatch
 ):
@@ -396,6 +405,8 @@ def test_a_smoke_test_of_a_whole_completion_with_random_weights(
         assert "best of 2 seeds" in notes
 
 
+# The test before completes with the same options; `test_own_models.py` evaluates a generator.
+@pytest.mark.slow
 def test_a_smoke_test_of_an_evaluation_with_random_weights(inpaint_folder, tmp_path, monkeypatch):
     photographed(tmp_path / "room", [camera_at(x, size=SIZE) for x in (-0.3, 0.1, 0.6)])
     case = {"scene": "room", "context": [0, 1], "target": 2, "near": 0.5, "far": 20.0}

@@ -63,7 +63,13 @@ NETWORKS = {
 }
 
 
-@pytest.mark.parametrize("name", NETWORKS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name in ("depthsplat", "volsplat")))
+        for name in NETWORKS
+    ],
+)
 def test_networks_reconstruct_on_the_device(device, name):
     torch.manual_seed(0)
     size = 56 if name == "depth-anything" else 64

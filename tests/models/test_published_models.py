@@ -65,6 +65,8 @@ def test_a_file_by_its_path_fills_the_network(mvsplat, mvsplat_file):
     assert load_reconstructor("mvsplat-re10k", mvsplat_file) is loaded
 
 
+# `test_weights.py` names the model of a small file.
+@pytest.mark.slow
 def test_the_file_of_another_model_is_named(mvsplat_file, tmp_path):
     with pytest.raises(InputError, match=r"re10k.ckpt does not fit .* are those of mvsplat-re10k"):
         build("volsplat-re10k", mvsplat_file)
@@ -116,12 +118,19 @@ def complete_room(monkeypatch, scene: Path, out: Path, model: str, *more: object
 
 
 @pytest.mark.parametrize(
-    "name", ["mvsplat-re10k", "depthsplat-base-dl3dv-256x448", "volsplat-re10k"]
+    "name",
+    [
+        "mvsplat-re10k",
+        pytest.param("depthsplat-base-dl3dv-256x448", marks=pytest.mark.slow),
+        pytest.param("volsplat-re10k", marks=pytest.mark.slow),
+    ],
 )
 def test_complete_gives_a_network_the_range_of_its_authors(
-    name, rooms, recorded, tmp_path, monkeypatch
+    name, rooms, recorded, tmp_path, monkeypatch, capsys
 ):
-    summary = complete_room(monkeypatch, rooms, tmp_path / "out", name, "--quiet")
+    """A scene in metres, which is not remarked upon."""
+    summary = complete_room(monkeypatch, rooms, tmp_path / "out", name)
+    assert "was trained on" not in capsys.readouterr().err
     near, far = PUBLISHED[name].near_far
     # The context, then the lift of the target.
     assert len(recorded.batches) == 2
@@ -159,11 +168,6 @@ def test_a_scene_in_another_unit_than_the_network_was_trained_on_is_told(
     complete_room(monkeypatch, scene, tmp_path / "out", "mvsplat-re10k")
     told = " ".join(capsys.readouterr().err.split())
     assert "this model was trained on 1 to 100: multiply the positions of the cameras by" in told
-
-
-def test_a_scene_in_metres_is_not_remarked_upon(rooms, recorded, tmp_path, monkeypatch, capsys):
-    complete_room(monkeypatch, rooms, tmp_path / "out", "mvsplat-re10k")
-    assert "was trained on" not in capsys.readouterr().err
 
 
 @dataclass(frozen=True)

@@ -27,7 +27,6 @@ pytest.importorskip("huggingface_hub", reason="needs gscompleter[models]")
 import huggingface_hub
 from huggingface_hub import constants
 
-from gscompleter import reconstructors
 from gscompleter.cli import main
 from gscompleter.models.weights import (
     PUBLISHED,
@@ -39,7 +38,7 @@ from gscompleter.models.weights import (
     load_strictly,
     read_state_dict,
 )
-from gscompleter.reconstructors import Reconstructor, load_reconstructor
+from gscompleter.reconstructors import load_reconstructor
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.system.errors import InputError
 from paths import ROOT
@@ -645,19 +644,6 @@ def test_variants_are_only_built_where_they_are_needed():
 
 
 # Reconstructors and the command.
-
-
-def test_a_reconstructor_gets_the_path_of_its_weights(monkeypatch: pytest.MonkeyPatch):
-    got = []
-
-    def make(weights: Path | None, device: str) -> Reconstructor:
-        got.append((weights, device))
-        return PlaneSweep()
-
-    monkeypatch.setitem(reconstructors.RECONSTRUCTORS, "mine", make)
-    load_reconstructor("mine", Path("w.pth"), "cuda")
-    load_reconstructor("mine")
-    assert got == [(Path("w.pth"), "cuda"), (None, "cpu")]
 
 
 def test_the_embedded_reconstructor_takes_no_weights():

@@ -119,17 +119,19 @@ def test_a_room_with_a_white_ceiling_has_no_sky(name):
         pytest.param("hololens_room", (0, 1), None, marks=pytest.mark.slow),
         ("hololens_room", (3, 4), (256, 256)),
         pytest.param("redkitchen", (0, 1), None, marks=pytest.mark.slow),
-        ("redkitchen", (18, 19), (256, 256)),
+        pytest.param("redkitchen", (18, 19), (256, 256), marks=pytest.mark.slow),
         ("open3d_rgbd", (0, 2), (256, 256)),
-        ("re10k_000c3ab1", (30, 31), None),
-        ("re10k_0d4de33c", (0, 4), (256, 256)),
+        pytest.param("re10k_000c3ab1", (30, 31), None, marks=pytest.mark.slow),
+        pytest.param("re10k_0d4de33c", (0, 4), (256, 256), marks=pytest.mark.slow),
     ],
 )
 def test_a_photographed_room_has_no_sky(scene, frames, size, shared):
     assert not has_sky(open_photographs(shared / "data" / scene).views(frames, size))
 
 
-@pytest.mark.parametrize("frames", [(0, 1), (34, 32), (22, 21)])
+@pytest.mark.parametrize(
+    "frames", [(0, 1), *(pytest.param(f, marks=pytest.mark.slow) for f in ((34, 32), (22, 21)))]
+)
 def test_a_photographed_street_has_a_sky(frames, shared):
     given = open_photographs(shared / "data" / "kitti_city", near=3.0, far=100.0)
     assert has_sky(given.views(frames, (256, 256)))

@@ -8,6 +8,8 @@ import pytest
 import torch
 from jaxtyping import TypeCheckError
 
+import checked_calls
+import cpu_times
 import gscompleter
 from gscompleter.evaluation.baselines.optimization import ssim_map
 from gscompleter.evaluation.metrics.image import psnr
@@ -37,6 +39,35 @@ def test_every_module_but_the_compiled_ones_is_loaded_by_the_hook():
 def test_a_wrong_shape_is_refused(function, shapes):
     with pytest.raises(TypeCheckError):
         function(*(torch.zeros(shape) for shape in shapes))
+
+
+def test_functions_are_checked_in_their_first_calls_of_each_test():
+    for _ in range(checked_calls.MOST_CHECKS):
+        quats_to_rotations(torch.ones(5, 4))
+    assert quats_to_rotations in checked_calls.unchecked
+    # As another test begins.
+    checked_calls.pytest_runtest_setup()
+    with pytest.raises(TypeCheckError):
+        quats_to_rotations(torch.zeros(5, 3))
+
+
+def test_long_tests_are_named_at_the_end(pytestconfig, capsys):
+    def report(name: str, seconds: float, **keywords: int) -> pytest.TestReport:
+        where = ("a.py", 1, name)
+        properties = [("cpu_seconds", seconds)]
+        return pytest.TestReport(
+            name, where, keywords, "passed", None, "teardown", user_properties=properties
+        )
+
+    terminal = pytest.TerminalReporter(pytestconfig)
+    terminal.stats = {
+        "": [report("short", 4.9), report("long", 5.1), report("longer", 9.0)],
+        "error": [report("slow", 60.0, slow=1)],
+    }
+    cpu_times.pytest_terminal_summary(terminal)
+    said = capsys.readouterr().out.splitlines()
+    assert "above 5 CPU seconds" in said[0]
+    assert said[1:] == ["   9.0 longer", "   5.1 long"]
 
 
 def test_files_that_begin_first_are_files(pytestconfig):

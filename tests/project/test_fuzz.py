@@ -15,6 +15,8 @@ from paths import SUPPORT
 pytest.importorskip("imageio_ffmpeg", reason="needs gscompleter[film]")
 
 
+# The next test damages the same files, and reads them in Python.
+@pytest.mark.slow
 @pytest.mark.linux
 def test_mutated_inputs_end_in_a_sentence_or_a_result():
     """It runs in a process of its own, whose forks inherit no threads."""
@@ -32,7 +34,7 @@ def test_mutated_inputs_end_in_a_sentence_or_a_result():
 @pytest.mark.linux
 def test_odd_values_and_damaged_files_end_in_a_sentence_or_a_result():
     """Calls of the Python interface and its readers, in a process of its own with its limits."""
-    calls, files = os.environ.get("FUZZ_CALLS", "20"), os.environ.get("FUZZ_FILES", "68")
+    calls, files = os.environ.get("FUZZ_CALLS", "10"), os.environ.get("FUZZ_FILES", "40")
     words = ["--calls", calls, "--files", files, "--seed", "2"]
     command = [sys.executable, str(SUPPORT / "fuzz_python.py"), *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

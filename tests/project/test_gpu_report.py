@@ -163,7 +163,8 @@ def test_limits_leave_time_for_what_comes_after_the_build():
 @pytest.mark.parametrize(
     "part",
     [
-        *("build", "agreement", "renderer", "models"),
+        *("build", "renderer", "models"),
+        pytest.param("agreement", marks=pytest.mark.slow),
         # Up to minutes on a CPU.
         *(
             pytest.param(part, marks=pytest.mark.slow)

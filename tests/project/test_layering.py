@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Iterator
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -27,9 +28,14 @@ def room_of(path: Path) -> str:
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
+@cache
+def parse(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
 def imported_rooms(path: Path) -> Iterator[str]:
     """Return the rooms that a file imports from, anywhere in it."""
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in ast.walk(parse(path)):
         if isinstance(node, ast.ImportFrom) and node.module == "gscompleter":
             yield from (alias.name for alias in node.names if alias.name != "__version__")
         elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("gscompleter."):
@@ -47,6 +53,7 @@ def test_every_room_has_its_floor():
     assert set(floors()) == {room_of(path) for path in files()}
 
 
+@cache
 def list_imports() -> dict[str, set[str]]:
     """List, for every package, the others that its files import."""
     found: dict[str, set[str]] = {}
@@ -89,7 +96,7 @@ def list_imports_inside(package: str) -> dict[str, set[str]]:
     for path in sorted((PACKAGE / package).rglob("*.py")):
         room = path.relative_to(PACKAGE / package).parts[0].removesuffix(".py")
         others = found.setdefault(room, set())
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in ast.walk(parse(path)):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("gscompleter."):
                 _, owner, *inner = node.module.split(".")
                 if owner == package:
@@ -124,7 +131,7 @@ def test_no_application_knows_the_options_of_a_command():
     known = [
         (path.name, name.id)
         for path in paths
-        for name in ast.walk(ast.parse(path.read_text()))
+        for name in ast.walk(parse(path))
         if isinstance(name, ast.Name)
         and re.fullmatch(r"\w+Options", name.id)
         # Options of a generator are settings; those of a help page are a group of fields.
@@ -156,7 +163,7 @@ def test_no_circle_of_modules():
     graph = TopologicalSorter()
     for path in files():
         own = ".".join(path.relative_to(ROOT / "src").with_suffix("").parts)
-        tree = ast.parse(path.read_text())
+        tree = parse(path)
         for node in ast.walk(tree) if room_of(path) in ("apps", "cli") else tree.body:
             if isinstance(node, ast.ImportFrom) and node.module:
                 names = {f"{node.module}.{alias.name}" for alias in node.names} & modules
@@ -176,7 +183,7 @@ def test_sentences_of_the_library_name_no_option_of_the_command_line():
     found = [
         (path.name, text.value)
         for path in rooms
-        for call in ast.walk(ast.parse(path.read_text()))
+        for call in ast.walk(parse(path))
         if isinstance(call, ast.Call) and getattr(call.func, "id", "").endswith("Error")
         for text in ast.walk(call)
         if isinstance(text, ast.Constant) and re.search(r"(^|[^-])--[a-z]", str(text.value))

@@ -98,6 +98,8 @@ def test_completions_in_one_process_have_no_start_up(scene, tmp_path):
         assert 0 <= one["seconds"][REST] < 0.5 * one["seconds"][PROCESS]
 
 
+# `quick` measures the same case with one generator.
+@pytest.mark.slow
 def test_generators_are_compared_in_the_same_holes(scene, tmp_path, monkeypatch, capsys):
     cases, out = write_cases(scene, near=0.5, far=20), tmp_path / "out"
     words = ("--cases", cases, "--quick", "--quiet", "--generators", "warp-inpaint")

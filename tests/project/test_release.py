@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shutil
 import site
@@ -93,15 +94,39 @@ def test_the_wheel_holds_the_package_the_viewer_and_the_licences(wheel):
 
 
 def test_the_same_sources_give_the_same_bytes_wherever_they_lie(
-    wheel, sdist, unpacked, tmp_path, monkeypatch
+    wheel, unpacked, tmp_path, monkeypatch
 ):
     """An sdist contains the viewer's libraries, and so needs no connection."""
     monkeypatch.setenv("GSCOMPLETER_HOME", str(tmp_path / "nothing"))
     monkeypatch.setenv("https_proxy", "http://127.0.0.1:9")
     assert built("wheel", tmp_path / "wheel", unpacked).read_bytes() == wheel.read_bytes()
+
+
+# The wheel of the unpacked sdist, above, is the same.
+@pytest.mark.slow
+def test_the_same_sources_give_the_same_sdist(sdist, unpacked, tmp_path):
     assert built("sdist", tmp_path / "sdist", unpacked).read_bytes() == sdist.read_bytes()
 
 
+def test_the_unpacked_wheel_answers(wheel, tmp_path):
+    with ZipFile(wheel) as archive:
+        archive.extractall(tmp_path)
+    said = "import gscompleter, gscompleter.cli as c; print(gscompleter.__file__); c.main()"
+    done = subprocess.run(
+        [sys.executable, "-c", said, "--version"],
+        cwd=tmp_path,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    file, version = done.stdout.splitlines()
+    assert Path(file).parent == tmp_path / "gscompleter"
+    assert version == __version__
+
+
+# `test_the_unpacked_wheel_answers` needs no environment of its own.
+@pytest.mark.slow
 @pytest.mark.linux
 def test_the_wheel_runs_by_itself_in_another_folder(wheel, tmp_path):
     """The environment has the wheel, and borrows its requirements from ours."""

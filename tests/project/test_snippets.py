@@ -7,6 +7,7 @@ output, or a file.
 
 from __future__ import annotations
 
+import ast
 import re
 import runpy
 import shlex
@@ -15,11 +16,13 @@ import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 import torch
 
+import gscompleter
 from command import run
 from gscompleter.apps.installation import PURPOSES
 from gscompleter.apps.viewer.packages import Libraries
@@ -57,6 +60,8 @@ NEEDS_PHOTOGRAPHS = ("--photos",)
 """Options that name photographs that COLMAP has to place; test_update.py has some."""
 WRITES_OUT = ("complete", "clean", "update", "remove", "repair")
 """Commands after which OUT is theirs."""
+PYTHON_FAST = {"README.md", "complete.md", "models.md"}
+"""Pages whose Python takes a few seconds; that of the others is slow."""
 PYTHON_NOT_RUN = {"docs/models.md": "needs published weights"}
 """Pages whose Python is only compiled, and why."""
 
@@ -256,7 +261,30 @@ def grey(nearest, target, context) -> torch.Tensor:
     return torch.full((target.height, target.width, 3), 0.5)
 
 
-@pytest.mark.parametrize("page", sorted({b.page for b in of("python")}), ids=lambda p: p.name)
+PYTHON_PAGES = sorted({block.page for block in of("python")})
+
+
+@pytest.mark.parametrize("page", PYTHON_PAGES, ids=lambda page: page.name)
+def test_python_names_what_there_is(page):
+    """All imports of the blocks work, and `gsc.NAME` is a name of the package."""
+    for block in of("python"):
+        if block.page != page:
+            continue
+        for node in ast.walk(ast.parse(block.text)):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("gscompleter"):
+                module = import_module(node.module)
+                assert all(hasattr(module, alias.name) for alias in node.names), block.name
+            if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "gsc":
+                assert hasattr(gscompleter, node.attr), f"{block.name}: gsc.{node.attr}"
+
+
+@pytest.mark.parametrize(
+    "page",
+    [
+        pytest.param(page, id=page.name, marks=[] if page.name in PYTHON_FAST else pytest.mark.slow)
+        for page in PYTHON_PAGES
+    ],
+)
 def test_python_runs(page, sandbox):
     """The blocks of a page, one after the other."""
     names = {"my_model": PlaneSweep(), "my_generator": grey}
@@ -271,7 +299,7 @@ def test_python_runs(page, sandbox):
     ("script", "prints"),
     [
         ("01_complete_a_scene", "Gaussians joined"),
-        ("04_stage_by_stage", "left"),
+        pytest.param("04_stage_by_stage", "left", marks=pytest.mark.slow),
         pytest.param("02_bring_your_own_models", "joined", marks=pytest.mark.slow),
         pytest.param("03_bring_your_own_generator", "joined", marks=pytest.mark.slow),
     ],

@@ -83,13 +83,17 @@ def test_given_depth_that_stereo_contradicts_is_left_out_and_a_line_says_so():
     misled = PlaneSweep()([give(views[0]), wrong[1]])
     assert misled.contradicted_depths == (1,)
     assert misled.notes[0].startswith("The given depth is not used in photograph 1, because")
-    assert torch.equal(PlaneSweep()(wrong).gaussians.means, plain.gaussians.means)
+    both_wrong = PlaneSweep()(wrong)
+    assert torch.equal(both_wrong.gaussians.means, plain.gaussians.means)
 
     # What the reconstructor refuses, no stage after it uses.
     state = GSCompleter().begin(wrong)
-    assert state.context_notes == PlaneSweep()(wrong).notes
+    assert state.context_notes == both_wrong.notes
     assert all(view.given_depth is None for view in state.views)
 
+
+def test_given_depth_that_stereo_confirms_is_used_without_a_line():
+    views = [view_of(Room(), camera_at(x, size=64), number) for number, x in enumerate((-0.2, 0.2))]
     right = PlaneSweep()([give(view) for view in views])
     assert right.contradicted_depths == ()
     assert right.notes == ()

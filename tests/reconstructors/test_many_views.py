@@ -248,7 +248,12 @@ def test_each_view_has_its_turn_as_often_as_the_others():
 
 
 @pytest.mark.parametrize(
-    ("count", "size", "expected"), [(3, 192, {96, 192}), (3, 190, {190}), (2, 192, {96, 192})]
+    ("count", "size", "expected"),
+    [
+        pytest.param(3, 192, {96, 192}, marks=pytest.mark.slow),
+        (3, 190, {190}),
+        (2, 192, {96, 192}),
+    ],
 )
 def test_large_images_are_matched_at_half_their_size_first(monkeypatch, count, size, expected):
     matched, costs = set(), stereo.compute_matching_costs

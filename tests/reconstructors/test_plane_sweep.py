@@ -94,7 +94,7 @@ def test_another_exposure_leaves_the_depth():
     assert share_within(found.depths[0].depth, left.depth, 0.05) > 0.8
 
 
-@pytest.mark.parametrize("unit", [0.001, 1000.0])
+@pytest.mark.parametrize("unit", [pytest.param(0.001, marks=pytest.mark.slow), 1000.0])
 def test_the_unit_of_the_scene_scales_means_and_sizes(unit):
     ours, theirs = PlaneSweep()(side_by_side()), PlaneSweep()(side_by_side(unit))
     # A winner-takes-all decision may flip by rounding; one pixel in a thousand may move, and the

@@ -79,10 +79,14 @@ def photographs(blank_from: float = 4.5) -> list[View]:
     ]
 
 
-def reconstruct(depth_of=None) -> Reconstruction:
+@pytest.fixture(scope="module")
+def plain() -> Reconstruction:
+    """Reconstruct them without predicted depths."""
+    return PlaneSweep()(photographs())
+
+
+def reconstruct(depth_of) -> Reconstruction:
     """Reconstruct them with predicted depths by frame."""
-    if depth_of is None:
-        return PlaneSweep()(photographs())
     return PlaneSweep(predict_depth=lambda v: predict(1 / depth_of(v).numpy()))(photographs())
 
 
@@ -131,8 +135,7 @@ def test_true_depth_helps_at_a_blank_wall():
     assert errors[1] < 0.85 * errors[0]
 
 
-def test_a_wrong_prediction_changes_no_bit_and_a_line_says_so():
-    plain = reconstruct()
+def test_a_wrong_prediction_changes_no_bit_and_a_line_says_so(plain):
     misled = reconstruct(lambda v: torch.from_numpy(WAVES))
     assert torch.equal(misled.gaussians.means, plain.gaussians.means)
     assert torch.equal(misled.gaussians.sh, plain.gaussians.sh)
@@ -149,8 +152,7 @@ def test_a_true_prediction_is_used_and_a_line_says_where():
     )
 
 
-def test_a_prediction_with_which_a_photograph_loses_is_refused(monkeypatch):
-    plain = reconstruct()
+def test_a_prediction_with_which_a_photograph_loses_is_refused(plain, monkeypatch):
     # The true depth costs nothing here, so that the limit has to be lower.
     monkeypatch.setattr(reconstructor, "MAX_LOSS", -100.0)
     refused = reconstruct(lambda v: v.depth)
@@ -174,6 +176,8 @@ def test_losses_are_those_of_each_photograph():
     assert PlaneSweep().measure_losses(views, plain, plain) == [0, 0]
 
 
+# `test_own_models.py` reads such a note in the row of an evaluation.
+@pytest.mark.slow
 def test_notes_reach_the_completion_and_its_summary(tmp_path):
     psi = PlaneSweep(
         predict_depth=lambda v: predict(1 / WAVES[: v.camera.height, : v.camera.width])

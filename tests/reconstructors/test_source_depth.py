@@ -140,16 +140,6 @@ def test_a_network_that_lacks_a_tensor_is_refused(tmp_path):
         load_source_depth(str(tmp_path))
 
 
-def test_the_depth_of_the_scene_and_the_published_network_have_names(monkeypatch):
-    assert load_source_depth("context") is compute_context_depth
-    calls = []
-    monkeypatch.setattr(
-        source_depth, "load_monocular", lambda *names: calls.append(names) or compute_context_depth
-    )
-    load_source_depth("monocular", "cuda")
-    assert calls == [(source_depth.MONOCULAR_MODEL, "cuda")]
-
-
 def test_a_model_of_transformers_gives_a_depth_in_the_scenes_unit(tmp_path):
     """A smoke test: random weights guess noise."""
     model = load_monocular(str(tiny_model(tmp_path)))

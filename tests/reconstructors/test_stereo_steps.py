@@ -283,7 +283,7 @@ def test_a_step_on_the_opacities_draws_one_photograph(monkeypatch):
     assert centers[1::2] == [views[1].camera.center[0]] * (OPACITY_STEPS // 2)
 
 
-@pytest.mark.parametrize("x", [0.35, -0.35])
+@pytest.mark.parametrize("x", [0.35, pytest.param(-0.35, marks=pytest.mark.slow)])
 def test_an_unseen_view_profits_too(x):
     views, renderer = pair(), load_renderer("cpu")
     unseen = view_of(Room(), camera_at(x, size=SIZE))

@@ -183,6 +183,8 @@ class KnowingReconstructor:
         return reconstruction_of(views, [view_of(Room(), view.camera).depth for view in views])
 
 
+# `tests/trust/test_photometric.py` completes a scene with a proxy.
+@pytest.mark.slow
 def test_a_scene_is_completed_alike_whether_or_not_it_has_a_proxy(monkeypatch):
     paint = lambda nearest, target, context: view_of(Room(), target).image  # noqa: E731
     asked = (VIEWS[::2], TARGET, CROWD, VIEWS[1:2])

@@ -82,6 +82,8 @@ def test_nothing_is_black(twin):
     assert not drawn.alpha.any()
 
 
+# The tests above compare its images and gradients.
+@pytest.mark.slow
 def test_a_given_scene_is_completed_with_it(twin):
     views = [view_of(Room(), camera_at(x, size=24), i) for i, x in enumerate((-0.3, 0.1))]
     target = camera_at(0.5, yaw=10, size=24)

@@ -362,7 +362,13 @@ def equal_but_for(*names: str) -> Gaussians:
     return replace(whole, **{name: alike[name] for name in fields if name not in names})
 
 
-@pytest.mark.parametrize("differing", [("means",), ()], ids=["one kind", "one place"])
+@pytest.mark.parametrize(
+    "differing",
+    [
+        pytest.param(("means",), id="one kind"),
+        pytest.param((), id="one place", marks=pytest.mark.slow),
+    ],
+)
 @pytest.mark.parametrize(
     "name",
     ["a.sog", "a.spz", "four.spz", "a.compressed.ply", "a.splat", "a.glb", "packed.glb", "a.ply"],
@@ -392,6 +398,8 @@ def test_what_is_the_same_for_all_gaussians_is_read_again(tmp_path, name, differ
         assert (read - given).abs().max() <= 2e-3 * gaussians.means.abs().max()
 
 
+# The test before reads such bundles, and others read folders.
+@pytest.mark.slow
 def test_a_sog_in_a_folder_and_packed_again_may_have_one_size_too(tmp_path):
     save_splat(tmp_path / "a.sog", equal_but_for("means"))
     with zipfile.ZipFile(tmp_path / "a.sog") as bundle:

@@ -52,10 +52,10 @@ def read_gaussians(path) -> Gaussians:
     return rotate_half_turn(make_observed(*map(torch.from_numpy, arrays)), HALF_TURN_X)
 
 
+# `test_ply.py` limits the size of a file so.
+@pytest.mark.slow
 @pytest.mark.linux
-@pytest.mark.parametrize(
-    "name", [NAMES[0], *(pytest.param(name, marks=pytest.mark.slow) for name in NAMES[1:])]
-)
+@pytest.mark.parametrize("name", NAMES)
 def test_a_full_disk_is_a_sentence_and_leaves_nothing(pxr, tmp_path, name):
     """A limit of the size of files stands for it; the temporary folder is not used."""
     code = (

@@ -115,7 +115,9 @@ def test_a_target_completes_only_what_an_object_encloses():
     assert done.targets[0].notes == ("The target sees no hole of the scene: nothing to complete.",)
 
 
-@pytest.mark.parametrize("name", OBJECTS)
+@pytest.mark.parametrize(
+    "name", [OBJECTS[0], *(pytest.param(name, marks=pytest.mark.slow) for name in OBJECTS[1:])]
+)
 def test_nothing_is_added_to_untouched_objects(name):
     path = DATA / "formats" / "gaussians" / name
     if not path.is_file():

@@ -10,12 +10,17 @@ from gscompleter.numerics import kernels
 from scenes import Room, camera_at, view_of
 
 
-def complete() -> None:
-    """Complete a room beside two and three photographs, reconstructed and given."""
+def complete(is_short: bool) -> None:
+    """Complete a room beside two and three photographs, reconstructed and given.
+
+    In short, beside two.
+    """
     target = camera_at(0.7, yaw=12, size=64)
     for places in ((-0.3, 0.1), (-0.3, 0.1, 0.3)):
         views = [view_of(Room(), camera_at(x, size=64)) for x in places]
         completion = GSCompleter()(views, target)
+        if is_short:
+            return
     GSCompleter()(views, target, completion.scene)
 
 

@@ -75,7 +75,14 @@ def test_a_module_is_run_as_the_main_one(strange, tmp_path, monkeypatch):
     assert not strange.exists()
 
 
-@pytest.mark.parametrize("is_known", [True, False], ids=["PYTHONSAFEPATH", "3.10"])
+@pytest.mark.parametrize(
+    "is_known",
+    [
+        pytest.param(True, id="PYTHONSAFEPATH"),
+        # The test before starts a plain process so.
+        pytest.param(False, id="3.10", marks=pytest.mark.slow),
+    ],
+)
 def test_workers_import_nothing_of_the_working_folder_and_work_in_it(
     is_known, strange, monkeypatch
 ):

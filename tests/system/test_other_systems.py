@@ -78,6 +78,18 @@ def test_the_simulation_refuses_what_is_open(windows, tmp_path):
 
 
 @pytest.mark.linux
+def test_no_file_is_open_when_it_gets_its_name(windows, completed_room, tmp_path, monkeypatch):
+    again = ("--overwrite", "--quiet")
+    splat = shutil.copy(completed_room / "completed.ply", tmp_path / "splat.ply")
+    for name in ("a.ply", "b.spz", "c.sog", "d.glb", "e.compressed.ply", "a.ply"):
+        assert run(monkeypatch, "convert", splat, tmp_path / name, *again) == 0
+    assert run(monkeypatch, "strip", splat, "--out", tmp_path / "s.ply", *again) == 0
+    assert {"a.ply", "s.ply"} <= set(windows)
+
+
+# The folders of results are those of `OutputFolder`, as in `test_output_folder.py`.
+@pytest.mark.slow
+@pytest.mark.linux
 def test_no_result_is_open_when_it_gets_its_name(
     windows, room, completed_room, tmp_path, monkeypatch
 ):
@@ -92,12 +104,7 @@ def test_no_result_is_open_when_it_gets_its_name(
     frames = ("--context", 0, 1, "--target", 2, "--near", 0.5, "--far", 20, "--resolution", 32)
     words = ("complete", room, "--scene", out / "context.ply", *frames, "--out", out)
     assert run(monkeypatch, *words, *again) == 0
-    for name in ("a.ply", "b.spz", "c.sog", "d.glb", "e.compressed.ply", "a.ply"):
-        assert run(monkeypatch, "convert", out / "completed.ply", tmp_path / name, *again) == 0
-    assert (
-        run(monkeypatch, "strip", out / "completed.ply", "--out", tmp_path / "s.ply", *again) == 0
-    )
-    assert {"completed.ply", "summary.json", "a.ply", "s.ply"} <= set(windows)
+    assert {"completed.ply", "summary.json"} <= set(windows)
 
 
 def test_renames_wait_for_programs_that_hold_a_new_file_for_a_moment(tmp_path, monkeypatch):
@@ -233,6 +240,8 @@ def test_signals_that_windows_lacks_are_not_asked_for(monkeypatch):
             signal.signal(number, handler)
 
 
+# `test_children.py` starts workers, which are spawned everywhere.
+@pytest.mark.slow
 def test_workers_begin_without_fork(monkeypatch):
     """Spawned processes import the program anew, as on Windows and macOS."""
     for name in ("fork", "forkpty", "register_at_fork"):
@@ -260,6 +269,9 @@ def test_two_servers_do_not_share_a_port(monkeypatch):
 # ------------------------------------------------------------------------------------ locale
 
 
+# `test_systems.py` finds texts in the encoding of the system, and `test_doors.py` has names of
+# bytes.
+@pytest.mark.slow
 @pytest.mark.linux
 @pytest.mark.parametrize("language", ["C", "POSIX"])
 def test_names_beyond_ascii_are_read_and_written_in_a_plain_locale(

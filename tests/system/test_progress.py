@@ -209,6 +209,8 @@ def read_terminal(file: int) -> str:
         return ""
 
 
+# Lines with bars are written to a terminal without a process above.
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminal")
 def test_on_a_terminal_there_is_a_line_with_a_bar(room, tmp_path):
     import pty

@@ -100,6 +100,8 @@ def test_a_share_of_a_core_is_one_thread(tmp_path, monkeypatch):
     assert cpu_threads.count_available_cores() == 1
 
 
+# `test_render.py` and `test_recolor.py` compare one thread with several.
+@pytest.mark.slow
 def test_the_bytes_of_a_completion_do_not_depend_on_the_threads(tmp_path):
     cameras = [camera_at(x, yaw=yaw, size=64) for x, yaw in ((-0.3, 0), (0.1, 0), (0.7, 12))]
     scene = photographed(tmp_path / "room", cameras)

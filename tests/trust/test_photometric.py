@@ -192,13 +192,18 @@ def complete(scene, splat, out, *more):
     return ["complete", scene, "--scene", splat, *asked, "--out", out, "--quiet", *more]
 
 
-@pytest.mark.parametrize("worth", [0, MIN_PROXY_GAUSSIANS], ids=["sorted", "as-given"])
+@pytest.mark.parametrize(
+    "worth",
+    [
+        pytest.param(0, id="sorted"),
+        pytest.param(MIN_PROXY_GAUSSIANS, id="as-given", marks=pytest.mark.slow),
+    ],
+)
 def test_the_command_recolours_and_strip_puts_back(tmp_path, monkeypatch, worth):
-    """Restored to the byte, whether or not the scene was sorted in between."""
+    """Restored to the byte, with further columns and whether or not the scene was sorted before."""
     monkeypatch.setattr("gscompleter.apps.completing.preparation.MIN_PROXY_GAUSSIANS", worth)
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
-    splat, out = tmp_path / "splat.ply", tmp_path / "out"
-    save_ply(splat, SCENE)
+    splat, out = labelled(tmp_path / "splat.ply", SCENE), tmp_path / "out"
     assert run(monkeypatch, *complete(scene, splat, out)) == 0
     removed = load_ply(out / "removed.ply")
     assert len(removed) > 0
@@ -236,20 +241,3 @@ def test_the_command_refuses_a_scene_that_does_not_fit(tmp_path, monkeypatch, ca
     assert run(monkeypatch, *complete(scene, tmp_path / "splat.ply", tmp_path / "out")) == 2
     assert f"The {len(SCENE):,} Gaussians of the scene and 3 photographs" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    "worth",
-    [
-        pytest.param(0, id="sorted"),
-        pytest.param(MIN_PROXY_GAUSSIANS, id="as-given", marks=pytest.mark.slow),
-    ],
-)
-def test_rows_of_another_program_come_back_whole(tmp_path, monkeypatch, worth):
-    monkeypatch.setattr("gscompleter.apps.completing.preparation.MIN_PROXY_GAUSSIANS", worth)
-    scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
-    splat, out = labelled(tmp_path / "splat.ply", SCENE), tmp_path / "out"
-    assert run(monkeypatch, *complete(scene, splat, out)) == 0
-    assert len(load_ply(out / "removed.ply")) > 0
-    assert run(monkeypatch, "strip", out / "completed.ply", "--out", tmp_path / "back.ply") == 0
-    assert (tmp_path / "back.ply").read_bytes() == splat.read_bytes()

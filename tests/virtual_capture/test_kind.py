@@ -61,24 +61,32 @@ def test_an_object_on_nothing_is_one(name):
     assert is_object(OBJECTS[name](), RENDERER)
 
 
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    "name",
+    [
+        *("closed room", "kitchen of three walls", "garden"),
+        *(
+            pytest.param(name, marks=pytest.mark.slow)
+            for name in ("room without a ceiling", "corner", "street")
+        ),
+    ],
+)
 def test_a_scene_is_none(name):
     assert not is_object(SCENES[name](), RENDERER)
 
 
 def test_it_depends_neither_on_the_unit_nor_on_the_axes_nor_on_outliers():
-    seat = chair()
-    floaters = cover([3000 * torch.eye(3) - 900], 0.02, opacity=0.1)
-    for changed in (
-        turn(seat, 35.0),
-        replace(seat, means=1e3 * seat.means + 5e3, scales=1e3 * seat.scales),
-        merge([seat, floaters]),
-    ):
-        assert is_object(changed, RENDERER)
+    seat = merge([chair(), cover([3000 * torch.eye(3) - 900], 0.02, opacity=0.1)])
+    seat = turn(seat, 35.0)
+    assert is_object(
+        replace(seat, means=1e3 * seat.means + 5e3, scales=1e3 * seat.scales), RENDERER
+    )
     kitchen = SCENES["kitchen of three walls"]()
     assert not is_object(turn(kitchen, 20.0), RENDERER)
 
 
+# `test_witnesses.py` finds such cameras; the next test has cameras of the user.
+@pytest.mark.slow
 def test_cameras_that_were_found_close_to_an_object_say_nothing(monkeypatch):
     monkeypatch.setattr("gscompleter.virtual_capture.standpoints.NUM_RANDOM", 80)
     monkeypatch.setattr("gscompleter.virtual_capture.standpoints.NUM_IMPROVED", 8)
@@ -97,10 +105,8 @@ def test_cameras_of_the_user_that_stand_between_walls_make_a_scene(monkeypatch):
     hall = room([face for face in ALL_FACES if face != CEILING])
     inside = [make_camera((x, 0.0, -1.2)) for x in (-1.0, 0.0, 1.0)]
     outside = [make_camera((x, -3.0, -9.0)) for x in (-1.0, 0.0, 1.0)]
-    assert is_object(hall, RENDERER)
     assert is_object(hall, RENDERER, outside)
     assert not is_object(hall, RENDERER, inside)
-    assert is_object(chair(), RENDERER, [make_camera((0.0, -0.15, -0.1))])
 
 
 def make_camera(center: tuple[float, float, float]) -> Camera:

@@ -38,8 +38,15 @@ def plain(tmp_path_factory):
     return path
 
 
-@pytest.mark.parametrize("frame", FRAMES)
-@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize(
+    ("name", "frame"),
+    # In short, every scene in one frame and one scene in every frame.
+    [
+        pytest.param(name, frame, marks=[pytest.mark.slow] * (number > 0 and frame != "+z"))
+        for number, name in enumerate(SCENES)
+        for frame in FRAMES
+    ],
+)
 def test_up_is_away_from_the_floor(name, frame, plain):
     upward = find_upward(plain, turn(SCENES[name](), FRAMES[frame]), RENDERER)
     (line,) = upward.describe()

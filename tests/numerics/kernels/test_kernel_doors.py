@@ -84,12 +84,15 @@ def lines_of(code: str, *words: object) -> list[str]:
     return done.stdout.split()
 
 
-def test_the_rasteriser_bears_every_number():
-    assert lines_of(DRAW, SUPPORT, *ODD) == [str(13 * len(ODD))]
+# The first numbers of each kind, and the others.
+@pytest.mark.parametrize("numbers", [ODD[:4], pytest.param(ODD[4:], marks=pytest.mark.slow)])
+def test_the_rasteriser_bears_every_number(numbers):
+    assert lines_of(DRAW, SUPPORT, *numbers) == [str(13 * len(numbers))]
 
 
-def test_the_plane_sweep_bears_every_number():
-    assert lines_of(SWEEP, *ODD) == [str(12 * len(ODD))]
+@pytest.mark.parametrize("numbers", [ODD[:4], pytest.param(ODD[4:], marks=pytest.mark.slow)])
+def test_the_plane_sweep_bears_every_number(numbers):
+    assert lines_of(SWEEP, *numbers) == [str(12 * len(numbers))]
 
 
 @pytest.mark.parametrize("odd", [*ODD, 7.0, -7.0, 2.5])

@@ -82,9 +82,9 @@ def test_a_splat_in_the_frame_of_its_photographs_stays_as_given(views, splat):
 @pytest.mark.parametrize(
     "trainer",
     [
-        normalize_opensplat,
         normalize_gsplat_cameras,
-        lambda poses: normalize_nerfstudio(poses, np.eye(3)),
+        pytest.param(normalize_opensplat, marks=pytest.mark.slow),
+        pytest.param(lambda poses: normalize_nerfstudio(poses, np.eye(3)), marks=pytest.mark.slow),
     ],
 )
 def test_what_trainers_do_is_computed_from_the_cameras(views, splat, trainer):

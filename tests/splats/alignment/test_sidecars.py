@@ -170,9 +170,9 @@ def test_a_splat_in_the_map_of_its_photographs_is_told_from_their_origin(splat):
     assert torch.allclose(told.means, splat.means, atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    "place", [(3000.0, 1000.0, 0.0), pytest.param((0.0, 0.0, 0.0), marks=pytest.mark.slow)]
-)
+# `tests/data/test_limits.py` completes a splat in large coordinates.
+@pytest.mark.slow
+@pytest.mark.parametrize("place", [(3000.0, 1000.0, 0.0), (0.0, 0.0, 0.0)])
 def test_a_result_is_relative_to_an_origin_where_the_splat_lies_there(
     room, splat, place, tmp_path, monkeypatch, capsys
 ):
@@ -192,6 +192,9 @@ def test_a_result_is_relative_to_an_origin_where_the_splat_lies_there(
     assert ("relative to a local origin" in capsys.readouterr().out) == any(place)
 
 
+# `test_estimate.py` finds similarities; `test_one_wrong_camera_in_the_list_changes_nothing` is
+# about cameras.
+@pytest.mark.slow
 def test_floaters_kilometres_away_change_nothing(tmp_path):
     """The frame is found in the images, which have to be larger for it."""
     cameras = [camera_at(*place, size=192) for place in PLACES]
