@@ -16,6 +16,7 @@ import gscompleter as gsc
 from command import run
 from gscompleter.apps.batch.running import complete_job
 from gscompleter.apps.commands.batch_rows import decide_row
+from gscompleter.apps.completing import run_info
 from gscompleter.apps.completing.printing import print_completion
 from gscompleter.apps.completing.run_info import read_held_out
 from gscompleter.apps.inputs.task import CompletionTask, Opened, Target
@@ -64,9 +65,10 @@ def complete(scene: Path, out: Path, *more: object, target: tuple[int, ...] = (T
     ]
 
 
-def test_the_unused_photographs_nearest_to_the_target_are_held_out(tmp_path):
-    """Of twelve, ten stand where the target does, and one of these is damaged."""
-    cameras = [camera_at(x, size=16) for x in (-0.3, 0.1, *[0.7] * 9, 3.0)]
+def test_the_unused_photographs_nearest_to_the_target_are_held_out(tmp_path, monkeypatch):
+    """Of nine, five stand where the target does, and one of these is damaged."""
+    monkeypatch.setattr(run_info, "MAX_HELD_OUT", 4)
+    cameras = [camera_at(x, size=16) for x in (-0.3, 0.1, *[0.7] * 6, 3.0)]
     folder = photographed(tmp_path / "scene", cameras)
     photographs = open_photographs(folder)
     request = SceneRequest(folder, resolution=None)
@@ -80,13 +82,11 @@ def test_the_unused_photographs_nearest_to_the_target_are_held_out(tmp_path):
         check_views=photographs.views([5]),
     )
     (folder / "3.png").write_bytes(b"damaged")
-    rows = read_held_out(opened, task, dict(enumerate(cameras)))
-    assert [row.view.frame for row in rows] == [4, 5, 6, 7, 8, 9, 10]
-    assert [row.is_check for row in rows] == [False, True, *[False] * 5]
-    kept_back = replace(opened, held_out=(11,))
-    assert [row.view.frame for row in read_held_out(kept_back, task, dict(enumerate(cameras)))] == [
-        11
-    ]
+    by_frame = dict(enumerate(cameras))
+    rows = read_held_out(opened, task, by_frame)
+    assert [(row.view.frame, row.is_check) for row in rows] == [(4, False), (5, True), (6, False)]
+    (row,) = read_held_out(replace(opened, held_out=(8,)), task, by_frame)
+    assert row.view.frame == 8
 
 
 def outcome_of(out: Path) -> dict:

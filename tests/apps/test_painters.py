@@ -163,7 +163,7 @@ def test_targets_may_be_some_of_those_that_were_exported(scene, holes, tmp_path,
     assert row["added"] > 0
 
 
-# Paintings in another folder, and of some targets, are completed below and above.
+# The test before completes a painting in another folder.
 @pytest.mark.slow
 def test_a_layer_in_another_folder_needs_the_cameras_alone(scene, holes, tmp_path, monkeypatch):
     """The painting is transparent outside of the mask, and no other file of the export is there."""

@@ -48,7 +48,7 @@ def read_summary(out: Path) -> dict:
 def test_photographs_fill_a_splat_and_others_confirm_it(room, cut, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     words = ("update", room, "--scene", cut, "--far", 20, "--hold-out", 2, "--out", out)
-    words += ("--resolution", 48)
+    words += ("--resolution", 64)
     assert run(monkeypatch, *words) == 0
     summary = read_summary(out)
     assert summary["targets"] == []

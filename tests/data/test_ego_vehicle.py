@@ -214,7 +214,7 @@ def test_it_is_told_and_shown(clip, tmp_path, monkeypatch):
     assert after[0] > after[1]
 
 
-# Synthetic scenes without a vehicle are opened by many tests.
+# `test_a_street_has_none` has synthetic streets.
 @pytest.mark.slow
 def test_real_scenes_have_none(shared):
     found = {}

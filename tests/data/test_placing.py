@@ -81,7 +81,7 @@ def test_new_photographs_are_placed_and_known_cameras_stay(known, new, tmp_path)
     assert np.array_equal(again.frames[7].c2w, joined.frames[7].c2w)
 
 
-# The test before places photographs near the origin.
+# `test_refining.py` has a far origin, and `test_poses.py` names what is not placed.
 @pytest.mark.slow
 def test_a_far_origin_does_not_matter_and_what_shows_something_else_is_named(known, new, tmp_path):
     pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")

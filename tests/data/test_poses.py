@@ -272,7 +272,7 @@ def test_masks_hidden_files_and_our_own_results_are_no_photographs(tmp_path):
     assert list_photograph_files(folder) == ["0.png", "1.png", "2.png"]
 
 
-# Other tests here find the cameras, and keep them.
+# `test_placing.py` runs COLMAP, and `test_the_next_run_keeps_what_was_found` keeps cameras.
 @pytest.mark.slow
 def test_photographs_alone_are_completed_and_their_cameras_kept(tmp_path, monkeypatch):
     pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")

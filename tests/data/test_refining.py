@@ -76,7 +76,7 @@ def test_shaken_cameras_come_back_into_the_given_frame(tmp_path):
     assert f"{done.given_error:.2f} px" in done.describe()
 
 
-# `tests/apps/test_refined_poses.py` keeps poses that agree.
+# `test_poses_are_refined_only_where_kept_back_matches_agree_better` decides without COLMAP.
 @pytest.mark.slow
 def test_cameras_that_agree_stay_bit_for_bit(tmp_path):
     pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")

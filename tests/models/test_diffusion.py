@@ -405,7 +405,7 @@ def test_a_smoke_test_of_a_whole_completion_with_random_weights(
         assert "best of 2 seeds" in notes
 
 
-# The test before completes with the same options; `test_own_models.py` evaluates a generator.
+# The test before completes with the same options, and `tests/evaluation/test_runs.py` evaluates.
 @pytest.mark.slow
 def test_a_smoke_test_of_an_evaluation_with_random_weights(inpaint_folder, tmp_path, monkeypatch):
     photographed(tmp_path / "room", [camera_at(x, size=SIZE) for x in (-0.3, 0.1, 0.6)])

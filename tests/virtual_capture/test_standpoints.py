@@ -59,7 +59,7 @@ def test_standpoints_are_level_covered_and_apart(room, monkeypatch):
     assert max(turns) > 20
 
 
-# What is drawn at random has a seed: `test_live.py` and `test_splat_alone.py` give the same bytes.
+# `test_around_target.py` finds the same cameras again in short.
 @pytest.mark.slow
 def test_the_same_standpoints_are_found_again(room, monkeypatch):
     monkeypatch.setattr("gscompleter.virtual_capture.standpoints.NUM_RANDOM", 80)
