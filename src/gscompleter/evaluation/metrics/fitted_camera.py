@@ -22,10 +22,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.evaluation.metrics.image import MAX_PSNR, compute_masked_psnr
+from gscompleter.evaluation.metrics.unused_photographs import shrink_view
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.render.protocols import Renderer
 from gscompleter.types import Camera, Gaussians, Render, View
 
+FIT_SIDE = 320
+"""Longer side of the image that the pose is fitted in, at most; scores are of the whole one."""
 MAX_MOVE = 4.0
 """Largest rotation and shift along each axis, in pixels: poses are not searched for, but mended."""
 STEP = 0.25
@@ -60,7 +63,7 @@ class FittedQuality:
     observed_psnr: float
     """Outside of holes."""
     moved: float
-    """Length of the rotation and shift, in pixels."""
+    """Length of the rotation and shift, in pixels of an image of at most `FIT_SIDE`."""
     gain: float
     """Mean of the gains of the channels."""
 
@@ -76,19 +79,24 @@ def measure_fitted(
     observed = ~dilate(holes, MARGIN) & target.valid_mask
     if observed.sum() < MIN_PIXELS:
         return None
-    truth = target.image.cpu().numpy()
-    counted = observed.cpu().numpy()
-    start = renderer.render(scene, target.camera)
-    unit = measure_depth(start, observed) / float(target.camera.K[0, 0])
+    # In a small image, for the time of some fifty renders; what counts there is what holes, masks
+    # and their margin leave of the photograph.
+    small = shrink_view(replace(target, ignore_mask=~observed), FIT_SIDE)
+    counted = small.valid_mask.cpu().numpy()
+    start = renderer.render(scene, small.camera)
+    unit = measure_depth(start, small.valid_mask) / float(small.camera.K[0, 0])
 
-    def draw(move: Move) -> Pixels:
-        camera = move_camera_by(target.camera, move, unit)
+    def render(camera: Camera) -> Pixels:
         image = renderer.render(scene, camera).image
         return np.asarray(image.clamp(0, 1).cpu().numpy(), np.float64)
 
-    move = fit_move(draw, truth, counted)
-    image = draw(move)
-    gains = fit_gains(image, truth, counted)
+    def draw(move: Move) -> Pixels:
+        return render(move_camera_by(small.camera, move, unit))
+
+    move = fit_move(draw, small.image.cpu().numpy(), counted)
+    pose = move_camera_by(small.camera, move, unit).c2w
+    image = render(replace(target.camera, c2w=pose))
+    gains = fit_gains(image, target.image.cpu().numpy(), observed.cpu().numpy())
     fitted = torch.from_numpy(np.clip(image * gains, 0, 1)).to(target.image)
     whole = compute_masked_psnr(fitted, target.image, target.valid_mask)
     outside = compute_masked_psnr(fitted, target.image, ~holes & target.valid_mask)
