@@ -14,6 +14,7 @@ from gscompleter.apps.evaluating.cases import collect_tasks
 from gscompleter.apps.requests.evaluation import EvaluationRequest, ReproductionRequest
 from gscompleter.data.formats import open_photographs
 from gscompleter.evaluation import scene_poses
+from gscompleter.evaluation.run_facts import RunFacts
 from gscompleter.evaluation.scene_poses import is_contradicted, refine_scene
 from gscompleter.evaluation.store import list_row_paths, read_run_file
 from scenes import photographed
@@ -85,6 +86,7 @@ def read_context_psnr(out: Path) -> float:
     return read_run_file(path)["steps"][0]["scores"]["context_psnr"][1]["after"]
 
 
+@pytest.mark.slow
 def test_methods_see_refined_cameras_and_tables_say_so(cases, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(scene_poses, "refine_poses", correct)
     refined, given = tmp_path / "refined", tmp_path / "given"
@@ -93,7 +95,7 @@ def test_methods_see_refined_cameras_and_tables_say_so(cases, tmp_path, monkeypa
     assert read_context_psnr(refined) > read_context_psnr(given) + 0.5
 
     first_line = (refined / "tables.md").read_text().splitlines()[0]
-    said = "poses: refined where matches missed them (room 0.40 to 0.10 px of 256)"
+    said = "poses: refined where matches missed them (room 0.40 to 0.10 px, of 256)"
     assert said in first_line
     assert "poses: as given" in (given / "tables.md").read_text().splitlines()[0]
     content = json.loads((refined / "tables.json").read_text())
@@ -103,6 +105,16 @@ def test_methods_see_refined_cameras_and_tables_say_so(cases, tmp_path, monkeypa
     capsys.readouterr()
     assert evaluate(monkeypatch, cases, refined, "--no-refine-poses") == 2
     assert "refines_poses" in capsys.readouterr().err
+
+
+def test_a_line_says_what_was_done_to_the_poses_of_each_scene():
+    facts = RunFacts("plane-sweep", "warp-inpaint", 0, 0, ())
+    assert facts.sentence.endswith("seed 0; poses: as given.")
+    poses = {f"room{number}": vars(DONE) for number in range(7)}
+    sentence = replace(facts, poses=poses).sentence
+    assert "room0 0.40 to 0.10 px, " in sentence
+    assert "room5" not in sentence
+    assert sentence.endswith("and 2 more scenes, of 256).")
 
 
 def test_without_colmap_poses_stay_and_a_line_says_what_would_help(

@@ -87,12 +87,12 @@ def describe_poses(refined: Mapping[str, Mapping[str, Any]]) -> str:
     if not refined:
         return "as given"
     errors = [
-        f"{strip_folder(scene)} {done['given_error']:.2f} to {done['refined_error']:.2f}"
+        f"{strip_folder(scene)} {done['given_error']:.2f} to {done['refined_error']:.2f} px"
         for scene, done in list(refined.items())[:MAX_NAMED]
     ]
     if len(refined) > MAX_NAMED:
         errors.append(f"and {len(refined) - MAX_NAMED} more scenes")
-    return f"refined where matches missed them ({', '.join(errors)} px of {ERROR_SIDE})"
+    return f"refined where matches missed them ({', '.join(errors)}, of {ERROR_SIDE})"
 
 
 def name_model(name: str, settings: Mapping[str, Any]) -> str:

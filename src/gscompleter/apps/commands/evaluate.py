@@ -180,9 +180,8 @@ class EvaluateOptions(SynthesisOptions, EngineOptions, MaskOptions):
     """Use also what stays the same while the camera moves, such as the bonnet of its car, instead
     of ignoring it."""
     no_refine_poses: bool = False
-    """Keep the given poses of photographs; else those that matches contradict are refined, once for
-    a scene. With a preset, a table or a figure of the paper, or an evaluation index they stay as
-    given."""
+    """Keep the given poses of photographs; else those that matches contradict are refined. Once for
+    a scene, and not with a preset, a table or figure of the paper, or an evaluation index."""
     limit: Annotated[int, Interval(ge=1)] | None = None
     """Most cases to run, over all shards."""
     apart: bool = False

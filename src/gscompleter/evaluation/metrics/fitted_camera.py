@@ -12,7 +12,7 @@ where rho is quadratic up to `ROBUST` and grows linearly beyond it. The score is
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -25,6 +25,7 @@ from gscompleter.evaluation.metrics.image import MAX_PSNR, compute_masked_psnr
 from gscompleter.evaluation.metrics.unused_photographs import shrink_view
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.render.protocols import Renderer
+from gscompleter.render.view_map import get_view_map
 from gscompleter.types import Camera, Gaussians, Render, View
 
 FIT_SIDE = 320
@@ -52,6 +53,8 @@ MIN_PIXELS = 500
 Pixels = Float[np.ndarray, "h w 3"]
 Move = Float[np.ndarray, "6"]
 """Rotation about x, y, z and shift along them, in camera axes and pixels."""
+Draw = Callable[[Sequence[Move]], list[Pixels]]
+"""Renders the scene after each move."""
 
 
 @dataclass(frozen=True)
@@ -90,8 +93,10 @@ def measure_fitted(
         image = renderer.render(scene, camera).image
         return np.asarray(image.clamp(0, 1).cpu().numpy(), np.float64)
 
-    def draw(move: Move) -> Pixels:
-        return render(move_camera_by(small.camera, move, unit))
+    map_views = get_view_map(scene.means, len(scene))
+
+    def draw(moves: Sequence[Move]) -> list[Pixels]:
+        return list(map_views(render, [move_camera_by(small.camera, m, unit) for m in moves]))
 
     move = fit_move(draw, small.image.cpu().numpy(), counted)
     pose = move_camera_by(small.camera, move, unit).c2w
@@ -124,20 +129,18 @@ def move_camera_by(camera: Camera, move: Move, unit: float) -> Camera:
     return replace(camera, c2w=torch.from_numpy(pose).to(camera.c2w))
 
 
-def fit_move(
-    draw: Callable[[Move], Pixels], truth: Pixels, counted: Bool[np.ndarray, "h w"]
-) -> Move:
+def fit_move(draw: Draw, truth: Pixels, counted: Bool[np.ndarray, "h w"]) -> Move:
     """Fit the move, from wide to narrow blur; zero if the picture is no nearer to the truth."""
     still = np.zeros(6)
     move = still
     for sigma in BLURS:
         move = fit_blurred(draw, move, truth, counted, sigma)
-    before, after = (measure_loss(draw(one), truth, counted) for one in (still, move))
+    before, after = (measure_loss(image, truth, counted) for image in draw([still, move]))
     return move if after < before else still
 
 
 def fit_blurred(
-    draw: Callable[[Move], Pixels],
+    draw: Draw,
     start: Move,
     truth: Pixels,
     counted: Bool[np.ndarray, "h w"],
@@ -150,12 +153,12 @@ def fit_blurred(
         return (blur(image, sigma) * gains - wanted)[counted].ravel()
 
     move = start
-    image = draw(move)
+    (image,) = draw([move])
     for _ in range(ROUNDS):
         gains = fit_gains(image, truth, counted)
         residuals = compute_residuals(image, gains)
-        steps = STEP * np.eye(6)
-        drawn = [compute_residuals(draw(move + step), gains) for step in steps]
+        steps = move + STEP * np.eye(6)
+        drawn = [compute_residuals(moved, gains) for moved in draw(list(steps))]
         slopes = np.stack([(one - residuals) / STEP for one in drawn], axis=1)
         weighted = slopes / np.maximum(np.abs(residuals), ROBUST)[:, None]
         # A little damping, where two of the numbers act alike, as a turn and a shift do.
@@ -166,7 +169,7 @@ def fit_blurred(
         loss = np.square(residuals).mean()
         for share in SHARES:
             following = np.clip(move + share * change, -MAX_MOVE, MAX_MOVE)
-            image = draw(following)
+            (image,) = draw([following])
             gains = fit_gains(image, truth, counted)
             if np.square(compute_residuals(image, gains)).mean() < loss:
                 break
