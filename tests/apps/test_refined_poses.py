@@ -8,52 +8,23 @@ import numpy as np
 import pytest
 
 from command import run
-from gscompleter import load_ply
-from gscompleter.apps.completing import preparation
+from gscompleter import load_ply, save_ply
+from gscompleter.apps.inputs import refined_poses
+from gscompleter.apps.inputs.reading import read_photographs
+from gscompleter.apps.inputs.splat import locate_splat, move_to_splat
+from gscompleter.apps.inputs.task import Opened
+from gscompleter.apps.requests.scene import SceneRequest
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.photographs import Photographs
-from gscompleter.data.sfm.refining import PoseRefinement
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
-from scenes import camera_at, photographed
-
-CAMERAS = [
-    camera_at(x=0.3 * i - 1.05, y=0.1 * (i % 3), z=0.05 * i, yaw=14 - 4 * i, size=160)
-    for i in range(8)
-]
-SHAKEN = 4
-"""Photograph whose given pose is turned by a pixel and a half."""
-CONTEXT = (2, SHAKEN)
-DONE = PoseRefinement(8, given_error=0.4, refined_error=0.1, moved=0.05)
+from gscompleter.types import merge
+from scenes import Room, gaussians_of, photographed, view_of
+from shaken_room import CAMERAS, CONTEXT, DONE, SHAKEN, correct, write_shaken
 
 
 @pytest.fixture
 def scene(tmp_path) -> Path:
     """Write photographs of the room, one of them with a wrong pose."""
-    folder = photographed(tmp_path / "scene", CAMERAS)
-    path = folder / "transforms.json"
-    content = json.loads(path.read_text())
-    content["frames"][SHAKEN]["transform_matrix"] = turn(
-        np.array(content["frames"][SHAKEN]["transform_matrix"])
-    ).tolist()
-    path.write_text(json.dumps(content))
-    return folder
-
-
-def turn(pose: np.ndarray) -> np.ndarray:
-    """Turn a camera by 0.6 degrees to the side and up."""
-    angle = np.radians(0.6)
-    about_y = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
-    about_x = [[1, 0, 0], [0, np.cos(angle), -np.sin(angle)], [0, np.sin(angle), np.cos(angle)]]
-    turned = pose.copy()
-    turned[:3, :3] = pose[:3, :3] @ np.array(about_y) @ np.array(about_x)
-    return turned
-
-
-def correct(photographs: Photographs) -> tuple[Photographs, PoseRefinement]:
-    """Stand in for COLMAP: give the wrong camera its true pose."""
-    frames = list(photographs.frames)
-    frames[SHAKEN] = replace(frames[SHAKEN], c2w=CAMERAS[SHAKEN].c2w.double().numpy())
-    return replace(photographs, frames=tuple(frames)), DONE
+    return write_shaken(tmp_path / "scene")
 
 
 QUICK = [
@@ -72,7 +43,7 @@ def complete(monkeypatch, scene: Path, out: Path, *more: object) -> dict:
 
 
 def test_refined_poses_are_told_and_kept(scene, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(preparation, "refine_poses", correct)
+    monkeypatch.setattr(refined_poses, "refine_poses", correct)
     out = tmp_path / "out"
     assert complete(monkeypatch, scene, out, *QUICK)["scene"]["refined_poses"] == vars(DONE)
     assert DONE.describe() in capsys.readouterr().err.replace("\n", " ")
@@ -81,7 +52,7 @@ def test_refined_poses_are_told_and_kept(scene, tmp_path, monkeypatch, capsys):
     assert np.array_equal(pose, CAMERAS[SHAKEN].c2w.double().numpy())
 
     # COLMAP is not asked again beside a splat: its poses lie there.
-    monkeypatch.setattr(preparation, "refine_poses", None)
+    monkeypatch.setattr(refined_poses, "refine_poses", None)
     capsys.readouterr()
     splat = ("--scene", out / "completed.ply", "--dry-run")
     complete(monkeypatch, scene, tmp_path / "again", *QUICK, *splat)
@@ -93,7 +64,7 @@ def test_refined_poses_are_told_and_kept(scene, tmp_path, monkeypatch, capsys):
 def test_contradicted_poses_are_refined_and_the_next_command_takes_them(
     scene, tmp_path, monkeypatch, capsys
 ):
-    monkeypatch.setattr(preparation, "refine_poses", correct)
+    monkeypatch.setattr(refined_poses, "refine_poses", correct)
     first = complete(monkeypatch, scene, tmp_path / "first")
     assert first["scene"]["refined_poses"] == vars(DONE)
     assert DONE.describe() in capsys.readouterr().err.replace("\n", " ")
@@ -109,7 +80,7 @@ def test_contradicted_poses_are_refined_and_the_next_command_takes_them(
     assert first["context"][1]["psnr_after"] > kept["context"][1]["psnr_after"] + 0.5
 
     # COLMAP is not asked again beside a splat: its poses lie there.
-    monkeypatch.setattr(preparation, "refine_poses", None)
+    monkeypatch.setattr(refined_poses, "refine_poses", None)
     capsys.readouterr()
     again = tmp_path / "again"
     splat = tmp_path / "first" / "completed.ply"
@@ -123,14 +94,14 @@ def test_contradicted_poses_are_refined_and_the_next_command_takes_them(
 
 
 def test_poses_that_agree_are_not_refined(tmp_path, monkeypatch):
-    monkeypatch.setattr(preparation, "refine_poses", None)
+    monkeypatch.setattr(refined_poses, "refine_poses", None)
     scene = photographed(tmp_path / "scene", CAMERAS)
     complete(monkeypatch, scene, tmp_path / "out", "--dry-run")
     assert not (tmp_path / "out" / "refined_poses.json").exists()
 
 
 def test_without_colmap_a_line_says_what_would_help(scene, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(preparation, "has_pycolmap", lambda: False)
+    monkeypatch.setattr(refined_poses, "has_pycolmap", lambda: False)
     complete(monkeypatch, scene, tmp_path / "out", "--dry-run")
     assert "pip install 'gscompleter[poses]' refines them" in capsys.readouterr().err
 
@@ -138,7 +109,7 @@ def test_without_colmap_a_line_says_what_would_help(scene, tmp_path, monkeypatch
 @pytest.mark.slow
 def test_refined_poses_that_agree_no_better_are_not_taken(scene, tmp_path, monkeypatch, capsys):
     worse = replace(DONE, refined_error=0.39)
-    monkeypatch.setattr(preparation, "refine_poses", lambda given: (given, worse))
+    monkeypatch.setattr(refined_poses, "refine_poses", lambda given: (given, worse))
     summary = complete(monkeypatch, scene, tmp_path / "out")
     assert summary["scene"]["refined_poses"] is None
     assert "Given poses are kept" in capsys.readouterr().err
@@ -158,3 +129,43 @@ def test_colmap_refines_the_photographs_of_a_command(scene, tmp_path, monkeypatc
     angle = np.degrees(np.arccos((np.trace(pose[:3, :3].T @ true[:3, :3]) - 1) / 2))
     before = photographs.frames[SHAKEN].c2w
     assert angle < 0.3 < np.degrees(np.arccos((np.trace(before[:3, :3].T @ true[:3, :3]) - 1) / 2))
+
+
+@pytest.fixture(scope="module")
+def splat(tmp_path_factory) -> Path:
+    """Write a splat of the room, in the frame of the true cameras."""
+    views = [view_of(Room(), camera) for camera in CAMERAS[::2]]
+    path = tmp_path_factory.mktemp("splat") / "room.ply"
+    save_ply(path, merge([gaussians_of(view) for view in views]))
+    return path
+
+
+@pytest.mark.slow
+def test_photographs_come_to_a_given_splat(scene, splat, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(refined_poses, "refine_poses", correct)
+    summary = complete(monkeypatch, scene, tmp_path / "refined", "--scene", splat)
+    done = summary["scene"]["refined_poses"]
+    assert done["splat_refined"] > done["splat_given"] + 0.1
+    said = capsys.readouterr().err.replace("\n", " ")
+    assert f"agrees with the photographs at {done['splat_given']:.2f} dB as given" in said
+    assert (tmp_path / "refined" / "refined_poses.json").is_file()
+    # The photographs have moved, and the splat has not.
+    assert summary["frame"]["method"] == "given"
+
+    kept = complete(monkeypatch, scene, tmp_path / "kept", "--scene", splat, "--no-refine-poses")
+    assert kept["scene"]["refined_poses"] is None
+    assert summary["context"][1]["psnr_before"] > kept["context"][1]["psnr_before"] + 0.5
+
+
+def test_poses_that_a_given_splat_contradicts_are_kept(scene, splat, monkeypatch):
+    photographs = open_photographs(scene)
+    refined, _ = correct(photographs)
+    opened = Opened(SceneRequest(scene), refined, "nerfstudio", len(refined))
+    task = read_photographs(opened, CONTEXT, "cpu")
+    task = move_to_splat(task, load_ply(splat), locate_splat(splat, False), opened)
+    # As if matches agreed with the wrong camera, which the splat does not.
+    done = refined_poses.ask_splat(refined, photographs, task, DONE)
+    assert done.is_contradicted_by_splat
+    assert not done.is_accepted
+    assert "Given poses are kept, though they miss matches by 0.40 px" in done.describe()
+    assert refined_poses.ask_splat(photographs, refined, task, DONE).is_accepted

@@ -116,8 +116,19 @@ def test_what_summary_json_has_is_on_the_page(completed_room):
         f"{100 * summary['coverage']['after']:.1f} %",
         f"scene depth = {row['affine']['scale']:.3f} × lifted depth",
         '"registration": { "iterations"',
+        # After one pose and one gain of the target's camera were fitted to its photograph.
+        f"PSNR, camera fitted {row['fitted']['psnr']:.2f} dB",
+        f"Target 1: moved by {row['fitted']['moved']:.2f} px",
     )
     assert [text for text in expected if text not in said] == []
+
+
+def test_the_errors_of_a_targets_camera_are_taken_out_of_a_second_score(completed_room):
+    (row,) = json.loads((completed_room / "summary.json").read_text())["targets"]
+    # Whatever a pose and a gain gain outside of holes, they lose nothing there.
+    assert row["fitted"]["observed_psnr"] > row["psnr_after"]
+    assert 0 <= row["fitted"]["moved"] < 5
+    assert row["fitted"]["gain"] == pytest.approx(1, abs=0.1)
 
 
 def test_the_same_folder_gives_the_same_bytes(completed_room, out, monkeypatch, capsys):

@@ -50,7 +50,10 @@ from gscompleter.apps.viewer.packages import (
 )
 from gscompleter.apps.viewer.page import make_page
 from gscompleter.apps.viewer.serving import make_page_server
+from gscompleter.data.formats import open_photographs
 from gscompleter.data.scene import write_cameras
+from gscompleter.data.sfm.refined_file import write_refined
+from gscompleter.data.sfm.refining import PoseRefinement
 from gscompleter.evaluation.metrics.coverage import Coverage
 from gscompleter.evaluation.verdict.rows import OutcomeRow
 from gscompleter.splats.formats import load_splat
@@ -353,6 +356,25 @@ def test_photographs_of_a_completion_are_jumped_to(tmp_path):
     assert [shot.name for shot in exhibit.cameras] == ["target-1", "photograph-0"]
     assert exhibit.cameras[1].thumbnail is not None
     assert exhibit.notes == ()
+
+
+def test_photographs_stand_where_their_refined_poses_are(tmp_path):
+    folder = completion_in(tmp_path / "out", np.eye(4), np.zeros(3))
+    (folder / "gone").mkdir()
+    write_image(folder / "gone" / "0.png", torch.rand(SIDE, SIDE, 3))
+    write_cameras(folder / "gone" / "transforms.json", [LEFT], ["0.png"])
+    given = open_photographs(folder / "gone")
+    c2w = given.frames[0].c2w.copy()
+    c2w[0, 3] += 0.25
+    refined = replace(given, frames=(replace(given.frames[0], c2w=c2w),))
+    done = PoseRefinement(1, given_error=0.3, refined_error=0.1, moved=0.05)
+    write_refined(folder / "refined_poses.json", given, refined, done)
+
+    # The file of a splat goes along, and says nothing of a result that kept the given poses.
+    for used, moved in ((None, 0.0), (vars(done), 0.25)):
+        change_summary(folder, "scene", "refined_poses", used)
+        shot = load_viewer_completion(folder, False).cameras[1]
+        assert shot.camera.center[0] - LEFT.center[0] == pytest.approx(moved, abs=1e-6)
 
 
 def change_summary(folder: Path, part: str, name: str, value: object) -> None:

@@ -9,9 +9,12 @@ import pytest
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.sfm.refined_file import hash_poses, take_refined, write_refined
+from gscompleter.data.sfm.refining import PoseRefinement
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.writing import REFINED_POSES_FILE
 from scenes import camera_at, photographed
+
+DONE = PoseRefinement(2, given_error=0.3, refined_error=0.1, moved=0.05)
 
 
 @pytest.fixture
@@ -33,9 +36,11 @@ def refined(given) -> Photographs:
 
 def test_poses_come_back_bit_for_bit_and_others_stay(given, refined, tmp_path):
     path = tmp_path / REFINED_POSES_FILE
-    write_refined(path, given, refined)
-    again = take_refined(given, path)
-    assert again is not None
+    write_refined(path, given, refined, DONE)
+    taken = take_refined(given, path)
+    assert taken is not None
+    again, done = taken
+    assert done == DONE
     for frame, wanted in zip(again.frames, refined.frames, strict=True):
         assert np.array_equal(frame.c2w, wanted.c2w)
     assert again.frames[2] is given.frames[2]
@@ -50,7 +55,7 @@ def test_poses_come_back_bit_for_bit_and_others_stay(given, refined, tmp_path):
 
 def test_photographs_with_other_poses_do_not_take_them(given, refined, tmp_path):
     path = tmp_path / REFINED_POSES_FILE
-    write_refined(path, given, refined)
+    write_refined(path, given, refined, DONE)
     assert take_refined(refined, path) is None
     assert take_refined(replace(given, frames=given.frames[:2]), path) is None
     assert hash_poses(given) != hash_poses(refined)
@@ -59,7 +64,7 @@ def test_photographs_with_other_poses_do_not_take_them(given, refined, tmp_path)
 def test_photographs_that_were_placed_among_the_given_ones_are_left_out(given, refined, tmp_path):
     path = tmp_path / REFINED_POSES_FILE
     joined = replace(refined, frames=(*refined.frames, given.frames[0]))
-    write_refined(path, given, joined)
+    write_refined(path, given, joined, DONE)
     assert take_refined(given, path) is not None
 
 
@@ -73,7 +78,7 @@ def test_photographs_that_were_placed_among_the_given_ones_are_left_out(given, r
 )
 def test_a_damaged_file_is_named(given, refined, tmp_path, change, words):
     path = tmp_path / REFINED_POSES_FILE
-    write_refined(path, given, refined)
+    write_refined(path, given, refined, DONE)
     content = json.loads(path.read_text())
     change(content)
     path.write_text(json.dumps(content))

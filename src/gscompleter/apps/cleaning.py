@@ -21,6 +21,7 @@ from gscompleter.apps.completing.run_info import describe_run_values, refuse_res
 from gscompleter.apps.inputs.depth_range import apply_splat_range
 from gscompleter.apps.inputs.describing import describe_opening, print_lines
 from gscompleter.apps.inputs.reading import read_photographs
+from gscompleter.apps.inputs.refined_poses import refine_opened
 from gscompleter.apps.inputs.splat import locate_splat, move_to_splat
 from gscompleter.apps.inputs.taken_out import take_over_edits
 from gscompleter.apps.inputs.task import InputSplatFile
@@ -149,7 +150,15 @@ def clean_by_photographs(
     compile_kernels([device])
     with stage("aligning the scene"):
         splat_file = locate_splat(splat.path, splat.drop_nonfinite)
-        task = move_to_splat(task, loaded, splat_file, opened)
+        placed = move_to_splat(task, loaded, splat_file, opened)
+    if photographs.scene.refines_poses:
+        refined = refine_opened(opened, placed, console)
+        if refined is not opened:
+            opened = refined
+            with stage("aligning the scene"):
+                task = read_photographs(opened, photographs.context, device)
+                placed = move_to_splat(task, loaded, splat_file, opened)
+    task = placed
 
     # From here on the splat is that of the task, whose coordinates may have a local origin.
     given = task.scene

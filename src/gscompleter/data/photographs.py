@@ -23,6 +23,7 @@ from torch import Tensor
 from gscompleter.data.cameras import compute_fov, compute_undistortion_map, find_pose_defect, remap
 from gscompleter.data.file_names import FolderListings
 from gscompleter.data.frame import Frame
+from gscompleter.data.ignored_regions import IgnoredRegions
 from gscompleter.data.local_origin import choose_local_origin, is_near
 from gscompleter.data.masks import fill_hidden, find_mask_in, find_masked, make_no_mask_error
 from gscompleter.data.moving_boxes import mask_moving
@@ -92,6 +93,8 @@ class Photographs:
     """True if boxes of moving objects are ignored like masks."""
     is_masked: bool = True
     """True if masks and alpha channels say what is ignored; else alpha is over black."""
+    regions: IgnoredRegions | None = None
+    """What is ignored in every photograph, besides masks; None for nothing."""
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -172,6 +175,10 @@ class Photographs:
     def ignore_moving(self) -> Photographs:
         """Return a copy in which boxes of moving objects are ignored like masks."""
         return replace(self, has_moving_boxes_ignored=True)
+
+    def ignore_regions(self, regions: IgnoredRegions | None) -> Photographs:
+        """Return a copy in which regions of every photograph are ignored like masks."""
+        return replace(self, regions=regions)
 
     def leave_out_masks(self) -> Photographs:
         """Return a copy in which masks and alpha channels hide nothing."""
@@ -342,10 +349,15 @@ class Photographs:
         what they show.
         """
         colors, alpha, orientation = frame.load_pixels()
-        if not self.is_masked:
-            return (colors if alpha is None else composite_over_black(colors, alpha)), None
         size = colors.shape[1], colors.shape[0]
-        hidden = find_masked(frame, alpha, size, orientation)
+        hidden = None
+        if self.is_masked:
+            hidden = find_masked(frame, alpha, size, orientation)
+        elif alpha is not None:
+            colors = composite_over_black(colors, alpha)
+        if self.regions is not None:
+            ignored = self.regions.draw(*size)
+            hidden = ignored if hidden is None else hidden | ignored
         return (colors if hidden is None else fill_hidden(colors, hidden)), hidden
 
     def _load_depth(

@@ -3,6 +3,8 @@
 {"resolution": [h, w], "cases": [{"scene", "context", "target", "near", "far", "neighbours"}, ...]}.
 Scenes are folders relative to the file, and may name variables of the environment. With "apart",
 true or a list of names of scenes, all cases or those of these scenes are kept apart (`apart.py`).
+"ignore" of a case is a list of polygons or the path of a mask: parts of its photographs that do not
+count.
 
 A file of scenes, {"scenes": [folder, ...], "apart": [name, ...]}, names those of a data set for the
 protocols, which choose frames themselves.
@@ -18,6 +20,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePath
 from typing import Any
 
+from gscompleter.data.ignored_regions import IgnoredRegions
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_json
 from gscompleter.system.tensor_checks import is_number
@@ -27,9 +30,11 @@ FILE_KEYS = ("resolution", "cases", "about", "apart")
 """Keys of the file; `about` is a remark for people."""
 SCENE_KEYS = ("scenes", "about", "apart")
 """Keys of a file of scenes."""
-CASE_KEYS = ("scene", "context", "target", "neighbours", "near", "far", "about")
+CASE_KEYS = ("scene", "context", "target", "neighbours", "near", "far", "ignore", "about")
 MAX_FRAME = 10**9
 MIN_CONTEXT = 2
+MIN_CORNERS = 3
+"""Fewest corners of a polygon."""
 
 
 @dataclass(frozen=True)
@@ -42,6 +47,8 @@ class CaseRow:
     neighbours: tuple[int, ...] = ()
     near: float | None = None
     far: float | None = None
+    ignore: IgnoredRegions | None = None
+    """What does not count in its photographs; None for nothing."""
     is_apart: bool = False
     """True if the file keeps the case apart."""
 
@@ -81,7 +88,9 @@ def read_case_file(path: Path) -> CaseFile:
     rows = content.get("cases")
     if not isinstance(rows, list) or not rows:
         raise InputError(f"{name}: cases has to be a list of cases, and is {show(rows)}.")
-    parsed = [parse_case_row(row, f"{name}: case {n}") for n, row in enumerate(rows, start=1)]
+    parsed = [
+        parse_case_row(row, f"{name}: case {n}", path.parent) for n, row in enumerate(rows, start=1)
+    ]
 
     # The scores of two cases of one name would overwrite each other.
     names = [(row.scene, row.context, row.target) for row in parsed]
@@ -149,8 +158,8 @@ def parse_apart(apart: Any, scenes: Sequence[str], name: str) -> list[bool]:
     return [scene in apart for scene in known]
 
 
-def parse_case_row(row: Any, name: str) -> CaseRow:
-    """Parse a case; sentences begin with its name."""
+def parse_case_row(row: Any, name: str, home: Path) -> CaseRow:
+    """Parse a case of a file in the folder `home`; sentences begin with its name."""
     if not isinstance(row, dict):
         raise InputError(f"{name} has to be an object with scene, context and target.")
     refuse_unknown(row, CASE_KEYS, name)
@@ -187,7 +196,43 @@ def parse_case_row(row: Any, name: str) -> CaseRow:
         raise InputError(
             f"{name} has near {near:g}, which is not before far {far:g}; correct them."
         )
-    return CaseRow(scene, context, target, neighbours, near, far)
+    ignore = parse_ignored(row.get("ignore"), name, home)
+    return CaseRow(scene, context, target, neighbours, near, far, ignore)
+
+
+def parse_ignored(value: Any, name: str, home: Path) -> IgnoredRegions | None:
+    """Parse what does not count: polygons, or the path of a mask; None if it is not given."""
+    if value is None:
+        return None
+    if isinstance(value, str) and value:
+        mask = home / os.path.expandvars(value)
+        if not os.path.isfile(mask):
+            raise InputError(
+                f"{name} has ignore {show(value)}, and there is no such file; name a mask "
+                "relative to the file of cases."
+            )
+        return IgnoredRegions(mask=mask)
+    if not isinstance(value, list) or not value or not all(map(is_polygon, value)):
+        raise InputError(
+            f"{name} has ignore {show(value)}, and a list of polygons is needed, each of three "
+            "corners [x, y] or more in shares of width and height from 0 to 1, or the path of a "
+            "mask."
+        )
+    return IgnoredRegions(tuple(tuple((float(x), float(y)) for x, y in one) for one in value))
+
+
+def is_polygon(value: Any) -> bool:
+    """Check whether a value is a list of corners, as shares of an image."""
+    return isinstance(value, list) and len(value) >= MIN_CORNERS and all(map(is_corner, value))
+
+
+def is_corner(value: Any) -> bool:
+    """Check whether a value is a point [x, y], as shares of an image."""
+    return (
+        isinstance(value, list)
+        and len(value) == 2
+        and all(not isinstance(v, bool) and is_number(v) and 0 <= v <= 1 for v in value)
+    )
 
 
 def refuse_unknown(content: Mapping[str, Any], known: Sequence[str], name: str) -> None:

@@ -14,11 +14,21 @@ from pathlib import Path
 from gscompleter.data.ego_vehicle import attach_vehicle_detector
 from gscompleter.data.formats import SCENE_FORMATS, detect_format, find_format, open_photographs
 from gscompleter.data.frame import describe_moved
+from gscompleter.data.ignored_regions import IgnoredRegions
 from gscompleter.data.masks import attach_masks
 from gscompleter.data.photographs import MAX_TRANSLATION, Photographs, Resolution
-from gscompleter.evaluation.case_file import is_scene_file, read_case_file, read_scene_file
+from gscompleter.evaluation.case_file import (
+    CaseFile,
+    is_scene_file,
+    read_case_file,
+    read_scene_file,
+)
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import holds_results
 from gscompleter.types import View
+
+REGION_SIDE = 512
+"""Size of the square in which regions to ignore are checked, in pixels."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +51,8 @@ class Case:
     """True if pixels in boxes of moving objects are ignored."""
     ego_mask: bool = True
     """True if pixels of the vehicle that carries the camera are ignored."""
+    ignore: IgnoredRegions | None = None
+    """What does not count in any of the photographs, besides masks; None for nothing."""
     apart_by: Path | None = None
     """File of cases that keeps this one apart, or None."""
 
@@ -50,19 +62,24 @@ class Case:
         frames = "+".join(str(frame) for frame in self.context)
         return f"{self.scene.name} {frames}>{self.target}"
 
-    def load(self, frames: tuple[int, ...]) -> list[View]:
-        """Load the photographs of `frames`."""
+    def open(self) -> Photographs:
+        """Open the photographs of the scene."""
         scene = open_photographs(self.scene, near=self.near, far=self.far)
         scene = scene if self.ego_mask else scene.keep_ego_vehicle()
         scene = scene if self.masks else scene.leave_out_masks()
         scene = scene.invert_masks() if self.invert_masks else scene
         scene = scene.ignore_moving() if self.ignore_moving else scene
-        return scene.views(frames, self.resolution)
+        return scene.ignore_regions(self.ignore)
+
+    def load(self, frames: tuple[int, ...]) -> list[View]:
+        """Load the photographs of `frames`."""
+        return self.open().views(frames, self.resolution)
 
 
 def read_cases(path: Path) -> list[Case]:
     """Read the cases of a file; raises as `read_case_file`."""
     content = read_case_file(path)
+    check_regions(content, path)
     return [
         Case(
             path.parent / os.path.expandvars(row.scene),
@@ -72,10 +89,25 @@ def read_cases(path: Path) -> list[Case]:
             content.resolution,
             row.near,
             row.far,
+            ignore=row.ignore,
             apart_by=path if row.is_apart else None,
         )
         for row in content.rows
     ]
+
+
+def check_regions(content: CaseFile, path: Path) -> None:
+    """Refuse regions to ignore whose mask cannot be read, or that leave nothing to score."""
+    for number, row in enumerate(content.rows, start=1):
+        if row.ignore is None:
+            continue
+        share = row.ignore.draw(REGION_SIDE, REGION_SIDE).mean()
+        if share in (0, 1):
+            what = "everything" if share else "nothing"
+            raise InputError(
+                f"{quote_value(path)}: case {number} has ignore with {what} in it; black pixels of "
+                "a mask, and what polygons enclose, do not count."
+            )
 
 
 @dataclass(frozen=True)

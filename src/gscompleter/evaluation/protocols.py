@@ -19,6 +19,7 @@ from annotated_types import Ge, MinLen
 from pydantic import Field, TypeAdapter, ValidationError
 
 from gscompleter.data.photographs import Photographs, Resolution
+from gscompleter.data.sfm.refining import PoseRefinement
 from gscompleter.evaluation.cases import Case
 from gscompleter.parts import MAX_TARGET_ID
 from gscompleter.system.errors import InputError, quote_value
@@ -207,15 +208,25 @@ class Task:
     context: tuple[int, ...]
     targets: tuple[int, ...]
     """Target frames, completed in this order into one scene."""
-    load: Callable[[tuple[int, ...]], list[View]]
+    open: Callable[[], Photographs]
+    """Opens the photographs of the scene."""
+    resolution: Resolution = None
     neighbours: tuple[int, ...] = ()
     """Frames beside the target, for scoring only."""
     keeps_order: bool = False
     """True to give Ψ the context in this order, as a published index has it, instead of sorted."""
     has_masks: bool = False
     """True if masks hide parts of the photographs of its scene."""
+    refines_poses: bool = False
+    """True to refine poses of the scene that matches contradict."""
+    poses: PoseRefinement | None = None
+    """What was done to the poses of `open`; None for nothing."""
     apart_by: Path | None = None
     """File that keeps the task apart, or None."""
+
+    def load(self, frames: tuple[int, ...]) -> list[View]:
+        """Load the photographs of `frames`."""
+        return self.open().views(frames, self.resolution)
 
     @property
     def name(self) -> str:
@@ -233,7 +244,8 @@ def make_case_task(case: Case) -> Task:
         case.scene.name,
         case.context,
         (case.target,),
-        case.load,
+        case.open,
+        case.resolution,
         case.neighbours,
         apart_by=case.apart_by,
     )
@@ -249,7 +261,7 @@ def make_tasks(
 
     With `keeps_order`, Ψ gets the context in the order of the split instead of sorted by frame.
     """
-    load = partial(load_clip_views, clip, resolution)
+    opened = partial(get_clip, clip)
     tasks = []
     for split in protocol.select_splits(clip):
         for frame in (*split.context, *split.targets):
@@ -259,19 +271,19 @@ def make_tasks(
                     f"has {len(clip)} frames; use the index of this data set."
                 )
         if split.is_sequence:
-            tasks.append(Task(clip.name, split.context, split.targets, load, (), keeps_order))
+            task = Task(clip.name, split.context, split.targets, opened, resolution)
+            tasks.append(replace(task, keeps_order=keeps_order))
             continue
         for target in split.targets:
             beside = find_neighbour_frames(target, split.context, len(clip))
-            tasks.append(Task(clip.name, split.context, (target,), load, beside, keeps_order))
+            task = Task(clip.name, split.context, (target,), opened, resolution, beside)
+            tasks.append(replace(task, keeps_order=keeps_order))
     return tasks
 
 
-def load_clip_views(
-    clip: Photographs, resolution: Resolution, frames: tuple[int, ...]
-) -> list[View]:
-    """Load photographs of a clip."""
-    return clip.views(frames, resolution)
+def get_clip(clip: Photographs) -> Photographs:
+    """Return a clip that is open already, as `Task.open`."""
+    return clip
 
 
 def find_neighbour_frames(target: int, context: Sequence[int], num_frames: int) -> tuple[int, ...]:

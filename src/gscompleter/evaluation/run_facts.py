@@ -6,17 +6,20 @@ It stands above every table, so that tables of two models cannot be confused.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path, PurePath
 from typing import Any
 
 from gscompleter.evaluation.apart import LEDGER
 from gscompleter.evaluation.columns import RunRow
 from gscompleter.evaluation.store import read_run_settings
+from gscompleter.numerics.two_views import ERROR_SIDE
 from gscompleter.system.plugins import is_in_file
 
 WEIGHT_FILES = (".ckpt", ".onnx", ".pt", ".pth", ".safetensors")
 """Endings of files of weights."""
+MAX_NAMED = 5
+"""Most scenes of which the line says how their poses were refined."""
 SETTING = "generator_"
 """Beginning of the names of the generator's settings."""
 
@@ -34,11 +37,15 @@ class RunFacts:
     """Number of cases that are kept apart."""
     commits: tuple[str, ...]
     """Commits of the code that computed the rows; none outside of a checkout."""
+    poses: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    """What was done to the poses of the scenes where they were refined, by the name of the scene;
+    all others are as given."""
 
     @property
     def sentence(self) -> str:
         """The facts in a line."""
         parts = [f"Ψ: {self.reconstructor}", f"Φ: {self.generator}", f"seed {self.seed}"]
+        parts.append(f"poses: {describe_poses(self.poses)}")
         if self.commits:
             parts.append(f"commit {' and '.join(self.commits)}")
         if self.num_apart:
@@ -67,7 +74,25 @@ def read_run_facts(out: Path, rows: Sequence[RunRow]) -> RunFacts:
         settings["seed"],
         settings["source"].get("apart", 0),
         tuple(sorted({row["commit"] for row in rows if row.get("commit")})),
+        {
+            row["task"]["scene"]: row["refined_poses"]
+            for row in rows
+            if row.get("refined_poses") is not None
+        },
     )
+
+
+def describe_poses(refined: Mapping[str, Mapping[str, Any]]) -> str:
+    """Describe what was done to the poses of scenes."""
+    if not refined:
+        return "as given"
+    errors = [
+        f"{strip_folder(scene)} {done['given_error']:.2f} to {done['refined_error']:.2f} px"
+        for scene, done in list(refined.items())[:MAX_NAMED]
+    ]
+    if len(refined) > MAX_NAMED:
+        errors.append(f"and {len(refined) - MAX_NAMED} more scenes")
+    return f"refined where matches missed them ({', '.join(errors)}, of {ERROR_SIDE})"
 
 
 def name_model_with_settings(name: str, settings: Mapping[str, Any]) -> str:

@@ -13,7 +13,8 @@ from gscompleter.config.generators import GeneratorSettings
 from gscompleter.evaluation import store
 from gscompleter.evaluation.measured_code import find_commit
 from gscompleter.evaluation.methods import Models, check_methods
-from gscompleter.evaluation.protocols import Task
+from gscompleter.evaluation.protocols import Task, get_clip
+from gscompleter.evaluation.scene_poses import refine_scene
 from gscompleter.evaluation.steps import PreparedTask, attempt, complete_task
 from gscompleter.generators import load_generator
 from gscompleter.reconstructors import load_reconstructor
@@ -187,9 +188,18 @@ class TaskRunner:
             with stage(f"{task.name}, {method}"), show_progress(None):
                 # Prepared once, by the first method whose row is missing.
                 if prepared is None:
-                    prepared = attempt(partial(prepare_task, task, folder, self.config))
+                    prepared = attempt(partial(self.prepare, task, folder))
                 content = build_row(task, method, prepared, folder)
             write_json(row, content)
+
+    def prepare(self, task: Task, folder: Path) -> PreparedTask:
+        """Prepare a task with the poses that its scene has in this run."""
+        photographs = task.open()
+        poses = None
+        if task.refines_poses:
+            photographs, poses = refine_scene(photographs, self.out)
+        opened = partial(get_clip, photographs)
+        return prepare_task(replace(task, open=opened, poses=poses), folder, self.config)
 
 
 def prepare_task(task: Task, folder: Path, config: RunConfig) -> PreparedTask:
@@ -217,6 +227,7 @@ def prepare_task(task: Task, folder: Path, config: RunConfig) -> PreparedTask:
         models,
         context.seconds,
         context.notes,
+        task.poses,
     )
 
 
@@ -271,7 +282,11 @@ def build_row(
         outcome = {"error": progress.error, "reconstruct_seconds": prepared.seconds, "steps": steps}
         if prepared.context_notes:
             outcome["context_notes"] = list(prepared.context_notes)
-    named = {key: getattr(task, key) for key in ("name", "context", "targets", "neighbours")}
+        poses = prepared.poses
+        if poses is not None and poses.is_accepted:
+            outcome["refined_poses"] = asdict(poses)
+    keys = ("name", "scene", "context", "targets", "neighbours")
+    named = {key: getattr(task, key) for key in keys}
     row = {"version": store.RUN_VERSION, "task": named, "method": method, **outcome}
     commit = find_commit()
     return row if commit is None else {**row, "commit": commit}

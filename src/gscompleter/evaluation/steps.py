@@ -15,6 +15,7 @@ from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
+from gscompleter.data.sfm.refining import PoseRefinement
 from gscompleter.evaluation import store
 from gscompleter.evaluation.gap_pictures import draw_gap
 from gscompleter.evaluation.memory import measure_peak_memory
@@ -43,6 +44,8 @@ class PreparedTask:
     """Wall time of the reconstruction of the context."""
     context_notes: tuple[str, ...] = ()
     """Sentences of Ψ about the photographs, such as on a depth that it did not use."""
+    poses: PoseRefinement | None = None
+    """What was done to the poses of the scene; None for nothing."""
 
 
 @dataclass(frozen=True)

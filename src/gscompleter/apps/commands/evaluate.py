@@ -179,6 +179,9 @@ class EvaluateOptions(SynthesisOptions, EngineOptions, MaskOptions):
     no_ego_mask: bool = False
     """Use also what stays the same while the camera moves, such as the bonnet of its car, instead
     of ignoring it."""
+    no_refine_poses: bool = False
+    """Keep the given poses of photographs; else those that matches contradict are refined. Once for
+    a scene, and not with a preset, a table or figure of the paper, or an evaluation index."""
     limit: Annotated[int, Interval(ge=1)] | None = None
     """Most cases to run, over all shards."""
     apart: bool = False
@@ -238,6 +241,8 @@ def decide_evaluation(
             ignore_moving=options.ignore_moving,
             one_per_scene=options.one_per_scene,
             ego_mask=not options.no_ego_mask,
+            # Numbers of others stand beside those of the paper, whose data are as they were given.
+            refines_poses=not (options.no_refine_poses or is_reproduction or len(models) > 1),
             limit=options.limit,
             apart=options.apart,
         ),

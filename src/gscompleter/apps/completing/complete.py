@@ -375,8 +375,9 @@ def write_chosen_cameras(folder: Path, opened: Opened, task: CompletionTask) -> 
     if opened.renders_from is not None:
         cameras = [view.camera for view in task.views]
         write_in_first_frame(folder / RENDERS_FILE, task, cameras)
-    if opened.refinement is not None and opened.given is not None:
-        write_refined(folder / REFINED_POSES_FILE, opened.given, opened.photographs)
+    if opened.given is not None:
+        path = folder / REFINED_POSES_FILE
+        write_refined(path, opened.given, opened.photographs, opened.refinement)
 
 
 def write_in_first_frame(path: Path, task: CompletionTask, cameras: Sequence[Camera]) -> None:

@@ -26,6 +26,7 @@ from gscompleter.apps.inputs.named_photographs import check_target_files
 from gscompleter.apps.inputs.opening import choose_working_size, open_scene
 from gscompleter.apps.inputs.paintings import read_paintings
 from gscompleter.apps.inputs.reading import read_task
+from gscompleter.apps.inputs.refined_poses import refine_opened, take_over_poses
 from gscompleter.apps.inputs.renders import open_renders
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.inputs.splat import add_check_views, locate_splat, move_to_splat
@@ -47,17 +48,13 @@ from gscompleter.config import CompleterConfig
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photograph_names import describe_offset
-from gscompleter.data.sfm.refined_file import take_refined
-from gscompleter.data.sfm.refining import MIN_REFINED, has_pycolmap, refine_poses
 from gscompleter.editing.cutting import Region
 from gscompleter.editing.removal import remove_gaussians
 from gscompleter.generators import load_generator
 from gscompleter.generators.painted import Painting
-from gscompleter.numerics.two_views import ERROR_SIDE
 from gscompleter.planning.planner import Choice, ViewPlanner
 from gscompleter.reconstructors import DepthAware, load_reconstructor
 from gscompleter.reconstructors.depth_predictors import StoredDepth
-from gscompleter.reconstructors.features.epipolar import measure_pose_fit
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.alignment.similarity import transform_camera
@@ -66,7 +63,6 @@ from gscompleter.splats.morton import sort_nearby
 from gscompleter.stages.context import prepare_single
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.writing import REFINED_POSES_FILE
 from gscompleter.system.progress import show_preparation, stage
 from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.types import Camera, Gaussians, View
@@ -187,14 +183,7 @@ def prepare_completion(
     else:
         config = work.config
         opened = open_for_completion(work, source, targets, console)
-        task = read_inputs(work, source, targets, opened)
-        # The paper takes poses as they are.
-        follows_paper = config.registration_method == "paper"
-        if work.splat is None and source.scene.refines_poses and not follows_paper:
-            refined = refine_opened(opened, task, console)
-            if refined.refinement is not None:
-                opened = refined
-                task = read_inputs(work, source, targets, opened)
+        opened, task = read_at_refined_poses(work, source, targets, opened, console)
     loaded = load_models(work, config, targets, opened, task, console)
     return make_prepared(request, targets, loaded)
 
@@ -254,38 +243,27 @@ def open_for_completion(
     return opened
 
 
-def refine_opened(opened: Opened, task: CompletionTask, console: Console) -> Opened:
-    """Refine the poses of all photographs together if matches of the context contradict them."""
-    fit = measure_pose_fit(task.views)
-    if fit is None or not fit.is_contradicted or len(opened.photographs.posed) < MIN_REFINED:
-        return opened
-    if not has_pycolmap():
-        print_lines(
-            console,
-            f"Matches contradict the given poses by {fit.given:.2f} px (of {ERROR_SIDE}); "
-            "pip install 'gscompleter[poses]' refines them.",
-        )
-        return opened
-    photographs, refinement = refine_poses(opened.photographs)
-    if refinement is None:
-        return opened
-    print_lines(console, refinement.describe())
-    if not refinement.is_accepted:
-        return opened
-    return replace(opened, photographs=photographs, given=opened.photographs, refinement=refinement)
+def read_at_refined_poses(
+    work: WorkRequest,
+    photographs: PhotographsRequest,
+    targets: TargetRequest,
+    opened: Opened,
+    console: Console,
+    num_known: int | None = None,
+) -> tuple[Opened, CompletionTask]:
+    """Read the inputs, and once more if poses that matches contradict could be refined.
 
-
-def take_over_poses(opened: Opened, splat: Path, console: Console) -> Opened:
-    """Take the refined poses that a splat was made with, which lie beside its file."""
-    path = splat.parent / REFINED_POSES_FILE
-    if not path.is_file():
-        return opened
-    photographs = take_refined(opened.photographs, path)
-    if photographs is None:
-        print_lines(console, f"{quote_value(path)} is of other photographs, and is not used.")
-        return opened
-    print_lines(console, f"Refined poses of {quote_value(path)} are used.")
-    return replace(opened, photographs=photographs, given=opened.photographs)
+    `num_known` is that of `refine_opened`.
+    """
+    task = read_inputs(work, photographs, targets, opened)
+    # The paper takes poses as they are.
+    follows_paper = work.config.registration_method == "paper"
+    if follows_paper or not photographs.scene.refines_poses:
+        return opened, task
+    refined = refine_opened(opened, task, console, num_known)
+    if refined is opened:
+        return opened, task
+    return refined, read_inputs(work, photographs, targets, refined)
 
 
 def read_inputs(

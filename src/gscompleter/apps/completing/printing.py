@@ -60,7 +60,11 @@ def print_completion(results: ResultsRequest) -> None:
 
 def make_score_table(summary: CompletionSummary) -> Table:
     """Make the table of PSNR before and after at each camera."""
-    table = Table("camera", "hole", "PSNR before", "PSNR after", "added", box=None)
+    has_fitted = any(target.fitted is not None for target in summary.targets)
+    columns = ["camera", "hole", "PSNR before", "PSNR after"]
+    # After one pose and one gain of the target's camera were fitted to its photograph.
+    columns += ["camera fitted", "added"] if has_fitted else ["added"]
+    table = Table(*columns, box=None)
     kind = "context" if summary.scene.renders_from is None else "render"
     # Photographs of the context have neither a hole nor Gaussians of their own.
     for row in summary.context:
@@ -76,7 +80,10 @@ def make_score_table(summary: CompletionSummary) -> Table:
         before = format_number(target.psnr_before)
         after = format_number(target.psnr_after)
         hole = format_percent(target.hole_fraction)
-        table.add_row(f"target: {target.name}", hole, before, after, f"{target.added:,}")
+        cells = [f"target: {target.name}", hole, before, after]
+        if has_fitted:
+            cells.append(format_number(None if target.fitted is None else target.fitted.psnr))
+        table.add_row(*cells, f"{target.added:,}")
     return table
 
 

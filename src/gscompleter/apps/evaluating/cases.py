@@ -34,6 +34,7 @@ from gscompleter.evaluation.cases import (
     read_cases,
 )
 from gscompleter.evaluation.paper import get_data_set
+from gscompleter.evaluation.protocols import EvaluationIndex
 from gscompleter.system.errors import InputError, quote_value
 
 
@@ -61,6 +62,7 @@ def collect_tasks(
     # Cases of one scene stand together in a file, so that each scene is opened once for its notes.
     for scene, group in groupby(cases, lambda case: case.scene):
         own = [protocols.make_case_task(apply_request(case, request)) for case in group]
+        own = [replace(task, refines_poses=request.refines_poses) for task in own]
         clip = None
         # A scene that cannot be opened fails later, and its row in the table has the reason.
         with suppress(InputError):
@@ -161,6 +163,9 @@ def iterate_tasks(
                 keeps_order = loader is not None
                 tasks = protocols.make_tasks(kept, clip, size, keeps_order)
                 tasks = [replace(task, apart_by=place.apart_by) for task in tasks]
+                # An index fixes the frames of a benchmark, so that numbers of others compare.
+                is_free = request.refines_poses and not isinstance(rule, EvaluationIndex)
+                tasks = [replace(task, refines_poses=is_free) for task in tasks]
                 tasks = mark_masked(clip, tasks, notes)
                 yield from tasks[:1] if request.one_per_scene else tasks
 

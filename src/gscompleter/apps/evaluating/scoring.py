@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 from rich.console import Console
@@ -18,6 +18,7 @@ from gscompleter.apps.requests.evaluation import CasesRequest, EvaluationRequest
 from gscompleter.apps.requests.scene import DEFAULT_LONG_SIDE, parse_resolution
 from gscompleter.apps.warmup import compile_kernels
 from gscompleter.data.photographs import check_resolution
+from gscompleter.data.sfm.refining import has_pycolmap
 from gscompleter.evaluation.apart import record_uses
 from gscompleter.evaluation.cases import SkippedScene
 from gscompleter.evaluation.methods import expand_methods
@@ -80,6 +81,7 @@ def score_methods(request: EvaluationRequest) -> Scored:
     for note in dict.fromkeys(notes):
         console.print(note, soft_wrap=True)
     print_skipped(skipped, console)
+    tasks = leave_poses_without_colmap(tasks, console)
 
     models = request.models
     config = RunConfig(
@@ -112,6 +114,18 @@ def score_methods(request: EvaluationRequest) -> Scored:
     line = f"Scored {counts.done}, failed {counts.failed}, done earlier {counts.skipped}"
     console.print(f"{line}, of {len(tasks)} cases by {len(methods)} methods.", soft_wrap=True)
     return Scored(len(tasks) * len(methods), own, counts.failures)
+
+
+def leave_poses_without_colmap(tasks: list[Task], console: Console) -> list[Task]:
+    """Leave poses as they are given where COLMAP is missing, and say so."""
+    if has_pycolmap() or not any(task.refines_poses for task in tasks):
+        return tasks
+    console.print(
+        "Poses stay as they are given; pip install 'gscompleter[poses]' refines those that matches "
+        "contradict.",
+        soft_wrap=True,
+    )
+    return [replace(task, refines_poses=False) for task in tasks]
 
 
 def will_score(tasks: Sequence[Task], methods: Sequence[str], request: EvaluationRequest) -> bool:
@@ -150,6 +164,7 @@ def describe_source(cases: CasesRequest, tasks: Sequence[Task]) -> dict[str, Any
         **({"apart": num_apart} if num_apart else {}),
         **({"one_per_scene": True} if cases.one_per_scene else {}),
         **({"ego_mask": False} if not cases.ego_mask else {}),
+        **({"refines_poses": True} if any(task.refines_poses for task in tasks) else {}),
         **({} if loader is None else {"loader": asdict(loader)}),
         **({} if cases.near is None else {"near": cases.near}),
         **({} if cases.far is None else {"far": cases.far}),

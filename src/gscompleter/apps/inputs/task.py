@@ -90,7 +90,7 @@ class Opened:
     given: Photographs | None = None
     """The photographs with the poses that were given; None if these are used."""
     refinement: PoseRefinement | None = None
-    """Change of the given poses by this command; None if it changed none."""
+    """Change of the given poses, by this command or an earlier one; None if they are used."""
     renders_from: str | None = None
     """Source of the cameras of renders that take the place of photographs: `cameras` of a
     file, around the `targets` or the `place` of a removal, the `pixels` of the splat, or

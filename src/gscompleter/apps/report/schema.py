@@ -79,6 +79,22 @@ class UnfilledRow:
 
 
 @dataclass(frozen=True)
+class FittedRow:
+    """Scores in dB after one pose and one gain of the target camera were fitted to its photograph.
+
+    The formula is that of `evaluation.metrics.fitted_camera`.
+    """
+
+    psnr: float
+    observed_psnr: float
+    """Outside of holes."""
+    moved: float
+    """Length of the rotation and shift, in pixels of an image of at most 320."""
+    gain: float
+    """Mean over the channels."""
+
+
+@dataclass(frozen=True)
 class TargetRow(ScoreRow):
     """Result at a target."""
 
@@ -111,6 +127,9 @@ class TargetRow(ScoreRow):
     """The same at four cameras between the nearest photograph and the target, on average."""
     painter: str | None = None
     """Who painted the image from which Gaussians were added; None if a generator made it."""
+    fitted: FittedRow | None = None
+    """Scores without the errors of the target's own camera; None without a photograph, or if too
+    little of it lies outside of holes."""
 
     @property
     def name(self) -> str:
@@ -158,6 +177,9 @@ class PosesRow:
     given_error: float
     refined_error: float
     moved: float
+    splat_given: float | None = None
+    """Mean PSNR in dB of a given splat at the given poses; None without one."""
+    splat_refined: float | None = None
 
 
 @dataclass(frozen=True)

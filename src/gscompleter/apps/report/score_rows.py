@@ -12,11 +12,13 @@ from gscompleter.apps.report.schema import (
     SCORES,
     AlignmentRow,
     ContextRow,
+    FittedRow,
     TargetRow,
     UnfilledRow,
 )
 from gscompleter.editing.removal import hide_removed
 from gscompleter.evaluation.metrics.coverage import RenderPair
+from gscompleter.evaluation.metrics.fitted_camera import measure_fitted
 from gscompleter.evaluation.metrics.image import compute_masked_psnr, ssim
 from gscompleter.evaluation.metrics.thin_gaps import (
     AT_TARGET,
@@ -34,6 +36,7 @@ from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.reconstructors.features.consistency import measure_pose_errors
 from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
+from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.state import Completion
 from gscompleter.target_result import TargetResult
 from gscompleter.types import View, merge
@@ -173,8 +176,30 @@ def score_targets(
         t.view and hide_removed(t.view.to(device), completion.source, renderer) for t in targets
     ]
     scores = map_in_parallel(compute_scores, pairs, views)
-    rows = zip(targets, completion.targets, scores, gaps, strict=True)
+    fitted = fit_targets(completion, views, pairs, renderer)
+    rows = zip(targets, completion.targets, scores, gaps, fitted, strict=True)
     return [make_target_row(completion, *row) for row in rows]
+
+
+def fit_targets(
+    completion: Completion,
+    photographs: Sequence[View | None],
+    pairs: Sequence[RenderPair],
+    renderer: Renderer,
+) -> list[FittedRow | None]:
+    """Score the scene at targets after a pose and a gain of each were fitted to its photograph."""
+    if not any(photographs):
+        return [None] * len(pairs)
+    # As stages see it: of a large scene its proxy.
+    scene = merge(completion.parts)
+    rows: list[FittedRow | None] = []
+    for photograph, pair in zip(photographs, pairs, strict=True):
+        holes = compute_hole_mask(pair.before.alpha)
+        fitted = None
+        if photograph is not None:
+            fitted = measure_fitted(scene, photograph, holes, renderer)
+        rows.append(None if fitted is None else FittedRow(**asdict(fitted)))
+    return rows
 
 
 def measure_gaps(completion: Completion, renderer: Renderer) -> list[TargetGaps]:
@@ -199,6 +224,7 @@ def make_target_row(
     result: TargetResult,
     scores: ScoreValues,
     gaps: TargetGaps,
+    fitted: FittedRow | None,
 ) -> TargetRow:
     """Make the row of a target."""
     fit = result.affine
@@ -224,6 +250,7 @@ def make_target_row(
         thin_gaps=gaps.share,
         flight_thin_gaps=gaps.flight_share,
         painter=result.painter or None,
+        fitted=fitted,
     )
 
 

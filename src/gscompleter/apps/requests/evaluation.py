@@ -38,6 +38,8 @@ class CasesRequest:
     """True to take only the first case of each scene and protocol."""
     ego_mask: bool = True
     """True to ignore what stays the same while the camera moves."""
+    refines_poses: bool = False
+    """True to refine the poses of a scene that matches contradict."""
     limit: int | None = None
     """Most cases, over all shares; None for all."""
     apart: bool = False

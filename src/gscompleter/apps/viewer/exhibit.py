@@ -22,6 +22,7 @@ from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.photograph_names import name_photograph
 from gscompleter.data.photographs import Resolution
 from gscompleter.data.scene import load_cameras
+from gscompleter.data.sfm.refined_file import take_refined
 from gscompleter.splats.alignment.similarity import transform_camera
 from gscompleter.splats.formats import load_splat
 from gscompleter.system.errors import InputError, quote_value
@@ -29,6 +30,7 @@ from gscompleter.system.files.image import encode_jpeg, read_pixels, turn_uprigh
 from gscompleter.system.files.output_folder import FOUND_POSES_FOLDER
 from gscompleter.system.files.writing import (
     CONTEXT_FILE,
+    REFINED_POSES_FILE,
     RENDERS_FILE,
     TARGETS_FILE,
 )
@@ -150,7 +152,7 @@ def load_known_cameras(
     if summary.scene.format == "photographs":
         source = folder / FOUND_POSES_FOLDER
     try:
-        photographs = load_context_cameras(source, summary, content)
+        photographs = load_context_cameras(folder, source, summary, content)
     except InputError:
         # A path is as the command was given it, and leads elsewhere from another folder.
         cause = "is not in this folder, and was named from another"
@@ -197,11 +199,18 @@ def load_render_cameras(
 
 
 def load_context_cameras(
-    source: Path, summary: CompletionSummary, content: ViewerContent
+    folder: Path, source: Path, summary: CompletionSummary, content: ViewerContent
 ) -> tuple[ViewerCamera, ...]:
-    """Load the photographs of a completion's context; InputError if they were moved."""
+    """Load the photographs of a completion's context, with the poses that it used.
+
+    Raises InputError if they were moved.
+    """
     name = summary.settings.get("format")
     photographs = open_photographs(source, None if name is None else str(name))
+    refined = folder / REFINED_POSES_FILE
+    if summary.scene.refined_poses is not None and refined.is_file():
+        taken = take_refined(photographs, refined)
+        photographs = photographs if taken is None else taken[0]
     relative = content.transform @ compute_frame_from_photographs(-photographs.origin)
     return tuple(
         ViewerCamera(

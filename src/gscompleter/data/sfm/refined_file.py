@@ -2,7 +2,8 @@
 
 The file has the keys of nerfstudio's `transforms.json`: OpenGL axes, the frame of the given
 photographs. Intrinsics are those of photographs without distortion. The photographs that it is of
-are known by their names and by a hash of the poses that were given.
+are known by their names and by a hash of the poses that were given. It has no frames where these
+are kept.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 
 from gscompleter.data.cameras import find_pose_defect
 from gscompleter.data.photographs import Photographs
+from gscompleter.data.sfm.refining import PoseRefinement
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.result_format import RESULT_MARK
@@ -41,10 +43,21 @@ class RefinedFile:
     given: str
     """Hash of the given poses."""
     frames: list[RefinedFrame]
+    refinement: PoseRefinement | None = None
+    """What was done; None where nothing was."""
 
 
-def write_refined(path: Path, given: Photographs, refined: Photographs) -> None:
-    """Write the poses of photographs that differ from the given ones."""
+def write_refined(
+    path: Path,
+    given: Photographs,
+    refined: Photographs,
+    refinement: PoseRefinement | None,
+    keep_existing: bool = False,
+) -> None:
+    """Write the poses of photographs that differ from the given ones.
+
+    `keep_existing` is that of `replace_file`.
+    """
     frames: list[dict[str, Any]] = []
     # Photographs that were placed among the given ones come after these, in a file of their own.
     for number, (before, frame) in enumerate(zip(given.frames, refined.frames, strict=False)):
@@ -60,14 +73,20 @@ def write_refined(path: Path, given: Photographs, refined: Photographs) -> None:
         **RESULT_MARK,
         "camera_model": "PINHOLE",
         "given": hash_poses(given),
+        "refinement": None if refinement is None else asdict(refinement),
         "frames": frames,
     }
-    with replace_file(path) as file:
+    with replace_file(path, keep_existing) as file:
         file.write((json.dumps(content, indent=1) + "\n").encode())
 
 
-def take_refined(photographs: Photographs, path: Path) -> Photographs | None:
-    """Return photographs with the poses of a file; None if it is of others, or of other poses."""
+def take_refined(
+    photographs: Photographs, path: Path
+) -> tuple[Photographs, PoseRefinement | None] | None:
+    """Return photographs with the poses of a file, and what was done to these.
+
+    None if the file is of others, or of other poses.
+    """
     content = read_typed_json(RefinedFile, path, REFINED_POSES_ADVICE)
     if content.given != hash_poses(photographs):
         return None
@@ -84,7 +103,7 @@ def take_refined(photographs: Photographs, path: Path) -> Photographs | None:
         replace(frame, c2w=poses[frame.file_name]) if frame.file_name in poses else frame
         for frame in photographs.frames
     ]
-    return replace(photographs, frames=tuple(frames))
+    return replace(photographs, frames=tuple(frames)), content.refinement
 
 
 def hash_poses(photographs: Photographs) -> str:

@@ -51,20 +51,42 @@ class PoseRefinement:
     refined_error: float
     moved: float
     """Median move of a camera centre, in steps between neighbouring cameras."""
+    splat_given: float | None = None
+    """Mean PSNR in dB of a given splat against the photographs at their given poses; None without
+    a splat."""
+    splat_refined: float | None = None
+    """The same at the refined poses."""
+
+    @property
+    def is_contradicted_by_splat(self) -> bool:
+        """True if a given splat agrees less with the photographs at the refined poses."""
+        if self.splat_given is None or self.splat_refined is None:
+            return False
+        return self.splat_refined < self.splat_given
 
     @property
     def is_accepted(self) -> bool:
-        """True if matches that were kept back agree clearly better."""
-        return self.refined_error <= MAX_ERROR_SHARE * self.given_error
+        """True if matches that were kept back agree clearly better, and a given splat no worse."""
+        agrees = self.refined_error <= MAX_ERROR_SHARE * self.given_error
+        return agrees and not self.is_contradicted_by_splat
 
     def describe(self) -> str:
         """Describe the refinement in a sentence for the user."""
         pixels = f"{self.given_error:.2f} px, and refined ones by {self.refined_error:.2f} px"
+        agreement = ""
+        if self.splat_given is not None and self.splat_refined is not None:
+            agreement = (
+                f"the splat agrees with the photographs at {self.splat_given:.2f} dB as given, and "
+                f"at {self.splat_refined:.2f} dB as refined"
+            )
+        if self.is_contradicted_by_splat:
+            return f"Given poses are kept, though they miss matches by {pixels}: {agreement}."
         if not self.is_accepted:
             return f"Given poses are kept: they miss matches by {pixels}."
         return (
             f"The poses of {self.photographs} photographs are refined: given ones miss matches "
-            f"that were kept back by {pixels} (of {ERROR_SIDE}); --no-refine-poses leaves them."
+            f"that were kept back by {pixels} (of {ERROR_SIDE}); "
+            f"{agreement}{'; ' if agreement else ''}--no-refine-poses leaves them."
         )
 
 

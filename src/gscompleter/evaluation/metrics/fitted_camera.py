@@ -12,7 +12,7 @@ where rho is quadratic up to `ROBUST` and grows linearly beyond it. The score is
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import cv2
@@ -22,10 +22,14 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.evaluation.metrics.image import MAX_PSNR, compute_masked_psnr
+from gscompleter.evaluation.metrics.unused_photographs import shrink_view
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.render.protocols import Renderer
+from gscompleter.render.view_map import get_view_map
 from gscompleter.types import Camera, Gaussians, Render, View
 
+FIT_SIDE = 320
+"""Longer side of the image that the pose is fitted in, at most; scores are of the whole one."""
 MAX_MOVE = 4.0
 """Largest rotation and shift along each axis, in pixels: poses are not searched for, but mended."""
 DERIVATIVE_STEP = 0.25
@@ -42,13 +46,15 @@ SHARES = (1.0, 0.5, 0.25)
 ROBUST = 0.03
 """Error of a colour from which on it pulls no more than linearly."""
 HOLE_MARGIN = 2
-"""Pixels around holes that do not count, since holes move with the camera."""
+"""PixelValues around holes that do not count, since holes move with the camera."""
 MIN_POSE_PIXELS = 500
 """Fewest pixels that determine a pose."""
 
 PixelValues = Float[np.ndarray, "h w 3"]
 Move = Float[np.ndarray, "6"]
 """Rotation about x, y, z and shift along them, in camera axes and pixels."""
+Draw = Callable[[Sequence[Move]], list[PixelValues]]
+"""Renders the scene after each move."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +66,7 @@ class FittedQuality:
     observed_psnr: float
     """Outside of holes."""
     moved: float
-    """Length of the rotation and shift, in pixels."""
+    """Length of the rotation and shift, in pixels of an image of at most `FIT_SIDE`."""
     gain: float
     """Mean of the gains of the channels."""
 
@@ -76,19 +82,26 @@ def measure_fitted(
     observed = ~dilate(holes, HOLE_MARGIN) & target.valid_mask
     if observed.sum() < MIN_POSE_PIXELS:
         return None
-    truth = target.image.cpu().numpy()
-    counted = observed.cpu().numpy()
-    start = renderer.render(scene, target.camera)
-    unit = measure_depth(start, observed) / float(target.camera.K[0, 0])
+    # In a small image, for the time of some fifty renders; what counts there is what holes, masks
+    # and their margin leave of the photograph.
+    small = shrink_view(replace(target, ignore_mask=~observed), FIT_SIDE)
+    counted = small.valid_mask.cpu().numpy()
+    start = renderer.render(scene, small.camera)
+    unit = measure_depth(start, small.valid_mask) / float(small.camera.K[0, 0])
 
-    def draw(move: Move) -> PixelValues:
-        camera = move_camera_by(target.camera, move, unit)
+    def render(camera: Camera) -> PixelValues:
         image = renderer.render(scene, camera).image
         return np.asarray(image.clamp(0, 1).cpu().numpy(), np.float64)
 
-    move = fit_move(draw, truth, counted)
-    image = draw(move)
-    gains = fit_gains(image, truth, counted)
+    map_views = get_view_map(scene.means, len(scene))
+
+    def draw(moves: Sequence[Move]) -> list[PixelValues]:
+        return list(map_views(render, [move_camera_by(small.camera, m, unit) for m in moves]))
+
+    move = fit_move(draw, small.image.cpu().numpy(), counted)
+    pose = move_camera_by(small.camera, move, unit).c2w
+    image = render(replace(target.camera, c2w=pose))
+    gains = fit_gains(image, target.image.cpu().numpy(), observed.cpu().numpy())
     fitted = torch.from_numpy(np.clip(image * gains, 0, 1)).to(target.image)
     whole = compute_masked_psnr(fitted, target.image, target.valid_mask)
     outside = compute_masked_psnr(fitted, target.image, ~holes & target.valid_mask)
@@ -116,20 +129,18 @@ def move_camera_by(camera: Camera, move: Move, unit: float) -> Camera:
     return replace(camera, c2w=torch.from_numpy(pose).to(camera.c2w))
 
 
-def fit_move(
-    draw: Callable[[Move], PixelValues], truth: PixelValues, counted: Bool[np.ndarray, "h w"]
-) -> Move:
+def fit_move(draw: Draw, truth: PixelValues, counted: Bool[np.ndarray, "h w"]) -> Move:
     """Fit the move, from wide to narrow blur; zero if the picture is no nearer to the truth."""
     still = np.zeros(6)
     move = still
     for sigma in BLURS:
         move = fit_blurred(draw, move, truth, counted, sigma)
-    before, after = (measure_loss(draw(one), truth, counted) for one in (still, move))
+    before, after = (measure_loss(image, truth, counted) for image in draw([still, move]))
     return move if after < before else still
 
 
 def fit_blurred(
-    draw: Callable[[Move], PixelValues],
+    draw: Draw,
     start: Move,
     truth: PixelValues,
     counted: Bool[np.ndarray, "h w"],
@@ -144,12 +155,12 @@ def fit_blurred(
         return (blur(image, sigma) * gains - wanted)[counted].ravel()
 
     move = start
-    image = draw(move)
+    (image,) = draw([move])
     for _ in range(MAX_NEWTON_STEPS):
         gains = fit_gains(image, truth, counted)
         residuals = compute_residuals(image, gains)
-        steps = DERIVATIVE_STEP * np.eye(6)
-        drawn = [compute_residuals(draw(move + step), gains) for step in steps]
+        steps = move + DERIVATIVE_STEP * np.eye(6)
+        drawn = [compute_residuals(moved, gains) for moved in draw(list(steps))]
         slopes = np.stack([(one - residuals) / DERIVATIVE_STEP for one in drawn], axis=1)
         weighted = slopes / np.maximum(np.abs(residuals), ROBUST)[:, None]
         # A little damping, where two of the numbers act alike, as a turn and a shift do.
@@ -160,7 +171,7 @@ def fit_blurred(
         loss = np.square(residuals).mean()
         for share in SHARES:
             following = np.clip(move + share * change, -MAX_MOVE, MAX_MOVE)
-            image = draw(following)
+            (image,) = draw([following])
             gains = fit_gains(image, truth, counted)
             if np.square(compute_residuals(image, gains)).mean() < loss:
                 break

@@ -1,0 +1,102 @@
+"""Refinement of given poses that matches contradict, for the commands.
+
+Beside a splat its frame stays, and the photographs come to it: refined poses are taken only if the
+splat, seen from them, agrees with the photographs at least as well as seen from the given ones.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from rich.console import Console
+
+from gscompleter.apps.inputs.describing import print_lines
+from gscompleter.apps.inputs.task import CompletionTask, Opened
+from gscompleter.data.local_origin import compute_frame_from_photographs
+from gscompleter.data.photographs import Photographs
+from gscompleter.data.sfm.refined_file import take_refined
+from gscompleter.data.sfm.refining import (
+    MIN_REFINED,
+    PoseRefinement,
+    has_pycolmap,
+    refine_poses,
+)
+from gscompleter.numerics.two_views import ERROR_SIDE
+from gscompleter.reconstructors.features.epipolar import measure_pose_fit
+from gscompleter.render.loading import load_renderer
+from gscompleter.splats.alignment.estimate import sample_views
+from gscompleter.splats.alignment.similarity import transform_view
+from gscompleter.splats.alignment.witness import compare_poses
+from gscompleter.system.errors import quote_value
+from gscompleter.system.files.writing import REFINED_POSES_FILE
+from gscompleter.system.progress import show_preparation
+
+
+def take_over_poses(opened: Opened, splat: Path, console: Console) -> Opened:
+    """Take the refined poses that a splat was made with, which lie beside its file."""
+    path = splat.parent / REFINED_POSES_FILE
+    if not path.is_file():
+        return opened
+    taken = take_refined(opened.photographs, path)
+    if taken is None:
+        print_lines(console, f"{quote_value(path)} is of other photographs, and is not used.")
+        return opened
+    photographs, refinement = taken
+    print_lines(console, f"Refined poses of {quote_value(path)} are used.")
+    return replace(opened, photographs=photographs, given=opened.photographs, refinement=refinement)
+
+
+def refine_opened(
+    opened: Opened, task: CompletionTask, console: Console, num_known: int | None = None
+) -> Opened:
+    """Refine the poses of all photographs together if matches of the context contradict them.
+
+    `task` was read at the given poses. Those that an earlier command refined stay, and so does
+    `opened` where nothing is taken. `num_known` is the number of photographs of the scene, if new
+    ones were placed after them.
+    """
+    if opened.given is not None or len(opened.photographs.posed) < MIN_REFINED:
+        return opened
+    with show_preparation("checking poses"):
+        fit = measure_pose_fit(task.views)
+    if fit is None or not fit.is_contradicted:
+        return opened
+    if not has_pycolmap():
+        print_lines(
+            console,
+            f"Matches contradict the given poses by {fit.given:.2f} px (of {ERROR_SIDE}); "
+            "pip install 'gscompleter[poses]' refines them.",
+        )
+        return opened
+    photographs, refinement = refine_poses(opened.photographs)
+    if refinement is None:
+        return opened
+    if task.scene is not None and refinement.is_accepted:
+        with show_preparation("comparing poses with the splat"):
+            refinement = ask_splat(opened.photographs, photographs, task, refinement)
+    print_lines(console, refinement.describe())
+    if not refinement.is_accepted:
+        return opened
+    given = replace(opened.photographs, frames=opened.photographs.frames[:num_known])
+    return replace(opened, photographs=photographs, given=given, refinement=refinement)
+
+
+def ask_splat(
+    given: Photographs, refined: Photographs, task: CompletionTask, refinement: PoseRefinement
+) -> PoseRefinement:
+    """Add how well the splat of a task agrees with photographs at given and at refined poses."""
+    assert task.scene is not None
+    # Photographs are read relative to their origin, and the frame of a task begins at their own.
+    transform = task.frame @ compute_frame_from_photographs(-given.origin)
+    before, after = (
+        [
+            transform_view(view.to(task.device), transform)
+            for view in sample_views(photographs, task.context_frames)
+        ]
+        for photographs in (given, refined)
+    )
+    agreement = compare_poses(task.scene, before, after, load_renderer(task.device.type))
+    if agreement is None:
+        return refinement
+    return replace(refinement, splat_given=agreement[0], splat_refined=agreement[1])
