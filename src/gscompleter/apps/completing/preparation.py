@@ -160,10 +160,11 @@ class Loaded:
 
 @dataclass(frozen=True)
 class Marks:
-    """Masks that mark what is wrong at the targets."""
+    """What is marked as wrong: by masks at the targets, or by a selection of Gaussians."""
 
     masks: tuple[Path, ...] = ()
     reading: MaskReading = MaskReading()
+    selection: Selection | None = None
 
 
 def prepare_completion(
@@ -491,6 +492,7 @@ def read_splat_alone(
         source.holes,
         source.up,
         place,
+        marks.selection,
     )
     with show_preparation("choosing cameras"):
         renderer = load_renderer(device)

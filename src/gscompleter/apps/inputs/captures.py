@@ -71,6 +71,8 @@ class RenderRequest:
     it."""
     place: Selection | None = None
     """Gaussians to be removed, around which cameras are found; None to complete the splat."""
+    marked: Selection | None = None
+    """Gaussians that are wrong, in place of masks; their hole is what the targets see of them."""
 
     def find_up(self, scene: Gaussians, renderer: Renderer) -> Upward:
         """Find the upward direction, for which the cameras beside the splat are read as well."""

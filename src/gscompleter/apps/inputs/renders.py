@@ -28,11 +28,13 @@ from gscompleter.apps.inputs.hole_kinds import (
     SplatKind,
     choose_kind,
     find_target_holes,
+    mark_selected,
     pair_masks,
     read_marks,
 )
 from gscompleter.apps.inputs.named_photographs import find_context, read_targets
 from gscompleter.apps.inputs.reading import check_sizes
+from gscompleter.apps.inputs.removal import select_gaussians
 from gscompleter.apps.inputs.selection import choose_context
 from gscompleter.apps.inputs.splat import place_scene
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened, Target
@@ -121,7 +123,7 @@ def open_renders(
     chosen = chosen or tuple(range(len(capture.cameras)))
     notes = [describe_capture(capture, len(chosen))]
     notes += [] if capture.upward is None else capture.upward.describe()
-    if kind == "enclosed" and not request.masks:
+    if kind == "enclosed" and not request.masks and request.marked is None:
         notes.append(OBJECT_NOTE)
 
     cameras = {number: capture.cameras[number].to(device) for number in chosen}
@@ -189,6 +191,9 @@ def choose_capture(
         pairs = pair_masks(request.masks, target_cameras)
         marks = [read_marks(path, camera, request.mask_reading) for path, camera in pairs]
         return capture, kind, marks
+    if request.marked is not None:
+        chosen = select_gaussians(request.marked, scene, known.origin)
+        return capture, kind, mark_selected(scene, chosen, target_cameras, renderer)
     if request.place is not None:
         return capture, kind, []
     config = replace(request.holes, kind=kind)
