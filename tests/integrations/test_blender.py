@@ -25,7 +25,7 @@ from scenes import Room, camera_at, gaussians_of, view_of
 ADD_ON = ROOT / "integrations" / "blender" / "gscompleter_blender.py"
 SIZE = 64
 CAMERA = replace(camera_at(0.02, size=SIZE), near=None, far=None)
-TURNED = replace(camera_at(0.1, 0.2, 10, size=SIZE), near=None, far=None)
+TURNED = replace(camera_at(0.1, z=0.1, yaw=10, size=SIZE), near=None, far=None)
 
 
 def load_add_on(bpy, name):
@@ -181,7 +181,8 @@ def test_blender_shows_the_points_where_its_cameras_see_them(blender, result):
 
     # What is drawn is a cloud of points with their colours.
     depsgraph = bpy.context.evaluated_depsgraph_get()
-    drawn = points.evaluated_get(depsgraph).evaluated_geometry().pointcloud
+    geometry = points.evaluated_get(depsgraph).evaluated_geometry()
+    drawn = geometry.pointcloud
     assert len(drawn.points) == len(given)
     assert drawn.attributes["color"].domain == "POINT"
 

@@ -166,6 +166,12 @@ def alone(tmp_path_factory) -> Path:
     return folder
 
 
+def find_alone(splat, target):
+    """Find the hole of a splat without photographs."""
+    inputs = {"splat": str(splat), "target": str(target), "height": SIZE, "width": SIZE}
+    return call("GSCompleterFindHoles", scene="", context="", **inputs)
+
+
 def test_a_splat_alone_is_shown_and_its_holes_are_found(alone):
     inputs = {"splat": str(alone / "splat.ply"), "height": SIZE, "width": SIZE}
     (image,) = call("GSCompleterShowSplat", target=str(alone / "camera.json"), **inputs)
@@ -175,7 +181,7 @@ def test_a_splat_alone_is_shown_and_its_holes_are_found(alone):
     assert (image[0] - truth).abs().mean() < 0.5 * (image[0] - other).abs().mean()
     with pytest.raises(gsc.InputError, match="has 1 cameras"):
         call("GSCompleterShowSplat", target=str(alone / "camera.json"), **inputs, camera=1)
-    away = find(alone, scene="", context="", target=str(alone / "away.json"), camera=0, **inputs)
+    away = find_alone(alone / "splat.ply", alone / "away.json")
     assert 0.02 < away[1].mean() < 0.5
     assert away[2].ready.opened.renders_from == "targets"
 
@@ -200,9 +206,7 @@ def test_a_painted_mask_is_repaired_and_the_record_goes_on(alone, tmp_path, monk
     assert gsc.load_splat(first).generated.any()
 
     # A painting on top of it is a second edit, and both come off one by one.
-    image, asked, holes, *_ = find(
-        alone, scene="", context="", splat=first, target=str(alone / "away.json"), camera=0
-    )
+    image, asked, holes, *_ = find_alone(first, alone / "away.json")
     painted = {"holes": holes, "image": paint(image, asked), "out": str(tmp_path)}
     (second,) = call("GSCompleterRegisterPainting", **painted)
     assert [edit.command for edit in read_edits(Path(second)).edits] == ["repair", "complete"]
