@@ -244,7 +244,9 @@ def decode_srgb(color: np.ndarray) -> np.ndarray:
 def draw_as_points(thing: bpy.types.Object, position: np.ndarray) -> None:
     """Draw the vertices of an object as points, by a modifier and a material of their colours."""
     material = bpy.data.materials.new("gscompleter color")
-    material.use_nodes = True
+    # Since Blender 5.0 materials have nodes from the beginning.
+    if material.node_tree is None:
+        material.use_nodes = True
     nodes, links = material.node_tree.nodes, material.node_tree.links
     nodes.clear()
     color = nodes.new("ShaderNodeAttribute")
