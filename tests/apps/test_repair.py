@@ -10,6 +10,7 @@ import torch
 from command import run
 from gscompleter import load_ply, load_renderer, save_ply
 from gscompleter.data.scene import write_cameras
+from gscompleter.numerics.geometry import look_up
 from gscompleter.system.files.image import write_image
 from gscompleter.types import Camera
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
@@ -115,6 +116,83 @@ def test_a_mask_of_a_photograph_is_repaired_at_its_number(folder, tmp_path, monk
     assert target["frame"] == 1
     assert target["hole_fraction"] > 0.03
     assert target["added"] > 20
+
+
+@pytest.fixture(scope="module")
+def selected(folder) -> Path:
+    """Return the Gaussians that the first mask shows, as another program saves a selection."""
+    given = load_ply(folder / "splat.ply")
+    mark = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    mark[SPOT] = True
+    save_ply(folder / "selected.ply", given[look_up(mark, given, camera_at(size=SIZE))])
+    return folder / "selected.ply"
+
+
+def test_a_selection_is_repaired_as_what_a_mask_marks(folder, selected, tmp_path, monkeypatch):
+    splat, out = folder / "splat.ply", tmp_path / "out"
+    words = ("--target", folder / "one.json", "--select", selected, "--quiet")
+    assert run(monkeypatch, "repair", splat, *words, "--out", out) == 0
+    summary = read_summary(out)
+    assert summary["settings"]["select"] == str(selected)
+    (target,) = summary["targets"]
+    assert target["added"] > 0.5 * len(load_ply(selected))
+
+    # The selection goes, and with it hardly more than what comes to light behind its border. Its
+    # place is filled with what continues the wall.
+    completed = load_ply(out / "completed.ply")
+    given = load_ply(splat)
+    kept = {row.numpy().tobytes() for row in completed[completed.generated == 0].means}
+    chosen = {row.numpy().tobytes() for row in load_ply(selected).means}
+    assert not kept & chosen
+    rows = {row.numpy().tobytes() for row in given.means}
+    assert kept <= rows
+    assert len(rows - chosen - kept) < 0.2 * len(chosen)
+    camera = camera_at(0.02, size=SIZE)
+    before = RENDERER.render(given, camera).image
+    cut = RENDERER.render(completed[completed.generated == 0], camera).image
+    after = RENDERER.render(completed, camera).image
+    lost = (cut - before)[SPOT].square().mean()
+    assert (after - before)[SPOT].square().mean() < 0.25 * lost
+    back = tmp_path / "back.ply"
+    assert run(monkeypatch, "strip", out / "completed.ply", "--out", back, "--quiet") == 0
+    assert back.read_bytes() == splat.read_bytes()
+
+
+def test_a_selection_is_repaired_with_photographs(folder, selected, tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    words = ("repair", folder / "photographs", "--scene", folder / "splat.ply", "--quiet")
+    marks = ("--target", folder / "one.json", "--select", selected)
+    assert run(monkeypatch, *words, *marks, "--out", out) == 0
+    summary = read_summary(out)
+    assert summary["scene"]["renders_from"] is None
+    assert summary["targets"][0]["hole_fraction"] > 0.03
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (("--select", "selected.ply"), "name the camera, or let `gscompleter remove --select`"),
+        (("--target", "one.json", "--select", "one.json"), "one.json"),
+        (
+            ("--target", "one.json", "--select", "selected.ply", "--mask", "first.png"),
+            "Masks and a selection both say what goes",
+        ),
+        (("--strokes", "strokes.json", "--select", "selected.ply"), "leave --target, --mask and"),
+        (("--target", "one.json"), "the selected Gaussians with --select"),
+        (
+            ("--target", "one.json", "--select", "selected.ply", "--invert-masks"),
+            "no photographs whose masks could be read",
+        ),
+    ],
+)
+def test_wrong_selections_are_refused_with_a_sentence(
+    folder, selected, tmp_path, monkeypatch, capsys, words, sentence
+):
+    paths = [folder / word if "." in word else word for word in words]
+    out = tmp_path / "out"
+    assert run(monkeypatch, "repair", folder / "splat.ply", *paths, "--out", out, "--quiet") == 2
+    assert sentence in " ".join(capsys.readouterr().err.split())
+    assert not out.exists()
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,8 @@ import gscompleter as gsc
 from command import run
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.scene import write_cameras
+from gscompleter.splats.edits import read_edits
+from gscompleter.splats.formats import read_provenance
 from paths import ROOT
 from scenes import Room, camera_at, gaussians_of, labelled, photographed, view_of
 
@@ -156,11 +158,80 @@ def test_a_splat_keeps_its_bytes(scene, tmp_path, monkeypatch):
     assert (tmp_path / "back.ply").read_bytes() == splat.read_bytes()
 
 
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory) -> Path:
+    """Return a splat of one photograph, with a camera beside that of the photograph."""
+    folder = tmp_path_factory.mktemp("alone")
+    gsc.save_ply(folder / "splat.ply", gaussians_of(view_of(Room(), camera_at(size=SIZE))))
+    write_cameras(folder / "camera.json", [camera_at(0.02, size=SIZE)])
+    write_cameras(folder / "away.json", [camera_at(0.4, size=SIZE)])
+    return folder
+
+
+def find_alone(splat, target):
+    """Find the hole of a splat without photographs."""
+    inputs = {"splat": str(splat), "target": str(target), "height": SIZE, "width": SIZE}
+    return call("GSCompleterFindHoles", scene="", context="", **inputs)
+
+
+def test_a_splat_alone_is_shown_and_its_holes_are_found(alone):
+    inputs = {"splat": str(alone / "splat.ply"), "height": SIZE, "width": SIZE}
+    (image,) = call("GSCompleterShowSplat", target=str(alone / "camera.json"), **inputs)
+    truth = view_of(Room(), camera_at(0.02, size=SIZE)).image
+    other = view_of(Room(), camera_at(0.3, size=SIZE)).image
+    assert image.shape == (1, SIZE, SIZE, 3)
+    assert (image[0] - truth).abs().mean() < 0.5 * (image[0] - other).abs().mean()
+    with pytest.raises(gsc.InputError, match="has 1 cameras"):
+        call("GSCompleterShowSplat", target=str(alone / "camera.json"), **inputs, camera=1)
+    away = find_alone(alone / "splat.ply", alone / "away.json")
+    assert 0.02 < away[1].mean() < 0.5
+    assert away[2].ready.opened.renders_from == "targets"
+
+
+def test_targets_are_searched_for_and_photographs_chosen(scene):
+    _, mask, holes, *_ = find(scene, context="", target="", camera=0)
+    assert len(holes.ready.task.targets) == 1
+    assert len(holes.state.views) >= 2
+    assert mask.sum() > 0
+
+
+def test_a_painted_mask_is_repaired_and_the_record_goes_on(alone, tmp_path, monkeypatch):
+    mask = torch.zeros(1, SIZE, SIZE)
+    mask[:, 26:38, 30:44] = 1.0
+    inputs = {"target": str(alone / "camera.json"), "out": str(tmp_path), "mask": mask}
+    first, after = call("GSCompleterRepair", splat=str(alone / "splat.ply"), **inputs)
+    assert after.shape == (1, SIZE, SIZE, 3)
+    given = {"splat": str(alone / "splat.ply"), "target": str(alone / "camera.json")}
+    (before,) = call("GSCompleterShowSplat", **given, height=SIZE, width=SIZE)
+    assert (after - before).abs()[mask == 0].mean() < 0.02
+    assert (after - before).abs()[mask == 1].max() > 0.1
+    assert gsc.load_splat(first).generated.any()
+
+    # A painting on top of it is a second edit, and both come off one by one.
+    image, asked, holes, *_ = find_alone(first, alone / "away.json")
+    painted = {"holes": holes, "image": paint(image, asked), "out": str(tmp_path)}
+    (second,) = call("GSCompleterRegisterPainting", **painted)
+    assert [edit.command for edit in read_edits(Path(second)).edits] == ["repair", "complete"]
+    assert len(read_provenance(Path(second)).runs) == 2
+    for word, given in (("--last", Path(first)), (None, alone / "splat.ply")):
+        back = tmp_path / "back.ply"
+        words = ["strip", second, "--out", back, "--overwrite", *filter(None, [word])]
+        assert run(monkeypatch, *words) == 0
+        assert back.read_bytes() == given.read_bytes()
+
+
+def test_a_mask_of_nothing_gets_a_sentence(alone, tmp_path):
+    inputs = {"target": str(alone / "camera.json"), "out": str(tmp_path)}
+    mask = torch.zeros(1, SIZE, SIZE)
+    with pytest.raises(gsc.InputError, match=r"mask\.png is black everywhere"):
+        call("GSCompleterRepair", splat=str(alone / "splat.ply"), mask=mask, **inputs)
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize(
     ("more", "sentence"),
     [
         ({"context": "left right"}, "no photograph 'left'"),
-        ({"context": " , "}, "No photographs are named"),
         ({"context": "0 9"}, "9"),
         ({"camera": 2}, "has 2 cameras"),
         ({"target": "nowhere.json"}, "nowhere.json"),

@@ -63,7 +63,8 @@ TASKS = sorted((DOCS / "guide").glob("*.md"))
 MOST_WORDS = 700
 MOST_BYTES = 150_000
 """Size of a picture that make_guide_pictures.py makes; the demo and its viewer have more."""
-WITHOUT_PICTURE = {"convert", "evaluate"}
+WITHOUT_PICTURE = {"convert", "evaluate", "supersplat", "lichtfeld", "blender", "comfyui"}
+"""Of the last four a picture would be of another program's window."""
 DECISIONS = sorted((DOCS / "decisions").glob("[0-9]*.md"))
 LINKED = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", ROOT / "llms.txt"]
 LINKED += [ROOT / "benchmarks" / "history.md", *sorted(DOCS.rglob("*.md"))]

@@ -17,6 +17,7 @@ from gscompleter.apps.commands.shared_decisions import (
 )
 from gscompleter.apps.commands.shared_options import CompletingOptions
 from gscompleter.apps.requests.completion import RepairRequest, TargetRequest
+from gscompleter.apps.requests.splat import Selection
 from gscompleter.config import CompleterConfig
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.system.errors import InputError
@@ -25,7 +26,7 @@ from gscompleter.system.process import import_without_collection
 
 @dataclass(frozen=True, kw_only=True)
 class RepairOptions(CompletingOptions):
-    """Take what masks mark out of a splat, and fill its place.
+    """Take what masks or a selection mark out of a splat, and fill its place.
 
     What is marked goes, up to the surface that is seen there, and is a hole whatever stands behind
     it. Photographs of the splat help. `gscompleter live` marks and repairs in the browser.
@@ -40,11 +41,14 @@ class RepairOptions(CompletingOptions):
     target: tuple[str, ...] = ()
     """Target cameras: file names or numbers of photographs, or a file of cameras (transforms.json,
     cameras.json, nerfstudio's camera_path.json, COLMAP's images.txt, SuperSplat poses).
-    One for each mask."""
+    One for each mask; with `--select`, those that the place is filled at."""
     mask: tuple[Path, ...] = ()
     """Masks of what goes, white there. An image for each target camera, in their order: what it
     marks is wrong, goes, is a hole whatever stands behind it, and is filled; `strip` puts it
     back."""
+    select: Path | None = None
+    """Remove the Gaussians of this file, a selection that another program saved. It stands in place
+    of masks; their place is a hole where the target cameras see it, whatever stands behind."""
     strokes: Path | None = None
     """The strokes.json that `live` saved. It stands in place of cameras and masks: its steps are
     done again, at its resolution and with its photographs unless others are named."""
@@ -55,9 +59,11 @@ class RepairOptions(CompletingOptions):
 
 def decide_repair(options: RepairOptions) -> RepairRequest:
     """Decide what is repaired at the cameras of masks."""
+    has_masks = options.select is None
     if options.scene is None and not has_splat_alone(options):
         raise InputError(
-            "Without a splat there is nothing that masks could mark; name it with --scene.", "mask"
+            "Without a splat there is nothing that could be marked; name it with --scene.",
+            "mask" if has_masks else "select",
         )
     check_context(options.context)
     check_generator(options.synthesis)
@@ -67,9 +73,12 @@ def decide_repair(options: RepairOptions) -> RepairRequest:
         decide_results(options),
         context=options.context,
         synthesis=options.synthesis,
-        has_marks=True,
+        has_marks=has_masks,
         adapt=CompleterConfig.for_marks,
     )
+    if options.select is not None:
+        selection = Selection(file=options.select, drop_nonfinite=options.drop_nonfinite)
+        return RepairRequest(completion, selection=selection)
     reading = MaskReading(options.invert_masks, options.large_masks)
     return RepairRequest(completion, options.mask, reading)
 
@@ -91,17 +100,34 @@ def run_repair(options: RepairOptions) -> int:
 def check_marks_named(options: RepairOptions) -> None:
     """Refuse options that do not say what is wrong, or say it twice."""
     if options.strokes is not None:
-        if options.target or options.mask:
+        if options.target or options.mask or options.select:
             raise InputError(
-                "Strokes have cameras and masks of their own; leave --target and --mask out.",
+                "Strokes have cameras and marks of their own; leave --target, --mask and --select "
+                "out.",
                 "strokes",
             )
-    elif not options.target and not options.mask:
+    elif options.mask and options.select:
         raise InputError(
-            "Nothing is named that is wrong; give --target and --mask, or the --strokes of a "
-            "session of `live`."
+            "Masks and a selection both say what goes; give one of them, or one after the other in "
+            "two commands.",
+            "select",
+        )
+    elif not options.target and not options.mask and not options.select:
+        raise InputError(
+            "Nothing is named that is wrong; give --target with --mask or --select, or the "
+            "--strokes of a session of `live`."
+        )
+    elif not options.target and options.select:
+        raise InputError(
+            "The place of a selection is filled as a camera sees it; name the camera, or let "
+            "`gscompleter remove --select` find cameras.",
+            "target",
         )
     elif not options.target:
         raise InputError("A mask is painted at a camera; name it.", "target")
-    elif not options.mask:
-        raise InputError("A camera alone marks nothing; name the mask painted there.", "mask")
+    elif not options.mask and not options.select:
+        raise InputError(
+            "A camera alone marks nothing; name the mask painted there, or the selected Gaussians "
+            "with --select.",
+            "mask",
+        )

@@ -8,8 +8,11 @@ from functools import partial
 from rich.console import Console
 
 from gscompleter.apps.completing.preparation import Gone, Marks, Prepared, prepare_completion
+from gscompleter.apps.completing.remove import choose_selected
 from gscompleter.apps.inputs.hole_kinds import pair_masks, read_marks
+from gscompleter.apps.inputs.removal import check_selection
 from gscompleter.apps.requests.completion import RepairRequest
+from gscompleter.apps.requests.splat import Selection
 from gscompleter.data.mask_checks import check_selected_share, check_selecting_masks
 from gscompleter.editing.marking import find_marked
 from gscompleter.planning.remove import contain_nothing
@@ -17,7 +20,9 @@ from gscompleter.system.errors import InputError
 
 
 def prepare_repair(request: RepairRequest, console: Console) -> Prepared:
-    """Open the scene, and load the models; what the masks show goes first."""
+    """Open the scene, and load the models; what is marked goes first."""
+    if request.selection is not None:
+        return prepare_selected(request, request.selection, console)
     check_selecting_masks(request.masks, request.reading, "the images of their cameras")
     marks = Marks(request.masks, request.reading)
     ready = prepare_completion(request.completion, console, marks)
@@ -29,6 +34,18 @@ def prepare_repair(request: RepairRequest, console: Console) -> Prepared:
         inverts_masks=request.reading.is_inverted,
         choose_gone=partial(choose_marked, request),
         settings={"mask": [str(path) for path in request.masks]},
+    )
+
+
+def prepare_selected(request: RepairRequest, selection: Selection, console: Console) -> Prepared:
+    """Open the scene, and load the models; the selected Gaussians go first."""
+    check_selection(selection)
+    ready = prepare_completion(request.completion, console, Marks(selection=selection))
+    return replace(
+        ready,
+        command=request.command,
+        choose_gone=partial(choose_selected, selection),
+        settings={"select": str(selection.file)},
     )
 
 

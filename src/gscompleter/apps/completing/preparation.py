@@ -156,10 +156,11 @@ class Loaded:
 
 @dataclass(frozen=True)
 class Marks:
-    """Masks that mark what is wrong at the targets."""
+    """What is marked as wrong: by masks at the targets, or by a selection of Gaussians."""
 
     masks: tuple[Path, ...] = ()
     reading: MaskReading = MaskReading()
+    selection: Selection | None = None
 
 
 def prepare_completion(
@@ -467,6 +468,7 @@ def read_splat_alone(
         place=place,
         masks=marks.masks,
         mask_reading=marks.reading,
+        marked=marks.selection,
         kind=source.holes,
         limits=work.config.holes,
     )

@@ -71,6 +71,8 @@ class RenderRequest:
     """Masks that mark what is wrong at each target, white there."""
     mask_reading: MaskReading = MaskReading()
     """How these are read."""
+    marked: Selection | None = None
+    """Gaussians that are wrong, in place of masks; their hole is what the targets see of them."""
     kind: Literal["auto", "all", "enclosed"] = "auto"
     """Kind of holes; `auto` takes those that an object encloses, and all in a scene."""
     limits: HoleConfig = HoleConfig()

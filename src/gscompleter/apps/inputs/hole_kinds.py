@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -19,6 +19,7 @@ from gscompleter.data.mask_checks import read_selected
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.numerics.geometry import add_near_plane
 from gscompleter.render.protocols import Renderer
+from gscompleter.render.removed import mark_shown
 from gscompleter.stages.enclosed_holes import keep_enclosed
 from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.stages.refusals import explain_little_covered
@@ -94,6 +95,25 @@ def find_target_holes(
     if reasons and None not in reasons:
         raise InputError(str(reasons[0]), "target")
     return holes
+
+
+def mark_selected(
+    scene: Gaussians,
+    chosen: Bool[Tensor, "n"],
+    targets: Sequence[Camera],
+    renderer: Renderer,
+) -> list[Bool[Tensor, "h w"]]:
+    """Mark the pixels of the targets that show chosen Gaussians.
+
+    Raises an InputError if no target shows any.
+    """
+    others = replace(scene, opacities=scene.opacities.masked_fill(chosen, 0.0), encoded=None)
+    marks = [mark_shown(scene[chosen], others, camera, renderer) for camera in targets]
+    if not any(mark.any() for mark in marks):
+        raise InputError(
+            "No target camera sees the selected Gaussians; name a camera that does.", "target"
+        )
+    return marks
 
 
 def pair_masks(masks: Sequence[Path], targets: Sequence[Camera]) -> list[tuple[Path, Camera]]:

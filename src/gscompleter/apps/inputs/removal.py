@@ -141,7 +141,8 @@ def refuse_nothing(
         low, high = format_corners(smallest.tolist(), largest.tolist())
         raise InputError(
             f"No Gaussian of the splat, which reaches from {low} to {high} in its own frame, is "
-            "selected; name another place, or selected Gaussians that were not moved."
+            "selected; name another place, or selected Gaussians that were neither moved nor "
+            "rounded (an uncompressed .ply)."
         )
     return chosen
 

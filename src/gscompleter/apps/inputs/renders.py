@@ -28,11 +28,13 @@ from gscompleter.apps.inputs.hole_kinds import (
     SplatAloneKind,
     choose_kind,
     find_target_holes,
+    mark_selected,
     pair_masks,
     read_marks,
 )
 from gscompleter.apps.inputs.named_photographs import find_context, read_targets
 from gscompleter.apps.inputs.reading import check_sizes
+from gscompleter.apps.inputs.removal import select_gaussians
 from gscompleter.apps.inputs.selection import choose_context
 from gscompleter.apps.inputs.splat import place_scene
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened
@@ -133,7 +135,7 @@ def open_renders(
     chosen = chosen or tuple(range(len(capture.cameras)))
     notes = [describe_capture(capture, len(chosen))]
     notes += [] if capture.upward is None else capture.upward.describe()
-    if decided.holes == "enclosed" and not request.masks:
+    if decided.holes == "enclosed" and not request.masks and request.marked is None:
         notes.append(OBJECT_NOTE)
 
     cameras = {number: capture.cameras[number].to(device) for number in chosen}
@@ -196,7 +198,7 @@ def choose_capture(
     named = [] if from_file is None else from_file.cameras
     is_lifted = pixel_center is not None
     kind = choose_kind(request.kind, scene, is_lifted, [*targets, *named], renderer)
-    holes = find_requested_holes(request, kind, targets, scene, renderer)
+    holes = find_requested_holes(request, kind, targets, scene, known.origin, renderer)
     if from_file is not None:
         return ChosenCapture(from_file, kind)
     if request.place is not None:
@@ -213,9 +215,12 @@ def find_requested_holes(
     kind: HoleKind,
     targets: Sequence[Camera],
     scene: Gaussians,
+    origin: Float[np.ndarray, "3"],
     renderer: Renderer,
 ) -> list[Bool[Tensor, "h w"]]:
     """Find the hole of each target: what is marked, or else empty; none where things are removed.
+
+    `scene` is relative to `origin`, which is in the coordinates of the file.
 
     Raises:
         InputError: There is another number of masks than of targets, or no target has a hole.
@@ -224,6 +229,9 @@ def find_requested_holes(
     if request.masks:
         pairs = pair_masks(request.masks, targets)
         return [read_marks(path, camera, request.mask_reading) for path, camera in pairs]
+    if request.marked is not None:
+        chosen = select_gaussians(request.marked, scene, origin)
+        return mark_selected(scene, chosen, targets, renderer)
     # What is removed leaves its hole later.
     if request.place is not None:
         return []

@@ -72,14 +72,19 @@ class CompletionRequest:
 
 @dataclass(frozen=True)
 class RepairRequest:
-    """Take what masks mark at the targets out of a splat, and fill its place."""
+    """Take what masks mark at the targets, or a selection, out of a splat, and fill its place.
+
+    The place is a hole whatever stands behind it.
+    """
 
     command: ClassVar[str] = "repair"
     completion: CompletionRequest
-    masks: tuple[Path, ...]
-    """An image for each target camera, in their order."""
+    masks: tuple[Path, ...] = ()
+    """An image for each target camera, in their order; none with a selection."""
     reading: MaskReading = MaskReading()
     """How these masks are read."""
+    selection: Selection | None = None
+    """What goes in place of what masks mark."""
 
 
 @dataclass(frozen=True)
