@@ -163,7 +163,7 @@ def test_targets_may_be_some_of_those_that_were_exported(scene, holes, tmp_path,
     assert row["added"] > 0
 
 
-# The test before completes a painting in another folder.
+# `test_a_painting_of_any_kind_and_size_ends_in_the_splat` has a painting in another folder.
 @pytest.mark.slow
 def test_a_layer_in_another_folder_needs_the_cameras_alone(scene, holes, tmp_path, monkeypatch):
     """The painting is transparent outside of the mask, and no other file of the export is there."""
