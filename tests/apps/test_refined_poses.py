@@ -140,3 +140,12 @@ def test_poses_that_a_given_splat_contradicts_are_kept(scene, splat, monkeypatch
     assert not done.is_accepted
     assert "Given poses are kept, though they miss matches by 0.40 px" in done.describe()
     assert refined_poses.ask_splat(photographs, refined, task, DONE).is_accepted
+
+
+def test_a_cleaning_compares_at_refined_poses(scene, splat, tmp_path, monkeypatch):
+    monkeypatch.setattr(refined_poses, "refine_poses", correct)
+    words = ("--scene", splat, "--context", *CONTEXT, "--resolution", 96, 96)
+    assert run(monkeypatch, "clean", scene, *words, "--out", tmp_path / "out") == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["scene"]["refined_poses"]["refined_error"] == DONE.refined_error
+    assert (tmp_path / "out" / "refined_poses.json").is_file()
