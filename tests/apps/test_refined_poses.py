@@ -16,7 +16,6 @@ from gscompleter.apps.inputs.task import Opened
 from gscompleter.apps.requests.scene import SceneRequest
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
-from gscompleter.types import merge
 from scenes import Room, gaussians_of, photographed, view_of
 from shaken_room import CAMERAS, CONTEXT, DONE, SHAKEN, correct, write_shaken
 
@@ -133,10 +132,9 @@ def test_colmap_refines_the_photographs_of_a_command(scene, tmp_path, monkeypatc
 
 @pytest.fixture(scope="module")
 def splat(tmp_path_factory) -> Path:
-    """Write a splat of the room, in the frame of the true cameras."""
-    views = [view_of(Room(), camera) for camera in CAMERAS[::2]]
+    """Write a splat of what the photograph with the wrong pose shows, from where it was taken."""
     path = tmp_path_factory.mktemp("splat") / "room.ply"
-    save_ply(path, merge([gaussians_of(view) for view in views]))
+    save_ply(path, gaussians_of(view_of(Room(), CAMERAS[SHAKEN])))
     return path
 
 
@@ -169,3 +167,12 @@ def test_poses_that_a_given_splat_contradicts_are_kept(scene, splat, monkeypatch
     assert not done.is_accepted
     assert "Given poses are kept, though they miss matches by 0.40 px" in done.describe()
     assert refined_poses.ask_splat(photographs, refined, task, DONE).is_accepted
+
+
+def test_a_cleaning_compares_at_refined_poses(scene, splat, tmp_path, monkeypatch):
+    monkeypatch.setattr(refined_poses, "refine_poses", correct)
+    words = ("--scene", splat, "--context", *CONTEXT, "--resolution", 96, 96)
+    assert run(monkeypatch, "clean", scene, *words, "--out", tmp_path / "out") == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["scene"]["refined_poses"]["refined_error"] == DONE.refined_error
+    assert (tmp_path / "out" / "refined_poses.json").is_file()

@@ -21,10 +21,10 @@ from gscompleter.apps.completing.run_info import describe_run_values, refuse_res
 from gscompleter.apps.inputs.depth_range import apply_splat_range
 from gscompleter.apps.inputs.describing import describe_opening, print_lines
 from gscompleter.apps.inputs.reading import read_photographs
-from gscompleter.apps.inputs.refined_poses import refine_opened
+from gscompleter.apps.inputs.refined_poses import refine_opened, write_refined_poses
 from gscompleter.apps.inputs.splat import locate_splat, move_to_splat
 from gscompleter.apps.inputs.taken_out import take_over_edits
-from gscompleter.apps.inputs.task import InputSplatFile
+from gscompleter.apps.inputs.task import InputSplatFile, Opened
 from gscompleter.apps.report.cleaning_picture import (
     REMOVED_PICTURE_FILE,
     RemovalSeen,
@@ -73,6 +73,8 @@ class Cleaning:
     cameras: Sequence[Camera]
     """Cameras that see most of what goes."""
     renderer: Renderer
+    opened: Opened | None = None
+    """The photographs that decided; None for a splat alone."""
 
     @property
     def counts(self) -> dict[str, int]:
@@ -121,6 +123,8 @@ def clean_splat(request: CleaningRequest) -> None:
                     earlier=cleaning.splat_file.edits,
                     run=None,
                 )
+                if cleaning.opened is not None:
+                    write_refined_poses(folder, cleaning.opened)
             elif cleaning.removed.any():
                 save_changed(folder, cleaning.given, cleaning.removed, cleaning.splat_file)
             if cleaning.removed.any():
@@ -187,7 +191,9 @@ def clean_by_photographs(
     scores, seen = score_cleaning(given, task.views, removed, renderer, opened.files)
     run_info = {**run_info, "photographs": scores, "seconds": seconds}
     assert task.splat_file is not None
-    return Cleaning(given, removed, task.splat_file, run_info, choose_cameras(seen), renderer)
+    return Cleaning(
+        given, removed, task.splat_file, run_info, choose_cameras(seen), renderer, opened
+    )
 
 
 def clean_alone(request: CleaningRequest) -> Cleaning:

@@ -29,6 +29,7 @@ from gscompleter.apps.completing.remove import prepare_removal
 from gscompleter.apps.completing.run_info import describe_run_values, read_held_out, refuse_results
 from gscompleter.apps.completing.update import prepare_update
 from gscompleter.apps.inputs.describing import describe_task, print_lines
+from gscompleter.apps.inputs.refined_poses import write_refined_poses
 from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.apps.report.completion import write_report
 from gscompleter.apps.report.film import write_comparison_video
@@ -50,7 +51,6 @@ from gscompleter.apps.requests.completion import (
 from gscompleter.completer import check_target_ids
 from gscompleter.config.generators import PaintedSettings
 from gscompleter.data.scene import describe_camera, write_cameras
-from gscompleter.data.sfm.refined_file import write_refined
 from gscompleter.editing.removal import restore_surroundings
 from gscompleter.evaluation.metrics.coverage import render_pairs, sample_held_out_cameras
 from gscompleter.numerics.kernels.parallel import run_in_background
@@ -61,7 +61,7 @@ from gscompleter.system.console import make_console
 from gscompleter.system.errors import print_error, quote_value
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.files.video import find_ffmpeg
-from gscompleter.system.files.writing import REFINED_POSES_FILE, RENDERS_FILE, TARGETS_FILE
+from gscompleter.system.files.writing import RENDERS_FILE, TARGETS_FILE
 from gscompleter.system.process import release_free_memory
 from gscompleter.system.progress import show_progress, stage
 from gscompleter.system.timing import add_seconds
@@ -375,9 +375,7 @@ def write_chosen_cameras(folder: Path, opened: Opened, task: CompletionTask) -> 
     if opened.renders_from is not None:
         cameras = [view.camera for view in task.views]
         write_in_first_frame(folder / RENDERS_FILE, task, cameras)
-    if opened.given is not None:
-        path = folder / REFINED_POSES_FILE
-        write_refined(path, opened.given, opened.photographs, opened.refinement)
+    write_refined_poses(folder, opened)
 
 
 def write_in_first_frame(path: Path, task: CompletionTask, cameras: Sequence[Camera]) -> None:

@@ -15,7 +15,7 @@ from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.photographs import Photographs
-from gscompleter.data.sfm.refined_file import take_refined
+from gscompleter.data.sfm.refined_file import take_refined, write_refined
 from gscompleter.data.sfm.refining import (
     MIN_REFINED,
     PoseRefinement,
@@ -80,6 +80,13 @@ def refine_opened(
         return opened
     given = replace(opened.photographs, frames=opened.photographs.frames[:num_known])
     return replace(opened, photographs=photographs, given=given, refinement=refinement)
+
+
+def write_refined_poses(folder: Path, opened: Opened) -> None:
+    """Write the poses that differ from the given ones beside a result, if there are any."""
+    if opened.given is not None:
+        path = folder / REFINED_POSES_FILE
+        write_refined(path, opened.given, opened.photographs, opened.refinement)
 
 
 def ask_splat(
