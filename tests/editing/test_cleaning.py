@@ -11,11 +11,12 @@ import torch
 
 from command import run
 from gscompleter.config import CleaningConfig
-from gscompleter.editing.cleaning import find_removable, find_superfluous, predict_error_change
+from gscompleter.editing.cleaning import find_removable, find_superfluous
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.render.loading import load_renderer
 from gscompleter.splats.ply import load_ply
 from gscompleter.stages.error_budgets import compute_squared_error
+from gscompleter.stages.superfluous import predict_error_change
 from gscompleter.types import View, merge, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, labelled, photographed, view_of
 
@@ -90,7 +91,8 @@ def test_what_no_photograph_shows_or_what_was_generated_stays():
 
 def test_the_change_is_the_one_that_drawing_shows():
     view, generator = VIEWS[0], torch.Generator().manual_seed(1)
-    change = predict_error_change(SCENE, NONE, view, RENDERER, 64, generator)
+    plan = RENDERER.freeze(SCENE[:0], view.camera).vary_opacities(SCENE)
+    change = predict_error_change(plan, SCENE.opacities, NONE, view, 64, generator)
 
     def error(scene):
         return compute_squared_error(RENDERER.render(scene, view.camera).image, view.image).item()
