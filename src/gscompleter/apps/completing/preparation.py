@@ -188,7 +188,7 @@ def prepare_completion(
         opened, task, config = read_splat_alone(work, source, targets, marks, place)
         print_lines(console, *opened.photographs.notes)
     else:
-        config = work.config
+        config = work.config if work.splat is None else work.config.for_photographs()
         opened = open_for_completion(work, source, targets, console)
         task = read_inputs(work, source, targets, opened)
         # The paper takes poses as they are.
