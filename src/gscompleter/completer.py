@@ -112,7 +112,8 @@ class GSCompleter:
             )
         if self.config is not None and not isinstance(self.config, CompleterConfig):
             raise InputError(
-                f"The config has to be a CompleterConfig, and is {describe(self.config)}."
+                "The config has to be a CompleterConfig, such as CompleterConfig.paper() or "
+                f"CompleterConfig.splat(), and is {describe(self.config)}."
             )
         if not is_whole(self.seed) or not 0 <= self.seed < MAX_SEED:
             raise InputError(

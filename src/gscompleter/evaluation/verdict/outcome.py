@@ -206,7 +206,8 @@ def describe_gain(
     has_unused = any(not row.is_check for row in scored)
     if not scored or (better and not has_unused):
         if not better:
-            return f"{work}; no unused photograph could test it"
+            # Where there is no unused photograph at all, nobody expects a test by one.
+            return f"{work}; no unused photograph could test it" if held_out else work
         gains = format_number(average(compute_gain(row) for row in better), 1)
         gain = "1 photograph gains" if len(better) == 1 else f"{len(better)} photographs gain"
         return f"{work}: {gain} {gains} dB"
