@@ -17,7 +17,12 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 
 from gscompleter.config import CleaningConfig
 from gscompleter.render.protocols import Renderer
-from gscompleter.stages.superfluous import exclude_needed, limit_errors, sum_error_changes
+from gscompleter.stages.superfluous import (
+    ErrorChanges,
+    exclude_needed,
+    limit_errors,
+    sum_error_changes,
+)
 from gscompleter.system.progress import track
 from gscompleter.types import Gaussians, View
 
@@ -27,10 +32,16 @@ def find_superfluous(
     views: Sequence[View],
     renderer: Renderer,
     config: CleaningConfig = CleaningConfig(),
-) -> Bool[Tensor, "n"]:
-    """Find Gaussians that can be removed together; generated and unobserved ones stay."""
+) -> dict[str, Bool[Tensor, "n"]]:
+    """Find Gaussians that can be removed together, by reason; generated and unobserved ones stay.
+
+    Each has one reason: photographs are better without `harmful` ones, and as good without those
+    that are `not needed`.
+    """
     none = torch.zeros_like(scene.generated, dtype=torch.bool)
-    removable = find_removable(scene, none, views, renderer, config) & (scene.generated == 0)
+    changes = rate_gaussians(scene, none, views, renderer, config)
+    removable = changes.are_observed & changes.find_removable(config) & (scene.generated == 0)
+    is_harmful = changes.gained > config.idle * changes.equal_share
     # A wall behind floaters is hidden, and looks superfluous. With the floaters faded, photographs
     # need it.
     removable &= find_removable(scene, removable, views, renderer, config)
@@ -39,7 +50,8 @@ def find_superfluous(
     # size as well.
     checks = [*views, *(halve_view(view) for view in views)]
     max_errors = limit_errors(scene, checks, config.tolerance, renderer)
-    return exclude_needed(scene, removable, checks, max_errors, renderer)
+    removed = exclude_needed(scene, removable, checks, max_errors, renderer)
+    return {"harmful": removed & is_harmful, "not needed": removed & ~is_harmful}
 
 
 def find_removable(
@@ -50,12 +62,23 @@ def find_removable(
     config: CleaningConfig,
 ) -> Bool[Tensor, "n"]:
     """Find Gaussians that can be removed one at a time while the others in `faded` are faint."""
+    changes = rate_gaussians(scene, faded, views, renderer, config)
+    return changes.are_observed & changes.find_removable(config)
+
+
+def rate_gaussians(
+    scene: Gaussians,
+    faded: Bool[Tensor, "n"],
+    views: Sequence[View],
+    renderer: Renderer,
+    config: CleaningConfig,
+) -> ErrorChanges:
+    """Rate each Gaussian of a scene by how photographs change without it."""
     # One after the other, since what is frozen of a large scene takes memory.
     frozen = (
         renderer.freeze(scene[:0], view.camera) for view in track(views, "Comparing photographs")
     )
-    changes = sum_error_changes(scene, faded, views, frozen, config)
-    return changes.are_observed & changes.find_removable(config)
+    return sum_error_changes(scene, faded, views, frozen, config)
 
 
 def halve_view(view: View) -> View:
