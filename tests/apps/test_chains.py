@@ -25,6 +25,7 @@ from gscompleter.apps.live.session import Step, apply_step
 from gscompleter.cli import parse_command
 from gscompleter.render.loading import load_renderer
 from gscompleter.splats.edits import read_edits
+from gscompleter.splats.row_kinds import count_row_kinds
 from gscompleter.splats.undo import strip_edits
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.image import write_image
@@ -206,9 +207,12 @@ def test_photographs_replace_what_was_invented_before(room, tmp_path):
     assert told in (updated.parent / "report.html").read_text()
     for row in summary["context"]:
         assert row["psnr_after"] > row["psnr_before"] + 3
-    # What was given stays, bit for bit, and each state comes back.
-    given, kept = load_ply(splat), load_ply(updated)
-    assert torch.equal(kept.means[: len(given)], given.means)
+    # What was given stays, bit for bit, also where the first command recoloured it.
+    given, kept = (scene[scene.generated == 0] for scene in map(load_ply, (completed, updated)))
+    assert torch.equal(given.means, kept.means)
+    kinds = [count_row_kinds(p, read_edits(p), len(load_ply(p))) for p in (completed, updated)]
+    assert kinds[0]["recolored"] == kinds[1]["recolored"] > 0
+    # Each state comes back.
     assert strip_last(updated, tmp_path / "before.ply") == completed.read_bytes()
     out = tmp_path / "first.ply"
     with pytest.MonkeyPatch.context() as patch:
