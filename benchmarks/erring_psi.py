@@ -3,9 +3,10 @@
     gscompleter evaluate CASES --reconstructor benchmarks/erring_psi.py:reconstruct --out OUT \
         --table ablation refinement dof alignment
 
-Plane-sweep measures depth by cameras that are given, so that its scale is right, two of its calls
-agree, and depth alignment and ray correction have nothing to mend. A network errs anew in each
-call. Here each call draws one affine error of inverse depth, and each view a smooth warp; Gaussians go
+Plane-sweep measures depth by cameras that are given: its scale is right, its calls agree, and
+depth alignment and ray correction have nothing to mend. A network errs anew in each call.
+
+Here each call draws one affine error of inverse depth, and each view a smooth warp. Gaussians go
 along with the depth of their pixel, as those of a pixel-aligned network do. The draws follow from
 the cameras and the images of a call alone, so that a run repeats byte for byte.
 """

@@ -235,7 +235,7 @@ def test_views_of_float64_are_refused_by_name():
         ({"generator": None}, "The generator has to be a function"),
         ({"reconstructor": None}, "The reconstructor has to be a function"),
         ({"renderer": "cpu"}, "The renderer has to be one"),
-        ({"config": "paper"}, "The config has to be a CompleterConfig"),
+        ({"config": "paper"}, r"a CompleterConfig, such as CompleterConfig\.paper\(\)"),
         ({"seed": "1"}, "The seed has to be a whole number"),
         ({"seed": -1}, "The seed has to be a whole number"),
     ],

@@ -8,9 +8,12 @@ from functools import cached_property
 from itertools import compress
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from gscompleter.config import CompleterConfig
 from gscompleter.config.settings import validate
+from gscompleter.editing.replacing import find_contested, let_step_aside, return_needed
 from gscompleter.generators import (
     FunctionGenerator,
     Generator,
@@ -21,7 +24,12 @@ from gscompleter.generators import (
 from gscompleter.guards import accept_at, prepare_guards
 from gscompleter.numerics.geometry import is_inside, pad_camera, pad_like, project
 from gscompleter.numerics.image_ops import is_enclosed
-from gscompleter.numerics.value_checks import check_camera, check_gaussians, check_inputs
+from gscompleter.numerics.value_checks import (
+    check_camera,
+    check_gaussians,
+    check_inputs,
+    check_row_mask,
+)
 from gscompleter.parts import MAX_TARGET_ID, Part, PartOrigin, find_last_target_id, make_part
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.reconstructors.depth_predictors import predict_nothing
@@ -100,7 +108,8 @@ class GSCompleter:
             )
         if self.config is not None and not isinstance(self.config, CompleterConfig):
             raise InputError(
-                f"The config has to be a CompleterConfig, and is {describe(self.config)}."
+                "The config has to be a CompleterConfig, such as CompleterConfig.paper() or "
+                f"CompleterConfig.splat(), and is {describe(self.config)}."
             )
         if not is_whole_number(self.seed) or not 0 <= self.seed < MAX_SEED:
             raise InputError(
@@ -167,12 +176,17 @@ class GSCompleter:
         scene: Gaussians | None = None,
         check_views: Sequence[View] | None = None,
         targets: Sequence[Camera] = (),
+        invented: Bool[Tensor, "n"] | None = None,
     ) -> Completion:
         """Initialize the context (stage 1; paper, Eq. 5); arguments and errors as in `__call__`.
 
         The LOD proxy of a large scene is made fine enough for photographs and known targets.
+        `invented` marks the Gaussians of `scene` that were invented earlier: they give way where
+        photographs show something else. By default nothing of a scene does, since a label does not
+        tell them from Gaussians that were only recoloured.
         """
         check_inputs(views, scene, check_views or (), targets)
+        check_row_mask(invented, scene, "The mask of what was invented")
         config = choose_config(self.config, scene, check_views)
         with record_seconds() as seconds, timed_stage("context"):
             context = init_context(
@@ -191,6 +205,10 @@ class GSCompleter:
                 context_notes=context.notes,
                 models=self.name_models(),
             )
+            # What was invented steps aside where photographs show something else, so that nobody
+            # takes it for a part of the scene that they contradict.
+            contested = find_contested(state, invented, self.scenes)
+            state = let_step_aside(state, contested)
             # Guards measure the scene as it was given, so before anything changes.
             state = prepare_guards(state, self.scenes)
 
@@ -198,7 +216,8 @@ class GSCompleter:
             # kept, and Φ invents only the rest (decision 051).
             rng = torch.Generator().manual_seed(self.seed)
             state = add_observed(self.reconstructor, state, self.scenes, rng)
-            if state.num_observed:
+            state = return_needed(state, contested, self.scenes)
+            if state.num_observed or contested is not None:
                 # What photographs gained by it has to stay, too.
                 state = prepare_guards(state, self.scenes)
 

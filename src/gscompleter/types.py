@@ -811,6 +811,8 @@ class ContextScene:
     """True for Gaussians that were chosen and removed."""
     revealed_mask: Bool[Tensor, "n"]
     """True for unseen Gaussians behind those, which are gone as well."""
+    replaced_mask: Bool[Tensor, "n"]
+    """True for Gaussians that were invented earlier and gave way to what photographs show."""
     removed: Gaussians
     """The Gaussians that were removed, cut where they reached out of the place that was chosen; to
     save memory, without their colours by direction."""
@@ -828,7 +830,7 @@ class ContextScene:
         none = gaussians[:0]
         nowhere = torch.zeros_like(gaussians.generated, dtype=torch.bool)
         none = replace(none, sh=none.sh[:, :1])
-        return ContextScene(gaussians, rendered, index, nowhere, nowhere, none)
+        return ContextScene(gaussians, rendered, index, nowhere, nowhere, nowhere, none)
 
     @cached_property
     def removed_pixels(self) -> dict[Hashable, Bool[Tensor, "h w"]]:
@@ -843,9 +845,24 @@ class ContextScene:
         return torch.arange(len(self.gaussians), device=self.gaussians.means.device)
 
     @property
-    def gone_mask(self) -> Bool[Tensor, "n"]:
-        """True for Gaussians that were removed or revealed: they are not in the scene."""
+    def removed_mask(self) -> Bool[Tensor, "n"]:
+        """True for Gaussians that went with a removal: chosen ones, and revealed ones."""
         return self.chosen_mask | self.revealed_mask
+
+    @property
+    def gone_mask(self) -> Bool[Tensor, "n"]:
+        """True for Gaussians that are not in the scene any more: removed or replaced."""
+        return self.removed_mask | self.replaced_mask
+
+    def leave_out(self, gone: Bool[Tensor, "m"]) -> ContextScene:
+        """Return the context without some of the rendered Gaussians, whose rows are numbered anew.
+
+        Masks of what they stand for are those of the caller.
+        """
+        # The new number of each rendered Gaussian: its place among those that stay. Those that are
+        # gone take the number of one that is left, which nobody reads.
+        number = ((~gone).cumsum(0) - 1).clamp_min(0)
+        return replace(self, rendered=self.rendered[~gone], proxy_index=number[self.stand_ins])
 
     def expand(self, values: Shaped[Tensor, "m *c"]) -> Shaped[Tensor, "n *c"]:
         """Map values of rendered Gaussians to those they stand for; 0 for those that are gone."""

@@ -8,6 +8,7 @@ from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from rich.console import Console
@@ -16,13 +17,15 @@ from torch import Tensor
 from command import run
 from gscompleter import load_camera, load_ply, save_ply
 from gscompleter.apps.commands.live import decide_live
+from gscompleter.apps.inputs.invented import mark_invented
 from gscompleter.apps.inputs.taken_out import describe_taken_out
-from gscompleter.apps.inputs.task import InputSplatFile
+from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile
 from gscompleter.apps.live import saving
 from gscompleter.apps.live.session import SessionStep, apply_step
 from gscompleter.cli import parse_command
 from gscompleter.render.loading import load_renderer
 from gscompleter.splats.edits import read_edits
+from gscompleter.splats.row_kinds import count_row_kinds
 from gscompleter.splats.undo import strip_edits
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.image import write_image
@@ -42,6 +45,7 @@ FEW = ("--context", 0, 4, 7)
 """The photographs that the splat was made of, for commands that would take all."""
 PHOTOGRAPHS = 255
 """Label of what photographs show, and of pieces of what was cut."""
+TASK = CompletionTask((), (), np.eye(4), np.zeros(3), {})
 CRATE = (-0.6, 0.2, 2.1, 0.4, 1.47, 3.1)
 
 
@@ -94,7 +98,8 @@ def check_counts(before: Path, after: Path) -> None:
     counts = json.loads((after.parent / "summary.json").read_text())["gaussians"]
     given, scene = load_ply(before), load_ply(after)
     assert counts["context"] == len(given)
-    assert len(scene) == len(given) - counts.get("removed", 0) + counts["added"]
+    num_gone = counts.get("removed", 0) + counts.get("replaced", 0)
+    assert len(scene) == len(given) - num_gone + counts["added"]
     # What a command appends, and what it recoloured, has labels of its own.
     old = set(given.generated.tolist())
     new = [label for label in set(scene.generated.tolist()) - old if label != PHOTOGRAPHS]
@@ -177,6 +182,50 @@ def test_lines_say_what_is_kept_and_what_is_not_known(without_crate, tmp_path):
     alone.write_bytes(without_crate.read_bytes())
     (line,) = describe_taken_out(InputSplatFile(alone), forgets=False)
     assert "What was removed is not known" in line
+
+
+@pytest.mark.slow
+def test_photographs_replace_what_was_invented_before(room, tmp_path):
+    """Complete -> update -> strip: photographs come of what the first command invented."""
+    left = photographed(tmp_path / "left", CAMERAS[:2])
+    splat, aside = tmp_path / "left.ply", room.parent / "aside" / "transforms.json"
+    save_ply(splat, merge([gaussians_of(view_of(ROOM, camera)) for camera in CAMERAS[:2]]))
+    completed = run_on(left, "complete", splat, tmp_path / "completed", "--target", aside)
+    check_counts(splat, completed)
+    num_invented = int((load_ply(completed).generated == 1).sum())
+    assert num_invented > 100
+
+    words = ("--context", 4, 7)
+    updated = run_on(room, "update", completed, tmp_path / "updated", *words)
+    check_counts(completed, updated)
+    summary = json.loads((updated.parent / "summary.json").read_text())
+    num_replaced = summary["gaussians"]["replaced"]
+    # Most is farther to the right than any photograph shows.
+    assert num_replaced > 0.05 * num_invented
+    assert num_replaced == num_invented - int((load_ply(updated).generated == 1).sum())
+    told = f"{num_replaced:,} invented Gaussians gave way to what photographs show"
+    assert told in (updated.parent / "report.html").read_text()
+    for row in summary["context"]:
+        assert row["psnr_after"] > row["psnr_before"] + 3
+    # What was given stays, bit for bit, also where the first command recoloured it.
+    given, kept = (scene[scene.generated == 0] for scene in map(load_ply, (completed, updated)))
+    assert torch.equal(given.means, kept.means)
+    kinds = [count_row_kinds(p, read_edits(p), len(load_ply(p))) for p in (completed, updated)]
+    assert kinds[0]["recolored"] == kinds[1]["recolored"] > 0
+    # Each state comes back.
+    assert strip_last(updated, tmp_path / "before.ply") == completed.read_bytes()
+    out = tmp_path / "first.ply"
+    with pytest.MonkeyPatch.context() as patch:
+        assert run(patch, "strip", updated, "--out", out, "--quiet") == 0
+    assert out.read_bytes() == splat.read_bytes()
+
+    # A label alone does not tell what was invented, so that without the record nothing goes.
+    alone = tmp_path / "alone.ply"
+    alone.write_bytes(completed.read_bytes())
+    task = replace(TASK, scene=load_ply(alone), splat_file=InputSplatFile(alone))
+    task, (line,) = mark_invented(task)
+    assert task.invented is None
+    assert line.endswith("that stays, also where photographs show something else.")
 
 
 @pytest.mark.slow

@@ -237,7 +237,10 @@ def test_a_loss_at_unused_photographs_is_in_the_headline(before, after, ending):
     checked = replace(row, is_check=True, psnr_before=after + 9)
     assert ending in describe_gain("It is done", [row, checked])  # it took part
     assert "the checking photograph 5" in describe_gain("It is done", [checked])
-    assert describe_gain("It is done", []) == "It is done; no unused photograph could test it"
+    unseen = replace(row, psnr_before=None, psnr_after=None)
+    assert describe_gain("It is done", [unseen]) == "It is done; no unused photograph could test it"
+    # Where there is none, nothing is said about it.
+    assert describe_gain("It is done", []) == "It is done"
 
 
 def test_sentences_become_clauses():
@@ -257,7 +260,7 @@ def test_a_splat_gains_at_its_photographs_where_no_other_one_tests_it():
     assert describe_gain("Done", [], context) == "Done: 2 photographs gain 5.0 dB"
     assert describe_gain("Done", [], context[:1]) == "Done: 1 photograph gains 6.0 dB"
     renders = [context_row(float("inf"), 40.0), context_row(None, None), context_row(50.0, 45.0)]
-    assert describe_gain("Done", [], renders) == "Done; no unused photograph could test it"
+    assert describe_gain("Done", [], renders) == "Done"
     checked = replace(held_out(3.0, 5.0), psnr_before=20.0, psnr_after=20.0, is_check=True)
     assert "2 photographs gain 5.0 dB" in describe_gain("Done", [checked], context)
     unused = replace(checked, is_check=False)

@@ -11,11 +11,12 @@ import torch
 
 from command import run
 from gscompleter.config import CleaningConfig
-from gscompleter.editing.cleaning import find_removable, find_superfluous, predict_error_change
+from gscompleter.editing.cleaning import find_removable, find_superfluous
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.render.loading import load_renderer
 from gscompleter.splats.ply import load_ply
 from gscompleter.stages.error_budgets import compute_squared_error
+from gscompleter.stages.superfluous import predict_error_change
 from gscompleter.types import View, merge, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, labelled, photographed, view_of
 
@@ -57,40 +58,57 @@ def losses(scene, taken, views=VIEWS):
     ]
 
 
+def find_all(*arguments) -> torch.Tensor:
+    """Find what is superfluous, whatever the reason."""
+    return torch.stack(list(find_superfluous(*arguments).values())).any(dim=0)
+
+
 def test_floaters_go_and_nothing_else():
     """Single Gaussians of the wall behind them may go, too, as photographs hardly change."""
     assert len(FLOATERS) > 3
-    taken = find_superfluous(SCENE, VIEWS, RENDERER, ONLY_HARMFUL)
+    taken = find_all(SCENE, VIEWS, RENDERER, ONLY_HARMFUL)
     assert taken[FLOAT].all()
     assert (taken & ~FLOAT).float().mean() < 1e-3
 
 
 def test_walls_are_not_blamed_for_the_floaters_before_them():
     at_first = find_removable(SCENE, NONE, VIEWS, RENDERER, ONLY_HARMFUL)
-    taken = find_superfluous(SCENE, VIEWS, RENDERER, ONLY_HARMFUL)
+    taken = find_all(SCENE, VIEWS, RENDERER, ONLY_HARMFUL)
     assert (taken & ~FLOAT).sum() < 0.2 * (at_first & ~FLOAT).sum()
 
 
 def test_what_is_idle_goes_too_and_no_photograph_gets_worse():
-    taken = find_superfluous(SCENE, VIEWS, RENDERER)
+    taken = find_all(SCENE, VIEWS, RENDERER)
     assert taken[FLOAT].all()
     assert max(losses(SCENE, taken)) <= CleaningConfig().tolerance
 
 
+def test_each_removed_gaussian_has_one_reason():
+    """Floaters are harmful; of the same surface twice, one is not needed."""
+    twice = merge([SCENE, SURFACES])
+    reasons = find_superfluous(twice, VIEWS, RENDERER)
+    assert set(reasons) == {"harmful", "not needed"}
+    assert not (reasons["harmful"] & reasons["not needed"]).any()
+    is_float = torch.cat([FLOAT, torch.zeros(len(SURFACES), dtype=torch.bool)])
+    assert reasons["harmful"][is_float].float().mean() > 0.5
+    assert reasons["not needed"][~is_float].any()
+
+
 def test_a_scene_that_is_right_stays_as_it_is():
-    assert not find_superfluous(SURFACES, VIEWS, RENDERER, ONLY_HARMFUL).any()
+    assert not find_all(SURFACES, VIEWS, RENDERER, ONLY_HARMFUL).any()
 
 
 def test_what_no_photograph_shows_or_what_was_generated_stays():
     behind = replace(FLOATERS, means=FLOATERS.means - torch.tensor([0.0, 0.0, 20.0]))
     ours = replace(FLOATERS, generated=torch.ones_like(FLOATERS.generated))
-    taken = find_superfluous(merge([SURFACES, behind, ours]), VIEWS, RENDERER)
+    taken = find_all(merge([SURFACES, behind, ours]), VIEWS, RENDERER)
     assert not taken[len(SURFACES) :].any()
 
 
 def test_the_change_is_the_one_that_drawing_shows():
     view, generator = VIEWS[0], torch.Generator().manual_seed(1)
-    change = predict_error_change(SCENE, NONE, view, RENDERER, 64, generator)
+    plan = RENDERER.freeze(SCENE[:0], view.camera).vary_opacities(SCENE)
+    change = predict_error_change(plan, SCENE.opacities, NONE, view, 64, generator)
 
     def error(scene):
         return compute_squared_error(RENDERER.render(scene, view.camera).image, view.image).item()
@@ -108,8 +126,8 @@ def test_without_the_guard_photographs_would_get_worse():
     none = torch.zeros(len(thrice), dtype=torch.bool)
     doubtful = find_removable(thrice, none, views, RENDERER, config)
     assert max(losses(thrice, doubtful, views)) > 1.0
-    unguarded = find_superfluous(thrice, views, RENDERER, replace(config, tolerance=10.0))
-    guarded = find_superfluous(thrice, views, RENDERER, config)
+    unguarded = find_all(thrice, views, RENDERER, replace(config, tolerance=10.0))
+    guarded = find_all(thrice, views, RENDERER, config)
     assert max(losses(thrice, unguarded, views)) > 0.05
     assert guarded.any()
     assert max(losses(thrice, guarded, views)) <= config.tolerance

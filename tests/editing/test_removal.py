@@ -14,6 +14,7 @@ from gscompleter.guards import load_guards
 from gscompleter.guards.free_space import Observed, ignore_removed, is_before_surface
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.parts import NOT_INVENTED
+from gscompleter.planning.remove import contain_nothing
 from gscompleter.render.removed import find_removed
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
@@ -204,3 +205,27 @@ def test_something_has_to_be_left(begun):
     everything = torch.ones(len(begun.context), dtype=torch.bool)
     with pytest.raises(InputError, match="Nothing would be left"):
         remove_gaussians(begun, everything, is_crate, COMPLETER.scenes)
+
+
+@pytest.mark.parametrize("has_photographs", [False, True])
+def test_photographs_decide_whether_what_stands_behind_a_mark_is_a_hole(has_photographs):
+    """The wall behind the box is in the splat, as the photographs beside it show it."""
+    views = [view_of(ROOM, camera_at(x, size=48)) for x in (-0.8, 0.0, 0.8)]
+    config = CompleterConfig.splat()
+    config = (config.for_photographs() if has_photographs else config).for_marks()
+    completer = GSCompleter(config=config)
+    begun = completer.begin(views, merge([gaussians_of(view) for view in views]), [])
+    chosen = is_crate(begun.context.means)
+    marked = remove_gaussians(begun, chosen, contain_nothing, completer.scenes)
+
+    target = camera_at(0.0, size=48)
+    view = completer.observe(marked, target)
+    shown = view_of(ROOM, target).depth < view_of(EMPTY, target).depth - 0.01
+    known = view.render.alpha > 0.95
+    depth = view_of(EMPTY, view.camera.padded).depth
+    wall = view.camera.crop(known & ((view.render.depth - depth).abs() < 0.1 * depth)) & shown
+    assert wall.float().sum() > 0.2 * shown.sum()
+    is_hole = view.camera.crop(view.holes)[wall].float().mean()
+    assert is_hole < 0.3 if has_photographs else is_hole > 0.9
+    # What no photograph sees behind the box is a hole in any case.
+    assert view.camera.crop(view.holes & ~known)[shown].any()

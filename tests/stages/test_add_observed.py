@@ -10,6 +10,7 @@ from gscompleter.config import CompleterConfig
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.numerics.geometry import project
 from gscompleter.parts import NOT_INVENTED
+from gscompleter.stages import add_observed
 from gscompleter.stages.add_observed import (
     Lack,
     choose_photographs,
@@ -68,6 +69,16 @@ def test_a_hole_that_photographs_show_is_filled_from_them():
         assert after > before + 8
     # What was given stays, bit for bit.
     assert torch.equal(state.scene.means[: len(CUT)], CUT.means)
+
+
+def test_additions_that_photographs_do_not_need_are_dropped(monkeypatch):
+    """Each of five photographs has a Gaussian for each of its pixels of the same box."""
+    few = begin(CUT)
+    monkeypatch.setattr(add_observed, "drop_superfluous", lambda added, *_: added)
+    all_pixels = begin(CUT)
+    assert 100 < few.num_observed < 0.7 * all_pixels.num_observed
+    for before, after in zip(score(all_pixels.scene), score(few.scene), strict=True):
+        assert after > before - 0.05
 
 
 def test_what_stands_before_a_wall_that_the_scene_shows_is_added():

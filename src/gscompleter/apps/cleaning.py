@@ -178,7 +178,8 @@ def clean_by_photographs(
 
     config = request.config.strengthen(request.strength)
     with record_seconds(()) as seconds, timed_stage("clean"):
-        removed = find_superfluous(given, task.views, renderer, config)
+        reasons = find_superfluous(given, task.views, renderer, config)
+    removed = torch.stack(list(reasons.values())).any(dim=0)
     run_info = describe_run_values(
         photographs,
         splat,
@@ -189,7 +190,8 @@ def clean_by_photographs(
         photographs.scene.masks.is_inverted,
     )
     scores, seen = score_cleaning(given, task.views, removed, renderer, opened.files)
-    run_info = {**run_info, "photographs": scores, "seconds": seconds}
+    counts = {reason: int(mask.sum()) for reason, mask in reasons.items()}
+    run_info = {**run_info, "reasons": counts, "photographs": scores, "seconds": seconds}
     assert task.splat_file is not None
     return Cleaning(
         given, removed, task.splat_file, run_info, choose_cameras(seen), renderer, opened
@@ -295,15 +297,16 @@ def describe_cleaning(summary: Mapping[str, Any]) -> str:
     counts = summary["gaussians"]
     seconds = summary["seconds"]["total"]
     text = f"{counts['removed']:,} of {counts['given']:,} Gaussians removed in {seconds:.1f} s; "
-    if "reasons" in summary:
-        reasons = ", ".join(f"{count:,} {name}" for name, count in summary["reasons"].items())
+    reasons = ", ".join(f"{count:,} {name}" for name, count in summary["reasons"].items())
+    if "photographs" not in summary:
         share = summary["seen_from_outside"]
         return f"{text}{reasons}; they are {share:.1%} of what is seen from outside"
 
     before = torch.tensor([row["psnr_before"] for row in summary["photographs"]])
     after = torch.tensor([row["psnr_after"] for row in summary["photographs"]])
     unmasked = [1 - row["ignored"] for row in summary["photographs"]]
-    return text + (
+    change = (
         f"mean PSNR of the photographs {before.mean():.2f} dB before, {after.mean():.2f} dB after"
         f"{describe_measured(unmasked)}, worst change {(after - before).min():+.3f} dB"
     )
+    return f"{text}{reasons}; {change}"

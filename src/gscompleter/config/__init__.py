@@ -138,6 +138,8 @@ class HoleConfig(Settings):
     the border of the image."""
     forces_removed: bool = False
     """Pixels that showed something removed are holes, whatever stands behind it."""
+    keeps_confirmed: bool = False
+    """Unless photographs confirm what stands behind it: then it shows the place as it is."""
     candidate_radius: PixelCount | None = 16
     """Distance to a hole, in pixels, within which Gaussians are registered (paper: None, all)."""
 
@@ -514,10 +516,18 @@ class CompleterConfig(Settings):
     def for_marks(self) -> CompleterConfig:
         """Return the same settings for a splat of which the user marked what is wrong.
 
-        That is removed, and its place is a hole whatever stands behind it.
+        That is removed, and its place is a hole whatever stands behind it, unless photographs
+        confirm that.
         """
         removal = self.for_removal()
         return replace(removal, holes=replace(removal.holes, forces_removed=True))
+
+    def for_photographs(self) -> CompleterConfig:
+        """Return the same settings for a splat with photographs, instead of renders of itself.
+
+        They tell whether what stands behind something that is marked is right.
+        """
+        return replace(self, holes=replace(self.holes, keeps_confirmed=True))
 
     def for_object(self) -> CompleterConfig:
         """Return the same settings for an object that stands on nothing.

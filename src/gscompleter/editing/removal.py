@@ -13,10 +13,9 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float, Int64
+from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.editing.cleaning import exclude_needed, limit_errors
 from gscompleter.editing.cutting import Region, cut
 from gscompleter.guards import prepare_guards
 from gscompleter.parts import Part, PartOrigin, make_part, split_into_parts
@@ -25,6 +24,7 @@ from gscompleter.render.fit_colors import RELAXATION, fit_colors
 from gscompleter.render.protocols import FrozenScene, Renderer
 from gscompleter.render.removed import mask_removed
 from gscompleter.stages.error_budgets import meet_error_budgets, set_error_budgets
+from gscompleter.stages.superfluous import exclude_needed, limit_errors
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
 from gscompleter.trust import Trust
@@ -55,6 +55,8 @@ def remove_gaussians(
     """
     source = state.source
     first = state.rendered_context
+    # What gave way to photographs is not there any more.
+    chosen = chosen & ~source.gone_mask
 
     # Rendered Gaussians go if they stand for none but chosen ones.
     used = source.stand_ins[~chosen & ~source.gone_mask]
@@ -68,9 +70,7 @@ def remove_gaussians(
 
     is_revealed = source.revealed_mask | source.expand(gone & ~unused)
     remaining = replace(
-        source,
-        rendered=source.rendered[~gone],
-        proxy_index=number_left(source, gone),
+        source.leave_out(gone),
         chosen_mask=source.chosen_mask | chosen,
         revealed_mask=is_revealed & ~chosen,
         removed=merge([source.removed, replace(inner, sh=inner.sh[:, :1])]),
@@ -95,16 +95,6 @@ def remove_gaussians(
         for photo, view, scene in zip(state.photos, views, shown, strict=True)
     )
     return prepare_guards(replace(changed, photos=photos), scenes)
-
-
-def number_left(source: ContextScene, gone: Bool[Tensor, "m"]) -> Int64[Tensor, "n"]:
-    """Compute the `proxy_index` of what is left, in which rendered Gaussians are numbered anew.
-
-    Those that are `gone` take the number of one that is left, which nobody reads.
-    """
-    # The new number of each rendered Gaussian: its place among those that stay.
-    number = ((~gone).cumsum(0) - 1).clamp_min(0)
-    return number[source.stand_ins]
 
 
 def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:

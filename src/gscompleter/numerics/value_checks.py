@@ -83,6 +83,20 @@ def check_gaussians(gaussians: object, name: str) -> None:
         )
 
 
+def check_row_mask(mask: object, scene: Gaussians | None, name: str) -> None:
+    """Raise InputError unless this is None, or has a truth value for each Gaussian of a scene."""
+    if mask is None:
+        return
+    if scene is None:
+        raise InputError(f"{name} marks Gaussians of a scene; give one, or leave the mask out.")
+    shape = scene.opacities.shape
+    if not isinstance(mask, Tensor) or mask.dtype != torch.bool or mask.shape != shape:
+        raise InputError(
+            f"{name} needs a truth value for each of {len(scene):,} Gaussians, as a bool tensor, "
+            f"and is {describe(mask)}."
+        )
+
+
 def _describe_defect(gaussians: Gaussians) -> str:
     """Describe the first property that holds numbers which no scene can have."""
     if _find_infinite(gaussians.means, LARGEST).any():

@@ -41,8 +41,10 @@ def find_removed(source: ContextScene, camera: Camera, renderer: Renderer) -> Bo
 def draw_removed(source: ContextScene, camera: Camera, renderer: Renderer) -> Bool[Tensor, "h w"]:
     """Draw the removed Gaussians among those that are left or were revealed, and mark them."""
     scene = source.gaussians
-    # What is chosen for removal is among `removed`, too, and must not be drawn twice.
-    others = replace(scene, opacities=scene.opacities.masked_fill(source.chosen_mask, 0.0))
+    # What is chosen for removal is among `removed`, too, and must not be drawn twice. What gave way
+    # to photographs hides nothing.
+    hidden = source.chosen_mask | source.replaced_mask
+    others = replace(scene, opacities=scene.opacities.masked_fill(hidden, 0.0))
     return mark_shown(source.removed, others, camera, renderer)
 
 

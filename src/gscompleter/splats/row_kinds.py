@@ -7,12 +7,15 @@ so have what was added for a target and what was only recoloured for it.
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Collection, Iterator
 from pathlib import Path
 
 import numpy as np
+from jaxtyping import Bool, Int64
+from numpy import ndarray
 
 from gscompleter.splats.edits import Edit, Edits
-from gscompleter.splats.undo import Keys, check_counts, compute_keys, split_key
+from gscompleter.splats.undo import check_counts, compute_keys, split_key
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import EDITS_FILE
 
@@ -25,20 +28,59 @@ def count_row_kinds(path: Path, edits: Edits, total: int) -> dict[str, int] | No
 
     Raise InputError for a record that contradicts itself.
     """
-    appending = [edit for edit in edits.edits if edit.added]
-    if not edits or not edits.is_unchanged or not all(edit.appended for edit in appending):
+    if not tells_kinds(edits) or not edits.is_unchanged:
         return None
-    check_counts(path, edits, total)
-    states, _ = compute_keys(edits)
-    numbers, places = split_key(states[-1])
-    counts = Counter({GIVEN: int((numbers == 0).sum())})
-    for number, edit in enumerate(edits.edits, start=1):
-        counts += count_appended(path, edit, places[numbers == number])
+    counts: Counter[str] = Counter()
+    for kind, rows in iterate_kinds(path, edits, total):
+        counts[kind] += len(rows)
     return {kind: count for kind, count in counts.items() if count}
 
 
-def count_appended(path: Path, edit: Edit, places: Keys) -> Counter[str]:
-    """Count those rows by their kind that are left of what an edit appended, by their places."""
+def find_rows_of_kinds(
+    path: Path, edits: Edits, total: int, kinds: Collection[str]
+) -> Bool[ndarray, "n"]:
+    """Find the rows of some kinds; the record has to tell them.
+
+    Raise InputError for a record that contradicts itself.
+    """
+    assert tells_kinds(edits)
+    assert edits.is_unchanged
+    found = np.zeros(total, bool)
+    for own, rows in iterate_kinds(path, edits, total):
+        found[rows] = own in kinds
+    return found
+
+
+def tells_kinds(edits: Edits) -> bool:
+    """Return True if a record tells the kinds of all rows that its edits appended."""
+    return bool(edits) and all(edit.appended for edit in edits.edits if edit.added)
+
+
+def has_recolored(edits: Edits) -> bool:
+    """Return True if any edit gave new colours to Gaussians that it was given."""
+    return any(rows.kind == "recolored" for edit in edits.edits for rows in edit.appended)
+
+
+def iterate_kinds(
+    path: Path, edits: Edits, total: int
+) -> Iterator[tuple[str, Int64[ndarray, "_k"]]]:
+    """Yield kinds with the numbers of their rows in a splat, which has `total` rows."""
+    check_counts(path, edits, total)
+    states, _ = compute_keys(edits)
+    numbers, places = split_key(states[-1])
+    yield GIVEN, np.flatnonzero(numbers == 0)
+    for number, edit in enumerate(edits.edits, start=1):
+        check_appended(path, edit)
+        # Rows of a kind stand together, so that the place decides.
+        own = np.flatnonzero(numbers == number)
+        ends = np.cumsum([part.count for part in edit.appended])
+        found = np.searchsorted(ends, places[own], side="right")
+        for index, part in enumerate(edit.appended):
+            yield part.kind, own[found == index]
+
+
+def check_appended(path: Path, edit: Edit) -> None:
+    """Refuse kinds whose numbers do not add up to what an edit appended."""
     if min((part.count for part in edit.appended), default=0) < 0 or (
         sum(part.count for part in edit.appended) != edit.added
     ):
@@ -46,10 +88,3 @@ def count_appended(path: Path, edit: Edit, places: Keys) -> Counter[str]:
             f"The kinds of rows in {EDITS_FILE} beside {quote_value(path)} do not add up to the "
             f"{edit.added:,} that {edit.command} appended; fetch all files of its folder again."
         )
-    # Rows of a kind stand together, so that the place decides.
-    ends = np.cumsum([part.count for part in edit.appended])
-    found = np.searchsorted(ends, places, side="right")
-    counts: Counter[str] = Counter()
-    for index, part in enumerate(edit.appended):
-        counts[part.kind] += int((found == index).sum())
-    return counts

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 from jaxtyping import Bool, Float
 from torch import Tensor
 
+from gscompleter.config.settings import COVERED
 from gscompleter.numerics.image_ops import blur_gaussian, dilate
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.protocols import FrozenScene
@@ -21,6 +22,7 @@ from gscompleter.stages.hole_masks import (
     find_hole_masks,
 )
 from gscompleter.state import Completion
+from gscompleter.trust.photometric import load_trust
 from gscompleter.types import Camera, ErrorBudget, PaddedCamera, Render, View, merge
 
 FULL_TRUST = 1.0
@@ -119,12 +121,14 @@ def render_target(state: Completion, camera: PaddedCamera, scenes: SceneRenderer
 
     frozen = scenes.freeze(state.parts, camera.padded)
     alpha = state.trust.compute_alpha(frozen, camera.padded)
-    edits = find_hole_edits(state, camera, scenes)
+    edits = find_hole_edits(state, camera, frozen, scenes)
     masks = find_hole_masks(frozen.render, alpha, camera, state.config.holes, edits, render_at)
     return TargetView(state, scenes, camera, frozen, alpha, masks)
 
 
-def find_hole_edits(state: Completion, camera: PaddedCamera, scenes: SceneRenderer) -> HoleEdits:
+def find_hole_edits(
+    state: Completion, camera: PaddedCamera, frozen: FrozenScene, scenes: SceneRenderer
+) -> HoleEdits:
     """Find where a removal may have opened holes, and where the user marked the scene as wrong."""
     config = state.config
     if len(state.source.removed) == 0:
@@ -135,9 +139,27 @@ def find_hole_edits(state: Completion, camera: PaddedCamera, scenes: SceneRender
     opened = add_border(removed) if config.completes_removals_only else None
     if not config.holes.forces_removed:
         return HoleEdits(opened)
+    if config.holes.keeps_confirmed:
+        removed = removed & ~find_confirmed(state, camera, frozen, scenes)
     # What an earlier target filled is no hole any more.
     filled = [part.gaussians for part in state.added_parts if part.origin.is_invented]
     if sum(map(len, filled)) == 0:
         return HoleEdits(opened, removed)
     alpha = scenes.renderer.render(merge(filled), camera.padded).alpha
     return HoleEdits(opened, removed & compute_hole_mask(alpha, config.holes))
+
+
+def find_confirmed(
+    state: Completion, camera: PaddedCamera, frozen: FrozenScene, scenes: SceneRenderer
+) -> Bool[Tensor, "h w"]:
+    """Find the pixels of a target whose surface photographs confirm, beside what was removed.
+
+    `frozen` is the scene at the padded target. It is trusted as a trained splat is, although all of
+    it counts as trusted after a removal.
+    """
+    views = [photo.view for photo in state.photos]
+    config = replace(state.config, trust="photometric")
+    trust = load_trust(config, state.parts, views, scenes)
+    trusted_alpha = trust.compute_alpha(frozen, camera.padded)
+    is_covered = ~compute_hole_mask(frozen.render.alpha, config.holes)
+    return is_covered & (trusted_alpha >= COVERED)

@@ -21,6 +21,7 @@ from gscompleter.apps.inputs.depth_range import (
 )
 from gscompleter.apps.inputs.describing import list_missing_photographs as list_missing_photographs
 from gscompleter.apps.inputs.describing import print_lines
+from gscompleter.apps.inputs.invented import mark_invented
 from gscompleter.apps.inputs.memory import check_scene
 from gscompleter.apps.inputs.named_photographs import check_target_files
 from gscompleter.apps.inputs.opening import choose_working_size, open_scene
@@ -119,7 +120,9 @@ class Prepared:
             with stage("removing"):
                 gone = self.choose_gone(self)
         task = self.task
-        begun = self.completer.begin(task.views, task.scene, task.check_views, task.target_cameras)
+        begun = self.completer.begin(
+            task.views, task.scene, task.check_views, task.target_cameras, task.invented
+        )
         guarding = tuple(begun.with_depth_range(camera) for camera in task.witnesses.guarding)
         begun = replace(begun, free_space_cameras=guarding)
         if gone is None:
@@ -182,7 +185,7 @@ def prepare_completion(
         opened, task, config = read_splat_alone(work, source, targets, marks, place)
         print_lines(console, *opened.photographs.notes)
     else:
-        config = work.config
+        config = work.config if work.splat is None else work.config.for_photographs()
         opened = open_for_completion(work, source, targets, console)
         opened, task = read_at_refined_poses(work, source, targets, opened, console)
     loaded = load_models(work, config, targets, opened, task, console)
@@ -345,7 +348,9 @@ def load_models(
             task = apply_splat_range(task, task.scene, completer.renderer)
             # Renders of the splat itself show nothing that it lacks.
             if opened.renders_from is None:
-                task, notes = take_over_edits(task, work.splat.forget_edits, completer.renderer)
+                task, notes = mark_invented(task)
+                task, edited = take_over_edits(task, work.splat.forget_edits, completer.renderer)
+                notes = (*notes, *edited)
     print_lines(console, *notes)
     return Loaded(opened, task, completer, collect_cameras(opened, task), seconds)
 

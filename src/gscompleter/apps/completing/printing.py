@@ -17,7 +17,11 @@ from gscompleter.apps.inputs.task import Opened, Target
 from gscompleter.apps.report.film import VIDEO_FILE
 from gscompleter.apps.report.page import REPORT_FILE
 from gscompleter.apps.report.pictures import IMAGES_FOLDER
-from gscompleter.apps.report.plain_words import group_target_warnings, list_warnings
+from gscompleter.apps.report.plain_words import (
+    describe_replaced,
+    group_target_warnings,
+    list_warnings,
+)
 from gscompleter.apps.report.schema import CompletionSummary, find_completed, read_summary
 from gscompleter.apps.requests.answer import AnswerRequest
 from gscompleter.apps.requests.completion import ExportRequest, ResultsRequest
@@ -95,6 +99,8 @@ def describe_completion(summary: CompletionSummary, results: ResultsRequest) -> 
         f"Added {counts['added']:,} Gaussians to {counts['context']:,} in {seconds:.1f} s: "
         f"{find_completed(results.out)}"
     )
+    if counts.get("replaced"):
+        yield describe_replaced(counts["replaced"])
     yield describe_size(results.out, results.suffix is None)
     yield f"Report: {results.out / REPORT_FILE}"
     if results.has_video and summary.targets:

@@ -24,7 +24,7 @@ from gscompleter.apps.inputs.depth_range import apply_splat_range
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.inputs.named_photographs import find_context
 from gscompleter.apps.inputs.reading import make_task
-from gscompleter.apps.inputs.selection import CHECK_VIEW_SIZE, collect_usable_cameras
+from gscompleter.apps.inputs.selection import choose_check_size, collect_usable_cameras
 from gscompleter.apps.inputs.splat import add_check_views
 from gscompleter.apps.inputs.taken_out import hide_taken_out
 from gscompleter.apps.inputs.task import Opened
@@ -164,11 +164,17 @@ def choose_evidence(
 
 
 def measure_lacks(loaded: Loaded) -> dict[int, float]:
-    """Measure the share of each photograph that the splat lacks, in small images, by frame."""
-    opened = loaded.opened.with_resolution(CHECK_VIEW_SIZE)
+    """Measure the share of each photograph that the splat lacks, in small images, by frame.
+
+    What was invented counts as lacking, since photographs may show something else there.
+    """
+    size = choose_check_size(loaded.opened.request.resolution)
+    opened = loaded.opened.with_resolution(size)
     task = loaded.task
     scene = task.scene
     assert scene is not None
+    if task.invented is not None:
+        scene = scene[~task.invented]
     cameras = collect_cameras(opened, task)
     checks = {view.frame: view for view in task.check_views or ()}
     frames = []
@@ -181,7 +187,7 @@ def measure_lacks(loaded: Loaded) -> dict[int, float]:
         if frame in checks:
             view = checks[frame]
         else:
-            (view,) = opened.photographs.views([frame], CHECK_VIEW_SIZE)
+            (view,) = opened.photographs.views([frame], size)
         # A view refuses an image and a camera on two devices, and cameras are on that of the task.
         view = replace(view.to(task.device), camera=cameras[frame])
         if task.taken_out is not None:

@@ -30,6 +30,17 @@ CHECK_VIEW_SIZE = 320
 """Longer side, in pixels, of check views and of the photographs for a depth range."""
 
 
+def choose_check_size(resolution: tuple[int, int] | int | None) -> tuple[int, int] | int:
+    """Choose the size of check views, which is that of the context if this is smaller.
+
+    Ψ takes images of one size, so that check views are then evidence beside the context.
+    """
+    if resolution is None:
+        return CHECK_VIEW_SIZE
+    sides = resolution if isinstance(resolution, tuple) else (resolution,)
+    return resolution if max(sides) <= CHECK_VIEW_SIZE else CHECK_VIEW_SIZE
+
+
 def choose_context(
     photographs: Photographs,
     targets: Sequence[Target],

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.apps.inputs.selection import (
-    CHECK_VIEW_SIZE,
+    choose_check_size,
     collect_usable_cameras,
     select_near_and_far,
 )
@@ -111,9 +111,10 @@ def add_check_views(task: CompletionTask, opened: Opened) -> CompletionTask:
     photographs = opened.photographs
     known = task.used_frames | set(opened.held_out)
     others = [frame for frame in range(len(photographs)) if frame not in known]
-    cameras = collect_usable_cameras(photographs, others, CHECK_VIEW_SIZE)
+    size = choose_check_size(opened.request.resolution)
+    cameras = collect_usable_cameras(photographs, others, size)
     views = []
     for frame in select_near_and_far(task.goals, cameras, MAX_CHECK_VIEWS):
         with suppress(InputError):
-            views += photographs.views([frame], CHECK_VIEW_SIZE)
+            views += photographs.views([frame], size)
     return replace(task, check_views=[view.to(task.device) for view in views])

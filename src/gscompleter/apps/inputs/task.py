@@ -101,8 +101,8 @@ class Opened:
         """True if the user can name the frames: photographs, or cameras of a file."""
         return self.renders_from in (None, "cameras")
 
-    def with_resolution(self, resolution: int) -> Opened:
-        """Return a copy with another working size, the longest side in pixels."""
+    def with_resolution(self, resolution: tuple[int, int] | int) -> Opened:
+        """Return a copy with another working size."""
         return replace(self, request=replace(self.request, resolution=resolution))
 
     @property
@@ -145,6 +145,9 @@ class CompletionTask:
     taken_out: TakenOut | None = None
     """What earlier edits took out of the input splat, which the photographs do not show any more;
     None for nothing."""
+    invented: Bool[Tensor, "n"] | None = None
+    """Mask of the Gaussians of `scene` that earlier commands invented, which give way to what
+    photographs show; None for none."""
 
     @property
     def device(self) -> torch.device:

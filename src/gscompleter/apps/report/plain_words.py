@@ -258,6 +258,15 @@ def describe_ignored(summary: CompletionSummary) -> str:
     return "is hidden by a mask, or stays the same while the camera moves, like a vehicle's bonnet"
 
 
+def describe_replaced(count: int) -> str:
+    """Describe invented Gaussians that an update or a further completion replaced."""
+    gaussians = "1 invented Gaussian" if count == 1 else f"{count:,} invented Gaussians"
+    return (
+        f"{gaussians} gave way to what photographs show; removed.ply has them, and strip puts them "
+        "back."
+    )
+
+
 def list_splat_notes(summary: CompletionSummary) -> Iterator[Note]:
     """List the notes on what photographs bring to a splat."""
     from_photographs = summary.gaussians.get("from_photographs")
@@ -281,6 +290,9 @@ def list_splat_notes(summary: CompletionSummary) -> Iterator[Note]:
             f"The splat does not reproduce {summary.new_photographs} of the photographs; it is "
             "recoloured to them, which helps most.",
         )
+    num_replaced = summary.gaussians.get("replaced")
+    if num_replaced:
+        yield Note("replaced", describe_replaced(num_replaced))
     num_removed = summary.gaussians.get("removed")
     if num_removed:
         yield Note("removed", f"{num_removed:,} {REMOVED_NOTE}")

@@ -262,9 +262,12 @@ def count_changes(completion: Completion) -> dict[str, Any]:
     num_pieces = completion.count_added("piece")
     if num_pieces:
         counts["pieces"] = num_pieces
-    num_removed = int(completion.source.gone_mask.sum())
+    num_removed = int(completion.source.removed_mask.sum())
     if num_removed:
         counts["removed"] = num_removed
+    num_replaced = int(completion.source.replaced_mask.sum())
+    if num_replaced:
+        counts["replaced"] = num_replaced
     if completion.config.trust == "full":
         return {"gaussians": counts}
     counts["recolored"] = int(completion.recolored_mask.sum())

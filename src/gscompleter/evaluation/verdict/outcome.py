@@ -87,6 +87,7 @@ def judge_completion(
         completion.num_observed > 0
         or completion.num_invented > 0
         or bool(completion.recolored_mask.any())
+        or bool(completion.source.replaced_mask.any())
     )
     if not has_gained:
         reason = explain_no_gain(completion) if has_searched else NOTHING_LACKS
@@ -139,7 +140,7 @@ def describe_mismatch(compared: Sequence[HeldOutRow]) -> str:
 
 def explain_no_gain(completion: Completion) -> str:
     """Explain in one sentence why nothing was added at any target."""
-    place = " in place of what was removed" if completion.source.gone_mask.any() else ""
+    place = " in place of what was removed" if completion.source.removed_mask.any() else ""
     results = completion.targets
     if not results:
         is_object = completion.config.holes.kind == "enclosed"
@@ -176,7 +177,7 @@ def describe_work(completion: Completion) -> str:
     """Describe in a clause what was done, and for how many of several targets."""
     has_added = completion.num_invented > 0
     has_observed = completion.num_observed > 0
-    if completion.source.gone_mask.any():
+    if completion.source.removed_mask.any():
         if not has_added:
             return REMOVED_ALONE
         work = "The selection is removed and its place is filled"
@@ -184,6 +185,8 @@ def describe_work(completion: Completion) -> str:
         work = f"The {'splat' if completion.is_given else 'scene'} is completed"
     elif has_observed:
         return "What photographs show and the splat lacked is added"
+    elif completion.source.replaced_mask.any():
+        return "What was invented and photographs contradict is taken out"
     else:
         return "Nothing was added to the splat; only colours changed"
     changed = count_changed(completion.targets)
@@ -203,7 +206,8 @@ def describe_gain(
     has_unused = any(not row.is_check for row in scored)
     if not scored or (better and not has_unused):
         if not better:
-            return f"{work}; no unused photograph could test it"
+            # Where there is no unused photograph at all, nobody expects a test by one.
+            return f"{work}; no unused photograph could test it" if held_out else work
         gains = format_number(average(compute_psnr_gain(row) for row in better), 1)
         gain = "1 photograph gains" if len(better) == 1 else f"{len(better)} photographs gain"
         return f"{work}: {gain} {gains} dB"

@@ -1,0 +1,199 @@
+"""Replacement of what was invented by what photographs show (not in the paper).
+
+Φ invents where no photograph looks. Photographs of that place may come later, and show something
+else: what was invented then stands in front of it, or in its place. So invented Gaussians that a
+photograph contests step aside while photographs are added (`add_observed`). Then those return that
+the photographs need, by the rule of the cleaning, or that are hidden by what they show.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.config import CleaningConfig
+from gscompleter.numerics.image_ops import average_box
+from gscompleter.render.cache import SceneRenderer
+from gscompleter.render.protocols import Renderer
+from gscompleter.render.view_map import get_view_map
+from gscompleter.stages.add_observed import MIN_ADDED_SHARE, compare_colors, find_usable
+from gscompleter.stages.hole_masks import compute_hole_mask
+from gscompleter.stages.superfluous import (
+    FADED_OPACITY,
+    exclude_needed,
+    limit_errors,
+    sum_error_changes,
+)
+from gscompleter.state import Completion
+from gscompleter.trust.photometric import sum_weights
+from gscompleter.types import Gaussians, Render, View, merge
+
+MAX_ROUNDS = 8
+"""Layers of invented Gaussians that step aside behind each other."""
+MIN_WEIGHT = 0.5
+"""Compositing weight of invented Gaussians from which on a pixel shows them."""
+MIN_SUM = 1e-3
+"""Compositing weight, summed over pixels, from which on a photograph shows a Gaussian."""
+MIN_VISIBLE = 0.5
+"""Share of an invented Gaussian that is not hidden by others, from which on it is in their way."""
+ERROR_RADIUS = 2
+"""Radius in pixels over which errors with and without invented Gaussians are compared."""
+
+
+@dataclass(frozen=True)
+class Contested:
+    """Invented Gaussians that photographs contest, and the scene with them."""
+
+    given: Completion
+    rows: Bool[Tensor, "m"]
+    """Those among the rendered Gaussians of `given`."""
+
+
+def find_contested(
+    state: Completion, invented: Bool[Tensor, "n"] | None, scenes: SceneRenderer
+) -> Contested | None:
+    """Find invented Gaussians of a begun scene that stand where photographs show something else.
+
+    `invented` marks those of the context. A photograph contests them where the scene is empty
+    without them, or fits it better. Returns None if none are contested, as in the paper.
+    """
+    if invented is None or not invented.any() or not state.config.add_observed:
+        return None
+    source = state.source
+    # A rendered Gaussian that stands for several is invented if all of them are.
+    is_other = torch.zeros(len(source.rendered), dtype=torch.bool, device=invented.device)
+    is_invented = ~is_other.index_fill(0, source.stand_ins[~invented], True)
+
+    masks = find_contested_pixels(state, source.rendered[~is_invented], scenes)
+    gone = torch.zeros_like(is_invented)
+    # A round lets the next layer step aside: what is behind the first was hidden until then.
+    for _ in range(MAX_ROUNDS):
+        left = source.rendered[~gone]
+        found = find_shown(left, is_invented[~gone], state, masks, scenes.renderer)
+        if not found.any():
+            break
+        gone = gone.masked_scatter(~gone, found)
+    return Contested(state, gone) if gone.any() else None
+
+
+def find_contested_pixels(
+    state: Completion, others: Gaussians, scenes: SceneRenderer
+) -> list[Bool[Tensor, "_ _"]]:
+    """Find the pixels of photographs in which they contest what was invented.
+
+    The scene is empty there without it, or fits the photograph better, or the photograph shows
+    something else. `others` is that scene.
+    """
+    views = [photo.view for photo in state.photos]
+    frozen = scenes.freeze_at(state.parts, [view.camera for view in views])
+    renders = [scene.render for scene in frozen]
+    differences, limit = compare_colors(views, renders)
+
+    def find(view: View, render: Render, difference: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+        rest = scenes.renderer.render(others, view.camera)
+        is_empty = compute_hole_mask(rest.alpha, state.config.holes)
+        is_worse = measure_error(render, view) > measure_error(rest, view)
+        return (is_empty | is_worse | (difference > limit)) & find_usable(view)
+
+    return list(get_view_map(others.means, len(others))(find, views, renders, differences))
+
+
+def measure_error(render: Render, view: View) -> Float[Tensor, "h w"]:
+    """Measure the squared error of a render, averaged over a few pixels."""
+    error = (view.fill_ignored(render.image.clamp(0, 1)) - view.image).square().mean(dim=-1)
+    return average_box(error, ERROR_RADIUS)
+
+
+def find_shown(
+    scene: Gaussians,
+    is_invented: Bool[Tensor, "m"],
+    state: Completion,
+    masks: Sequence[Bool[Tensor, "_ _"]],
+    renderer: Renderer,
+) -> Bool[Tensor, "m"]:
+    """Find the invented Gaussians that photographs show mostly in their contested pixels."""
+
+    def sum_shown(view: View, contested: Bool[Tensor, "h w"]) -> Float[Tensor, "m 3"]:
+        frozen = renderer.freeze(scene, view.camera)
+        shown = contested & (frozen.splat(is_invented.to(scene.means)) > MIN_WEIGHT)
+        # Along its borders every photograph shows a little of what was added beside it.
+        if shown.float().mean() < MIN_ADDED_SHARE:
+            shown = torch.zeros_like(shown)
+        # A backprojection takes three channels.
+        layers = torch.stack([shown, ~shown, torch.zeros_like(shown)], dim=-1)
+        return frozen.backproject(layers.to(scene.means))
+
+    sums = torch.zeros_like(scene.means)
+    views = [photo.view for photo in state.photos]
+    for part in get_view_map(scene.means, len(scene))(sum_shown, views, masks):
+        sums += part
+    return is_invented & (sums[:, 0] > sums[:, 1]) & (sums[:, 0] > MIN_SUM)
+
+
+def let_step_aside(state: Completion, contested: Contested | None) -> Completion:
+    """Return the scene without the contested Gaussians; the same if there are none."""
+    return state if contested is None else drop_rows(state, state, contested.rows)
+
+
+def drop_rows(state: Completion, given: Completion, rows: Bool[Tensor, "m"]) -> Completion:
+    """Return a state whose context is that of the given scene without some rendered Gaussians."""
+    source = given.source
+    if rows.any():
+        source = replace(source.leave_out(rows), replaced_mask=source.expand(rows))
+    return replace(state, source=source, rendered_context=source.rendered)
+
+
+def return_needed(
+    state: Completion,
+    contested: Contested | None,
+    scenes: SceneRenderer,
+    config: CleaningConfig = CleaningConfig(),
+) -> Completion:
+    """Let contested Gaussians return that photographs need, or that these hide.
+
+    `state` is the scene without them, with what photographs show. The others gave way.
+    """
+    if contested is None:
+        return state
+    given = contested.given
+    candidates = given.source.rendered[contested.rows]
+    is_dropped = find_contradicted(state, candidates, scenes, config)
+
+    # One at a time they are superfluous; together they may not be. No photograph may be worse than
+    # it was with all of them.
+    views = [photo.view for photo in state.photos]
+    limits = limit_errors(merge(given.parts), views, config.tolerance, scenes.renderer)
+    scene = merge(state.parts)
+    removable = torch.cat([is_dropped.new_zeros(len(scene)), is_dropped])
+    dropped = exclude_needed(merge([scene, candidates]), removable, views, limits, scenes.renderer)[
+        len(scene) :
+    ]
+    return drop_rows(state, given, contested.rows.masked_scatter(contested.rows, dropped))
+
+
+def find_contradicted(
+    state: Completion, candidates: Gaussians, scenes: SceneRenderer, config: CleaningConfig
+) -> Bool[Tensor, "c"]:
+    """Find candidates by which photographs lose, or that stand needlessly before what they show.
+
+    All of them are faint in the comparison: otherwise those that are behind others look needless.
+    """
+    views = [photo.view for photo in state.photos]
+    frozen = scenes.freeze_at(state.parts, [view.camera for view in views])
+    are_faint = torch.ones_like(candidates.opacities, dtype=torch.bool)
+    changes = sum_error_changes(candidates, are_faint, views, frozen, config)
+
+    # What photographs do not show, since something is before it, contradicts none of them.
+    faint = replace(candidates, opacities=candidates.opacities.clamp_max(FADED_OPACITY))
+    visible = torch.zeros_like(candidates.opacities)
+    alone = torch.zeros_like(candidates.opacities)
+    for view, scene in zip(views, frozen, strict=True):
+        visible += sum_weights(scene.extend(faint))[-len(candidates) :]
+        alone += sum_weights(scenes.renderer.freeze(faint, view.camera))
+    is_in_the_way = visible > MIN_VISIBLE * alone
+    is_harmful = changes.gained > config.idle * changes.equal_share
+    return changes.are_observed & changes.find_removable(config) & (is_in_the_way | is_harmful)

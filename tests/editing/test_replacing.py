@@ -1,0 +1,138 @@
+"""What was invented gives way to what photographs show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from gscompleter import GSCompleter, load_renderer
+from gscompleter.config import CompleterConfig
+from gscompleter.editing.replacing import find_contested
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.parts import OBSERVED
+from gscompleter.render.cache import SceneRenderer
+from gscompleter.state import Completion
+from gscompleter.system.errors import InputError
+from gscompleter.types import Gaussians, Reconstruction, View, make_observed, merge, sh_from_rgb
+from scenes import Room, camera_at, gaussians_of, reconstruction_of, view_of
+
+SCENES = SceneRenderer(load_renderer("cpu"))
+SIZE = 48
+RENDERER = load_renderer("cpu")
+ROOM = Room()
+PLACES = (-0.6, -0.3, 0.0, 0.3, 0.6)
+PHOTOS = [view_of(ROOM, camera_at(x, size=SIZE), k) for k, x in enumerate(PLACES)]
+WHOLE = merge([gaussians_of(PHOTOS[index]) for index in (0, 2, 4)])
+PHOTOS = [replace(v, image=RENDERER.render(WHOLE, v.camera).image.clamp(0, 1)) for v in PHOTOS]
+"""Photographs that the whole scene reproduces exactly."""
+SPLAT = CompleterConfig.splat()
+
+
+def find_crate(scene: Gaussians) -> torch.Tensor:
+    low, high = (torch.tensor(corner) for corner in ROOM.boxes[1])
+    return ((scene.means > low - 0.05) & (scene.means < high + 0.05)).all(dim=1)
+
+
+CUT = WHOLE[~find_crate(WHOLE)]
+"""The scene without the front box: a hole that all photographs show."""
+
+
+def make_board(z: float, x: float = -0.1, color: float = 0.9, width: float = 0.5) -> Gaussians:
+    """Make an opaque grey board that was invented for target 1, across the view of the box."""
+    steps = torch.linspace(-width, width, 25)
+    places = torch.cartesian_prod(steps + x, steps + 0.8)
+    means = torch.cat([places, torch.full((len(places), 1), z)], dim=1)
+    board = make_observed(
+        means,
+        torch.tensor([[1.0, 0, 0, 0]]).repeat(len(means), 1),
+        torch.full((len(means), 3), 0.03),
+        torch.full((len(means),), 0.95),
+        sh_from_rgb(torch.full((len(means), 3), color)),
+    )
+    return replace(board, generated=torch.ones_like(board.generated))
+
+
+def reconstruct_exactly(views: list[View]) -> Reconstruction:
+    """Reconstruct photographs as an ideal Ψ: the true surface of each pixel."""
+    return reconstruction_of(views, [view.depth for view in views])
+
+
+def begin(
+    scene: Gaussians, marks: bool = True, config: CompleterConfig = SPLAT, photos=PHOTOS
+) -> Completion:
+    """Begin with a scene, in which what has a label was invented, or nothing without `marks`."""
+    completer = GSCompleter(reconstruct_exactly, config=config)
+    invented = scene.generated != OBSERVED if marks else None
+    return completer.begin(photos[:2], scene, photos[2:], invented=invented)
+
+
+def score(scene: Gaussians) -> list[float]:
+    return [psnr(RENDERER.render(scene, v.camera).image.clamp(0, 1), v.image) for v in PHOTOS]
+
+
+@pytest.mark.parametrize("z", [1.6, 2.6], ids=["before the box", "within it"])
+def test_what_stands_before_a_photographed_surface_gives_way(z):
+    scene = merge([CUT, make_board(z)])
+    kept, replaced = begin(scene, marks=False), begin(scene)
+    assert kept.source.replaced_mask.sum() == 0
+    gone = replaced.source.replaced_mask
+    is_board = scene.generated != OBSERVED
+    assert gone.any()
+    for view in PHOTOS:
+        left = replaced.scene
+        shown = RENDERER.freeze(left, view.camera).splat((left.generated == 1).float())
+        assert (shown > 0.5).float().mean() < 0.002
+    # What was given stays, bit for bit.
+    assert not gone[~is_board].any()
+    assert torch.equal(replaced.scene.means[: len(CUT)], CUT.means)
+    for before, without, after in zip(
+        score(scene), score(kept.scene), score(replaced.scene), strict=True
+    ):
+        assert after > before + 8
+        assert after > without + 3
+
+
+def test_what_photographs_do_not_show_stays():
+    """One board is beside all photographs, the other within the box, which hides it."""
+    beside = make_board(3.0, x=9.0)
+    inside = make_board(2.6, width=0.15)
+    scene = merge([WHOLE, beside, inside])
+    assert find_contested(begin(scene, marks=False), scene.generated != OBSERVED, SCENES) is None
+
+
+def test_what_only_one_place_shows_stays_where_nothing_else_is_known():
+    """Photographs from one place have no stereo: without the board there would be a hole."""
+    one = [replace(PHOTOS[2], frame=k) for k in range(3)]
+    scene = merge([CUT, make_board(2.6, color=0.4)])
+    state = begin(scene, photos=one)
+    assert state.num_observed == 0
+    # Its edge stood before what the scene shows.
+    assert state.source.replaced_mask[len(CUT) :].float().mean() < 0.5
+    assert score(state.scene)[2] > score(scene)[2] - 0.02
+
+
+def test_what_photographs_confirm_is_still_there():
+    """The box was invented as it is: photographs show it, whoever made it."""
+    box = WHOLE[find_crate(WHOLE)]
+    box = replace(box, generated=torch.ones_like(box.generated))
+    scene = merge([CUT, box])
+    state = begin(scene)
+    for before, after in zip(score(scene), score(state.scene), strict=True):
+        # As good as photographs are reconstructed, of which nobody sees a difference.
+        assert after > min(before, 35)
+
+
+@pytest.mark.parametrize("config", [replace(SPLAT, add_observed=False), CompleterConfig.paper()])
+def test_nothing_gives_way_where_photographs_add_nothing(config):
+    scene = merge([CUT, make_board(1.6)])
+    assert not begin(scene, config=config).source.replaced_mask.any()
+
+
+def test_a_wrong_mask_is_refused():
+    completer = GSCompleter(reconstruct_exactly)
+    with pytest.raises(InputError, match="needs a truth value for each of"):
+        completer.begin(PHOTOS, WHOLE, invented=torch.zeros(3, dtype=torch.bool))
+    with pytest.raises(InputError, match="marks Gaussians of a scene"):
+        completer.begin(PHOTOS, invented=torch.zeros(3, dtype=torch.bool))
