@@ -39,7 +39,7 @@ def find_superfluous(
     that are `not needed`.
     """
     none = torch.zeros_like(scene.generated, dtype=torch.bool)
-    changes = rate_gaussians(scene, none, views, renderer, config)
+    changes = rate_by_photographs(scene, none, views, renderer, config)
     removable = changes.are_observed & changes.find_removable(config) & (scene.generated == 0)
     is_harmful = changes.gained > config.idle * changes.equal_share
     # A wall behind floaters is hidden, and looks superfluous. With the floaters faded, photographs
@@ -62,11 +62,11 @@ def find_removable(
     config: CleaningConfig,
 ) -> Bool[Tensor, "n"]:
     """Find Gaussians that can be removed one at a time while the others in `faded` are faint."""
-    changes = rate_gaussians(scene, faded, views, renderer, config)
+    changes = rate_by_photographs(scene, faded, views, renderer, config)
     return changes.are_observed & changes.find_removable(config)
 
 
-def rate_gaussians(
+def rate_by_photographs(
     scene: Gaussians,
     faded: Bool[Tensor, "n"],
     views: Sequence[View],

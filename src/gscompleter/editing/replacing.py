@@ -73,7 +73,7 @@ def find_contested(
     # A round lets the next layer step aside: what is behind the first was hidden until then.
     for _ in range(MAX_ROUNDS):
         left = source.rendered[~gone]
-        found = find_shown(left, is_invented[~gone], state, masks, scenes.renderer)
+        found = find_contested_invented(left, is_invented[~gone], state, masks, scenes.renderer)
         if not found.any():
             break
         gone = gone.masked_scatter(~gone, found)
@@ -108,7 +108,7 @@ def measure_error(render: Render, view: View) -> Float[Tensor, "h w"]:
     return average_box(error, ERROR_RADIUS)
 
 
-def find_shown(
+def find_contested_invented(
     scene: Gaussians,
     is_invented: Bool[Tensor, "m"],
     state: Completion,
@@ -161,7 +161,7 @@ def return_needed(
         return state
     given = contested.given
     candidates = given.source.rendered[contested.rows]
-    is_dropped = find_contradicted(state, candidates, scenes, config)
+    is_dropped = find_unneeded_candidates(state, candidates, scenes, config)
 
     # One at a time they are superfluous; together they may not be. No photograph may be worse than
     # it was with all of them.
@@ -175,7 +175,7 @@ def return_needed(
     return drop_rows(state, given, contested.rows.masked_scatter(contested.rows, dropped))
 
 
-def find_contradicted(
+def find_unneeded_candidates(
     state: Completion, candidates: Gaussians, scenes: SceneRenderer, config: CleaningConfig
 ) -> Bool[Tensor, "c"]:
     """Find candidates by which photographs lose, or that stand needlessly before what they show.

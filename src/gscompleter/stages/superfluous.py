@@ -171,8 +171,8 @@ def find_needed_by_photographs(
 ) -> Bool[Tensor, "n"]:
     """Find the missing Gaussians that a photograph needs back to be within its limit.
 
-    Opacities [n] are those that the Gaussians have if they are not missing. After `MAX_RETURN_ROUNDS`
-    rounds the photograph gets back all that it sees.
+    Opacities [n] are those that the Gaussians have if they are not missing. After
+    `MAX_RETURN_ROUNDS` rounds the photograph gets back all that it sees.
     """
     back = torch.zeros_like(missing)
     for _ in range(MAX_RETURN_ROUNDS):

@@ -140,7 +140,7 @@ def find_hole_edits(
     if not config.holes.forces_removed:
         return HoleEdits(opened)
     if config.holes.keeps_confirmed:
-        removed = removed & ~find_confirmed(state, camera, frozen, scenes)
+        removed = removed & ~find_confirmed_surface(state, camera, frozen, scenes)
     # What an earlier target filled is no hole any more.
     filled = [part.gaussians for part in state.added_parts if part.origin.is_invented]
     if sum(map(len, filled)) == 0:
@@ -149,7 +149,7 @@ def find_hole_edits(
     return HoleEdits(opened, removed & compute_hole_mask(alpha, config.holes))
 
 
-def find_confirmed(
+def find_confirmed_surface(
     state: Completion, camera: PaddedCamera, frozen: FrozenScene, scenes: SceneRenderer
 ) -> Bool[Tensor, "h w"]:
     """Find the pixels of a target whose surface photographs confirm, beside what was removed.

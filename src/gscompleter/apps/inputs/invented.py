@@ -21,13 +21,13 @@ def mark_invented(task: CompletionTask) -> tuple[CompletionTask, tuple[str, ...]
     """Mark what earlier commands invented in the splat of a task; lines tell about it."""
     assert task.scene is not None
     assert task.splat_file is not None
-    invented = find_invented(task.splat_file, task.scene)
+    invented = read_invented_rows(task.splat_file, task.scene)
     is_unknown = invented is None and bool(has_target(task.scene).any())
     notes = (describe_unknown(task.splat_file),) if is_unknown else ()
     return replace(task, invented=invented), notes
 
 
-def find_invented(splat_file: InputSplatFile, scene: Gaussians) -> Bool[Tensor, "n"] | None:
+def read_invented_rows(splat_file: InputSplatFile, scene: Gaussians) -> Bool[Tensor, "n"] | None:
     """Find the Gaussians of a splat that earlier commands invented; None if nothing tells.
 
     A label alone does not: Gaussians of a user that were recoloured for a target have its number.

@@ -55,7 +55,7 @@ Move = Float[np.ndarray, "6"]
 
 
 @dataclass(frozen=True)
-class Picture:
+class MovedPicture:
     """The scene after a move of the camera."""
 
     image: PixelValues
@@ -64,7 +64,7 @@ class Picture:
     nothing."""
 
 
-Draw = Callable[[Move], Picture]
+Draw = Callable[[Move], MovedPicture]
 """Renders the scene after a move."""
 
 
@@ -104,15 +104,15 @@ def measure_fitted(
     rays = small.camera.z_rays().double().cpu().numpy()
     rays = rays @ small.camera.c2w[:3, :3].double().cpu().numpy()
 
-    def draw(move: Move) -> Picture:
+    def draw(move: Move) -> MovedPicture:
         render = renderer.render(scene, move_camera_by(small.camera, move, median / focal))
         shown = render.depth_map()
         depth = shown.depth.where(shown.valid, median).double().cpu().numpy()
-        return Picture(read_image(render), rays * depth[..., None])
+        return MovedPicture(clamp_image(render), rays * depth[..., None])
 
     move = fit_move(draw, small.image.cpu().numpy(), counted, median, focal)
     pose = move_camera_by(small.camera, move, median / focal).c2w
-    image = read_image(renderer.render(scene, replace(target.camera, c2w=pose)))
+    image = clamp_image(renderer.render(scene, replace(target.camera, c2w=pose)))
     gains = fit_gains(image, target.image.cpu().numpy(), observed.cpu().numpy())
     fitted = torch.from_numpy(np.clip(image * gains, 0, 1)).to(target.image)
     whole = compute_masked_psnr(fitted, target.image, target.valid_mask)
@@ -126,8 +126,8 @@ def measure_fitted(
     )
 
 
-def read_image(render: Render) -> PixelValues:
-    """Read the colours of a render, in [0, 1]."""
+def clamp_image(render: Render) -> PixelValues:
+    """Clamp the colours of a render to [0, 1]."""
     return np.asarray(render.image.clamp(0, 1).cpu().numpy(), np.float64)
 
 
@@ -167,14 +167,14 @@ def fit_move(
 def fit_blurred(
     draw: Draw,
     move: Move,
-    picture: Picture,
+    picture: MovedPicture,
     truth: PixelValues,
     counted: Bool[np.ndarray, "h w"],
     sigma: float,
     *,
     median: float,
     focal: float,
-) -> tuple[Move, Picture]:
+) -> tuple[Move, MovedPicture]:
     """Fit the move to blurred images, by steps of Gauss and Newton with robust weights.
 
     `picture` is the scene after `move`, from which it begins; returns both at the end.
