@@ -6,6 +6,7 @@ import torch
 
 from gscompleter import CompleterConfig, load_renderer
 from gscompleter.config import GapConfig
+from gscompleter.guards import prepare_guards
 from gscompleter.numerics.geometry import compute_z_depths, pad_camera
 from gscompleter.parts import PartOrigin, make_part
 from gscompleter.render.cache import SceneRenderer
@@ -87,6 +88,37 @@ def replace_frozen(view: TargetView, added: Gaussians) -> TargetView:
 def test_what_is_wide_or_opaque_is_no_gap():
     assert not find_gaps(look_at_gap(12)).any()
     assert not find_gaps(look_at_gap(0)).any()
+
+
+def photograph_screen(x: float) -> View:
+    """Photograph a screen before a wall, from `x`."""
+    camera = camera_at(x, size=SIZE)
+    across = camera.center[0] + SCREEN * camera.z_rays()[..., 0]
+    is_screen = across.abs() < 0.3
+    depth = torch.where(is_screen, SCREEN, WALL)
+    image = torch.where(is_screen[..., None], torch.tensor([0.8, 0.3, 0.1]), torch.tensor(0.2))
+    return View(image, camera, 0, depth)
+
+
+def test_gaps_on_both_sides_of_a_screen_are_closed():
+    scene = gaussians_of(photograph_screen(0.0))
+    photograph = replace(photograph_screen(-0.5), depth=None)
+    completer = knowing(CompleterConfig())
+    begun = begin_with(scene, [photograph], CompleterConfig())
+    state = prepare_guards(begun, completer.scenes)
+    target = completer.observe(state, CAMERA)
+    # The target sees no hole, and nothing is behind the screen.
+    added = make_part(PartOrigin("target", 1), scene[-SIZE:])
+    closing = completer.close_gaps(state, target, added)
+    for camera in move_beside(CAMERA, [photograph], GapConfig().displacement):
+        before, after = (
+            find_gaps(
+                view_gaps(replace(state, added_parts=parts), camera, completer.scenes, GapConfig())
+            )
+            for parts in ((added,), (added, closing))
+        )
+        assert before.sum() > SIZE
+        assert after.sum() < 0.1 * before.sum()
 
 
 def test_a_few_pixels_are_not_worth_closing():
