@@ -39,7 +39,13 @@ from gscompleter.render.protocols import Renderer
 from gscompleter.stages.add_observed import add_observed
 from gscompleter.stages.additions import Additions
 from gscompleter.stages.align_depth import align_depth
-from gscompleter.stages.close_gaps import continue_surfaces, find_gaps, view_gaps
+from gscompleter.stages.close_gaps import (
+    are_worth_closing,
+    continue_surfaces,
+    find_gaps,
+    move_beside,
+    view_gaps,
+)
 from gscompleter.stages.context import choose_config, init_context
 from gscompleter.stages.fade_border import fade_border
 from gscompleter.stages.filter_holes import filter_holes
@@ -305,7 +311,8 @@ class GSCompleter:
         """
         origin = PartOrigin("gap", state.next_target_id)
         nothing = make_part(origin, added.gaussians[:0])
-        if state.config.gaps.displacement == 0 or len(added) == 0:
+        config = state.config.gaps
+        if config.displacement == 0 or len(added) == 0:
             return nothing
         # The target is not counted as completed yet: what is added here gets its id, and has to be
         # content with its budgets.
@@ -313,14 +320,20 @@ class GSCompleter:
             replace(photo, budgets=budgets)
             for photo, budgets in zip(state.photos, target.budgets, strict=True)
         )
-        with_added = replace(state, added_parts=(*state.added_parts, added), photos=photos)
-        view = view_gaps(with_added, target.camera.target, self.scenes, state.config.gaps)
-        gaps = find_gaps(view)
-        if not gaps.any():
-            return nothing
-        image, continued = continue_surfaces(view, gaps)
-        candidates = Additions.begin(origin, "continue", continued)
-        return accept_at(view, candidates, image, DepthAffine(), keep_as_it_is).to_part()
+        state = replace(state, added_parts=(*state.added_parts, added), photos=photos)
+        closed = [nothing]
+        for camera in move_beside(target.camera.target, state.views, config.displacement):
+            # What the camera before it closed is not a gap any more.
+            view = view_gaps(state, camera, self.scenes, config)
+            gaps = find_gaps(view)
+            if not are_worth_closing(gaps):
+                continue
+            image, continued = continue_surfaces(view, gaps)
+            candidates = Additions.begin(origin, "continue", continued)
+            part = accept_at(view, candidates, image, DepthAffine(), keep_as_it_is).to_part()
+            state = replace(state, added_parts=(*state.added_parts, part))
+            closed.append(part)
+        return make_part(origin, merge([part.gaussians for part in closed]))
 
     @run_in_plain_torch
     def advance_batch(self, state: Completion, targets: Sequence[Camera]) -> Completion:

@@ -12,6 +12,9 @@ from gscompleter.reconstructors.plane_sweep.directional_colors import (
     fit_directional_colors,
 )
 from gscompleter.reconstructors.plane_sweep.virtual_views import (
+    UNCONFIRMED_DETAIL,
+    WarpedPhotograph,
+    confirm_detail,
     extrapolate_camera,
     make_virtual_views,
 )
@@ -22,6 +25,7 @@ from scenes import Room, camera_at, gaussians_of, view_of
 
 SIZE = 96
 GAIN = 0.85
+WALL = 4.0
 
 
 def take_pair() -> list[View]:
@@ -75,6 +79,43 @@ def test_virtual_photographs_show_what_the_nearer_photograph_does():
         assert made.camera.center[0] == pytest.approx(x, abs=1e-5)
         difference = (made.image - truth).abs().mean(dim=-1)[seen]
         assert difference.median() < 0.01
+
+
+def look_at_fine_wall(x: float) -> View:
+    """Photograph a wall with waves that are 3 pixels long, from `x`."""
+    camera = camera_at(x, size=SIZE)
+    across, down = (camera.center + WALL * camera.z_rays())[..., :2].unbind(dim=-1)
+    wavenumber = 2 * torch.pi / (3 * WALL / camera.K[0, 0])
+    waves = torch.sin(wavenumber * across) * torch.cos(0.1 * wavenumber * down)
+    image = (0.5 + 0.3 * waves)[..., None].expand(SIZE, SIZE, 3).contiguous()
+    return View(image, camera, depth=torch.full((SIZE, SIZE), WALL))
+
+
+def test_virtual_photographs_keep_the_finest_detail_that_both_photographs_show():
+    views, renderer = [look_at_fine_wall(x) for x in (-0.2, 0.23)], load_renderer("cpu")
+    scene = merge([gaussians_of(view) for view in views])
+    depths = [renderer.render(scene, view.camera).depth_map() for view in views]
+    for made in make_virtual_views(scene, views, depths, renderer):
+        truth = look_at_fine_wall(made.camera.center[0].item()).image
+        middle = slice(SIZE // 3, 2 * SIZE // 3)
+        shown, wanted = (one[middle, middle] - 0.5 for one in (made.image, truth))
+        assert (shown * wanted).sum() > 0.75 * wanted.square().sum()
+
+
+def test_detail_counts_as_far_as_the_other_photograph_has_it_there():
+    generator = torch.Generator().manual_seed(0)
+    noises = [0.5 + 0.1 * torch.randn(SIZE, SIZE, 3, generator=generator) for _ in range(2)]
+    seen = torch.ones(SIZE, SIZE)
+    own, other = (WarpedPhotograph(noise, seen) for noise in noises)
+
+    def measure_detail(by: WarpedPhotograph) -> float:
+        return ((confirm_detail(own, by) - 0.5).std() / (own.image - 0.5).std()).item()
+
+    assert measure_detail(own) > 0.99
+    # Of detail that is elsewhere little more than the blurred image is left.
+    assert measure_detail(other) < 0.4
+    unseen = replace(own, share=torch.zeros(SIZE, SIZE))
+    assert measure_detail(unseen) == pytest.approx(UNCONFIRMED_DETAIL, abs=0.05)
 
 
 def test_each_photograph_keeps_its_tone_and_cameras_beyond_see_the_nearer_one():

@@ -79,9 +79,9 @@ def test_a_matrix_times_its_inverse_is_one():
 def test_each_virtual_photograph_stands_beyond_the_nearest_neighbour():
     views = take_photographs()
     cameras = [view.camera for view in views]
-    assert find_nearest_camera(cameras[0], cameras) is cameras[1]
+    assert find_nearest_camera(cameras[0], cameras) == 1
     # A second photograph from the same place gives no direction to go on in.
-    assert find_nearest_camera(cameras[2], [*cameras, cameras[2]]) is cameras[1]
+    assert find_nearest_camera(cameras[2], [*cameras, cameras[2]]) == 1
     renderer = load_renderer("cpu")
     scene = merge([gaussians_of(view) for view in views])
     depths = [renderer.render(scene, camera).depth_map() for camera in cameras]

@@ -2,15 +2,21 @@
 
 from dataclasses import replace
 
-import pytest
 import torch
 
 from gscompleter import CompleterConfig, load_renderer
 from gscompleter.config import GapConfig
+from gscompleter.guards import prepare_guards
 from gscompleter.numerics.geometry import compute_z_depths, pad_camera
 from gscompleter.parts import PartOrigin, make_part
 from gscompleter.render.cache import SceneRenderer
-from gscompleter.stages.close_gaps import continue_surfaces, find_gaps, move_on, view_gaps
+from gscompleter.stages.close_gaps import (
+    are_worth_closing,
+    continue_surfaces,
+    displace_camera,
+    find_gaps,
+    view_gaps,
+)
 from gscompleter.stages.target_view import TargetView, render_target
 from gscompleter.types import Gaussians, View, merge
 from knowing_models import knowing
@@ -46,13 +52,16 @@ def look_at_gap(width: int = WIDTH) -> TargetView:
     return view_gaps(state, CAMERA, scenes, GapConfig())
 
 
-def test_the_camera_moves_on_from_its_nearest_photograph_without_turning():
+def test_cameras_move_on_from_the_nearest_photograph_and_to_both_sides_without_turning():
     views = [view_of(Room(), camera_at(x, size=SIZE)) for x in (-1.0, 0.0)]
     target = camera_at(0.4, yaw=12, size=SIZE)
-    moved = move_on(target, views, 0.5)
-    assert moved.center.tolist() == pytest.approx([0.6, 0.0, 0.0], abs=1e-6)
-    assert torch.equal(moved.c2w[:3, :3], target.c2w[:3, :3])
-    assert torch.equal(moved.K, target.K)
+    moved = displace_camera(target, views, 0.5)
+    to_the_right = 0.2 * target.c2w[:3, 0]
+    expected = [torch.tensor([0.6, 0.0, 0.0]), *(target.center + s * to_the_right for s in (1, -1))]
+    for camera, center in zip(moved, expected, strict=True):
+        assert torch.allclose(camera.center, center, atol=1e-6)
+        assert torch.equal(camera.c2w[:3, :3], target.c2w[:3, :3])
+        assert torch.equal(camera.K, target.K)
 
 
 def test_a_gap_takes_depth_and_colour_of_the_farther_surface():
@@ -81,6 +90,45 @@ def test_what_is_wide_or_opaque_is_no_gap():
     assert not find_gaps(look_at_gap(0)).any()
 
 
+def photograph_screen(x: float) -> View:
+    """Photograph a screen before a wall, from `x`."""
+    camera = camera_at(x, size=SIZE)
+    across = camera.center[0] + SCREEN * camera.z_rays()[..., 0]
+    is_screen = across.abs() < 0.3
+    depth = torch.where(is_screen, SCREEN, WALL)
+    image = torch.where(is_screen[..., None], torch.tensor([0.8, 0.3, 0.1]), torch.tensor(0.2))
+    return View(image, camera, 0, depth)
+
+
+def test_gaps_on_both_sides_of_a_screen_are_closed():
+    scene = gaussians_of(photograph_screen(0.0))
+    photograph = replace(photograph_screen(-0.5), depth=None)
+    completer = knowing(CompleterConfig())
+    begun = begin_with(scene, [photograph], CompleterConfig())
+    state = prepare_guards(begun, completer.scenes)
+    target = completer.observe(state, CAMERA)
+    # The target sees no hole, and nothing is behind the screen.
+    added = make_part(PartOrigin("target", 1), scene[-SIZE:])
+    closing = completer.close_gaps(state, target, added)
+    for camera in displace_camera(CAMERA, [photograph], GapConfig().displacement):
+        before, after = (
+            find_gaps(
+                view_gaps(replace(state, added_parts=parts), camera, completer.scenes, GapConfig())
+            )
+            for parts in ((added,), (added, closing))
+        )
+        assert before.sum() > SIZE
+        assert after.sum() < 0.1 * before.sum()
+
+
+def test_a_few_pixels_are_not_worth_closing():
+    gaps = torch.zeros((256, 256), dtype=torch.bool)
+    gaps[100, 100:106] = True
+    assert not are_worth_closing(gaps)
+    gaps[101, 100] = True
+    assert are_worth_closing(gaps)
+
+
 def test_where_nothing_is_known_nothing_is_added():
     photograph, scene = make_torn_scene()
     scenes = SceneRenderer(load_renderer("cpu"))
@@ -94,21 +142,22 @@ def views_of_room() -> list[View]:
     return [view_of(Room(), camera_at(x, size=SIZE), i) for i, x in enumerate((-0.3, 0.1))]
 
 
-def complete(config: CompleterConfig) -> tuple[float, Gaussians]:
-    """Complete the room; return the share of gaps where the camera moves on, and the additions."""
+def complete(config: CompleterConfig) -> tuple[list[int], Gaussians]:
+    """Complete the room; return the pixels of gaps beside the target, and the additions."""
     views = views_of_room()
     completer = knowing(config)
     done = completer(views, camera_at(0.7, yaw=12, size=SIZE))
     (result,) = done.targets
-    looked = view_gaps(done, result.target, completer.scenes, GapConfig())
-    return find_gaps(looked).float().mean().item(), result.added
+    beside = displace_camera(result.target, views, GapConfig().displacement)
+    looks = [view_gaps(done, camera, completer.scenes, GapConfig()) for camera in beside]
+    return [int(find_gaps(look).sum()) for look in looks], result.added
 
 
-def test_a_completion_leaves_fewer_gaps_under_the_number_of_its_target():
+def test_a_completion_leaves_fewer_gaps_on_each_side_under_the_number_of_its_target():
     with_gaps, former = complete(replace(CompleterConfig(), gaps=GapConfig(displacement=0.0)))
     without, added = complete(CompleterConfig())
-    assert with_gaps > 0
-    assert without < with_gaps
+    assert max(with_gaps) > 0
+    assert all(after <= before / 2 for before, after in zip(with_gaps, without, strict=True))
     # What the target added before is still there, and comes first.
     assert len(added) > len(former)
     assert torch.equal(added.means[: len(former)], former.means)

@@ -222,11 +222,11 @@ class PsnrGuardConfig(Settings):
 
 @dataclass(frozen=True)
 class GapConfig(Settings):
-    """Closing of thin gaps, which open where the camera moves on from a target."""
+    """Closing of thin gaps, which open where the camera moves from a target."""
 
     displacement: Annotated[float, Interval(ge=0, le=2)] = 0.35
-    """Move of the camera that looks for gaps, away from the photograph nearest to the target and
-    relative to their baseline; 0 closes none (paper)."""
+    """Moves of the cameras that look for gaps, away from the photograph nearest to the target and
+    to both sides, relative to their baseline; 0 closes none (paper)."""
     max_alpha: Annotated[float, Interval(gt=0, le=1)] = 0.85
     """Accumulated opacity below which a thin structure is a gap."""
 

@@ -52,7 +52,11 @@ def compute_sparse_depth(points: Float[Tensor, "n 3"], camera: Camera) -> Float[
 def sample(
     values: Float[Tensor, "h w c"], pixels: Float[Tensor, "*shape 2"], mode: str = "bilinear"
 ) -> Float[Tensor, "*shape c"]:
-    """Sample `values` at pixel coordinates, `bilinear` or `nearest`, extending the border."""
+    """Sample `values` at pixel coordinates, extending the border.
+
+    `mode` is `bilinear`, `nearest` or `bicubic`, which keeps more of the finest octave and may
+    overshoot.
+    """
     h, w, c = values.shape
     x, y = pixels.unbind(-1)
     # Divided by numbers, since a tensor of the size would be copied to the GPU in each call.

@@ -27,9 +27,9 @@ DIRECTIONAL_PENALTY = 1.0
 the images."""
 DIRECTIONAL_ANGLE = 0.015
 """Angle in radians, from the middle to the ray of a photograph, at which that cost is doubled."""
-DIRECTIONAL_RELAXATIONS = (3.0, 1.0), (2.5, 1.0, 2.5, 1.0)
-"""Step sizes of the rounds on the photographs alone, then on all; long and short ones in turn
-converge faster than equal ones (Richardson 1911)."""
+DIRECTIONAL_RELAXATIONS = (4.0, 1.0), (5.0, 1.0, 1.5, 1.0)
+"""Step sizes of the rounds on the photographs alone, then on all (Richardson 1911). The long ones
+restore fine detail, which converges slowest, and the others damp what they exaggerate."""
 DAMPED_BLEND_WEIGHT = 0.05
 """Summed weight up to which colours are damped, as hardly any image shows them."""
 

@@ -2,23 +2,47 @@
 
 Photographs do not determine the colours of many more Gaussians than pixels: fitted to them alone,
 colours cancel errors of depth, pose and exposure there and look wrong from everywhere else. Virtual
-photographs say what the scene should look like elsewhere.
+photographs say what the scene should look like elsewhere. They show the finest detail as far as two
+photographs have it in the same place: a pixel beside its place it would be an error.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from gscompleter.config.settings import COVERED
 from gscompleter.numerics.geometry import is_inside, project, sample, unproject
+from gscompleter.numerics.image_ops import blur_gaussian
 from gscompleter.render.protocols import Renderer
-from gscompleter.types import Camera, DepthMap, Gaussians, View
+from gscompleter.types import Camera, DepthMap, Gaussians, Render, View
 
 COLOR_DEPTH_TOLERANCE = 0.03
 """Relative depth difference at which the share of a photograph's colour falls to 1/e."""
+DETAIL_SIGMA = 1.6
+"""Standard deviation of the blur that takes detail away, in pixels."""
+WINDOW_SIGMA = 2.0
+"""Standard deviation of the window in which detail is compared, in pixels."""
+MIN_SHARED = 0.3
+"""Share of that window that both photographs have to show."""
+UNCONFIRMED_DETAIL = 0.6
+"""Share of its detail that a photograph shows where no other one can confirm it; about what
+bilinear sampling keeps of the finest octave."""
+LEAST_DETAIL = 1e-5
+"""Sum of squared colour differences in a window up to which there is no detail."""
+
+
+@dataclass(frozen=True)
+class WarpedPhotograph:
+    """A photograph warped to another camera, without a decision about what that camera sees."""
+
+    image: Float[Tensor, "h w 3"]
+    share: Float[Tensor, "h w"]
+    """Share in [0, 1] with which it shows the surface that the other camera sees."""
 
 
 def make_virtual_views(
@@ -26,28 +50,28 @@ def make_virtual_views(
 ) -> list[View]:
     """Warp each photograph to a camera beyond it, through the depth of `scene` there.
 
-    The camera continues the way from the nearest other photograph. `depths` are those of the scene
-    at the photographs.
+    The camera continues the way from the nearest other photograph, which has to confirm the detail.
+    `depths` are those of the scene at the photographs.
     """
     cameras = [view.camera for view in views]
-    return [
-        warp(
-            view,
-            depth,
-            scene,
-            extrapolate_camera(find_nearest_camera(view.camera, cameras), view.camera),
-            renderer,
-        )
-        for view, depth in zip(views, depths, strict=True)
-    ]
+    virtual = []
+    for view, depth in zip(views, depths, strict=True):
+        nearest = find_nearest_camera(view.camera, cameras)
+        camera = extrapolate_camera(cameras[nearest], view.camera)
+        # Backward warps: the depth that the scene draws in the virtual camera says where each of
+        # its pixels lies in a photograph.
+        shown = renderer.render(scene, camera)
+        own = warp(view, depth, shown, camera)
+        other = warp(views[nearest], depths[nearest], shown, camera)
+        virtual.append(View(blend(confirm_detail(own, other), own.share, shown), camera))
+    return virtual
 
 
-def find_nearest_camera(camera: Camera, cameras: Sequence[Camera]) -> Camera:
-    """Find the nearest of `cameras` that stands in another place."""
+def find_nearest_camera(camera: Camera, cameras: Sequence[Camera]) -> int:
+    """Find the index of the nearest of `cameras` that stands in another place."""
     distances = torch.stack([(camera.center - other.center).norm() for other in cameras])
     # Cameras in one place give no direction to go on in.
-    distances = torch.where(distances > 0, distances, torch.inf)
-    return cameras[int(distances.argmin())]
+    return int(torch.where(distances > 0, distances, torch.inf).argmin())
 
 
 def extrapolate_camera(before: Camera, camera: Camera) -> Camera:
@@ -60,22 +84,52 @@ def extrapolate_camera(before: Camera, camera: Camera) -> Camera:
     return replace(camera, c2w=c2w)
 
 
-def warp(view: View, own: DepthMap, scene: Gaussians, camera: Camera, renderer: Renderer) -> View:
-    """Warp a photograph to another camera; what it does not show keeps the colours of `scene`."""
-    # Backward warp: the depth that the scene draws in the virtual camera says where each of its
-    # pixels lies in the photograph.
-    shown = renderer.render(scene, camera)
-    covered = shown.alpha >= COVERED
+def warp(view: View, own: DepthMap, shown: Render, camera: Camera) -> WarpedPhotograph:
+    """Warp a photograph with depth `own` to the camera of a render, through the depth of that."""
     pixels, z = project(unproject(shown.depth, camera), view.camera)
-    layers = torch.cat([view.image, own.depth[..., None], own.valid[..., None]], dim=-1)
-    sampled, depth, valid = sample(layers, pixels).split([3, 1, 1], dim=-1)
+    # Outside of the photograph its border goes on. Bicubic weights of points that lie there without
+    # a bound, as those of a camera plane do, are not finite.
+    x, y = pixels.unbind(dim=-1)
+    near = torch.stack([x.clamp(0, view.camera.width), y.clamp(0, view.camera.height)], dim=-1)
+    # Bilinear samples would lose a third of the finest octave.
+    image = sample(view.image, near, "bicubic")
+    layers = torch.stack([own.depth, own.valid.to(own.depth)], dim=-1)
+    depth, valid = sample(layers, pixels).unbind(dim=-1)
 
     # A surface that another one hides in the photograph is not sampled: the two depths differ.
-    error = (z - depth[..., 0]) / (COLOR_DEPTH_TOLERANCE * z.abs().clamp_min(1e-12))
-    seen = covered & is_inside(pixels, z, view.camera) & (valid[..., 0] >= 0.5)
-    share = torch.exp(-error.square()) * seen
+    error = (z - depth) / (COLOR_DEPTH_TOLERANCE * z.abs().clamp_min(1e-12))
+    seen = (shown.alpha >= COVERED) & is_inside(pixels, z, view.camera) & (valid >= 0.5)
+    return WarpedPhotograph(image, torch.exp(-error.square()) * seen)
 
+
+def confirm_detail(own: WarpedPhotograph, other: WarpedPhotograph) -> Float[Tensor, "h w 3"]:
+    """Return the image of `own`, with its detail weakened where `other` does not have it.
+
+    Detail counts by its correlation with that of the other photograph, which estimates the share of
+    it that stands in its place.
+    """
+    smooth = blur_gaussian(own.image, DETAIL_SIGMA)
+    detail = own.image - smooth
+    other_detail = other.image - blur_gaussian(other.image, DETAIL_SIGMA)
+
+    # Both sums of squares, their product and what both photographs show, in one blur.
+    shared = own.share * other.share
+    products = (detail.square(), other_detail.square(), detail * other_detail)
+    sums = [shared * product.sum(dim=-1) for product in products]
+    own_energy, other_energy, product, covered = blur_gaussian(
+        torch.stack([*sums, shared], dim=-1), WINDOW_SIGMA
+    ).unbind(dim=-1)
+    energy = (own_energy * other_energy).clamp_min(0).sqrt() + LEAST_DETAIL
+    correlation = (product / energy).clamp(0, 1)
+    confirmed = correlation.where(covered > MIN_SHARED, UNCONFIRMED_DETAIL)
+    return smooth + confirmed[..., None] * detail
+
+
+def blend(
+    warped: Float[Tensor, "h w 3"], share: Float[Tensor, "h w"], shown: Render
+) -> Float[Tensor, "h w 3"]:
+    """Blend a warped photograph with the render, whose colours stay where it shows nothing."""
     # Where the scene ends it is half transparent, and a completion adds what is behind. Colours
     # divided by alpha would be too bright then (decision 043).
-    wanted = shown.alpha[..., None] * sampled
-    return View((shown.image + share[..., None] * (wanted - shown.image)).clamp(0, 1), camera)
+    wanted = shown.alpha[..., None] * warped
+    return (shown.image + share[..., None] * (wanted - shown.image)).clamp(0, 1)
