@@ -42,8 +42,8 @@ from gscompleter.stages.align_depth import align_depth
 from gscompleter.stages.close_gaps import (
     are_worth_closing,
     continue_surfaces,
+    displace_camera,
     find_gaps,
-    move_beside,
     view_gaps,
 )
 from gscompleter.stages.context import choose_config, init_context
@@ -322,7 +322,7 @@ class GSCompleter:
         )
         state = replace(state, added_parts=(*state.added_parts, added), photos=photos)
         closed = [nothing]
-        for camera in move_beside(target.camera.target, state.views, config.displacement):
+        for camera in displace_camera(target.camera.target, state.views, config.displacement):
             # What the camera before it closed is not a gap any more.
             view = view_gaps(state, camera, self.scenes, config)
             gaps = find_gaps(view)
