@@ -30,6 +30,7 @@ from gscompleter.cli import COMMANDS, parse_command
 from gscompleter.config.settings import validate
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from paths import ROOT
+from room_mesh import points_of, write_ply_points
 from scenes import camera_at, photographed
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]

@@ -98,8 +98,8 @@ def test_a_mesh_that_lies_about_a_given_scene_is_refused(geometry, words):
 @pytest.mark.parametrize(
     ("geometry", "words"),
     [
-        (SHIFTED, "room.ply"),
-        (ENLARGED, "differs by 50 % from what the photographs measure, about 1.5 times as far"),
+        (SHIFTED, "surfaces of room.ply contradict what stereo measures in 2 of 2"),
+        (ENLARGED, "room.ply differs by a factor of 1.5 from what the photographs measure"),
         (MESH.move(np.array([0.0, 0, 1000])), "covers hardly anything that the photographs show"),
     ],
 )

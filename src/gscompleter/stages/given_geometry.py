@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
@@ -21,9 +20,8 @@ from gscompleter.numerics.given_geometry import GivenGeometry
 from gscompleter.numerics.image_ops import fill_smoothly, smooth_masked
 from gscompleter.numerics.sky import mask_out_sky
 from gscompleter.reconstructors.features.depth_factor import (
-    MIN_SAMPLES,
-    POSE_NOISE,
     compare_with_matches,
+    fit_depth_factor,
 )
 from gscompleter.stages.synthesize import GeneratedView
 from gscompleter.stages.target_view import TargetView
@@ -34,8 +32,6 @@ from gscompleter.types import DepthMap, Gaussians, Render, View
 
 MAX_DEVIATION = 0.05
 """Largest deviation of depth, relative, that still counts as the same surface."""
-MAX_MEASURED_DEVIATION = float(np.expm1(POSE_NOISE))
-"""The same for triangulated matches, which errors of the poses of a pair scale."""
 MIN_COMPARED = 0.001
 """Smallest share of the photographs' pixels that has to be compared."""
 MIN_AGREEING = 0.5
@@ -75,7 +71,18 @@ def require_same_scene(
         num_pixels += compared.numel()
     ratio = torch.cat(ratios).cpu()
     require_overlap(geometry, len(ratio), num_pixels)
-    require_agreement(geometry, ratio, "the scene shows at the photographs", MAX_DEVIATION)
+    deviation = ratio.abs().median().expm1().item()
+    if deviation <= MAX_DEVIATION:
+        return
+    factor = ratio.median()
+    is_scaled = (ratio - factor).abs().median().expm1().item() <= MAX_DEVIATION
+    scale = f", about {factor.exp().item():.3g} times as far away" if is_scaled else ""
+    raise InputError(
+        f"The depth of {geometry.name} differs by {100 * deviation:.0f} % from what the scene "
+        f"shows at the photographs{scale}, and at most {100 * MAX_DEVIATION:.0f} % count as the "
+        f"same surfaces; {ADVICE}.",
+        "geometry",
+    )
 
 
 def give_photographs_depth(
@@ -115,11 +122,19 @@ def give_depth_before_scene(
     samples = compare_with_matches(
         [view.to("cpu") for view in views], [depth.cpu() for depth in drawn]
     )
-    if len(samples) < MIN_SAMPLES:
+    fit = fit_depth_factor(samples)
+    if fit is None:
         note = f"The photographs show too little to compare {geometry.name} with; it is used as "
         return given, (f"{note}it is.",)
-    ratio = torch.from_numpy(samples.given / samples.measured).log()
-    require_agreement(geometry, ratio, "the photographs measure", MAX_MEASURED_DEVIATION)
+    # The test of every given depth: a pair with errors of its poses measures no better than that.
+    if not fit.is_consistent or fit.factor != 1.0:
+        scale = f" by a factor of {1 / fit.factor:.3g}" if fit.is_consistent else ""
+        raise InputError(
+            f"The depth of {geometry.name} differs{scale} from what the photographs measure at "
+            f"{len(samples):,} compared pixels ({fit.agreement:.0%} agree"
+            f"{' with that factor' if scale else ''}); {ADVICE}.",
+            "geometry",
+        )
     return given, ()
 
 
@@ -150,27 +165,6 @@ def require_overlap(geometry: GivenGeometry, num_compared: int, num_pixels: int)
             f"{ADVICE}.",
             "geometry",
         )
-
-
-def require_agreement(
-    geometry: GivenGeometry, ratio: Float[Tensor, "n"], of: str, most: float
-) -> None:
-    """Raise InputError if most depths of geometry differ from what is seen.
-
-    `ratio` has the logarithms of its depths relative to those that `of` names, and `most` is the
-    largest relative deviation.
-    """
-    deviation = ratio.abs().median().expm1().item()
-    if deviation <= most:
-        return
-    factor = ratio.median()
-    is_scaled = (ratio - factor).abs().median().expm1().item() <= MAX_DEVIATION
-    scale = f", about {factor.exp().item():.3g} times as far away" if is_scaled else ""
-    raise InputError(
-        f"The depth of {geometry.name} differs by {100 * deviation:.0f} % from what {of}{scale}, "
-        f"and at most {100 * most:.0f} % count as the same surfaces; {ADVICE}.",
-        "geometry",
-    )
 
 
 @dataclass(frozen=True)
