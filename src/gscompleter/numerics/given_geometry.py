@@ -13,7 +13,7 @@ from gscompleter.numerics.kernels import surface_depth as kernels
 from gscompleter.system.errors import InputError
 from gscompleter.types import Camera
 
-NUM_NEIGHBOURS = 8
+NUM_PLANE_POINTS = 8
 """Neighbours of a point that tell the plane of its surface: in a grid, those all around."""
 SPACING_NEIGHBOUR = 4
 """The neighbour whose distance is the spacing: in a grid, the last of those beside a point."""
@@ -95,9 +95,9 @@ def replace_points(
 
     step = -(-len(points) // MAX_POINTS) if len(points) else 1
     points = points[::step]
-    if len(points) <= NUM_NEIGHBOURS:
+    if len(points) <= NUM_PLANE_POINTS:
         return np.empty((0, 3)), np.empty((0, 3), np.int64)
-    distances, neighbours = cKDTree(points).query(points, NUM_NEIGHBOURS + 1)
+    distances, neighbours = cKDTree(points).query(points, NUM_PLANE_POINTS + 1)
     spacing = distances[:, SPACING_NEIGHBOUR]
     spacing = np.minimum(spacing, MAX_SPACING * np.median(spacing[neighbours[:, 1:]], axis=1))
 

@@ -36,7 +36,7 @@ MIN_COMPARED = 0.001
 """Smallest share of the photographs' pixels that has to be compared."""
 MIN_AGREEING = 0.5
 """Smallest share of the compared pixels around one that has to agree."""
-NEIGHBOURHOOD = 1 / 64
+COMPARED_AROUND = 1 / 64
 """Half the side of that neighbourhood, relative to the longer side of the image. At the edges of
 surfaces a render mixes the depth of two, and agrees with neither."""
 ADVICE = "give it in the frame and unit of the scene"
@@ -189,7 +189,7 @@ def fit_to_surface(drawn: Float[Tensor, "h w"], surface: DepthMap) -> FittedDept
         return FittedDepth(drawn, torch.zeros_like(is_there))
     ratio = torch.where(compared, surface.depth / drawn, 1.0).clamp_min(1e-6).log()
     agrees = compared & (ratio.abs().expm1() <= MAX_DEVIATION)
-    radius = max(1, round(NEIGHBOURHOOD * max(drawn.shape)))
+    radius = max(1, round(COMPARED_AROUND * max(drawn.shape)))
     share = smooth_masked(agrees.to(drawn)[..., None], compared, radius)[..., 0]
     agreement = fill_smoothly(share, compared)
     bent = drawn * fill_smoothly(ratio, agrees).exp()

@@ -95,14 +95,14 @@ def describe_completion(summary: CompletionSummary, results: ResultsRequest) -> 
         f"Added {counts['added']:,} Gaussians to {counts['context']:,} in {seconds:.1f} s: "
         f"{find_completed(results.out)}"
     )
-    yield from describe_geometry(summary)
+    yield from describe_geometry_use(summary)
     yield describe_size(results.out, results.suffix is None)
     yield f"Report: {results.out / REPORT_FILE}"
     if results.has_video and summary.targets:
         yield f"Video: {results.out / VIDEO_FILE}"
 
 
-def describe_geometry(summary: CompletionSummary) -> Iterator[str]:
+def describe_geometry_use(summary: CompletionSummary) -> Iterator[str]:
     """Write the sentence on the use of geometry from elsewhere, if there is any."""
     shares = [row.geometry.share for row in summary.targets if row.geometry is not None]
     if not shares:

@@ -251,12 +251,12 @@ def make_target_row(
         thin_gaps=gaps.share,
         flight_thin_gaps=gaps.flight_share,
         painter=result.painter or None,
-        geometry=describe_geometry(result.geometry),
+        geometry=make_geometry_row(result.geometry),
         fitted=fitted,
     )
 
 
-def describe_geometry(use: GeometryUse) -> GeometryRow | None:
+def make_geometry_row(use: GeometryUse) -> GeometryRow | None:
     """Make the row of the use of geometry; None if none is given."""
     if not use.name:
         return None

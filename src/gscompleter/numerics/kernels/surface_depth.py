@@ -5,7 +5,7 @@ import numpy as np
 from gscompleter.numerics.kernels.cache import njit
 from gscompleter.numerics.kernels.parallel import share
 
-MIN_DEPTH = 1e-12
+SAFE_DEPTH = 1e-12
 """Smallest z-depth, relative to the farthest corner, of a corner whose pixel says where it is."""
 
 
@@ -31,7 +31,7 @@ def _draw_rows(begin, end, corners, faces, depth):
 
         # The box around the triangle. One that reaches behind the camera may cover any pixel.
         left, right, top, bottom = 0, width, begin, end
-        if min(a[2], b[2], c[2]) > MIN_DEPTH * farthest:
+        if min(a[2], b[2], c[2]) > SAFE_DEPTH * farthest:
             ax, bx, cx = a[0] / a[2], b[0] / b[2], c[0] / c[2]
             ay, by, cy = a[1] / a[2], b[1] / b[2], c[1] / c[2]
             # Compared as floats, since corners far beside the image exceed integers.
