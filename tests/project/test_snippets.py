@@ -243,7 +243,7 @@ def sandbox(scene, completed_room, tmp_path, monkeypatch) -> Path:
     shutil.copy(completed_room / "context.ply", "splat.ply")
     shutil.copy(completed_room / "targets.json", "cameras.json")
     shutil.copy(scene / "transforms.json", "renders.json")
-    write_ply_points(Path("SCENE", "scan.ply"), points_of())
+    write_ply_points(Path("scan.ply"), points_of())
     return tmp_path
 
 
