@@ -51,9 +51,9 @@ def without():
     return GSCompleter()(VIEWS, TARGET, seen_scene())
 
 
-def test_a_mesh_gives_a_given_scene_the_depth_of_its_hole(without):
+def test_a_mesh_gives_a_given_scene_the_depth_of_its_hole():
     (result,) = GSCompleter()(VIEWS, TARGET, seen_scene(), geometry=MESH).targets
-    assert measure_hole_error(without.targets[0]) > 0.1
+    # Without it the error is 0.2.
     assert measure_hole_error(result) < 0.04
     assert result.geometry.share > 0.95
     assert 0 < result.geometry.added <= len(result.added)
@@ -65,6 +65,7 @@ def test_a_mesh_gives_a_given_scene_the_depth_of_its_hole(without):
 @pytest.mark.slow
 def test_points_give_a_given_scene_the_depth_of_its_hole(without):
     (result,) = GSCompleter()(VIEWS, TARGET, seen_scene(), geometry=POINTS).targets
+    assert measure_hole_error(without.targets[0]) > 0.1
     assert measure_hole_error(result) < 0.4 * measure_hole_error(without.targets[0])
 
 
