@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from gscompleter.generators import load_generator as load_generator
     from gscompleter.guards import Attempt as Attempt
     from gscompleter.guards import Guard as Guard
+    from gscompleter.numerics.given_geometry import GivenGeometry as GivenGeometry
     from gscompleter.planning.remove import remove as remove
     from gscompleter.reconstructors import DepthAware as DepthAware
     from gscompleter.reconstructors import Lifter as Lifter
@@ -38,6 +39,7 @@ if TYPE_CHECKING:
     from gscompleter.render.protocols import Renderer as Renderer
     from gscompleter.splats import load_splat as load_splat
     from gscompleter.splats import save_splat as save_splat
+    from gscompleter.splats.geometry_files import load_geometry as load_geometry
     from gscompleter.splats.ply import load_ply as load_ply
     from gscompleter.splats.ply import save_ply as save_ply
     from gscompleter.stages.target_view import TargetView as TargetView
@@ -69,6 +71,8 @@ _HOMES = {
     "load_camera": "data.scene",
     "load_cameras": "data.scene",
     "load_views": "data.scene",
+    "GivenGeometry": "numerics.given_geometry",
+    "load_geometry": "splats.geometry_files",
     "remove": "planning.remove",
     "load_reconstructor": "reconstructors",
     "load_renderer": "render.loading",

@@ -23,6 +23,7 @@ from gscompleter.generators import (
 )
 from gscompleter.guards import accept_at, prepare_guards
 from gscompleter.numerics.geometry import is_inside, pad_camera, pad_like, project
+from gscompleter.numerics.given_geometry import GivenGeometry
 from gscompleter.numerics.image_ops import is_enclosed
 from gscompleter.numerics.value_checks import (
     check_camera,
@@ -46,10 +47,19 @@ from gscompleter.stages.close_gaps import (
     find_gaps,
     view_gaps,
 )
-from gscompleter.stages.context import choose_config, init_context
+from gscompleter.stages.context import InitialContext, choose_config, init_context
 from gscompleter.stages.fade_border import fade_border
 from gscompleter.stages.filter_holes import filter_holes
 from gscompleter.stages.find_unfilled import find_unfilled
+from gscompleter.stages.given_geometry import (
+    add_geometry_depth,
+    check_geometry,
+    count_on_geometry,
+    give_depth_before_scene,
+    give_photographs_depth,
+    require_same_scene,
+    require_uncontradicted,
+)
 from gscompleter.stages.lift import lift
 from gscompleter.stages.new_photos import find_new_photos, recolor_to_photos
 from gscompleter.stages.recolor import recolor
@@ -136,6 +146,7 @@ class GSCompleter:
         target: Camera | Sequence[Camera],
         scene: Gaussians | None = None,
         check_views: Sequence[View] | None = None,
+        geometry: GivenGeometry | None = None,
     ) -> Completion:
         """Complete what `views` never saw, as seen from one or several targets.
 
@@ -147,16 +158,19 @@ class GSCompleter:
                 reconstructs the context from `views`.
             check_views: Further photographs of `scene` that must not get worse. With them the scene
                 is trusted only as far as the photographs confirm it.
+            geometry: A scan or mesh in the frame and unit of the cameras (`load_geometry`). It
+                gives depth where photographs show none, as far as it agrees with what they show.
 
         Raises:
-            InputError: Too few views, no baseline, too many targets, no view sees the scene, or no
-                target sees enough of it.
+            InputError: Too few views, no baseline, too many targets, no view sees the scene, no
+                target sees enough of it, or the geometry contradicts the photographs.
         """
         targets = list_targets(target)
         if scene is not None:
             check_gaussians(scene, "The scene")
             check_target_ids(scene, len(targets))
-        return self.complete(self.begin(views, scene, check_views, targets), targets)
+        begun = self.begin(views, scene, check_views, targets, geometry=geometry)
+        return self.complete(begun, targets)
 
     @show_in_notebook()
     @run_in_plain_torch
@@ -183,6 +197,7 @@ class GSCompleter:
         check_views: Sequence[View] | None = None,
         targets: Sequence[Camera] = (),
         invented: Bool[Tensor, "n"] | None = None,
+        geometry: GivenGeometry | None = None,
     ) -> Completion:
         """Initialize the context (stage 1; paper, Eq. 5); arguments and errors as in `__call__`.
 
@@ -194,10 +209,19 @@ class GSCompleter:
         check_inputs(views, scene, check_views or (), targets)
         check_row_mask(invented, scene, "The mask of what was invented")
         config = choose_config(self.config, scene, check_views)
+        if geometry is not None:
+            check_geometry(geometry, config)
         with record_seconds() as seconds, timed_stage("context"):
+            geometry_notes: tuple[str, ...] = ()
+            if geometry is not None and scene is None:
+                views, geometry_notes = give_depth_before_scene(geometry, views)
             context = init_context(
                 self.reconstructor, views, scene, check_views or (), targets, self.renderer
             )
+            if geometry is not None and scene is None:
+                require_uncontradicted(geometry, views, context.views)
+            elif geometry is not None:
+                context = self.give_depth(geometry, context)
             photos = tuple(Photo(view) for view in context.views)
             state = Completion(
                 config,
@@ -208,7 +232,8 @@ class GSCompleter:
                 Trust(),
                 is_given=scene is not None,
                 seed=self.seed,
-                context_notes=context.notes,
+                context_notes=(*geometry_notes, *context.notes),
+                geometry=geometry,
                 models=self.name_models(),
             )
             # What was invented steps aside where photographs show something else, so that nobody
@@ -235,6 +260,14 @@ class GSCompleter:
             state = replace(state, trust=trust)
             state = recolor_to_photos(state, [context.views[i] for i in new], self.scenes)
         return replace(state, exposure_gains=context.exposure_gains, seconds=seconds)
+
+    def give_depth(self, geometry: GivenGeometry, context: InitialContext) -> InitialContext:
+        """Give the photographs of a given scene the depth of geometry; refuse one that lies."""
+        cameras = [view.camera for view in context.views]
+        frozen = self.scenes.freeze_at((context.source.rendered,), cameras)
+        renders = [scene.render for scene in frozen]
+        require_same_scene(geometry, context.views, renders)
+        return replace(context, views=give_photographs_depth(geometry, context.views, renders))
 
     def name_models(self) -> dict[str, str]:
         """Name Ψ, the depth that helps it, and Φ, for the record of what is invented."""
@@ -269,6 +302,7 @@ class GSCompleter:
             if unchanged.skip_reason:
                 return state.extended(unchanged, seconds)
             image = reference or self.synthesize([view])[0]  # Eq. 6
+            image, use = add_geometry_depth(image, view)
             lifted = lift(self.reconstructor, image, anchor, view)  # Eq. 7
             affine = align_depth(lifted, anchor, view, rng)  # Eq. 8
             register = REGISTRATIONS[state.config.registration_method]
@@ -299,6 +333,7 @@ class GSCompleter:
                 num_recolored=recolored.count,
                 synthesis_notes=image.notes,
                 lift_notes=lifted.notes,
+                geometry=count_on_geometry(use, added, image),
                 painter=image.painter,
                 rejection=filled.rejection,
             )

@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import CompleterConfig
+from gscompleter.numerics.given_geometry import GivenGeometry
 from gscompleter.parts import Part, PartKind, find_last_target_id
 from gscompleter.system.files.display import Displayed
 from gscompleter.system.plugins import load_function
@@ -68,6 +69,8 @@ class Completion(Displayed):
     """Seed of all random numbers."""
     context_notes: tuple[str, ...] = ()
     """Sentences of Ψ about the context."""
+    geometry: GivenGeometry | None = None
+    """Geometry from elsewhere, whose depth is used in holes; None for none."""
     models: Mapping[str, str] = field(default_factory=dict)
     """Names of the `reconstructor`, its `depth` and the `generator`, for those who read files."""
 

@@ -64,6 +64,31 @@ class Unfilled:
         return f"{max(1, round(100 * self.share))} % of the hole stays empty{because}."
 
 
+@dataclass(frozen=True)
+class GeometryUse:
+    """What geometry from elsewhere gives at a target."""
+
+    name: str = ""
+    """Name of the geometry for sentences; empty if none is given."""
+    share: float = 0.0
+    """Share of the pixels of the hole, at the padded target, whose depth it gives."""
+    contradicted: float = 0.0
+    """Share of these pixels at which it has a depth that is not used, because it disagrees with
+    what the scene shows around."""
+    added: int = 0
+    """Number of added Gaussians that stand where it says."""
+
+    def describe(self) -> str:
+        """Write the sentence for people; empty without geometry."""
+        if not self.name:
+            return ""
+        share, contradicted = (f"{100 * part:.0f} %" for part in (self.share, self.contradicted))
+        sentence = f"{self.name} gives the depth of {share} of the hole"
+        if round(100 * self.contradicted) > 0:
+            sentence += f"; at {contradicted} it disagrees with the scene around, and is not used"
+        return f"{sentence}."
+
+
 @dataclass(frozen=True, repr=False)
 class TargetResult(Displayed):
     """Result of one target camera. No stage reads it."""
@@ -98,6 +123,8 @@ class TargetResult(Displayed):
     """Sentences of the generator about its image."""
     lift_notes: tuple[str, ...] = ()
     """Sentences of Ψ about the depth of that image."""
+    geometry: GeometryUse = GeometryUse()
+    """Use of geometry from elsewhere; nothing if none is given."""
     painter: str = ""
     """Who painted the image elsewhere; empty if Φ synthesized it."""
     unfilled: Unfilled = Unfilled()
@@ -129,7 +156,7 @@ class TargetResult(Displayed):
         """Sentences about fallbacks and rejections, for a reader of the results."""
         if self.skip_reason:
             return (self.skip_reason,)
-        notes = [*self.synthesis_notes, *self.lift_notes]
+        notes = [*self.synthesis_notes, *self.lift_notes, self.geometry.describe()]
         if self.anchor_fallback:
             notes.append("Every view is turned too far; the least-turned one is the anchor.")
         if self.affine.is_refitted_at_target:

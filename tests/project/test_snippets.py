@@ -30,6 +30,7 @@ from gscompleter.cli import COMMANDS, parse_command
 from gscompleter.config.settings import validate
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from paths import ROOT
+from room_mesh import points_of, write_ply_points
 from scenes import camera_at, photographed
 
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -242,6 +243,7 @@ def sandbox(scene, completed_room, tmp_path, monkeypatch) -> Path:
     shutil.copy(completed_room / "context.ply", "splat.ply")
     shutil.copy(completed_room / "targets.json", "cameras.json")
     shutil.copy(scene / "transforms.json", "renders.json")
+    write_ply_points(Path("scan.ply"), points_of())
     return tmp_path
 
 

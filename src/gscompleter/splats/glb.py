@@ -11,13 +11,13 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int, Shaped
 from numpy import ndarray
 from torch import Tensor
 
@@ -64,12 +64,21 @@ KNOWN_ATTRIBUTES = {
 """Attributes that are read, and what viewers of points show."""
 COLOR_SPACE = "srgb_rec709_display"
 """The colour space in which all splat trainers work."""
-COMPONENT_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+COMPONENT_TYPES = {
+    5120: "<i1",
+    5121: "<u1",
+    5122: "<i2",
+    5123: "<u2",
+    5125: "<u4",
+    5126: "<f4",
+}
 """numpy names of the component types."""
 FLOAT = 5126
 """Component type that is written."""
 POINTS = 0
 """Primitive mode that is written."""
+TRIANGLES, TRIANGLE_STRIP, TRIANGLE_FAN = 4, 5, 6
+"""Primitive modes of meshes."""
 NUM_COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 MAX_FILE_BYTES = 2**32 - 1
 """Largest size that the header of a .glb can state."""
@@ -150,6 +159,24 @@ def _find_primitives(
     document: GlbDocument,
 ) -> Iterator[tuple[dict[str, Any], Float[Tensor, "4 4"]]]:
     """Find the primitives of Gaussians in the scene, each with its transform to the scene."""
+    for node, place in _walk_nodes(document, _read_similarity):
+        for primitive in _list_primitives(document, node):
+            if EXTENSION in primitive.get("extensions", {}):
+                yield primitive, place
+
+
+def _list_primitives(document: GlbDocument, node: dict[str, Any]) -> list[dict[str, Any]]:
+    """List the primitives of a node's mesh; none if it has none."""
+    if "mesh" not in node:
+        return []
+    primitives: list[dict[str, Any]] = document.table["meshes"][node["mesh"]]["primitives"]
+    return primitives
+
+
+def _walk_nodes(
+    document: GlbDocument, read_transform: Callable[[dict[str, Any]], Float[Tensor, "4 4"]]
+) -> Iterator[tuple[dict[str, Any], Float[Tensor, "4 4"]]]:
+    """Walk through the nodes of the scene, each with its transform to the scene."""
     table = document.table
     scenes = table.get("scenes")
     roots = scenes[table.get("scene", 0)]["nodes"] if scenes else range(len(table["nodes"]))
@@ -163,26 +190,75 @@ def _find_primitives(
             raise DamagedError("its nodes contain each other")
         visited.add(index)
         node = table["nodes"][index]
-        place = above @ _read_transform(node)
+        place = above @ read_transform(node)
         waiting += [(child, place) for child in node.get("children", ())]
-        if "mesh" in node:
-            for primitive in table["meshes"][node["mesh"]]["primitives"]:
-                if EXTENSION in primitive.get("extensions", {}):
-                    yield primitive, place
+        yield node, place
+
+
+def _read_similarity(node: dict[str, Any]) -> Float[Tensor, "4 4"]:
+    """Read the transform of a node, which must not stretch Gaussians unevenly."""
+    place = _read_transform(node)
+    require_similarity(place, "node")
+    return place
 
 
 def _read_transform(node: dict[str, Any]) -> Float[Tensor, "4 4"]:
-    """Read the transform of a node; only similarities are accepted."""
+    """Read the transform of a node."""
     if "matrix" in node:
-        place = torch.tensor(node["matrix"], dtype=torch.float64).reshape(4, 4).T
-    else:
-        x, y, z, w = (float(value) for value in node.get("rotation", (0, 0, 0, 1)))
-        place = torch.eye(4, dtype=torch.float64)
-        place[:3, :3] = quats_to_rotations(torch.tensor([w, x, y, z], dtype=torch.float64))
-        place[:3, :3] *= torch.tensor(node.get("scale", (1, 1, 1)), dtype=torch.float64)
-        place[:3, 3] = torch.tensor(node.get("translation", (0, 0, 0)), dtype=torch.float64)
-    require_similarity(place, "node")
+        return torch.tensor(node["matrix"], dtype=torch.float64).reshape(4, 4).T
+    x, y, z, w = (float(value) for value in node.get("rotation", (0, 0, 0, 1)))
+    place = torch.eye(4, dtype=torch.float64)
+    place[:3, :3] = quats_to_rotations(torch.tensor([w, x, y, z], dtype=torch.float64))
+    place[:3, :3] *= torch.tensor(node.get("scale", (1, 1, 1)), dtype=torch.float64)
+    place[:3, 3] = torch.tensor(node.get("translation", (0, 0, 0)), dtype=torch.float64)
     return place
+
+
+def read_glb_meshes(path: Path) -> tuple[Float[ndarray, "n 3"], Int[ndarray, "m 3"]]:
+    """Read the vertices and triangles of a .glb that holds a mesh, or the points of one.
+
+    Coordinates are those of the file: they are not turned to the axes of a .ply.
+    """
+    document = _parse_document(read_bytes(path))
+    vertices, faces = [np.empty((0, 3))], [np.empty((0, 3), np.int64)]
+    count = num_primitives = 0
+    for node, place in _walk_nodes(document, _read_transform):
+        for primitive in _list_primitives(document, node):
+            num_primitives += 1
+            if num_primitives > MAX_PRIMITIVES:
+                raise DamagedError(f"it claims to hold more than {MAX_PRIMITIVES:,} primitives")
+            if EXTENSION in primitive.get("extensions", {}):
+                raise UnsupportedError("holds Gaussians; name a mesh or points as geometry")
+            if primitive.get("extensions", {}).get("KHR_draco_mesh_compression"):
+                raise UnsupportedError("holds a mesh compressed by Draco; export it without that")
+            points = _read_accessor(document, _get_accessor(document, primitive, "POSITION"))
+            linear, shift = place[:3, :3].numpy(), place[:3, 3].numpy()
+            vertices.append(points.astype(np.float64) @ linear.T + shift)
+            faces.append(count + _read_triangles(document, primitive, len(points)))
+            count += len(points)
+            check_count(count, len(document.binary))
+    if count == 0:
+        raise UnsupportedError("holds neither a mesh nor points")
+    return np.concatenate(vertices), np.concatenate(faces)
+
+
+def _read_triangles(
+    document: GlbDocument, primitive: dict[str, Any], count: int
+) -> Int[ndarray, "m 3"]:
+    """Read the triangles of a primitive of `count` vertices, as indices of these."""
+    order = np.arange(count, dtype=np.int64)
+    if "indices" in primitive:
+        accessor = document.table["accessors"][primitive["indices"]]
+        order = _read_numbers(document, accessor)[:, 0].astype(np.int64)
+    mode = primitive.get("mode", TRIANGLES)
+    if mode == TRIANGLES:
+        return order[: len(order) // 3 * 3].reshape(-1, 3)
+    if mode == TRIANGLE_STRIP:
+        return np.stack([order[:-2], order[1:-1], order[2:]], axis=1)
+    if mode == TRIANGLE_FAN:
+        return np.stack([np.broadcast_to(order[:1], len(order) - 2), order[1:-1], order[2:]], 1)
+    # Points; lines are drawn by nobody who measures a surface.
+    return np.empty((0, 3), np.int64)
 
 
 def _get_accessor(document: GlbDocument, primitive: dict[str, Any], name: str) -> dict[str, Any]:
@@ -243,10 +319,23 @@ def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gauss
 
 
 def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[ndarray, "n k"]:
-    """Read the numbers of an accessor from the binary part; integers may stand for fractions."""
+    """Read the numbers of an accessor as float32; integers may stand for fractions."""
+    values = _read_numbers(document, accessor)
+    kind = values.dtype
+    if kind.kind == "f":
+        return values.astype(np.float32)
+    if not accessor.get("normalized") and values.shape[1] != 3:
+        raise UnsupportedError("has rotations or opacities that are no fractions")
+    # Signed normalized integers are symmetric: the lowest one stands for -1, too.
+    largest = np.iinfo(kind).max if accessor.get("normalized") else 1
+    return np.maximum(values.astype(np.float32) / largest, -1 if largest > 1 else -np.inf)
+
+
+def _read_numbers(document: GlbDocument, accessor: dict[str, Any]) -> Shaped[ndarray, "n k"]:
+    """Read the numbers of an accessor from the binary part, as they are stored."""
     view = {} if "sparse" in accessor else document.table["bufferViews"][accessor["bufferView"]]
     if view.get("buffer") != 0 or view.get("extensions"):
-        raise UnsupportedError("holds its Gaussians sparse, compressed or in another file")
+        raise UnsupportedError("holds its numbers sparse, compressed or in another file")
     kind = np.dtype(COMPONENT_TYPES[accessor["componentType"]])
     width = NUM_COMPONENTS[accessor["type"]]
     start = int(view.get("byteOffset", 0)) + int(accessor.get("byteOffset", 0))
@@ -255,14 +344,7 @@ def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[nda
     # The last row may be shorter than the distance between two.
     num_bytes = len(document.binary) - start + max(stride - width * kind.itemsize, 0)
     check_rows(num_bytes, stride, shape[0])
-    values = np.ndarray(shape, kind, document.binary, start, (stride, kind.itemsize))
-    if kind.kind == "f":
-        return values.astype(np.float32)
-    if not accessor.get("normalized") and width != 3:
-        raise UnsupportedError("has rotations or opacities that are no fractions")
-    # Signed normalized integers are symmetric: the lowest one stands for -1, too.
-    largest = np.iinfo(kind).max if accessor.get("normalized") else 1
-    return np.maximum(values.astype(np.float32) / largest, -1 if largest > 1 else -np.inf)
+    return np.ndarray(shape, kind, document.binary, start, (stride, kind.itemsize))
 
 
 def write_glb(path: Path, gaussians: Gaussians, made_by: Provenance = NOTHING_KNOWN) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from gscompleter.config import RegistrationConfig
 from gscompleter.numerics.adam import Adam
-from gscompleter.numerics.geometry import compute_z_depths, move_to_depths, slide
+from gscompleter.numerics.geometry import compute_z_depths, look_up, move_to_depths, slide
 from gscompleter.numerics.image_ops import fill_smoothly
 from gscompleter.numerics.sky import mask_out_sky
 from gscompleter.render.protocols import JointScene, Renderer
@@ -64,6 +64,32 @@ def register_along_rays(
         anchor: The photograph that depth is compared at, besides the target.
         view: The scene at the target.
     """
+    registered = register_lifted(lifted, affine, reference, anchor, view)
+    if reference.given_depth is None:
+        return registered
+    # Geometry from elsewhere is a measurement, bent to what the scene shows around the hole
+    # already; the losses above know nothing of a hole's depth.
+    gaussians = place_at_given(registered.gaussians, registered.pixel_index, reference)
+    return replace(registered, gaussians=gaussians)
+
+
+def place_at_given(
+    gaussians: Gaussians, pixel_index: Int[Tensor, "n"] | None, reference: View
+) -> Gaussians:
+    """Move Gaussians to the given depth of their pixel, or of the pixel that shows their mean."""
+    assert reference.given_depth is not None
+    if pixel_index is None:
+        depths = look_up(reference.given_depth, gaussians, reference.camera)
+    else:
+        depths = reference.given_depth.flatten()[pixel_index]
+    z = compute_z_depths(gaussians.means, reference.camera)
+    return move_to_depths(gaussians, reference.camera, depths.where(depths > 0, z))
+
+
+def register_lifted(
+    lifted: Lift, affine: DepthAffine, reference: View, anchor: Anchor, view: TargetView
+) -> Registration:
+    """Register Gaussians by what the scene shows; arguments as in `register_along_rays`."""
     config = view.state.config.registration
     pixel_index = lifted.pixel_index
     camera = reference.camera
@@ -77,7 +103,7 @@ def register_along_rays(
         return Registration(registered, None, losses)
     if config.hole_depth == "scene":
         # A trained splat has its depth from many photographs, which two-view stereo cannot better.
-        depth = continue_scene_depth(view).flatten()[pixel_index]
+        depth = continue_scene_depth(view, reference).flatten()[pixel_index]
         return Registration(move_to_depths(coarse, camera, depth), pixel_index, ())
     if config.extrapolate_into_holes and config.degrees_of_freedom == 1:
         return register_beside_holes(coarse, pixel_index, reference, anchor, view)
@@ -85,11 +111,20 @@ def register_along_rays(
     return Registration(registered, pixel_index, losses)
 
 
-def continue_scene_depth(view: TargetView) -> Float[Tensor, "h w"]:
-    """Compute the z-depth of the scene at the padded target, continued smoothly into its holes."""
+def continue_scene_depth(view: TargetView, reference: View) -> Float[Tensor, "h w"]:
+    """Compute the z-depth of the scene at the padded target, continued smoothly into its holes.
+
+    A given depth of the reference is continued like that of the scene.
+    """
     surface = view.render.depth_map(view.state.config.holes.max_alpha)
     # Beside an object there is neither a hole nor a depth.
-    depth = fill_smoothly(surface.depth, ~view.holes & surface.valid)
+    known = ~view.holes & surface.valid
+    depth = surface.depth
+    if reference.given_depth is not None:
+        is_given = reference.given_depth > 0
+        depth = torch.where(is_given, reference.given_depth, depth)
+        known = known | is_given
+    depth = fill_smoothly(depth, known)
     forced = view.masks.edits.forced
     if forced is None:
         return depth

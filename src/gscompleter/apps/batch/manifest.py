@@ -27,7 +27,16 @@ FOLDER = "folder"
 """Column of the scene folder."""
 NAME_COLUMN = "name"
 """Column of the job name."""
-PATH_COLUMNS = (FOLDER, "scene", "cameras", "weights", "depth_weights", "images", "ignore")
+PATH_COLUMNS = (
+    FOLDER,
+    "scene",
+    "cameras",
+    "weights",
+    "depth_weights",
+    "images",
+    "ignore",
+    "geometry",
+)
 """Options that are paths."""
 MARKERS = ("batch.json", "run.json")
 """Files that mark the output folders of `batch` and `evaluate`."""

@@ -47,9 +47,9 @@ class Group:
 # fmt: off
 HELP_GROUPS = (
     Group("input", "What is given, and how it is read.", (
-        "scene", "cameras", "up", "photos", "context", "format", "frames", "resolution", "near",
-        "far", "no_given_depth", "no_refine_poses", "no_masks", "ignore", "invert_masks",
-        "large_masks", "ignore_moving", "no_ego_mask", "drop_nonfinite",
+        "scene", "cameras", "up", "photos", "geometry", "context", "format", "frames",
+        "resolution", "near", "far", "no_given_depth", "no_refine_poses", "no_masks", "ignore",
+        "invert_masks", "large_masks", "ignore_moving", "no_ego_mask", "drop_nonfinite",
     )),
     Group("computing", "Models, settings, and where they run.", (
         "reconstructor", "weights", "depth", "depth_weights", "config", "device",

@@ -69,7 +69,7 @@ from gscompleter.types import Camera
 
 REGIONS = ("box", "box_rotation", "sphere", "margin")
 """Settings of a place."""
-NAMED_FILES = ("mask", "select", "images", "photos")
+NAMED_FILES = ("mask", "select", "images", "photos", "geometry")
 """Settings that name files."""
 
 

@@ -60,6 +60,7 @@ from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.alignment.similarity import transform_camera
 from gscompleter.splats.formats import find_origin, load_splat
+from gscompleter.splats.geometry_files import load_geometry
 from gscompleter.splats.morton import sort_nearby
 from gscompleter.stages.context import prepare_single
 from gscompleter.state import Completion
@@ -121,7 +122,12 @@ class Prepared:
                 gone = self.choose_gone(self)
         task = self.task
         begun = self.completer.begin(
-            task.views, task.scene, task.check_views, task.target_cameras, task.invented
+            task.views,
+            task.scene,
+            task.check_views,
+            task.target_cameras,
+            invented=task.invented,
+            geometry=task.geometry,
         )
         guarding = tuple(begun.with_depth_range(camera) for camera in task.witnesses.guarding)
         begun = replace(begun, free_space_cameras=guarding)
@@ -323,6 +329,8 @@ def load_models(
         known = [t.view if targets.images is None else t.placed_painting for t in task.targets]
         completer = load_completer(models, config, [image for image in known if image is not None])
     completer, task = use_predicted_depth(models, completer, task)
+    if work.geometry is not None:
+        task = add_geometry(task, work.geometry)
     reconstructor = completer.reconstructor
 
     # A single photograph has no stereo, so a network predicts its depth; a splat needs neither.
@@ -353,6 +361,15 @@ def load_models(
                 notes = (*notes, *edited)
     print_lines(console, *notes)
     return Loaded(opened, task, completer, collect_cameras(opened, task), seconds)
+
+
+def add_geometry(task: CompletionTask, path: Path) -> CompletionTask:
+    """Add geometry from a file, whose frame is that of the splat, or of the photographs."""
+    with show_preparation("reading the geometry"):
+        geometry = load_geometry(path)
+    # Both are read relative to an origin.
+    origin = task.origin if task.splat_file is None else task.splat_file.origin
+    return replace(task, geometry=geometry.move(-origin))
 
 
 def use_predicted_depth(
@@ -410,6 +427,8 @@ def check_completion_inputs(
     """
     load_completer(work.models, work.config, ())
     check_target_files(targets.named, photographs.scene.resolution)
+    if work.geometry is not None:
+        load_geometry(work.geometry)
     if work.splat is not None:
         read_splat(work.splat)
 
@@ -550,6 +569,7 @@ def describe_settings(ready: Prepared) -> dict[str, Any]:
         "depth": models.depth,
         "network_device": models.network_device,
         **models.describe_generator(),
+        "geometry": None if ready.work.geometry is None else str(ready.work.geometry),
         "images": None if targets.images is None else str(targets.images),
         "uses_target_photographs": models.generator == "oracle",
         **ready.settings,

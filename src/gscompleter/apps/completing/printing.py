@@ -101,10 +101,25 @@ def describe_completion(summary: CompletionSummary, results: ResultsRequest) -> 
     )
     if counts.get("replaced"):
         yield describe_replaced(counts["replaced"])
+    yield from describe_geometry_use(summary)
     yield describe_size(results.out, results.suffix is None)
     yield f"Report: {results.out / REPORT_FILE}"
     if results.has_video and summary.targets:
         yield f"Video: {results.out / VIDEO_FILE}"
+
+
+def describe_geometry_use(summary: CompletionSummary) -> Iterator[str]:
+    """Write the sentence on the use of geometry from elsewhere, if there is any."""
+    shares = [row.geometry.share for row in summary.targets if row.geometry is not None]
+    if not shares:
+        return
+    name = quote_value(Path(str(summary.settings["geometry"])).name)
+    holes = "the hole" if len(shares) == 1 else "the holes"
+    parts = ", ".join(format_percent(share) for share in shares)
+    yield (
+        f"{name} gives the depth of {parts} of {holes}: {summary.gaussians['on_geometry']:,} "
+        "Gaussians stand where it says, in generated colours."
+    )
 
 
 def answer_plan(

@@ -18,6 +18,7 @@ from gscompleter.data.photographs import Photographs
 from gscompleter.data.sfm.refining import PoseRefinement
 from gscompleter.editing.taken_out import TakenOut
 from gscompleter.generators.painted import Painting
+from gscompleter.numerics.given_geometry import GivenGeometry
 from gscompleter.splats.edits import Edits, read_edits
 from gscompleter.types import Camera, Gaussians, View
 from gscompleter.virtual_capture.witnesses import Witnesses
@@ -142,6 +143,8 @@ class CompletionTask:
     """Predicted z-depth that lies beside photographs, by frame: it only supports stereo."""
     witnesses: Witnesses = Witnesses()
     """Further cameras from which a splat without photographs looks well."""
+    geometry: GivenGeometry | None = None
+    """Geometry from elsewhere in the frame of the result; None for none."""
     taken_out: TakenOut | None = None
     """What earlier edits took out of the input splat, which the photographs do not show any more;
     None for nothing."""

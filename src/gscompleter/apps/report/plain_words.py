@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from gscompleter.apps.report.schema import (
 from gscompleter.data.depth_beside_colmap import DEPTH_KINDS
 from gscompleter.evaluation.verdict.kept import KeptRow
 from gscompleter.evaluation.verdict.numbers import format_number, format_percent
+from gscompleter.system.errors import quote_value
 
 FRAME_NOTES = {
     "cameras": "in the frame of its cameras.json, not in that of the photographs",
@@ -237,6 +239,12 @@ def list_photograph_notes(summary: CompletionSummary) -> Iterator[Note]:
 
 def describe_given_depth(share: float, summary: CompletionSummary) -> str:
     """Describe the largest share of a photograph whose depth is known without stereo."""
+    if summary.settings.get("geometry"):
+        name = quote_value(Path(str(summary.settings["geometry"])).name)
+        return (
+            f"Up to {format_percent(share)} of a photograph's pixels have the depth of {name}, or "
+            "one that was measured or predicted, which decides their surfaces."
+        )
     has_maps = any(kind in note for kind in DEPTH_KINDS for note in summary.scene.notes)
     has_only_points = summary.scene.format in POINT_FORMATS and not has_maps
     is_predicted = len(summary.context) == 1 and summary.settings.get("depth") != "none"

@@ -95,6 +95,18 @@ class FittedRow:
 
 
 @dataclass(frozen=True)
+class GeometryRow:
+    """What geometry from elsewhere (`settings.geometry`) gives at a target."""
+
+    share: float = 0.0
+    """Share of the pixels of the hole, at the padded target, whose depth it gives."""
+    contradicted: float = 0.0
+    """Share of them at which it disagrees with the scene around, and is not used."""
+    added: int = 0
+    """Number of added Gaussians that stand where it says; their colours are generated."""
+
+
+@dataclass(frozen=True)
 class TargetRow(ScoreRow):
     """Result at a target."""
 
@@ -127,6 +139,8 @@ class TargetRow(ScoreRow):
     """The same at four cameras between the nearest photograph and the target, on average."""
     painter: str | None = None
     """Who painted the image from which Gaussians were added; None if a generator made it."""
+    geometry: GeometryRow | None = None
+    """Use of geometry from elsewhere; None without it."""
     fitted: FittedRow | None = None
     """Scores without the errors of the target's own camera; None without a photograph, or if too
     little of it lies outside of holes."""

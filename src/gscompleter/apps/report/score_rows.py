@@ -13,6 +13,7 @@ from gscompleter.apps.report.schema import (
     AlignmentRow,
     ContextRow,
     FittedRow,
+    GeometryRow,
     TargetRow,
     UnfilledRow,
 )
@@ -38,7 +39,7 @@ from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
 from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.state import Completion
-from gscompleter.target_result import TargetResult
+from gscompleter.target_result import GeometryUse, TargetResult
 from gscompleter.types import View, merge
 
 MIN_POSED = 3
@@ -250,8 +251,16 @@ def make_target_row(
         thin_gaps=gaps.share,
         flight_thin_gaps=gaps.flight_share,
         painter=result.painter or None,
+        geometry=make_geometry_row(result.geometry),
         fitted=fitted,
     )
+
+
+def make_geometry_row(use: GeometryUse) -> GeometryRow | None:
+    """Make the row of the use of geometry; None if none is given."""
+    if not use.name:
+        return None
+    return GeometryRow(use.share, use.contradicted, use.added)
 
 
 def count_changes(completion: Completion) -> dict[str, Any]:
@@ -259,6 +268,8 @@ def count_changes(completion: Completion) -> dict[str, Any]:
     counts = {"context": len(completion.context), "added": len(completion.added)}
     if completion.is_given:
         counts["from_photographs"] = completion.num_observed
+    if completion.geometry is not None:
+        counts["on_geometry"] = sum(result.geometry.added for result in completion.targets)
     num_pieces = completion.count_added("piece")
     if num_pieces:
         counts["pieces"] = num_pieces

@@ -27,6 +27,8 @@ class WorkRequest:
 
     splat: SplatRequest | None = None
     """The splat to complete; None to reconstruct the scene from its photographs."""
+    geometry: Path | None = None
+    """Mesh or points in the frame of the scene, whose depth is used in holes; None for none."""
     models: ModelRequest = ModelRequest()
     config: CompleterConfig = CompleterConfig()
     """Settings. For a splat without photographs, its Gaussians tell later what a hole of it is, and

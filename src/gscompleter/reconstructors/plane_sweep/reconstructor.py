@@ -146,7 +146,10 @@ class PlaneSweep(Splatter):
         # carried over as points.
         known = anchor.given_depth > 0
         points = unproject(anchor.given_depth, anchor.camera)[known]
-        turned = replace(image, given_depth=compute_sparse_depth(points, image.camera))
+        depths = compute_sparse_depth(points, image.camera)
+        if image.given_depth is not None:
+            depths = image.given_depth.where(image.given_depth > 0, depths)
+        turned = replace(image, given_depth=depths)
         (depth,) = self.estimate_depths([turned])
         return self.lift_pixels([image], [depth, DepthMap(anchor.given_depth, known)], pixel_mask)
 

@@ -24,7 +24,7 @@ from gscompleter.system.errors import InputError, quote_value, refuse_pointer
 from gscompleter.system.files.reading import open_file
 from gscompleter.system.files.writing import replace_file
 
-_SCALARS = {
+PLY_SCALARS = {
     **dict.fromkeys(("char", "int8"), "i1"),
     **dict.fromkeys(("uchar", "uint8"), "u1"),
     **dict.fromkeys(("short", "int16"), "i2"),
@@ -96,7 +96,7 @@ def _parse_elements(lines: Iterable[bytes]) -> list[Element]:
                 case ["property", "list", _, _, name]:
                     tables[-1][2].append((name, "O"))
                 case ["property", kind, name]:
-                    tables[-1][2].append((name, byte_order + _SCALARS[kind]))
+                    tables[-1][2].append((name, byte_order + PLY_SCALARS[kind]))
                 case _:
                     raise DamagedError
         except (LookupError, ValueError) as error:

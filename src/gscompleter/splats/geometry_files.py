@@ -1,0 +1,176 @@
+"""Reader of meshes and points: .ply, .obj, and .glb without Gaussians.
+
+Coordinates are taken as they stand in a file, in the axes of the scene; colours are not read.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, Int
+from numpy import ndarray
+
+from gscompleter.numerics.given_geometry import GivenGeometry, make_geometry
+from gscompleter.splats.glb import read_glb_meshes
+from gscompleter.splats.packing import UnsupportedError
+from gscompleter.splats.ply import MEANS
+from gscompleter.system.damage import DamagedError, describe_damage
+from gscompleter.system.errors import InputError, quote_value, require_path
+from gscompleter.system.files.ply import PLY_SCALARS, PlyFile, read_ply_file
+from gscompleter.system.files.reading import read_bytes
+
+Mesh = tuple[Float[ndarray, "n 3"], Int[ndarray, "m 3"]]
+"""Vertices, and the triangles between them; none for points."""
+
+NO_FACES = np.empty((0, 3), np.int64)
+_FACE_ELEMENT = re.compile(
+    rb"^element\s+(\w+)\s+(\d+)\s*\n((?:(?:property|comment)\s[^\n]*\n)*)", re.MULTILINE
+)
+_FACE_LISTS = ("vertex_indices", "vertex_index")
+"""Names of the list of a face's corners."""
+
+
+def load_geometry(path: Path | str) -> GivenGeometry:
+    """Load a mesh or points (.ply, .obj, .glb), for the argument `geometry` of a completion.
+
+    Polygons are cut into triangles. Raises InputError for other files, and for damaged ones.
+    """
+    path = require_path(path)
+    name = quote_value(path.name)
+    read = READERS.get(path.suffix.lower())
+    if read is None:
+        raise InputError(
+            f"{quote_value(path)} is no geometry that is read; name a mesh or points as "
+            f"{', '.join(READERS)}.",
+            "geometry",
+        )
+    try:
+        vertices, faces = read(path)
+    except UnsupportedError as error:
+        raise InputError(f"{quote_value(path)} {error}.", "geometry") from error
+    except InputError:
+        raise
+    except (ValueError, LookupError, TypeError, struct.error, ArithmeticError) as error:
+        raise InputError(
+            f"{quote_value(path)} cannot be read: {describe_damage(error)}; export it again.",
+            "geometry",
+        ) from error
+    return make_geometry(vertices, faces, name)
+
+
+def read_ply_geometry(path: Path) -> Mesh:
+    """Read the vertices and faces of a .ply."""
+    file = read_ply_file(path, MEANS, "mesh or point cloud")
+    if "f_dc_0" in (file.rows.dtype.names or ()):
+        raise UnsupportedError("holds Gaussians; name a mesh or points as geometry")
+    vertices = np.stack([file.rows[name].astype(np.float64) for name in MEANS], axis=1)
+    return vertices, _read_ply_faces(path, file)
+
+
+def _read_ply_faces(path: Path, file: PlyFile) -> Int[ndarray, "m 3"]:
+    """Read the faces of a .ply, which have to follow its vertices."""
+    elements = list(_FACE_ELEMENT.finditer(file.header))[1:]
+    faces = [number for number, found in enumerate(elements) if found[1] == b"face"]
+    if not faces or int(elements[faces[0]][2]) == 0:
+        return NO_FACES
+    if faces[0] != 0:
+        raise UnsupportedError("has other elements between its vertices and its faces")
+    count = int(elements[0][2])
+    properties = [line.split() for line in elements[0][3].splitlines()]
+    properties = [words for words in properties if words[0] == b"property"]
+    lists = [words for words in properties if words[1] == b"list"]
+    if len(lists) != 1 or lists[0][4].decode("latin-1") not in _FACE_LISTS:
+        raise UnsupportedError("has faces without one list of vertex indices")
+    place = properties.index(lists[0])
+    if file.is_ascii:
+        lines = read_bytes(path)[len(file.header) :].split(b"\n")
+        rows = [line.split() for line in lines if line.strip()]
+        rows = rows[len(file.rows) : len(file.rows) + count]
+        if len(rows) < count:
+            raise DamagedError(f"it ends after {len(rows):,} of {count:,} faces")
+        return cut_polygons([int(i) for i in row[place + 1 :][: int(row[place])]] for row in rows)
+    return _read_binary_faces(file, count, properties, place)
+
+
+def _read_binary_faces(
+    file: PlyFile, count: int, properties: list[list[bytes]], place: int
+) -> Int[ndarray, "m 3"]:
+    """Read the faces of a binary .ply, whose list is the property number `place`."""
+    order = ">" if b"binary_big_endian" in file.header else "<"
+
+    def get_type(word: bytes) -> np.dtype:
+        return np.dtype(order + PLY_SCALARS[word.decode("latin-1")])
+
+    before = sum(get_type(words[1]).itemsize for words in properties[:place])
+    after = sum(get_type(words[1]).itemsize for words in properties[place + 1 :])
+    number, index = get_type(properties[place][2]), get_type(properties[place][3])
+    data = np.asarray(file.trailer)
+
+    # Nearly all files have triangles alone, whose rows are equally long.
+    row = np.dtype(
+        [
+            ("before", f"V{before}"),
+            ("number", number),
+            ("corners", index, 3),
+            ("after", f"V{after}"),
+        ]
+    )
+    if len(data) >= count * row.itemsize:
+        rows = np.frombuffer(data, row, count)
+        if (rows["number"] == 3).all():
+            return rows["corners"].astype(np.int64)
+
+    polygons: list[list[int]] = []
+    start = 0
+    for _ in range(count):
+        start += before
+        if start + number.itemsize > len(data):
+            raise DamagedError(f"it ends after {len(polygons):,} of {count:,} faces")
+        sides = int(np.frombuffer(data, number, 1, start)[0])
+        start += number.itemsize
+        if start + sides * index.itemsize + after > len(data):
+            raise DamagedError(f"it ends after {len(polygons):,} of {count:,} faces")
+        polygons.append(np.frombuffer(data, index, sides, start).tolist())
+        start += sides * index.itemsize + after
+    return cut_polygons(polygons)
+
+
+def read_obj_geometry(path: Path) -> Mesh:
+    """Read the vertices (v) and faces (f) of a .obj; all else is for looks."""
+    vertices: list[list[float]] = []
+    polygons: list[list[int]] = []
+    for number, line in enumerate(read_bytes(path).decode("utf-8", "replace").splitlines(), 1):
+        match line.split():
+            case ["v", x, y, z, *_]:
+                try:
+                    vertices.append([float(x), float(y), float(z)])
+                except ValueError as error:
+                    raise DamagedError(f"line {number} is no vertex") from error
+            case ["f", *corners]:
+                try:
+                    indices = [int(corner.partition("/")[0]) for corner in corners]
+                except ValueError as error:
+                    raise DamagedError(f"line {number} is no face") from error
+                # Indices count from 1, or back from the last vertex so far.
+                polygons.append([i - 1 if i > 0 else len(vertices) + i for i in indices])
+    if not vertices:
+        raise DamagedError("it holds no vertices")
+    return np.array(vertices), cut_polygons(polygons)
+
+
+def cut_polygons(polygons: Iterable[list[int]]) -> Int[ndarray, "m 3"]:
+    """Cut polygons into triangles that share their first corner."""
+    triangles = [
+        (corners[0], corners[i], corners[i + 1])
+        for corners in polygons
+        for i in range(1, len(corners) - 1)
+    ]
+    return np.array(triangles, np.int64).reshape(-1, 3)
+
+
+READERS = {".ply": read_ply_geometry, ".obj": read_obj_geometry, ".glb": read_glb_meshes}
+"""Readers by ending."""

@@ -1,0 +1,223 @@
+"""Depth of geometry from elsewhere where photographs measure none (not in the paper).
+
+A scan or a mesh knows what is behind the chair. It is a measurement of others, in a frame that may
+be another one, so it is believed only as far as it agrees with what the scene shows: as a whole at
+the photographs, and around each hole at the target.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.config import CompleterConfig
+from gscompleter.numerics.geometry import look_up
+from gscompleter.numerics.given_geometry import GivenGeometry
+from gscompleter.numerics.image_ops import fill_smoothly, smooth_masked
+from gscompleter.numerics.sky import mask_out_sky
+from gscompleter.reconstructors.features.depth_factor import (
+    compare_with_matches,
+    fit_depth_factor,
+)
+from gscompleter.stages.synthesize import GeneratedView
+from gscompleter.stages.target_view import TargetView
+from gscompleter.system.errors import InputError
+from gscompleter.system.tensor_checks import describe
+from gscompleter.target_result import GeometryUse
+from gscompleter.types import DepthMap, Gaussians, Render, View
+
+MAX_DEVIATION = 0.05
+"""Largest deviation of depth, relative, that still counts as the same surface."""
+MIN_COMPARED = 0.001
+"""Smallest share of the photographs' pixels that has to be compared."""
+MIN_AGREEING = 0.5
+"""Smallest share of the compared pixels around one that has to agree."""
+COMPARED_AROUND = 1 / 64
+"""Half the side of that neighbourhood, relative to the longer side of the image. At the edges of
+surfaces a render mixes the depth of two, and agrees with neither."""
+ADVICE = "give it in the frame and unit of the scene"
+
+
+def check_geometry(geometry: object, config: CompleterConfig) -> None:
+    """Raise InputError for a value that is no geometry, or if the config can use none."""
+    if not isinstance(geometry, GivenGeometry):
+        raise InputError(
+            f"The geometry has to be what gsc.load_geometry returns, and is {describe(geometry)}.",
+            "geometry",
+        )
+    if config.registration_method == "paper":
+        raise InputError(
+            "The paper's registration takes no geometry from elsewhere; leave the geometry or the "
+            "config of the paper out.",
+            "geometry",
+        )
+
+
+def require_same_scene(
+    geometry: GivenGeometry, views: Sequence[View], renders: Sequence[Render]
+) -> None:
+    """Raise InputError if geometry contradicts a scene as its photographs see it."""
+    ratios = []
+    num_pixels = 0
+    for view, render in zip(views, renders, strict=True):
+        surface = mask_out_sky(render, view.camera)
+        drawn = geometry.draw_depth(view.camera)
+        compared = surface.valid & (drawn > 0)
+        ratios.append((drawn[compared] / surface.depth[compared]).log())
+        num_pixels += compared.numel()
+    ratio = torch.cat(ratios).cpu()
+    require_overlap(geometry, len(ratio), num_pixels)
+    deviation = ratio.abs().median().expm1().item()
+    if deviation <= MAX_DEVIATION:
+        return
+    factor = ratio.median()
+    is_scaled = (ratio - factor).abs().median().expm1().item() <= MAX_DEVIATION
+    scale = f", about {factor.exp().item():.3g} times as far away" if is_scaled else ""
+    raise InputError(
+        f"The depth of {geometry.name} differs by {100 * deviation:.0f} % from what the scene "
+        f"shows at the photographs{scale}, and at most {100 * MAX_DEVIATION:.0f} % count as the "
+        f"same surfaces; {ADVICE}.",
+        "geometry",
+    )
+
+
+def give_photographs_depth(
+    geometry: GivenGeometry, views: Sequence[View], renders: Sequence[Render]
+) -> tuple[View, ...]:
+    """Give photographs of a scene the depth of geometry, where it agrees with what is around.
+
+    Photographs that have a measured depth keep that.
+    """
+    given = []
+    for view, render in zip(views, renders, strict=True):
+        if view.depth is None and len(view.known_depths) == 0:
+            fit = fit_to_surface(
+                geometry.draw_depth(view.camera), mask_out_sky(render, view.camera)
+            )
+            view = replace(view, given_depth=fit.depth.where(view.valid_mask, 0.0))
+        given.append(view)
+    return tuple(given)
+
+
+def give_depth_before_scene(
+    geometry: GivenGeometry, views: Sequence[View]
+) -> tuple[list[View], tuple[str, ...]]:
+    """Give photographs the depth of geometry before a scene is made of them, and say what is so.
+
+    Raises InputError if what they measure by their matches contradicts it.
+    """
+    drawn = [geometry.draw_depth(view.camera) for view in views]
+    num_pixels = sum(depth.numel() for depth in drawn)
+    require_overlap(geometry, sum(int((depth > 0).sum()) for depth in drawn), num_pixels)
+    given = []
+    for view, depth in zip(views, drawn, strict=True):
+        if view.depth is None and len(view.known_depths) == 0:
+            view = replace(view, given_depth=depth.where(view.valid_mask, 0.0))
+        given.append(view)
+
+    samples = compare_with_matches(
+        [view.to("cpu") for view in views], [depth.cpu() for depth in drawn]
+    )
+    fit = fit_depth_factor(samples)
+    if fit is None:
+        note = f"The photographs show too little to compare {geometry.name} with; it is used as "
+        return given, (f"{note}it is.",)
+    # The test of every given depth: a pair with errors of its poses measures no better than that.
+    if not fit.is_consistent or fit.factor != 1.0:
+        scale = f" by a factor of {1 / fit.factor:.3g}" if fit.is_consistent else ""
+        raise InputError(
+            f"The depth of {geometry.name} differs{scale} from what the photographs measure at "
+            f"{len(samples):,} compared pixels ({fit.agreement:.0%} agree"
+            f"{' with that factor' if scale else ''}); {ADVICE}.",
+            "geometry",
+        )
+    return given, ()
+
+
+def require_uncontradicted(
+    geometry: GivenGeometry, given: Sequence[View], used: Sequence[View]
+) -> None:
+    """Raise InputError if Ψ left out the depth of geometry in half the photographs, or more.
+
+    `given` are the photographs before the scene was made of them, `used` those after it, which have
+    no depth any more where stereo contradicts it.
+    """
+    num_given = sum(view.given_depth is not None for view in given)
+    num_dropped = num_given - sum(view.given_depth is not None for view in used)
+    if num_given and 2 * num_dropped >= num_given:
+        raise InputError(
+            f"The surfaces of {geometry.name} contradict what stereo measures in {num_dropped} of "
+            f"{num_given} photographs; {ADVICE}.",
+            "geometry",
+        )
+
+
+def require_overlap(geometry: GivenGeometry, num_compared: int, num_pixels: int) -> None:
+    """Raise InputError if geometry and photographs hardly show one place."""
+    if num_compared < MIN_COMPARED * num_pixels:
+        raise InputError(
+            f"{geometry.name} covers hardly anything that the photographs show ({num_compared:,} "
+            f"of {num_pixels:,} pixels), so that nothing tells whether they belong together; "
+            f"{ADVICE}.",
+            "geometry",
+        )
+
+
+@dataclass(frozen=True)
+class FittedDepth:
+    """Depth of geometry at a camera, fitted to the surfaces that the scene shows there."""
+
+    depth: Float[Tensor, "h w"]
+    """z-depth in scene units; 0 where there is none, or where it is not believed."""
+    contradicted: Bool[Tensor, "h w"]
+    """True where geometry is not believed."""
+
+
+def fit_to_surface(drawn: Float[Tensor, "h w"], surface: DepthMap) -> FittedDepth:
+    """Drop the depth of geometry where it disagrees with the scene around, and bend the rest to it.
+
+    So no step is left at the border of a hole by a deviation that counts as the same surface.
+    """
+    is_there = drawn > 0
+    compared = is_there & surface.valid
+    if not compared.any():
+        # Nothing is seen here; at the photographs the geometry was the same as the scene.
+        return FittedDepth(drawn, torch.zeros_like(is_there))
+    ratio = torch.where(compared, surface.depth / drawn, 1.0).clamp_min(1e-6).log()
+    agrees = compared & (ratio.abs().expm1() <= MAX_DEVIATION)
+    radius = max(1, round(COMPARED_AROUND * max(drawn.shape)))
+    share = smooth_masked(agrees.to(drawn)[..., None], compared, radius)[..., 0]
+    agreement = fill_smoothly(share, compared)
+    bent = drawn * fill_smoothly(ratio, agrees).exp()
+    believed = is_there & (agreement >= MIN_AGREEING)
+    return FittedDepth(bent.where(believed, 0.0), is_there & ~believed)
+
+
+def add_geometry_depth(image: GeneratedView, view: TargetView) -> tuple[GeneratedView, GeometryUse]:
+    """Give the synthesized image the depth of the geometry where the scene shows nothing."""
+    geometry = view.state.geometry
+    if geometry is None:
+        return image, GeometryUse()
+    camera = view.camera.padded
+    surface = mask_out_sky(view.render, camera)
+    seen = replace(surface, valid=surface.valid & ~view.holes)
+    fit = fit_to_surface(geometry.draw_depth(camera), seen)
+    num_holes = int(view.holes.sum().clamp_min(1))
+    use = GeometryUse(
+        geometry.name,
+        share=int((view.holes & (fit.depth > 0)).sum()) / num_holes,
+        contradicted=int((view.holes & fit.contradicted).sum()) / num_holes,
+    )
+    return replace(image, given_depth=fit.depth.where(~seen.valid, 0.0)), use
+
+
+def count_on_geometry(use: GeometryUse, added: Gaussians, image: View) -> GeometryUse:
+    """Count the added Gaussians that stand at the depth of the geometry."""
+    if image.given_depth is None:
+        return use
+    is_given = look_up(image.given_depth > 0, added, image.camera)
+    return replace(use, added=int(is_given.sum()))

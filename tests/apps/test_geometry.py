@@ -1,0 +1,89 @@
+"""`complete --geometry`: what it says, what it writes, and what it refuses."""
+
+import json
+
+import numpy as np
+import pytest
+
+from command import run
+from gscompleter import load_geometry, save_ply
+from gscompleter.apps.commands.complete import decide_completion
+from gscompleter.cli import parse_command
+from room_mesh import mesh_of, write_obj, write_ply_mesh
+from scenes import Room, camera_at, gaussians_of, merge, photographed, view_of
+
+CAMERAS = [camera_at(x, size=64) for x in (-0.3, 0.1)]
+TARGET = camera_at(0.9, yaw=35, size=64)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Return a folder of photographs, a splat of what two of them see, and meshes of the room."""
+    folder = tmp_path_factory.mktemp("geometry")
+    photographed(folder / "room", [*CAMERAS, TARGET])
+    save_ply(folder / "splat.ply", merge([gaussians_of(view_of(Room(), c)) for c in CAMERAS]))
+    vertices, quads = mesh_of()
+    write_ply_mesh(folder / "scan.ply", (vertices, quads))
+    write_obj(folder / "lie.obj", (1.3 * vertices, quads))
+    return folder
+
+
+def complete(folder, out, *more):
+    scene = (folder / "room", "--scene", folder / "splat.ply")
+    return ["complete", *scene, "--context", 0, 1, "--target", 2, "--out", out, *more]
+
+
+@pytest.mark.slow
+def test_the_summary_and_the_terminal_say_what_geometry_gave(folder, tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    assert run(monkeypatch, *complete(folder, out, "--geometry", folder / "scan.ply")) == 0
+    summary = json.loads((out / "summary.json").read_text())
+    (row,) = summary["targets"]
+    assert summary["settings"]["geometry"] == str(folder / "scan.ply")
+    assert row["geometry"]["share"] > 0.9
+    assert 0 < row["geometry"]["added"] <= row["added"]
+    assert summary["gaussians"]["on_geometry"] == row["geometry"]["added"]
+    share = f"{100 * row['geometry']['share']:.0f} %"
+    assert any(note.startswith(f"scan.ply gives the depth of {share}") for note in row["notes"])
+    printed = " ".join(capsys.readouterr().out.split())
+    assert "scan.ply gives the depth of" in printed
+    assert "Gaussians stand where it says, in generated colours." in printed
+    page = (out / "report.html").read_text()
+    assert "scan.ply gives the depth of" in page
+    assert "have the depth of scan.ply" in page
+    edits = json.loads((out / "edits.json").read_text())
+    assert edits["edits"][-1]["settings"]["geometry"] == "scan.ply"
+
+
+def test_geometry_that_lies_is_refused_and_nothing_is_written(
+    folder, tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / "out"
+    assert run(monkeypatch, *complete(folder, out, "--geometry", folder / "lie.obj")) == 2
+    said = capsys.readouterr().err
+    assert "The depth of lie.obj differs by 30 % from what the scene shows" in said
+    assert "about 1.3 times as far away" in said
+    assert not out.exists()
+
+
+def test_a_wrong_file_is_refused_before_the_photographs_are_read(
+    folder, tmp_path, monkeypatch, capsys
+):
+    missing = folder / "missing.ply"
+    command = ["complete", folder / "room", "--target", 2, "--out", tmp_path / "out"]
+    assert run(monkeypatch, *command, "--geometry", missing) == 2
+    assert "missing.ply" in capsys.readouterr().err
+
+
+def test_the_option_becomes_a_part_of_the_request(folder, tmp_path):
+    words = complete(folder, tmp_path / "out", "--geometry", folder / "scan.ply")
+    request = decide_completion(parse_command([str(word) for word in words]))
+    assert request.work.geometry == folder / "scan.ply"
+
+
+def test_geometry_of_a_map_is_read_relative_to_its_origin(folder, tmp_path):
+    """Coordinates of maps are too large for float32, and so are those of their meshes."""
+    vertices, quads = mesh_of()
+    far = np.array([500_000.0, 5_400_000.0, 100.0])
+    geometry = load_geometry(write_ply_mesh(tmp_path / "map.ply", (vertices + far, quads)))
+    np.testing.assert_allclose(geometry.move(-far).vertices, vertices, atol=1e-8)
