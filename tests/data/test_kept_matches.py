@@ -12,7 +12,7 @@ import pycolmap
 from gscompleter.data.sfm.kept_matches import (
     KEPT_BACK,
     NumberedMatches,
-    drop_contradicted,
+    drop_wrong_places,
     keep_back_tracks,
     measure_model,
     rate_places,
@@ -60,7 +60,7 @@ def observe() -> tuple[dict[int, np.ndarray], NumberedMatches]:
 def test_right_places_are_confirmed():
     keypoints, kept = observe()
     model = make_model(CENTRES)
-    checked = drop_contradicted(model, kept, keypoints)
+    checked = drop_wrong_places(model, kept, keypoints)
     assert checked.dropped == []
     assert checked.distance < 0.5
     assert model.num_reg_images() == 5
@@ -72,7 +72,7 @@ def test_a_photograph_in_a_wrong_place_goes_and_the_others_stay(wrong):
     centres = CENTRES.copy()
     centres[wrong - 1] += [0.2, 1.0, 0.5]
     model = make_model(centres)
-    assert drop_contradicted(model, kept, keypoints).dropped == [wrong]
+    assert drop_wrong_places(model, kept, keypoints).dropped == [wrong]
     assert sorted(model.reg_image_ids()) == [n for n in range(1, 6) if n != wrong]
 
 
@@ -85,12 +85,12 @@ def test_one_photograph_alone_does_not_confirm_a_place():
     distances = measure_model(model, {(4, 5): kept[4, 5]}, keypoints)
     assert np.median(distances[4, 5]) < 0.5
     assert rate_places(distances, [4, 5]) == {4: math.inf, 5: math.inf}
-    assert drop_contradicted(model, kept, keypoints).dropped == [5]
+    assert drop_wrong_places(model, kept, keypoints).dropped == [5]
 
 
 def test_a_model_that_nothing_confirms_is_empty_in_the_end():
     keypoints, _ = observe()
-    checked = drop_contradicted(make_model(CENTRES), {}, keypoints)
+    checked = drop_wrong_places(make_model(CENTRES), {}, keypoints)
     assert sorted(checked.dropped) == [1, 2, 3, 4, 5]
     assert checked.distance == math.inf
 

@@ -31,7 +31,7 @@ MAX_DISTANCE = 1.0
 image whose shorter side is `ERROR_SIDE`."""
 MAX_PAIR_DISTANCE = 1.5
 """Largest such distance between two photographs one of which confirms the other."""
-MIN_CONFIRMING = 2
+MIN_CONFIRMING_PHOTOGRAPHS = 2
 """Fewest photographs that confirm the place of one. One alone does not tell how far away it was
 taken: any point of the line between both has the same epipolar lines."""
 
@@ -109,7 +109,7 @@ class CheckedPlaces:
     """Median distance of the others' matches from their epipolar lines, as in `measure_model`."""
 
 
-def drop_contradicted(
+def drop_wrong_places(
     model: pycolmap.Reconstruction, kept: NumberedMatches, keypoints: Keypoints
 ) -> CheckedPlaces:
     """Take photographs out of a model whose places the matches that were kept back do not confirm.
@@ -166,6 +166,6 @@ def rate_places(
     for number in numbers:
         own = [one for pair, one in distances.items() if number in pair]
         confirming = sum(float(np.median(one)) <= MAX_PAIR_DISTANCE for one in own)
-        is_enough = confirming >= MIN_CONFIRMING
+        is_enough = confirming >= MIN_CONFIRMING_PHOTOGRAPHS
         medians[number] = float(np.median(np.concatenate(own))) if is_enough else math.inf
     return medians

@@ -19,7 +19,7 @@ import torch
 from jaxtyping import Float, Int
 from PIL import Image
 
-from gscompleter.data.sfm.matching import MATCHING_SEED, ColmapJob, Pairs
+from gscompleter.data.sfm.matching import MATCHING_SEED, ColmapJob, Pairs, read_image_number
 
 MAX_LEARNED_FEATURES = 2048
 """Most features in a photograph; the time of a pair grows with their square."""
@@ -127,7 +127,7 @@ def match_learned(
     with pycolmap.Database.open(job.database) as database:
         database.clear_two_view_geometries()
         database.clear_matches()
-        numbers = [database.read_image_with_name(name).image_id for name in names]
+        numbers = [read_image_number(database, name) for name in names]
         for number, found in zip(numbers, features, strict=True):
             database.update_keypoints(number, found.pixels)
         for i, j in sorted(pairs):

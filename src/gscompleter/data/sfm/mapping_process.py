@@ -19,7 +19,7 @@ import numpy as np
 import pycolmap
 
 from gscompleter.data.panorama import VIEWS, compute_view_rotation
-from gscompleter.data.sfm.kept_matches import CheckedPlaces, drop_contradicted, keep_back_tracks
+from gscompleter.data.sfm.kept_matches import CheckedPlaces, drop_wrong_places, keep_back_tracks
 from gscompleter.data.sfm.learned_features import (
     LearnedMatcher,
     load_learned_matcher,
@@ -32,6 +32,7 @@ from gscompleter.data.sfm.matching import (
     extract_features,
     match,
     prepare_colmap,
+    read_image_number,
     select_pairs,
 )
 from gscompleter.data.sfm.poses import (
@@ -193,10 +194,10 @@ def map_with_learned_features(
     masked = [copy.name for copy in job.photographs if copy.is_masked]
     match_learned(job, matcher, names, masked, pairs)
     with pycolmap.Database.open(job.database) as database:
-        numbers = [database.read_image_with_name(name).image_id for name in names]
+        numbers = [read_image_number(database, name) for name in names]
         kept = keep_back_tracks(database, numbers)
         keypoints = {number: database.read_keypoints(number)[:, :2] for number in numbers}
-    mapped = map_photographs(job, lambda model: drop_contradicted(model, kept, keypoints))
+    mapped = map_photographs(job, lambda model: drop_wrong_places(model, kept, keypoints))
     return replace(mapped, features=LEARNED)
 
 

@@ -24,9 +24,15 @@ from gscompleter.data.sfm.kept_matches import (
     keep_back_tracks,
     measure_pair_distances,
 )
-from gscompleter.data.sfm.matching import ColmapJob, extract_features, match, prepare_colmap
+from gscompleter.data.sfm.matching import (
+    ColmapJob,
+    extract_features,
+    match,
+    prepare_colmap,
+    read_image_number,
+)
 from gscompleter.data.sfm.placing import KnownCopy, PinholeNumbers
-from gscompleter.data.sfm.placing_process import make_known_camera, read_image_number
+from gscompleter.data.sfm.placing_process import make_known_camera
 
 REFINING_ROUNDS = 3
 """Rounds of triangulation and adjustment; better cameras find more points."""
