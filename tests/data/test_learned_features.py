@@ -13,6 +13,8 @@ from PIL import Image
 
 pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
 
+import pycolmap
+
 import stand_in_xfeat
 from gscompleter.data.sfm import mapping_process
 from gscompleter.data.sfm.learned_features import (
@@ -57,6 +59,7 @@ def run_mapping(folder: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> dict:
     return json.loads(capsys.readouterr().out.splitlines()[-1])
 
 
+# `test_kept_matches.py` has the check of places, and the tests below the parts.
 @pytest.mark.slow
 def test_learned_features_place_what_sift_does_not(tmp_path, monkeypatch, capsys, stand_in):
     (tmp_path / "images").mkdir()
@@ -66,6 +69,28 @@ def test_learned_features_place_what_sift_does_not(tmp_path, monkeypatch, capsys
     assert len(found["registered"]) >= 4
     assert not found["lacks_learned"]
     assert (tmp_path / "model" / "cameras.bin").is_file()
+
+
+def test_a_model_with_too_few_points_gives_way_and_one_with_as_many_photographs_stays():
+    sift, learned = (make_mapped(3, points) for points in (40, 400))
+    assert max(sift, learned, key=mapping_process.rate_use) is sift
+    assert max(make_mapped(3, 5), learned, key=mapping_process.rate_use) is learned
+    assert max(sift, make_mapped(4, 40), key=mapping_process.rate_use).rating[1] == 4
+    nothing = mapping_process.Mapped(None, False)
+    assert max(sift, nothing, key=mapping_process.rate_use) is sift
+
+
+def make_mapped(photographs: int, points: int) -> mapping_process.Mapped:
+    """Make a model with so many photographs and points."""
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera.create_from_model_name(1, "SIMPLE_RADIAL", 190, 160, 160)
+    model.add_camera_with_trivial_rig(camera)
+    for number in range(1, photographs + 1):
+        image = pycolmap.Image(name=f"{number}.png", camera_id=1, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+    for number in range(points):
+        model.add_point3D(np.array([number, 0.0, 1.0]), pycolmap.Track())
+    return mapping_process.Mapped(model, False)
 
 
 def test_without_the_package_its_lack_is_told(tmp_path, monkeypatch, capsys):

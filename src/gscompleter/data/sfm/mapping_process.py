@@ -85,7 +85,6 @@ class Mapped:
     features: str = SIFT
     contradicted: tuple[str, ...] = ()
     """Photographs that were taken out, since matches that were kept back contradict them."""
-
     kept_distance: float = 0.0
     """Median distance of matches that were kept back from their epipolar lines; 0 without such."""
 
@@ -130,9 +129,13 @@ def main() -> None:
         if matcher is not None:
             learned = map_with_learned_features(job, matcher, names, pairs)
             # Where both place as many, SIFT's features are the more precise ones.
-            if learned.rating[:2] > found.rating[:2]:
-                found = learned
+            found = max(found, learned, key=rate_use)
     print(json.dumps({**write_model(job, found), "lacks_learned": lacks_learned}))
+
+
+def rate_use(found: Mapped) -> tuple[bool, int]:
+    """Rate a model of some features by whether it can be used, then by its photographs."""
+    return found.is_usable(MIN_PHOTOGRAPHS), found.rating[1]
 
 
 def count_wanted(job: MappingJob) -> int:
