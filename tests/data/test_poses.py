@@ -121,6 +121,44 @@ def test_photographs_without_a_camera_are_named(tmp_path, monkeypatch, capsys):
     assert said[1].startswith("3 of 4 cameras and 90 points, mean error 0.50 px: ")
 
 
+def test_learned_features_are_told_and_what_matches_contradict_is_named(tmp_path, monkeypatch):
+    script = model_script(["0.png", "2.png", "3.png"], features="XFeat", contradicted=("1.png",))
+    stand_in(monkeypatch, tmp_path, script)
+    first, second, third = find_poses(blank(tmp_path / "p", 4), tmp_path / "out").notes
+    assert first == "SIFT placed too few photographs; the learned features XFeat placed 3 of 4."
+    assert second == "XFeat put 1.png where matches that were kept back do not agree."
+    assert third.startswith("No camera was found for 1.png; ")
+    # As it is read from the summary.
+    assert find_poses(tmp_path / "p", tmp_path / "out").notes == [first, second, third]
+
+
+@pytest.mark.parametrize("command", ["poses", "complete"])
+def test_where_too_few_are_placed_the_missing_extra_is_named(
+    tmp_path, monkeypatch, capsys, command
+):
+    stand_in(monkeypatch, tmp_path, model_script(["0.png"], lacks_learned=True))
+    given, out = blank(tmp_path / "p", 4), tmp_path / "out"
+    assert run(monkeypatch, command, given, "--out", out, "--quiet") == 2
+    said = " ".join(capsys.readouterr().err.split())
+    assert "placed 1 of 4 photographs" in said
+    assert "pip install 'gscompleter[features]' adds features that match farther apart." in said
+
+
+def test_few_placed_photographs_are_searched_again_once_the_extra_is_there(tmp_path, monkeypatch):
+    given, out = blank(tmp_path / "p", 8), tmp_path / "out"
+    stand_in(monkeypatch, tmp_path, model_script(["0.png", "2.png", "3.png"], lacks_learned=True))
+    monkeypatch.setattr(poses, "has_learned_features", lambda: False)
+    (note,) = find_poses(given, out).notes
+    assert note.endswith(
+        "; pip install 'gscompleter[features]' adds features that match farther apart."
+    )
+    assert find_poses(given, out).reused
+    stand_in(monkeypatch, tmp_path, "raise SystemExit('asked again')")
+    monkeypatch.setattr(poses, "has_learned_features", lambda: True)
+    with pytest.raises(InputError, match="asked again"):
+        find_poses(given, out, overwrite=True)
+
+
 @pytest.mark.parametrize(
     ("count", "points", "plausible", "told"),
     [

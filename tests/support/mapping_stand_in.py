@@ -27,7 +27,13 @@ def stand_in(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, script: str) -> No
 
 
 def model_script(
-    registered: list[str], points: int = 90, plausible: bool = True, focal: float | None = None
+    registered: list[str],
+    points: int = 90,
+    plausible: bool = True,
+    focal: float | None = None,
+    features: str = "SIFT",
+    contradicted: tuple[str, ...] = (),
+    lacks_learned: bool = False,
 ) -> str:
     """Write a script that reports these photographs as registered."""
     result = {
@@ -36,6 +42,9 @@ def model_script(
         "error": 0.5,
         "is_plausible": plausible,
         "focal": focal,
+        "features": features,
+        "contradicted": contradicted,
+        "lacks_learned": lacks_learned,
     }
     return f"""
 import json, pathlib, sys

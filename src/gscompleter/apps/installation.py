@@ -33,6 +33,7 @@ PURPOSES = {
     "diffusion": "--generator pe-field and diffusers-inpaint",
     "onnx": "--generator migan and lama",
     "poses": "photographs whose cameras are not known",
+    "features": "cameras of photographs too far apart for SIFT",
     "browser": "the picture of the viewer in the documentation",
     "film": "videos as SCENE, and complete --video",
     "ray": "batch --engine ray",

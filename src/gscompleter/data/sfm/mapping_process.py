@@ -9,8 +9,9 @@ import json
 import math
 import sys
 from collections import Counter
+from collections.abc import Callable
 from copy import deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -18,22 +19,35 @@ import numpy as np
 import pycolmap
 
 from gscompleter.data.panorama import VIEWS, compute_view_rotation
+from gscompleter.data.sfm.kept_matches import CheckedPlaces, drop_wrong_places, keep_back_tracks
+from gscompleter.data.sfm.learned_features import (
+    LearnedMatcher,
+    load_learned_matcher,
+    match_learned,
+)
 from gscompleter.data.sfm.matching import (
     MATCHING_SEED,
     ColmapJob,
+    Pairs,
     extract_features,
     match,
     prepare_colmap,
+    read_image_number,
     select_pairs,
 )
-from gscompleter.data.sfm.poses import MIN_PHOTOGRAPHS, UprightCopy
+from gscompleter.data.sfm.poses import (
+    LEARNED,
+    MIN_MODEL_POINTS,
+    MIN_PHOTOGRAPHS,
+    SIFT,
+    WANTED_SHARE,
+    UprightCopy,
+)
 
 LENS_MODEL = "SIMPLE_RADIAL"
 """COLMAP's camera model: one focal length, one distortion coefficient."""
 GUESSED_FOCAL = 1.2
 """Focal length in longer image sides, if EXIF lacks it."""
-WANTED_SHARE = 0.5
-"""Share of the photographs in a model below which other focal lengths are tried."""
 MIN_FOR_CENTRE = 10
 """Fewest photographs per camera to refine its principal point."""
 MAX_OFF_CENTRE = 0.1
@@ -57,6 +71,40 @@ class MappingJob(ColmapJob):
     """True if these are views of panoramas, in the folders view_0, view_1, …"""
 
 
+PlaceCheck = Callable[[pycolmap.Reconstruction], CheckedPlaces]
+"""Takes photographs in wrong places out of a model."""
+
+
+@dataclass(frozen=True)
+class Mapped:
+    """The best model of the photographs."""
+
+    model: pycolmap.Reconstruction | None
+    is_focal_fixed: bool
+    """True if its focal length was fixed at first."""
+    features: str = SIFT
+    contradicted: tuple[str, ...] = ()
+    """Photographs that were taken out, since matches that were kept back contradict them."""
+    kept_distance: float = 0.0
+    """Median distance of matches that were kept back from their epipolar lines; 0 without such."""
+
+    @property
+    def rating(self) -> tuple[bool, int, float, int]:
+        """Plausible lenses, photographs, agreement with kept matches, and points, in this order."""
+        if self.model is None:
+            return False, 0, -math.inf, 0
+        photographs = self.model.num_reg_images()
+        points = self.model.num_points3D()
+        # By less than a tenth of a pixel they tell no model from another.
+        agreement = -round(self.kept_distance, 1)
+        return has_plausible_lenses(self.model), photographs, agreement, points
+
+    def is_usable(self, wanted: int) -> bool:
+        """Check for plausible lenses, and enough photographs and points."""
+        is_plausible, photographs, _, points = self.rating
+        return is_plausible and photographs >= wanted and points >= MIN_MODEL_POINTS
+
+
 def main() -> None:
     """Run the job that standard input holds."""
     task = json.load(sys.stdin)
@@ -67,11 +115,32 @@ def main() -> None:
     if job.is_panoramic:
         join_views(job)
     names = [one.name for one in job.photographs]
-    pairs = select_pairs(job, names)
     # Between views of one panorama there is no baseline.
     centres = [name.partition("/")[2] if job.is_panoramic else name for name in names]
-    match(job, names, {(i, j) for i, j in pairs if centres[i] != centres[j]})
-    print(json.dumps(map_photographs(job)))
+    pairs = {(i, j) for i, j in select_pairs(job, names) if centres[i] != centres[j]}
+    match(job, names, pairs)
+    found = map_photographs(job)
+
+    lacks_learned = False
+    # The views of a panorama overlap all around, and their rig was not tried with other features.
+    if not job.is_panoramic and not found.is_usable(count_wanted(job)):
+        matcher = load_learned_matcher()
+        lacks_learned = matcher is None
+        if matcher is not None:
+            learned = map_with_learned_features(job, matcher, names, pairs)
+            # Where both place as many, SIFT's features are the more precise ones.
+            found = max(found, learned, key=rate_use)
+    print(json.dumps({**write_model(job, found), "lacks_learned": lacks_learned}))
+
+
+def rate_use(found: Mapped) -> tuple[bool, int]:
+    """Rate a model of some features by whether it can be used, then by its photographs."""
+    return found.is_usable(MIN_PHOTOGRAPHS), found.rating[1]
+
+
+def count_wanted(job: MappingJob) -> int:
+    """Count the photographs that a model should have."""
+    return max(MIN_PHOTOGRAPHS, math.ceil(WANTED_SHARE * len(job.photographs)))
 
 
 def find_features(job: MappingJob) -> None:
@@ -106,53 +175,95 @@ def join_views(job: MappingJob) -> None:
         pycolmap.apply_rig_config([rig], database)
 
 
-def map_photographs(job: MappingJob) -> dict[str, Any]:
-    """Find cameras and points from the matches; write the best model and return its quality.
+def map_photographs(job: MappingJob, check: PlaceCheck | None = None) -> Mapped:
+    """Find cameras and points from the matches in the database; `check` is of `select_model`."""
+    found = select_model(job, check)
+    if found.model is None or job.is_panoramic:
+        return found
+    if min(_count_photographs(found.model).values()) < MIN_FOR_CENTRE:
+        # Fewer photographs cannot separate the principal point from a rotation.
+        return found
+    return replace(found, model=refine_lenses(found.model, refine_principal_point=True))
+
+
+def map_with_learned_features(
+    job: MappingJob, matcher: LearnedMatcher, names: list[str], pairs: Pairs
+) -> Mapped:
+    """Map again with learned features, and leave out what matches that were kept back contradict.
+
+    Learned features also match what only looks alike, so that a photograph can be in a wrong place
+    though the lens is plausible and hundreds of matches agree.
+    """
+    masked = [copy.name for copy in job.photographs if copy.is_masked]
+    match_learned(job, matcher, names, masked, pairs)
+    with pycolmap.Database.open(job.database) as database:
+        numbers = [read_image_number(database, name) for name in names]
+        kept = keep_back_tracks(database, numbers)
+        keypoints = {number: database.read_keypoints(number)[:, :2] for number in numbers}
+    mapped = map_photographs(job, lambda model: drop_wrong_places(model, kept, keypoints))
+    return replace(mapped, features=LEARNED)
+
+
+def write_model(job: MappingJob, found: Mapped) -> dict[str, Any]:
+    """Write a model and return its quality.
 
     `registered` are the names of the copies, `error` is the mean reprojection error in pixels, and
     `focal` the focal length in pixels if it was fixed at first, else None.
     """
-    model, is_focal_fixed = select_model(job)
+    quality = {"features": found.features, "contradicted": list(found.contradicted)}
+    model = found.model
     if model is None:
-        return {"registered": [], "points": 0, "error": 0.0, "is_plausible": True, "focal": None}
-    counts = _count_photographs(model)
-    if min(counts.values()) >= MIN_FOR_CENTRE and not job.is_panoramic:
-        # Fewer photographs cannot separate the principal point from a rotation.
-        model = refine_lenses(model, refine_principal_point=True)
+        nothing = {"registered": [], "points": 0, "error": 0.0, "is_plausible": True}
+        return {**quality, **nothing, "focal": None}
     Path(job.model).mkdir(parents=True)
     model.write(job.model)
+    counts = _count_photographs(model)
+    is_fixed = found.is_focal_fixed
     return {
+        **quality,
         "registered": [model.images[i].name for i in model.reg_image_ids()],
         "points": model.num_points3D(),
         "error": model.compute_mean_reprojection_error(),
         "is_plausible": has_plausible_lenses(model),
-        "focal": model.cameras[max(counts)].mean_focal_length() if is_focal_fixed else None,
+        "focal": model.cameras[max(counts)].mean_focal_length() if is_fixed else None,
     }
 
 
-def select_model(job: MappingJob) -> tuple[pycolmap.Reconstruction | None, bool]:
-    """Map with a free focal length, then with plausible fixed ones (True), until it is good."""
+def select_model(job: MappingJob, check: PlaceCheck | None = None) -> Mapped:
+    """Map with a free focal length, then with plausible fixed ones (True), until it is good.
+
+    `check` takes photographs in wrong places out of each model before these are compared. With it
+    all focal lengths are tried: a wrong one bends a model that otherwise looks good.
+    """
     if job.is_panoramic:  # the focal length of views is known
-        return map_largest(job, is_focal_fixed=True), False
-    best = map_largest(job)
-    is_focal_fixed = False
+        return Mapped(map_largest(job, is_focal_fixed=True), False)
+    best = check_places(map_largest(job), False, check)
     # A plausible model with enough photographs is kept; until then further focal lengths are tried.
     wanted = math.ceil(WANTED_SHARE * len(job.photographs))
     for fov in FIXED_FOVS:
-        if _rate_model(best) >= (True, wanted, 0):
+        if check is None and best.rating[:2] >= (True, wanted):
             break
-        with_fixed_focals = map_with_fixed_focals(job, fov)
-        if _rate_model(with_fixed_focals) > _rate_model(best):
+        with_fixed_focals = check_places(map_with_fixed_focals(job, fov), True, check)
+        if with_fixed_focals.rating > best.rating:
             best = with_fixed_focals
-            is_focal_fixed = True
-    return best, is_focal_fixed
+    return best
 
 
-def _rate_model(model: pycolmap.Reconstruction | None) -> tuple[bool, int, int]:
-    """Rate a model by plausible lenses, then photographs, then points."""
-    if model is None:
-        return False, 0, 0
-    return has_plausible_lenses(model), model.num_reg_images(), model.num_points3D()
+def check_places(
+    model: pycolmap.Reconstruction | None, is_focal_fixed: bool, check: PlaceCheck | None
+) -> Mapped:
+    """Take out of a model the photographs that `check` finds in wrong places."""
+    if model is None or check is None:
+        return Mapped(model, is_focal_fixed and model is not None)
+    checked = check(model)
+    dropped = tuple(model.images[number].name for number in checked.dropped)
+    left = model if model.num_reg_images() >= MIN_PHOTOGRAPHS else None
+    return Mapped(
+        left,
+        is_focal_fixed and left is not None,
+        contradicted=dropped,
+        kept_distance=checked.distance,
+    )
 
 
 def map_with_fixed_focals(job: MappingJob, fov: float) -> pycolmap.Reconstruction | None:

@@ -81,6 +81,13 @@ def extract_features(job: ColmapJob, name: str, camera: int, is_masked: bool) ->
     )
 
 
+def read_image_number(database: pycolmap.Database, name: str) -> int:
+    """Return the number of a photograph in the database."""
+    image = database.read_image_with_name(name)
+    assert image is not None
+    return int(image.image_id)
+
+
 def select_pairs(job: ColmapJob, names: Sequence[str]) -> Pairs:
     """Choose the photographs to match: sequence neighbours, all pairs, or similar photographs."""
     # The neighbours of a sequence are known; in a set of unknown order all pairs, or for many

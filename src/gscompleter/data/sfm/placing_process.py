@@ -24,6 +24,7 @@ from gscompleter.data.sfm.matching import (
     extract_features,
     match,
     prepare_colmap,
+    read_image_number,
     select_pairs,
 )
 from gscompleter.data.sfm.placing import KnownCopy, NewCopy, PinholeNumbers
@@ -198,13 +199,6 @@ def describe_placed(
             is_placed = copy.name in placed
             rows.append({"is_placed": is_placed, "like": like, "matches": counts[like]})
     return {"new": rows, "error": float(model.compute_mean_reprojection_error())}
-
-
-def read_image_number(database: pycolmap.Database, name: str) -> int:
-    """Return the number of a copy in the database."""
-    image = database.read_image_with_name(name)
-    assert image is not None
-    return int(image.image_id)
 
 
 def count_matches(database: pycolmap.Database, one: int, other: int) -> int:

