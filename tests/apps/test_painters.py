@@ -101,6 +101,14 @@ def test_an_export_has_what_a_painter_needs(scene, exported):
         expected = view_of(Room(), camera).depth.numpy()
         known = ~painted.numpy()
         assert np.median(np.abs(depth / expected - 1)[known]) < 0.05
+    field = np.load(exported / content["visible_field_path"])
+    # The distance changes its sign at the surface in the middle of the first target.
+    camera = cameras[0]
+    for voxels, sign in ((-2, 1), (2, -1)):
+        depth = float(view_of(Room(), camera).depth[32, 32]) + voxels * float(field["voxel_size"])
+        point = (camera.center + depth * camera.c2w[:3, 2]).numpy()
+        voxel = np.round((point - field["origin"]) / field["voxel_size"]).astype(int)
+        assert np.sign(field["distance"][tuple(voxel)]) == sign
     listed = summary_of(exported)["files"]
     assert sorted(path.name for path in exported.iterdir()) == listed
 

@@ -171,7 +171,7 @@ def test_ego_vehicles_are_looked_for_where_no_authors_code_is_followed(preset, i
     given = EvaluateOptions(paths=(DRAWN / "re10k",), out=Path("out"), preset=preset)
     request = decide_evaluation(replace(given, protocol=("n-1",)))
     tasks = collect_tasks(request.run.cases, [], [])
-    clips = [task.load.args[0] for task in tasks]
+    clips = [task.open() for task in tasks]
     assert {frame.vehicle is not None for clip in clips for frame in clip.frames} == {is_looked_for}
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -19,8 +20,10 @@ from gscompleter.apps.inputs.holes_file import HOLES_FILE, HoleRow, read_holes
 from gscompleter.apps.inputs.paintings import is_exported
 from gscompleter.apps.inputs.task import Target
 from gscompleter.apps.report.hole_pictures import HolePictures, draw_hole
+from gscompleter.config.settings import COVERED
 from gscompleter.data.scene import describe_camera
 from gscompleter.numerics.geometry import pad_camera
+from gscompleter.numerics.visible_field import compute_visible_field
 from gscompleter.splats.alignment.similarity import get_scale, transform_camera_exactly
 from gscompleter.stages.refusals import explain_skip
 from gscompleter.stages.target_view import TargetView, render_target
@@ -32,7 +35,9 @@ from gscompleter.system.files.result_format import RESULT_MARK
 from gscompleter.system.progress import track
 from gscompleter.types import Camera
 
-EXPORTED = ("target*.png", PATH_VIDEO, PATH_MASK, HOLES_FILE)
+VISIBLE_FIELD = "visible_field.npz"
+"""What the cameras see, for programs that complete geometry."""
+EXPORTED = ("target*.png", PATH_VIDEO, PATH_MASK, VISIBLE_FIELD, HOLES_FILE)
 """Globs of the files that an export may write."""
 DEPTH_STEPS = 65535
 """Largest value of a 16-bit depth map."""
@@ -117,9 +122,34 @@ def write_holes(folder: Path, ready: Prepared, begun: Completion, has_path: bool
         "context": list(frames),
         "frames": rows,
         "path": path,
+        "visible_field_path": write_visible_field(folder, ready, begun, exported),
     }
     (folder / HOLES_FILE).write_bytes(json.dumps(content, indent=1).encode() + b"\n")
     return skipped
+
+
+def write_visible_field(
+    folder: Path, ready: Prepared, begun: Completion, exported: Sequence[ExportedHole]
+) -> str | None:
+    """Write the distance field that photographs and targets see, in the frame of the photographs.
+
+    Return the name of its file, or None if they see nothing.
+    """
+    back = np.linalg.inv(ready.task.frame)
+    cameras = [view.camera for view in begun.views]
+    frozen = ready.completer.scenes.freeze_at(begun.parts, cameras)
+    seen = [transform_camera_exactly(camera.to("cpu"), back) for camera in cameras]
+    depths = [
+        scene.render.depth.where(scene.render.alpha >= COVERED, 0.0).cpu() * get_scale(back)
+        for scene in frozen
+    ]
+    seen += [hole.camera.to("cpu") for hole in exported]
+    depths += [hole.depth.cpu() for hole in exported]
+    field = compute_visible_field(seen, depths)
+    if field is None:
+        return None
+    np.savez_compressed(folder / VISIBLE_FIELD, **vars(field))
+    return VISIBLE_FIELD
 
 
 def observe_hole(ready: Prepared, begun: Completion, target: Target) -> TargetView:
