@@ -8,7 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from rich.table import Table
+from rich.table import Column, Table
 
 from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.completing.keeping import describe_size
@@ -65,10 +65,11 @@ def print_completion(results: ResultsRequest) -> None:
 def make_score_table(summary: CompletionSummary) -> Table:
     """Make the table of PSNR before and after at each camera."""
     has_fitted = any(target.fitted is not None for target in summary.targets)
-    columns = ["camera", "hole", "PSNR before", "PSNR after"]
+    columns = ["hole", "PSNR before", "PSNR after"]
     # After one pose and one gain of the target's camera were fitted to its photograph.
     columns += ["camera fitted", "added"] if has_fitted else ["added"]
-    table = Table(*columns, box=None)
+    # Headers are broken in a narrow terminal, and names of files are not.
+    table = Table(Column("camera", no_wrap=True), *columns, box=None)
     kind = "context" if summary.scene.renders_from is None else "render"
     # Photographs of the context have neither a hole nor Gaussians of their own.
     for row in summary.context:
