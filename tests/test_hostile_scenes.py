@@ -20,6 +20,7 @@ from gscompleter import InputError
 from gscompleter.data.driving.mmdet3d import load_plain
 from gscompleter.data.formats import open_photographs
 from gscompleter.system.errors import MAX_MESSAGE_LENGTH
+from measured_photographs import find_moving
 from pose_files import WRITERS, write_photographs
 
 
@@ -36,7 +37,7 @@ def read(path: Path) -> None:
     photographs = open_photographs(path)
     for frame in range(len(photographs)):
         photographs.views([frame])
-        photographs.find_moving(frame)
+        find_moving(photographs, frame)
 
 
 # ---- infos of nuScenes and Waymo ----------------------------------------------------------------

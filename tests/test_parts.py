@@ -72,8 +72,8 @@ def test_counts_are_those_of_the_scene():
 def test_a_removal_whose_place_is_empty_is_not_called_filled():
     headline = judge_completion(remove_row(add(SHOWN, PIECES)), []).headline
     assert headline == (
-        "The selection is removed, and its place is not filled; no unused photograph could test "
-        "it; 5 Gaussians from photographs, none invented."
+        "The selection is removed, and its place is not filled; 5 Gaussians from photographs, "
+        "none invented."
     )
     headline = judge_completion(remove_row(add(SHOWN, PIECES, FILLED)), []).headline
     assert headline.startswith("The selection is removed and its place is filled")
