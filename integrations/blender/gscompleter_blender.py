@@ -59,7 +59,7 @@ TYPES = {
 
 
 class GscompleterError(Exception):
-    """What is wrong, and what to do, in one sentence."""
+    """Tell a person in one sentence what is wrong and what to do."""
 
 
 # -------------------------------------------------------------------------------------- files

@@ -12,7 +12,7 @@ from .session import Request, Sent, Session, find_photographs
 
 
 class State:
-    """What the panel shows. Of the module, since the program may make panels anew."""
+    """Hold the fields and the state of the panel, beside it: the program may make panels anew."""
 
     def __init__(self) -> None:
         self.session = Session()

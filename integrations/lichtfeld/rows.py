@@ -26,7 +26,7 @@ def list_columns(num_rest: int) -> list[str]:
 
 @dataclass(frozen=True)
 class Splat:
-    """What a .ply of Gaussians holds."""
+    """Hold the rows of a .ply of Gaussians, with their labels and the comments of its head."""
 
     rows: np.ndarray
     """[n, p] of float32, in the order of `list_columns`."""

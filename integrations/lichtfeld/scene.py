@@ -1,4 +1,4 @@
-"""What LichtFeld Studio shows, as files for gscompleter, and a result as a layer of its own.
+"""Write the scene of LichtFeld Studio for gscompleter, and show a result as a layer of its own.
 
 Three frames: **data** is that of the files (cameras look along +z, y is down); **visualizer** is
 what the interface speaks of (y and z turned round, cameras look along -z); and each node may be
@@ -25,7 +25,7 @@ TOLERANCE = 1e-4
 
 
 class HealError(Exception):
-    """What is wrong, and what to do, in one sentence."""
+    """Tell a person in one sentence what is wrong and what to do."""
 
 
 @dataclass(frozen=True)

@@ -30,7 +30,7 @@ KEPT_BESIDE = ("removed.ply", "refined_poses.json")
 
 @dataclass(frozen=True)
 class Request:
-    """What a person asks for."""
+    """Name the command of a heal, and its settings."""
 
     command: str
     """`repair` or `remove`."""
@@ -42,7 +42,7 @@ class Request:
 
 @dataclass(frozen=True)
 class Sent:
-    """What was sent, by which the result is shown."""
+    """Keep what was sent to gscompleter, to tell in its result what changed."""
 
     request: Request
     shown: Shown

@@ -212,16 +212,7 @@ class GSCompleter:
         if geometry is not None:
             check_geometry(geometry, config)
         with record_seconds() as seconds, timed_stage("context"):
-            geometry_notes: tuple[str, ...] = ()
-            if geometry is not None and scene is None:
-                views, geometry_notes = give_depth_before_scene(geometry, views)
-            context = init_context(
-                self.reconstructor, views, scene, check_views or (), targets, self.renderer
-            )
-            if geometry is not None and scene is None:
-                require_uncontradicted(geometry, views, context.views)
-            elif geometry is not None:
-                context = self.give_depth(geometry, context)
+            context = self.make_context(views, scene, check_views or (), targets, geometry)
             photos = tuple(Photo(view) for view in context.views)
             state = Completion(
                 config,
@@ -232,7 +223,7 @@ class GSCompleter:
                 Trust(),
                 is_given=scene is not None,
                 seed=self.seed,
-                context_notes=(*geometry_notes, *context.notes),
+                context_notes=context.notes,
                 geometry=geometry,
                 models=self.name_models(),
             )
@@ -260,6 +251,34 @@ class GSCompleter:
             state = replace(state, trust=trust)
             state = recolor_to_photos(state, [context.views[i] for i in new], self.scenes)
         return replace(state, exposure_gains=context.exposure_gains, seconds=seconds)
+
+    def make_context(
+        self,
+        views: Sequence[View],
+        scene: Gaussians | None,
+        check_views: Sequence[View],
+        targets: Sequence[Camera],
+        geometry: GivenGeometry | None,
+    ) -> InitialContext:
+        """Initialize the context, whose photographs get the depth of geometry if there is any.
+
+        Before Ψ makes the scene of them, so that it uses it; a scene that is given tells first
+        whether the geometry lies.
+        """
+
+        def init(photographs: Sequence[View]) -> InitialContext:
+            return init_context(
+                self.reconstructor, photographs, scene, check_views, targets, self.renderer
+            )
+
+        if geometry is None:
+            return init(views)
+        if scene is not None:
+            return self.give_depth(geometry, init(views))
+        given, notes = give_depth_before_scene(geometry, views)
+        context = init(given)
+        require_uncontradicted(geometry, given, context.views)
+        return replace(context, notes=(*notes, *context.notes))
 
     def give_depth(self, geometry: GivenGeometry, context: InitialContext) -> InitialContext:
         """Give the photographs of a given scene the depth of geometry; refuse one that lies."""

@@ -21,10 +21,10 @@ from gscompleter.apps.completing.run_info import describe_run_values, refuse_res
 from gscompleter.apps.inputs.depth_range import apply_splat_range
 from gscompleter.apps.inputs.describing import describe_opening, print_lines
 from gscompleter.apps.inputs.reading import read_photographs
-from gscompleter.apps.inputs.refined_poses import refine_opened, write_refined_poses
+from gscompleter.apps.inputs.refined_poses import read_at_refined_poses, write_refined_poses
 from gscompleter.apps.inputs.splat import locate_splat, move_to_splat
 from gscompleter.apps.inputs.taken_out import take_over_edits
-from gscompleter.apps.inputs.task import InputSplatFile, Opened
+from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened
 from gscompleter.apps.report.cleaning_picture import (
     REMOVED_PICTURE_FILE,
     RemovalSeen,
@@ -148,21 +148,21 @@ def clean_by_photographs(
     # The splat is also read before cameras are searched for, so that a damaged file is refused
     # within seconds: the search takes minutes.
     opened = open_input(photographs, splat, console, partial(load_given_splat, splat))
-    with stage("reading photographs"):
-        task = read_photographs(opened, photographs.context, device)
     loaded = load_given_splat(splat)
-    compile_kernels([device])
-    with stage("aligning the scene"):
-        splat_file = locate_splat(splat.path, splat.drop_nonfinite)
-        placed = move_to_splat(task, loaded, splat_file, opened)
+    splat_file = locate_splat(splat.path, splat.drop_nonfinite)
+
+    def read(opened: Opened) -> CompletionTask:
+        """Read the photographs in the frame of the splat."""
+        with stage("reading photographs"):
+            task = read_photographs(opened, photographs.context, device)
+        compile_kernels([device])
+        with stage("aligning the scene"):
+            return move_to_splat(task, loaded, splat_file, opened)
+
     if photographs.scene.refines_poses:
-        refined = refine_opened(opened, placed, console)
-        if refined is not opened:
-            opened = refined
-            with stage("aligning the scene"):
-                task = read_photographs(opened, photographs.context, device)
-                placed = move_to_splat(task, loaded, splat_file, opened)
-    task = placed
+        opened, task = read_at_refined_poses(opened, read, console)
+    else:
+        task = read(opened)
 
     # From here on the splat is that of the task, whose coordinates may have a local origin.
     given = task.scene

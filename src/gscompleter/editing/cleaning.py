@@ -41,7 +41,7 @@ def find_superfluous(
     none = torch.zeros_like(scene.generated, dtype=torch.bool)
     changes = rate_by_photographs(scene, none, views, renderer, config)
     removable = changes.are_observed & changes.find_removable(config) & (scene.generated == 0)
-    is_harmful = changes.gained > config.idle * changes.equal_share
+    is_harmful = changes.find_harmful(config)
     # A wall behind floaters is hidden, and looks superfluous. With the floaters faded, photographs
     # need it.
     removable &= find_removable(scene, removable, views, renderer, config)

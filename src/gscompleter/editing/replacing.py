@@ -24,7 +24,7 @@ from gscompleter.stages.add_observed import MIN_ADDED_SHARE, compare_colors, fin
 from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.stages.superfluous import (
     FADED_OPACITY,
-    exclude_needed,
+    exclude_needed_additions,
     limit_errors,
     sum_error_changes,
 )
@@ -163,15 +163,12 @@ def return_needed(
     candidates = given.source.rendered[contested.rows]
     is_dropped = find_unneeded_candidates(state, candidates, scenes, config)
 
-    # One at a time they are superfluous; together they may not be. No photograph may be worse than
-    # it was with all of them.
+    # No photograph may be worse than it was with all of them.
     views = [photo.view for photo in state.photos]
     limits = limit_errors(merge(given.parts), views, config.tolerance, scenes.renderer)
-    scene = merge(state.parts)
-    removable = torch.cat([is_dropped.new_zeros(len(scene)), is_dropped])
-    dropped = exclude_needed(merge([scene, candidates]), removable, views, limits, scenes.renderer)[
-        len(scene) :
-    ]
+    dropped = exclude_needed_additions(
+        merge(state.parts), candidates, is_dropped, views, limits, scenes.renderer
+    )
     return drop_rows(state, given, contested.rows.masked_scatter(contested.rows, dropped))
 
 
@@ -195,5 +192,5 @@ def find_unneeded_candidates(
         visible += sum_weights(scene.extend(faint))[-len(candidates) :]
         alone += sum_weights(scenes.renderer.freeze(faint, view.camera))
     is_in_the_way = visible > MIN_VISIBLE * alone
-    is_harmful = changes.gained > config.idle * changes.equal_share
-    return changes.are_observed & changes.find_removable(config) & (is_in_the_way | is_harmful)
+    can_go = is_in_the_way | changes.find_harmful(config)
+    return changes.are_observed & changes.find_removable(config) & can_go

@@ -38,7 +38,11 @@ from gscompleter.stages.new_photos import match_exposure
 from gscompleter.stages.refine import refine_opacities
 from gscompleter.stages.register import apply_affine
 from gscompleter.stages.select_anchor import find_nearest_view
-from gscompleter.stages.superfluous import exclude_needed, limit_errors, sum_error_changes
+from gscompleter.stages.superfluous import (
+    exclude_needed_additions,
+    limit_errors,
+    sum_error_changes,
+)
 from gscompleter.state import Completion
 from gscompleter.system.progress import track
 from gscompleter.trust.photometric import compute_color_differences
@@ -375,8 +379,7 @@ def drop_superfluous(
     for _ in range(THINNING_ROUNDS):
         none = torch.zeros_like(added.opacities, dtype=torch.bool)
         changes = sum_error_changes(added, none, views, frozen, THINNING)
-        # One at a time they are superfluous; together they may not be.
-        is_removable = torch.cat([none.new_zeros(len(scene)), changes.find_removable(THINNING)])
-        gone = exclude_needed(merge([scene, added]), is_removable, views, limits, renderer)
-        added = fit_to_photographs(added[~gone[len(scene) :]], views, frozen)
+        removable = changes.find_removable(THINNING)
+        gone = exclude_needed_additions(scene, added, removable, views, limits, renderer)
+        added = fit_to_photographs(added[~gone], views, frozen)
     return added

@@ -22,7 +22,7 @@ from gscompleter.stages.error_budgets import (
     select_fewest,
 )
 from gscompleter.trust.photometric import sum_weights
-from gscompleter.types import Gaussians, View
+from gscompleter.types import Gaussians, View, merge
 
 FADED_OPACITY = 0.02
 """Largest opacity of a faded Gaussian; at zero it would have no gradient."""
@@ -53,6 +53,10 @@ class ErrorChanges:
     def find_removable(self, config: CleaningConfig) -> Bool[Tensor, "n"]:
         """Find Gaussians that can be removed one at a time."""
         return self.lost < self.gained / config.min_ratio + config.idle * self.equal_share
+
+    def find_harmful(self, config: CleaningConfig) -> Bool[Tensor, "n"]:
+        """Find Gaussians without which photographs are better."""
+        return self.gained > config.idle * self.equal_share
 
 
 def sum_error_changes(
@@ -160,6 +164,23 @@ def exclude_needed(
             )
         if torch.equal(missing, missing_before):
             return removable.masked_scatter(removable, missing)
+
+
+def exclude_needed_additions(
+    scene: Gaussians,
+    added: Gaussians,
+    removable: Bool[Tensor, "n"],
+    views: Sequence[View],
+    max_errors: Sequence[float],
+    renderer: Renderer,
+) -> Bool[Tensor, "n"]:
+    """Remove needed ones from a mask of additions to a scene, of which nothing goes.
+
+    As `exclude_needed` does: one at a time they are superfluous; together they may not be.
+    """
+    among_all = torch.cat([removable.new_zeros(len(scene)), removable])
+    gone = exclude_needed(merge([scene, added]), among_all, views, max_errors, renderer)
+    return gone[len(scene) :]
 
 
 def find_needed_by_photographs(

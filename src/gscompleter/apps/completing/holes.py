@@ -36,7 +36,7 @@ from gscompleter.system.progress import track
 from gscompleter.types import Camera
 
 VISIBLE_FIELD = "visible_field.npz"
-"""What the cameras see, for programs that complete geometry."""
+"""File of the distance field that the cameras see, for programs that complete geometry."""
 EXPORTED = ("target*.png", PATH_VIDEO, PATH_MASK, VISIBLE_FIELD, HOLES_FILE)
 """Globs of the files that an export may write."""
 DEPTH_STEPS = 65535

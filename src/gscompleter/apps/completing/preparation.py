@@ -27,7 +27,7 @@ from gscompleter.apps.inputs.named_photographs import check_target_files
 from gscompleter.apps.inputs.opening import choose_working_size, open_scene
 from gscompleter.apps.inputs.paintings import read_paintings
 from gscompleter.apps.inputs.reading import read_task
-from gscompleter.apps.inputs.refined_poses import refine_opened, take_over_poses
+from gscompleter.apps.inputs.refined_poses import read_at_refined_poses, take_over_poses
 from gscompleter.apps.inputs.renders import open_renders
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.inputs.splat import add_check_views, locate_splat, move_to_splat
@@ -193,7 +193,7 @@ def prepare_completion(
     else:
         config = work.config if work.splat is None else work.config.for_photographs()
         opened = open_for_completion(work, source, targets, console)
-        opened, task = read_at_refined_poses(work, source, targets, opened, console)
+        opened, task = read_opened(work, source, targets, opened, console)
     loaded = load_models(work, config, targets, opened, task, console)
     return make_prepared(request, targets, loaded)
 
@@ -253,7 +253,7 @@ def open_for_completion(
     return opened
 
 
-def read_at_refined_poses(
+def read_opened(
     work: WorkRequest,
     photographs: PhotographsRequest,
     targets: TargetRequest,
@@ -261,19 +261,16 @@ def read_at_refined_poses(
     console: Console,
     num_known: int | None = None,
 ) -> tuple[Opened, CompletionTask]:
-    """Read the inputs, and once more if poses that matches contradict could be refined.
+    """Read the inputs, at refined poses unless these are to be taken as they are.
 
     `num_known` is that of `refine_opened`.
     """
-    task = read_inputs(work, photographs, targets, opened)
+    read = partial(read_inputs, work, photographs, targets)
     # The paper takes poses as they are.
     follows_paper = work.config.registration_method == "paper"
     if follows_paper or not photographs.scene.refines_poses:
-        return opened, task
-    refined = refine_opened(opened, task, console, num_known)
-    if refined is opened:
-        return opened, task
-    return refined, read_inputs(work, photographs, targets, refined)
+        return opened, read(opened)
+    return read_at_refined_poses(opened, read, console, num_known)
 
 
 def read_inputs(

@@ -17,7 +17,7 @@ from gscompleter.apps.completing.preparation import (
     load_models,
     make_prepared,
     open_for_completion,
-    read_at_refined_poses,
+    read_opened,
     use_predicted_depth,
 )
 from gscompleter.apps.inputs.depth_range import apply_splat_range
@@ -74,7 +74,7 @@ def prepare_update(request: UpdateRequest, console: Console) -> Prepared:
     new = list(range(num_known, len(opened.photographs)))
     opened = hold_out(opened, request.hold_out, source.context, new)
 
-    opened, task = read_at_refined_poses(work, source, NO_TARGETS, opened, console, num_known)
+    opened, task = read_opened(work, source, NO_TARGETS, opened, console, num_known)
     loaded = load_models(work, work.config, NO_TARGETS, opened, task, console)
     loaded = choose_evidence(work.models, source.context, loaded, new)
     settings = {

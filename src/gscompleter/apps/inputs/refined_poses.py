@@ -6,6 +6,7 @@ splat, seen from them, agrees with the photographs at least as well as seen from
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -45,6 +46,21 @@ def take_over_poses(opened: Opened, splat: Path, console: Console) -> Opened:
     photographs, refinement = taken
     print_lines(console, f"Refined poses of {quote_value(path)} are used.")
     return replace(opened, photographs=photographs, given=opened.photographs, refinement=refinement)
+
+
+def read_at_refined_poses(
+    opened: Opened,
+    read: Callable[[Opened], CompletionTask],
+    console: Console,
+    num_known: int | None = None,
+) -> tuple[Opened, CompletionTask]:
+    """Read a task, and once more if poses that matches contradict could be refined.
+
+    `num_known` is that of `refine_opened`.
+    """
+    task = read(opened)
+    refined = refine_opened(opened, task, console, num_known)
+    return (opened, task) if refined is opened else (refined, read(refined))
 
 
 def refine_opened(

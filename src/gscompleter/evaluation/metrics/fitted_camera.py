@@ -104,13 +104,17 @@ def measure_fitted(
     rays = small.camera.z_rays().double().cpu().numpy()
     rays = rays @ small.camera.c2w[:3, :3].double().cpu().numpy()
 
-    def draw(move: Move) -> MovedPicture:
-        render = renderer.render(scene, move_camera_by(small.camera, move, median / focal))
+    def read_picture(render: Render) -> MovedPicture:
         shown = render.depth_map()
         depth = shown.depth.where(shown.valid, median).double().cpu().numpy()
         return MovedPicture(clamp_image(render), rays * depth[..., None])
 
-    move = fit_move(draw, small.image.cpu().numpy(), counted, median, focal)
+    def draw(move: Move) -> MovedPicture:
+        camera = move_camera_by(small.camera, move, median / focal)
+        return read_picture(renderer.render(scene, camera))
+
+    first = read_picture(start)
+    move = fit_move(draw, first, small.image.cpu().numpy(), counted, median, focal)
     pose = move_camera_by(small.camera, move, median / focal).c2w
     image = clamp_image(renderer.render(scene, replace(target.camera, c2w=pose)))
     gains = fit_gains(image, target.image.cpu().numpy(), observed.cpu().numpy())
@@ -147,15 +151,21 @@ def move_camera_by(camera: Camera, move: Move, unit: float) -> Camera:
 
 
 def fit_move(
-    draw: Draw, truth: PixelValues, counted: Bool[np.ndarray, "h w"], median: float, focal: float
+    draw: Draw,
+    first: MovedPicture,
+    truth: PixelValues,
+    counted: Bool[np.ndarray, "h w"],
+    median: float,
+    focal: float,
 ) -> Move:
     """Fit the move, from wide to narrow blur; zero if the picture is no nearer to the truth.
 
-    `median` is the median depth in scene units, and `focal` the focal length in pixels.
+    `first` is the picture before any move. `median` is the median depth in scene units, and `focal`
+    the focal length in pixels.
     """
     still = np.zeros(6)
-    first = draw(still)
-    move, picture = still, first
+    move = still
+    picture = first
     for sigma in BLURS:
         move, picture = fit_blurred(
             draw, move, picture, truth, counted, sigma, median=median, focal=focal
@@ -207,7 +217,8 @@ def fit_blurred(
         else:
             return move, picture
         is_done = np.abs(following - move).max() < MIN_STEP
-        move, picture = following, moved
+        move = following
+        picture = moved
         if is_done:
             break
     return move, picture

@@ -30,7 +30,10 @@ def _draw_rows(begin, end, corners, faces, depth):
             continue
 
         # The box around the triangle. One that reaches behind the camera may cover any pixel.
-        left, right, top, bottom = 0, width, begin, end
+        left = 0
+        right = width
+        top = begin
+        bottom = end
         if min(a[2], b[2], c[2]) > SAFE_DEPTH * farthest:
             ax, bx, cx = a[0] / a[2], b[0] / b[2], c[0] / c[2]
             ay, by, cy = a[1] / a[2], b[1] / b[2], c[1] / c[2]
