@@ -17,7 +17,6 @@ from gscompleter.apps.inputs.removal import (
     find_in_masks,
     find_in_region,
     find_masks,
-    find_same_positions,
     widen_regions,
 )
 from gscompleter.apps.report.removal_pictures import find_largest
@@ -28,7 +27,7 @@ from gscompleter.numerics.geometry import axis_angle_to_matrix, rotations_to_qua
 from gscompleter.parts import NOT_INVENTED
 from gscompleter.render.loading import load_renderer
 from gscompleter.system.files.image import read_image, write_image
-from gscompleter.types import merge
+from gscompleter.types import find_equal_positions, merge
 from scenes import Room, camera_at, cast, gaussians_of, photographed, random_gaussians, view_of
 
 SIZE = 48
@@ -237,10 +236,10 @@ def test_masks_choose_what_lies_in_them(scene, tmp_path):
 def test_a_selection_is_found_by_position():
     splat = random_gaussians(50)
     splat.means[3] = splat.means[7]
-    found = find_same_positions(splat, splat[torch.tensor([7, 20])])
+    found = find_equal_positions(splat.means, splat[torch.tensor([7, 20])].means)
     assert torch.nonzero(found)[:, 0].tolist() == [3, 7, 20]
     moved = random_gaussians(50, seed=1)
-    assert not find_same_positions(splat, moved).any()
+    assert not find_equal_positions(splat.means, moved.means).any()
 
 
 @pytest.mark.parametrize(

@@ -6,18 +6,14 @@ from dataclasses import replace
 from functools import partial
 from typing import Any
 
-import numpy as np
-import torch
-from jaxtyping import Bool, Float
 from rich.console import Console
-from torch import Tensor
 
 from gscompleter.apps.completing.preparation import Gone, Prepared, prepare_completion
 from gscompleter.apps.inputs.removal import (
     check_removal_masks,
     check_selection,
-    choose_gaussians,
-    find_in_region,
+    contain_points,
+    select_with_masks,
     widen_regions,
 )
 from gscompleter.apps.requests.completion import RemovalRequest
@@ -49,20 +45,12 @@ def prepare_removal(request: RemovalRequest, console: Console) -> Prepared:
 
 def choose_selected(selection: Selection, ready: Prepared) -> Gone:
     """Choose the selected Gaussians."""
-    chosen = choose_gaussians(
+    chosen = select_with_masks(
         selection, ready.task, ready.opened, ready.cameras, ready.completer.renderer
     )
     # Gaussians that reach out of a box or the sphere are cut at its border. Those that a mask or a
     # file selects go as a whole.
     return Gone(chosen, partial(contain_points, selection, ready.task.origin))
-
-
-def contain_points(
-    selection: Selection, origin: Float[np.ndarray, "3"], points: Float[Tensor, "n 3"]
-) -> Bool[Tensor, "n"]:
-    """Find points, in the frame of the result, in the boxes and the sphere."""
-    # The region is given in the coordinates of the file, which float32 may not resolve.
-    return find_in_region(points.double() + torch.from_numpy(origin).to(points.device), selection)
 
 
 def describe_selection(selection: Selection) -> dict[str, Any]:

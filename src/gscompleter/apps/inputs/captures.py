@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.apps.inputs.named_photographs import PhotographNames
-from gscompleter.apps.inputs.removal import select_gaussians
+from gscompleter.apps.inputs.removal import select_without_masks
 from gscompleter.apps.requests.scene import DEFAULT_LONG_SIDE, SceneRequest
 from gscompleter.apps.requests.splat import Selection
 from gscompleter.config import HoleConfig
@@ -194,7 +194,7 @@ def search_around_place(
 ) -> Capture:
     """Search for cameras around what is to be removed."""
     assert request.place is not None
-    chosen = select_gaussians(request.place, scene, origin)
+    chosen = select_without_masks(request.place, scene, origin)
     upward = request.find_up(scene, renderer)
     side = choose_side(request.reading.resolution)
     cameras = choose_cameras_around_place(scene, chosen, upward.direction, side, renderer)

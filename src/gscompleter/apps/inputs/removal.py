@@ -29,20 +29,20 @@ from gscompleter.system.progress import track
 from gscompleter.types import Camera, Gaussians, find_equal_positions
 
 MAX_MARGIN = 0.05
-"""Largest margin of a region, relative to its smallest side or its radius."""
+"""Largest margin of regions, relative to the shortest side of the boxes and the sphere's radius.
+What is beside a small region stays, however large its Gaussians are."""
 
 
 def check_selection(selection: Selection) -> None:
-    """Refuse a selection that is missing or impossible."""
+    """Refuse a selection that is missing or impossible, before the scene is opened."""
     if not (selection.boxes or selection.sphere or selection.masks or selection.file):
         raise InputError(
             "Nothing is named that is to be removed; give --box, --sphere, --mask or --select."
         )
 
-    # A rest of fewer than six numbers is no box and is refused by their count.
     lows, highs = split_boxes(selection.boxes)
     is_finite = bool(np.isfinite(selection.boxes).all())
-    if len(selection.boxes) % 6 or not is_finite or not bool((lows < highs).all()):
+    if len(selection.boxes) % 6 != 0 or not is_finite or not bool((lows < highs).all()):
         raise InputError(
             "A box needs six numbers: its smallest x, y and z, then its largest; several boxes "
             "need six each.",
@@ -58,29 +58,25 @@ def check_selection(selection: Selection) -> None:
         )
     if selection.masks and not os.path.isdir(selection.masks):
         raise InputError(f"There is no folder {quote_value(selection.masks)}.", "mask")
-    # Only the positions of its Gaussians count. Read now to refuse a damaged file before the scene
-    # is opened.
+    # Read to refuse a damaged file. Of its Gaussians only the positions count.
     if selection.file:
         load_splat(selection.file, selection.drop_nonfinite, ignore_properties=True)
 
 
-def choose_gaussians(
+def select_with_masks(
     selection: Selection,
     task: CompletionTask,
     opened: Opened,
     cameras: Mapping[int, Camera],
     renderer: Renderer,
 ) -> Bool[Tensor, "n"]:
-    """Choose the Gaussians of the input splat that are selected in any way.
+    """Select the Gaussians of the input splat that are selected in any way, by masks as well.
 
     `cameras` are those of the photographs by frame, in the frame of the splat.
     """
     scene = task.scene
     assert scene is not None
-
-    # Boxes and spheres are in the coordinates of the file. The scene was shifted to a local origin
-    # if these are large, and float32 could not resolve them.
-    chosen = find_selected(selection, scene, task.origin)
+    chosen = find_by_position(selection, scene, task.origin)
     if selection.masks:
         photographs = opened.photographs
         masks = find_masks(selection.masks, [frame.name for frame in photographs.frames])
@@ -91,20 +87,21 @@ def choose_gaussians(
                 "mask",
             )
         resolution = opened.request.resolution
-        shown = find_in_masks(
+        is_in_masks = find_in_masks(
             masks, scene, photographs, cameras, resolution, renderer, selection.mask_reading
         )
-        check_selected_share(shown.float().mean().item(), selection.mask_reading)
-        chosen |= shown
-    return refuse_nothing(chosen, scene, task.origin)
+        # Masks that are the other way round select most of the splat.
+        check_selected_share(is_in_masks.float().mean().item(), selection.mask_reading)
+        chosen |= is_in_masks
+    return require_chosen(chosen, scene, task.origin)
 
 
-def select_gaussians(
+def select_without_masks(
     selection: Selection, scene: Gaussians, origin: Float[np.ndarray, "3"]
 ) -> Bool[Tensor, "n"]:
-    """Select the Gaussians of a splat without photographs, and so without masks of them.
+    """Select the Gaussians of a splat without photographs, of which masks would be.
 
-    `scene` is relative to `origin`, which is in the coordinates of the file.
+    `origin` is that of `compute_file_points`.
     """
     if selection.masks:
         raise InputError(
@@ -112,32 +109,47 @@ def select_gaussians(
             "--select, or name cameras with --cameras and masks as these.",
             "mask",
         )
-    return refuse_nothing(find_selected(selection, scene, origin), scene, origin)
+    return require_chosen(find_by_position(selection, scene, origin), scene, origin)
 
 
-def find_selected(
+def find_by_position(
     selection: Selection, scene: Gaussians, origin: Float[np.ndarray, "3"]
 ) -> Bool[Tensor, "n"]:
-    """Find the Gaussians of a scene that are selected in any way but by masks."""
-    points = scene.means.double() + torch.from_numpy(origin).to(scene.means.device)
-    chosen = find_in_region(points, selection)
+    """Find the Gaussians that boxes, the sphere or the file of a selection select.
+
+    `origin` is that of `compute_file_points`.
+    """
+    chosen = contain_points(selection, origin, scene.means)
     if selection.file:
         selected = load_splat_at(selection.file, scene.origin, selection.drop_nonfinite)
-        # Moved as the scene was, whose positions are then exactly equal.
+        # The file of a scene may lie at the large coordinates of its photographs without an origin
+        # of its own. It was then shifted by their origin, in the arithmetic of `shift_to_origin`.
         if scene.origin is None and origin.any():
             moved = selected.means.double() - torch.from_numpy(origin)
             selected = replace(selected, means=moved.float())
-        chosen |= find_same_positions(scene, selected.to(scene.means.device))
+        # Programs that save a selection leave positions as they were, so that exactly equal ones
+        # are those of the same Gaussians.
+        chosen |= find_equal_positions(scene.means, selected.means.to(scene.means.device))
     return chosen
 
 
-def refuse_nothing(
+def compute_file_points(
+    points: Float[Tensor, "n 3"], origin: Float[np.ndarray, "3"]
+) -> Float[Tensor, "n 3"]:
+    """Compute points of the scene in the coordinates of the splat's file, in float64.
+
+    The scene is relative to `origin`, a point in these coordinates. It is not zero if they are too
+    large for float32, as those of maps.
+    """
+    return points.double() + torch.from_numpy(origin).to(points.device)
+
+
+def require_chosen(
     chosen: Bool[Tensor, "n"], scene: Gaussians, origin: Float[np.ndarray, "3"]
 ) -> Bool[Tensor, "n"]:
-    """Return the choice, unless it is empty."""
+    """Return the mask of chosen Gaussians, or raise InputError if it is empty."""
     if not chosen.any():
-        points = scene.means.double() + torch.from_numpy(origin).to(scene.means.device)
-        smallest, largest = points.aminmax(dim=0)
+        smallest, largest = compute_file_points(scene.means, origin).aminmax(dim=0)
         low, high = format_corners(smallest.tolist(), largest.tolist())
         raise InputError(
             f"No Gaussian of the splat, which reaches from {low} to {high} in its own frame, is "
@@ -153,21 +165,31 @@ def widen_regions(
     """Let boxes and the sphere reach farther by one Gaussian of what they enclose.
 
     The centres of the Gaussians on a face lie on both sides of it: a region drawn exactly on an
-    object would leave half of each face standing. `scene` is relative to `origin`.
+    object would leave half of each face standing. `origin` is that of `compute_file_points`.
     """
-    points = scene.means.double() + torch.from_numpy(origin).to(scene.means.device)
-    inside = find_in_region(points, selection)
-    sides = [] if selection.sphere is None else [float(selection.sphere[3])]
+    inside = contain_points(selection, origin, scene.means)
+    lengths = [] if selection.sphere is None else [float(selection.sphere[3])]
     lows, highs = split_boxes(selection.boxes)
-    sides += (highs - lows).flatten().tolist()
-    if not sides or not inside.any():
+    lengths += (highs - lows).flatten().tolist()
+    if not lengths or not inside.any():
         return selection
+    # The size of a Gaussian is the standard deviation along its longest axis.
     size = scene.scales[inside].amax(dim=1).median().item()
-    return replace(selection, margin=min(size, MAX_MARGIN * min(sides)))
+    return replace(selection, margin=min(size, MAX_MARGIN * min(lengths)))
+
+
+def contain_points(
+    selection: Selection, origin: Float[np.ndarray, "3"], points: Float[Tensor, "n 3"]
+) -> Bool[Tensor, "n"]:
+    """Find points of the scene in the boxes or the sphere of a selection.
+
+    `origin` is that of `compute_file_points`.
+    """
+    return find_in_region(compute_file_points(points, origin), selection)
 
 
 def find_in_region(points: Float[Tensor, "n 3"], selection: Selection) -> Bool[Tensor, "n"]:
-    """Find points in the boxes and the sphere of a selection."""
+    """Find points, in the coordinates of the file, in the boxes or the sphere of a selection."""
     margin = selection.margin
     inside = find_in_boxes(points, selection.boxes, selection.box_rotation, margin)
     if selection.sphere:
@@ -177,7 +199,7 @@ def find_in_region(points: Float[Tensor, "n 3"], selection: Selection) -> Bool[T
 
 
 def split_boxes(numbers: Sequence[float]) -> tuple[Float[Tensor, "b 3"], Float[Tensor, "b 3"]]:
-    """Split numbers into the smallest and the largest corners of boxes; a rest is left out."""
+    """Split numbers, six for each box, into the smallest and the largest corners; drop the rest."""
     num_boxes = len(numbers) // 6
     corners = torch.tensor(numbers[: 6 * num_boxes], dtype=torch.float64).reshape(-1, 6)
     return corners[:, :3], corners[:, 3:]
@@ -193,7 +215,7 @@ def find_in_boxes(
 
     The boxes reach farther by `margin` on every side.
     """
-    # The square of a large number overflows, and a rotation has no length.
+    # A quaternion of any length is the same rotation. Scaled, its square does not overflow.
     largest = max(abs(part) for part in rotation)
     axes = quats_to_rotations(points.new_tensor([part / largest for part in rotation]))
 
@@ -208,16 +230,20 @@ def find_in_boxes(
 
 
 def check_removal_masks(folder: Path, names: Sequence[str], reading: MaskReading) -> None:
-    """Refuse masks of a removal that select nothing, or most of most photographs of these names."""
+    """Refuse masks of a removal that select nothing, or most of most of their photographs.
+
+    `names` are those of all photographs of the scene.
+    """
     masks = list(find_masks(folder, names).values())
     check_selecting_masks(masks, reading, "the photographs")
 
 
 def find_masks(folder: Path, names: Sequence[str]) -> dict[int, Path]:
-    """Find the masks that are named as photographs, by the number of the name."""
+    """Find the masks that are named as photographs, by the index of the name in `names`."""
     masks = {}
     for number, name in enumerate(map(Path, names)):
-        # Of a/b.jpg: a/b.jpg.png, a/b.png, b.jpg.png or b.png, as annotation programs name masks.
+        # The mask of a/b.jpg is a/b.jpg.png, a/b.png, b.jpg.png or b.png, as annotation programs
+        # name them.
         stems = (name, name.with_suffix(""), Path(name.name), Path(name.stem))
         path = find_file(
             [folder], [f"{stem}{ending}" for stem in stems for ending in TRIED_ENDINGS]
@@ -244,24 +270,19 @@ def find_in_masks(
 ) -> Bool[Tensor, "n"]:
     """Find Gaussians of which photographs show more inside of their masks than outside.
 
-    A mask is scaled to its photograph; one of another aspect ratio raises an InputError.
+    Photographs without a camera in `cameras`, which is by frame, do not count. A mask is scaled to
+    its photograph; one of another aspect ratio raises an InputError.
     """
-    # How much of each Gaussian all photographs show: inside of masks, outside, and an empty third
-    # channel.
+    # Columns of `sum_in_mask`: how much of each Gaussian is seen inside of masks, outside, and 0.
     sums = torch.zeros_like(scene.means)
     for number in track([number for number in masks if number in cameras], "masks"):
         frame = photographs.frame(number)
         size = frame.size()
-        # Masks of a scene hide what is black; here white is what goes, unless it is inverted.
         turn = frame.find_turn()
+        # `load_mask` marks black pixels, which masks of a scene hide. Here white is what goes, or
+        # black if masks are inverted.
         selected = ~load_mask(masks[number], size, frame.title, turn, reading.is_inverted)
         mask = resize_mask(frame, selected, size, resolution)
         frozen = renderer.freeze(scene, cameras[number])
         sums += sum_in_mask(frozen, torch.from_numpy(mask).to(sums))
     return sums[:, 0] > sums[:, 1]
-
-
-def find_same_positions(scene: Gaussians, selected: Gaussians) -> Bool[Tensor, "n"]:
-    """Find Gaussians of a scene at exactly the positions of others."""
-    # Exactly, because a program that saves a selection leaves the positions as they were.
-    return find_equal_positions(scene.means, selected.means)

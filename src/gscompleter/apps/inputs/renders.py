@@ -34,7 +34,7 @@ from gscompleter.apps.inputs.hole_kinds import (
 )
 from gscompleter.apps.inputs.named_photographs import find_context, read_targets
 from gscompleter.apps.inputs.reading import check_sizes
-from gscompleter.apps.inputs.removal import select_gaussians
+from gscompleter.apps.inputs.removal import select_without_masks
 from gscompleter.apps.inputs.selection import choose_context
 from gscompleter.apps.inputs.splat import place_scene
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened
@@ -230,7 +230,7 @@ def find_requested_holes(
         pairs = pair_masks(request.masks, targets)
         return [read_marks(path, camera, request.mask_reading) for path, camera in pairs]
     if request.marked is not None:
-        chosen = select_gaussians(request.marked, scene, origin)
+        chosen = select_without_masks(request.marked, scene, origin)
         return mark_selected(scene, chosen, targets, renderer)
     # What is removed leaves its hole later.
     if request.place is not None:

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.apps.inputs.removal import find_in_region, widen_regions
+from gscompleter.apps.inputs.removal import contain_points, widen_regions
 from gscompleter.apps.requests.splat import Selection
 from gscompleter.completer import GSCompleter
 from gscompleter.config import CompleterConfig
@@ -129,12 +130,7 @@ def remove_in_box(
     """
     given = Selection(corners, rotation)
     selection = widen_regions(given, state.context[~state.source.gone_mask], origin)
-
-    def contains(points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
-        # Coordinates of maps are too large for float32.
-        absolute = points.double() + torch.from_numpy(origin).to(points.device)
-        return find_in_region(absolute, selection)
-
+    contains = partial(contain_points, selection, origin)
     with stage("removing"):
         context = contains(state.context.means) & ~state.source.gone_mask
         added = [contains(part.means) for part in state.parts[1:]]

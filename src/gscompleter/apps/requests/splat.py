@@ -27,15 +27,16 @@ class Selection:
     """Gaussians of a splat that are selected in any of these ways; coordinates are the file's."""
 
     boxes: Sequence[float] = ()
-    """Six numbers per box: its smallest x, y and z, then its largest."""
+    """Six numbers per box: its smallest x, y and z, then its largest, before it is rotated."""
     box_rotation: Sequence[float] = (1.0, 0.0, 0.0, 0.0)
     """Quaternion wxyz that rotates the boxes about their centres."""
     sphere: Sequence[float] | None = None
-    """Centre and radius."""
+    """Centre x, y and z, and radius."""
     masks: Path | None = None
-    """Folder of images that are named as photographs, white where something goes."""
+    """Folder of images that are named as photographs, white (or as `mask_reading` says) where
+    something goes."""
     file: Path | None = None
-    """File of selected Gaussians."""
+    """File of selected Gaussians, which are found in the splat by their positions."""
     drop_nonfinite: bool = False
     """True to drop Gaussians of that file that contain NaN or infinity."""
     margin: float = 0.0
