@@ -143,6 +143,12 @@ def test_weights_that_belong_to_no_model_are_refused(weights):
         assign_weights(("mvsplat-re10k", "volsplat-re10k"), [Path(path) for path in weights])
 
 
+def test_two_weights_for_one_model_are_refused():
+    twice = [Path("mvsplat-re10k=a.ckpt"), Path("mvsplat-re10k=b.ckpt")]
+    with pytest.raises(InputError, match="mvsplat-re10k is given two files of weights"):
+        assign_weights(("mvsplat-re10k", "volsplat-re10k"), twice)
+
+
 def test_each_run_of_table_i_gets_its_own_weights():
     given = decide(preset="re10k", weights=(Path("mvsplat-re10k=re10k.ckpt"),))
     runs = [make_run(given, PAPER.tables["models"], model, "n-30") for model in given.weights]

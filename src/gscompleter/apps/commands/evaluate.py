@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from annotated_types import Interval
@@ -47,57 +47,64 @@ FigureName = Literal[
     "qualitative", "densification", "registration", "seams", "sequence", "all"
 ]
 # fmt: on
+ComparedKind = Literal["depth", "generator"]
+"""Kind of models that are compared in a table of their own."""
+
 AUTO = "auto"
 """Generator of the preset, or else the default one."""
-
-
 WEIGHTS_SETTING = "generator_weights"
-"""Setting that belongs to one generator."""
+"""Setting that several generators cannot share: a file of weights is of one network."""
 
 
 @dataclass(frozen=True)
 class PresetGeneratorOptions(GeneratorOptions):
     """Models that synthesize images, and their settings."""
 
+    # The parent has one generator; a type checker allows no other type.
     generator: tuple[str, ...] = (AUTO,)  # type: ignore[assignment]
     """Model that synthesizes the image at a target. As in `complete`; `auto` is that of the preset,
     or else warp-inpaint; several are compared in one table, and a setting goes to those of them
     that have it."""
 
     def make_settings(self) -> GeneratorSettings:
-        """Return the settings of one generator; raises as those of `complete`."""
+        """Return the settings of the only generator; errors are as in `GeneratorOptions`."""
         (name,) = self.generator
         return GeneratorOptions(**{**vars(self), "generator": name}).make_settings()
 
     def share_settings(self) -> dict[str, PresetGeneratorOptions]:
-        """Return options with one generator each, and those of the given settings that it has.
+        """Return, by generator, options with it alone and those of the given settings that it has.
 
-        Raise InputError for a setting that none has, and for weights that several would take.
+        Raises:
+            InputError: None of the generators has a given setting, or several would take the
+                weights.
         """
         given = {
-            name: value
-            for name, value in vars(self).items()
-            if name.startswith(PREFIX) and value != getattr(PresetGeneratorOptions, name)
+            setting: value
+            for setting, value in vars(self).items()
+            if setting.startswith(PREFIX) and value != getattr(PresetGeneratorOptions, setting)
         }
-        kinds = {name: get_settings_class(name) for name in self.generator}
-        for setting in given:
-            having = [g for g, kind in kinds.items() if hasattr(kind, setting.removeprefix(PREFIX))]
-            if not having:
+        taken: dict[str, dict[str, Any]] = {name: {} for name in self.generator}
+        for setting, value in given.items():
+            takers = [
+                name
+                for name in self.generator
+                if hasattr(get_settings_class(name), setting.removeprefix(PREFIX))
+            ]
+            if not takers:
                 raise InputError(
-                    f"None of the generators {', '.join(kinds)} has this setting; leave it out.",
+                    f"None of the generators {', '.join(taken)} has this setting; leave it out.",
                     setting,
                 )
-            if setting == WEIGHTS_SETTING and len(having) > 1:
+            if setting == WEIGHTS_SETTING and len(takers) > 1:
                 raise InputError(
-                    f"These weights would be taken by {' and '.join(having)}; compare them without "
+                    f"These weights would be taken by {' and '.join(takers)}; compare them without "
                     "weights of your own, or one after the other.",
                     setting,
                 )
+            for name in takers:
+                taken[name][setting] = value
         return {
-            name: PresetGeneratorOptions(
-                (name,), **{k: v for k, v in given.items() if hasattr(kind, k.removeprefix(PREFIX))}
-            )
-            for name, kind in kinds.items()
+            name: PresetGeneratorOptions((name,), **settings) for name, settings in taken.items()
         }
 
 
@@ -145,6 +152,7 @@ class EvaluateOptions(SynthesisOptions, EngineOptions, MaskOptions):
     reconstructor: tuple[str, ...] = ()
     """Model that turns photographs into Gaussians. It is plane-sweep (the default), or one or
     several of `gscompleter models`, or functions of yours as file.py:function."""
+    # As for the generator: the parent has one depth.
     depth: tuple[str, ...] = ("none",)  # type: ignore[assignment]
     """Monocular depth that helps plane-sweep where stereo measures nothing. It is none, moge-2, or
     a function of yours as file.py:function; several are compared in one table."""
@@ -196,37 +204,36 @@ class EvaluateOptions(SynthesisOptions, EngineOptions, MaskOptions):
 def decide_evaluation(
     options: EvaluateOptions,
 ) -> EvaluationRequest | ComparisonRequest | ReproductionRequest:
-    """Decide which methods run with which models, or which tables and figures need them."""
+    """Decide which methods run with which models, or which tables and figures need them.
+
+    The result runs one choice of models, compares several depths or generators in one table, or
+    reproduces tables and figures of the paper.
+    """
     from gscompleter.evaluation.paper import get_data_set  # no help page waits for torch
 
     # What is not given is as in the preset, or as without one.
     preset = get_data_set(options.preset)
-    is_reproduction = bool(options.preset or options.table or options.figure)
-    models = options.reconstructor or preset.reconstructor
-    if len(set(models)) < len(models):
-        raise InputError("A reconstructor is named twice; change --reconstructor.")
-    if not options.depth or len(set(options.depth)) < len(options.depth):
-        raise InputError("A depth is named twice, or none is; change --depth.", "depth")
-    weights = assign_weights(models, options.weights)
-    depth_weights = assign_weights(options.depth, options.depth_weights, "depth", "depth-weights")
-    named = [preset.generator if name == AUTO else name for name in options.synthesis.generator]
-    if not named or len(set(named)) < len(named):
-        raise InputError("A generator is named twice, or none is; change --generator.", "generator")
-    compared = {"depth": options.depth, "generator": named}
-    several = [kind for kind, names in compared.items() if len(names) > 1]
-    if several and (is_reproduction or len(models) > 1 or len(several) > 1):
-        raise InputError(
-            f"Several {several[0]}s are compared with one reconstructor in a table of their own; "
-            "leave --preset, --table and --figure out, and name one of the others.",
-            several[0],
-        )
+    reconstructors = options.reconstructor or preset.reconstructor
+    is_reproduction = bool(
+        options.preset or options.table or options.figure or len(reconstructors) > 1
+    )
+    generators = tuple(
+        preset.generator if name == AUTO else name for name in options.synthesis.generator
+    )
+    refuse_repeated(reconstructors, options.depth, generators)
+    compared = find_compared(options.depth, generators, is_reproduction)
     if not options.paths:
         raise InputError("No data is given; name a cases.json, or scenes with --protocol.")
-    synthesis = replace(options.synthesis, generator=tuple(named))
-    shared = synthesis.share_settings() if len(named) > 1 else {named[0]: synthesis}
-    decided = {
-        name: decide_run_models(options, models[0], weights[models[0]], depth_weights, own)
-        for name, own in shared.items()
+
+    first = reconstructors[0]
+    weights = assign_weights(reconstructors, options.weights)
+    depth_weights = assign_weights(options.depth, options.depth_weights, "depth", "depth-weights")
+    synthesis = replace(options.synthesis, generator=generators)
+    # A single generator refuses a setting that it does not have in a sentence of its own.
+    shared = synthesis.share_settings() if len(generators) > 1 else {generators[0]: synthesis}
+    models = {
+        generator: decide_run_models(options, first, weights[first], depth_weights, own)
+        for generator, own in shared.items()
     }
     run = EvaluationRequest(
         cases=CasesRequest(
@@ -242,26 +249,26 @@ def decide_evaluation(
             one_per_scene=options.one_per_scene,
             ego_mask=not options.no_ego_mask,
             # Numbers of others stand beside those of the paper, whose data are as they were given.
-            refines_poses=not (options.no_refine_poses or is_reproduction or len(models) > 1),
+            refines_poses=not (options.no_refine_poses or is_reproduction),
             limit=options.limit,
             apart=options.apart,
         ),
         methods=options.methods,
-        models=decided[named[0]],
+        models=models[generators[0]],
         out=options.out,
         rerun=options.rerun,
         engine=decide_engine(options),
         answer=options.answer,
     )
-    if "depth" in several:
-        depths = {
+    if compared == "depth":
+        with_depths = {
             depth: replace(run.models, depth=depth, depth_weights=own)
             for depth, own in depth_weights.items()
         }
-        return ComparisonRequest(run=run, kind="depth", models=depths)
-    if several:
-        return ComparisonRequest(run=run, kind="generator", models=decided)
-    if not is_reproduction and len(models) == 1:
+        return ComparisonRequest(run=run, kind=compared, models=with_depths)
+    if compared == "generator":
+        return ComparisonRequest(run=run, kind=compared, models=models)
+    if not is_reproduction:
         return run
     return ReproductionRequest(
         run=run,
@@ -274,6 +281,36 @@ def decide_evaluation(
     )
 
 
+def refuse_repeated(
+    reconstructors: Sequence[str], depths: Sequence[str], generators: Sequence[str]
+) -> None:
+    """Refuse a model that is named twice, and options that name none."""
+    if len(set(reconstructors)) < len(reconstructors):
+        raise InputError("A reconstructor is named twice; name each once.", "reconstructor")
+    if not depths or len(set(depths)) < len(depths):
+        raise InputError("A depth is named twice, or none is; name each once.", "depth")
+    if not generators or len(set(generators)) < len(generators):
+        raise InputError("A generator is named twice, or none is; name each once.", "generator")
+
+
+def find_compared(
+    depths: Sequence[str], generators: Sequence[str], is_reproduction: bool
+) -> ComparedKind | None:
+    """Find the kind of which several models are named, or None.
+
+    Raise InputError if both are, or beside what a reproduction of the paper runs.
+    """
+    named: dict[ComparedKind, Sequence[str]] = {"depth": depths, "generator": generators}
+    several = [kind for kind, names in named.items() if len(names) > 1]
+    if len(several) > 1 or (several and is_reproduction):
+        raise InputError(
+            f"Several {several[0]}s are compared with one reconstructor in a table of their own; "
+            "leave --preset, --table and --figure out, and name one of the others.",
+            several[0],
+        )
+    return several[0] if several else None
+
+
 def decide_run_models(
     options: EvaluateOptions,
     reconstructor: str,
@@ -281,7 +318,11 @@ def decide_run_models(
     depth_weights: Mapping[str, Path | None],
     synthesis: PresetGeneratorOptions,
 ) -> ModelRequest:
-    """Decide on the models of a run and their devices."""
+    """Decide on the models of a run and their devices.
+
+    Of several depths it takes the first. `weights` are those of the reconstructor, `depth_weights`
+    those by depth; `synthesis` names one generator.
+    """
     from gscompleter.render.device import choose_devices
 
     devices = choose_devices(options.device, options.renderer_device, options.network_device)
@@ -306,8 +347,11 @@ def assign_weights(
 ) -> dict[str, Path | None]:
     """Assign files of weights to models: one for each in their order, or by `NAME=FILE`.
 
-    None for those without a file, which take the published one. Raise InputError if a file has no
-    model.
+    Models without a file get None, for the published one. `kind` and `option` name the models and
+    the option in errors.
+
+    Raises:
+        InputError: A file has no model, or a model two files.
     """
     named: dict[str, Path] = {}
     plain: list[Path] = []
@@ -315,6 +359,10 @@ def assign_weights(
         # A path may contain `=`, too; only a known name before it makes it NAME=FILE.
         name, _, file = str(word).partition("=")
         if file and name in models:
+            if name in named:
+                raise InputError(
+                    f"{quote_value(name)} is given two files of weights; give one.", option
+                )
             named[name] = Path(file)
         else:
             plain.append(word)
@@ -323,13 +371,14 @@ def assign_weights(
             f"{quote_value(plain[0])} belongs to no {kind}; give --{option} one file for "
             f"each of {', '.join(models)} in this order, or {models[0]}=FILE for some of them."
         )
-    named = named or dict(zip(models, plain, strict=False))
-    return {model: named.get(model) for model in models}
+    # There are as many plain files as models, or none.
+    files = dict(zip(models, plain, strict=True)) if plain else named
+    return {model: files.get(model) for model in models}
 
 
 def run_evaluate(options: EvaluateOptions) -> int:
     """Run and score the methods, or write tables and figures; return the exit code."""
-    # Imported here, so that help pages do not wait for torch.
+    # No help page waits for torch.
     with import_without_collection():
         from gscompleter.apps.evaluating.reproduction import run_evaluation
     return run_evaluation(decide_evaluation(options))
