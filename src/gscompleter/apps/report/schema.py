@@ -1,4 +1,7 @@
-"""Rows of `summary.json` and `report.json`, which a completion writes and pages read."""
+"""Rows of `summary.json` and `report.json`, which a completion writes, and their readers.
+
+Shares and fractions are in [0, 1], PSNR is in dB, and frames are the numbers of photographs.
+"""
 
 from __future__ import annotations
 
@@ -22,8 +25,10 @@ from gscompleter.system.files.writing import COMPLETED_FILES, SUMMARY_FILE
 
 RECORD_FILE = "report.json"
 SUMMARY_ADVICE = "complete the scene again"
+"""What to do about a damaged file."""
 MAX_FRAME_NUMBER = 1e12
-"""Largest number of the transform and the origin, in scene units: its square is finite."""
+"""Largest absolute number of the transform and the origin of a `ResultFrame`: the determinant and
+what is computed in float32 stay finite."""
 
 EARLY_ENTRIES: Mapping[str, Any] = MappingProxyType(
     {
@@ -36,6 +41,7 @@ EARLY_ENTRIES: Mapping[str, Any] = MappingProxyType(
 """Entries of `summary.json` that versions before the first number of a format did not all write."""
 
 SCORES = ("psnr_before", "psnr_after", "ssim_before", "ssim_after")
+"""Names of the scores of a `ScoreRow`."""
 
 T = TypeVar("T")
 Vector = tuple[float, float, float]
@@ -44,24 +50,31 @@ MatrixRow = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class AlignmentRow:
-    """Depth alignment of a target."""
+    """Depth alignment of a target, as in `DepthAffine`: `scale * depth + shift`."""
 
     scale: float
     shift: float
+    """In scene units."""
     inliers: float
+    """Fraction of the compared pixels that agree with the fit."""
     method: str
+    """Estimator: ransac, median or identity."""
     agreement: float | None = None
+    """Fraction of the context visible at the target that agrees with it; None if not checked."""
 
 
 @dataclass(frozen=True)
 class ContextRow(ScoreRow):
-    """A photograph of the context."""
+    """A photograph of the context, or one that checks an input splat."""
 
     exposure_gain: Vector | None = None
+    """Factor of each colour relative to the image that is used; None if not estimated."""
     dynamic_fraction: float = 0.0
+    """Share of the pixels that show what moved."""
     given_depth: float = 0.0
     """Share of the pixels whose depth was given."""
     ignored: float = 0.0
+    """Share of the pixels that are ignored, by masks for example."""
     pose_error: float | None = None
     """Median distance, in pixels, of features that it shares with other photographs from where the
     poses put them; None for fewer than three photographs, or few features."""
@@ -72,26 +85,30 @@ class UnfilledRow:
     """The part of the dilated hole mask, at the padded target, that stays empty."""
 
     share: float = 0.0
+    """Share of the pixels of the mask."""
     lost_by: Mapping[str, float] = field(default_factory=dict)
-    """Share by the step or guard that lost it; empty if there is little."""
+    """The same by the step or guard that lost them; empty if there is little."""
     regions: tuple[tuple[int, int, int, int], ...] = ()
-    """Boxes (left, top, right, bottom) of the largest regions, in pixels of the target image."""
+    """Boxes (left, top, right, bottom) of the largest regions, in pixels of the target image; its
+    padding has coordinates below 0 and beyond its size."""
 
 
 @dataclass(frozen=True)
 class FittedRow:
-    """Scores in dB after one pose and one gain of the target camera were fitted to its photograph.
+    """Scores after a pose and a gain of the target's camera were fitted to its photograph.
 
-    The formula is that of `evaluation.metrics.fitted_camera`.
+    `evaluation.metrics.fitted_camera` has the formula.
     """
 
     psnr: float
+    """Of the whole image."""
     observed_psnr: float
     """Outside of holes."""
     moved: float
-    """Length of the rotation and shift, in pixels of an image of at most 320."""
+    """Length of the fitted rotation and shift, in pixels of an image whose longer side is at most
+    320."""
     gain: float
-    """Mean over the channels."""
+    """Mean of the fitted exposure gains of the channels."""
 
 
 @dataclass(frozen=True)
@@ -101,26 +118,33 @@ class GeometryRow:
     share: float = 0.0
     """Share of the pixels of the hole, at the padded target, whose depth it gives."""
     contradicted: float = 0.0
-    """Share of them at which it disagrees with the scene around, and is not used."""
+    """Share of these pixels at which it disagrees with the scene around, and is not used."""
     added: int = 0
     """Number of added Gaussians that stand where it says; their colours are generated."""
 
 
 @dataclass(frozen=True)
 class TargetRow(ScoreRow):
-    """Result at a target."""
+    """Result at a target. Its `frame` is None for a camera without a photograph."""
 
     anchor: int | None
+    """Frame of the anchor."""
     anchor_fallback: bool
+    """True if all views exceed the rotation limit, so that the least turned one is the anchor."""
     hole_fraction: float
+    """Fraction of the target image in holes before its completion."""
     affine: AlignmentRow
     added: int
+    """Number of added Gaussians."""
     recolored: int = 0
+    """Number of Gaussians of the context that got new colours."""
     derived_from: int | None = None
+    """Frame that a planned camera was derived from; None if the user gave the camera."""
     target_id: int | None = None
     """Value of `generated` of its Gaussians in completed.ply; None if nothing was changed."""
     unfilled: UnfilledRow = UnfilledRow()
     notes: tuple[str, ...] = ()
+    """Sentences about how the target was completed."""
     warnings: tuple[str, ...] = ()
     """Those of the notes that ask for a look at the result."""
     refused: str | None = None
@@ -134,7 +158,7 @@ class TargetRow(ScoreRow):
     anchor_file: str | None = None
     """File of the anchor's photograph."""
     thin_gaps: float = 0.0
-    """Share of the image that is cracks thinner than 5 pixels, afterwards."""
+    """Share of the image of the completed scene that is cracks thinner than 5 pixels."""
     flight_thin_gaps: float = 0.0
     """The same at four cameras between the nearest photograph and the target, on average."""
     painter: str | None = None
@@ -159,14 +183,14 @@ class TargetRow(ScoreRow):
 
 @dataclass(frozen=True)
 class RemovalRow:
-    """Possible remainder of a removed object, in the photograph that shows the object largest."""
+    """Signs that a removal left parts of an object, in the photograph that shows it largest."""
 
     frame: int | None
     file: str | None
     shown: float
-    """Share of the image that showed it."""
+    """Share of the image that showed the object."""
     continued: float
-    """Share of its outline beyond which the surface goes on in the same colour."""
+    """Share of the object's outline beyond which its surface goes on in the same colour."""
 
     @property
     def photograph(self) -> str:
@@ -176,24 +200,34 @@ class RemovalRow:
 
 @dataclass(frozen=True)
 class ResultFrame:
-    """Transform from the photographs to the .ply."""
+    """Frame of the written Gaussians."""
 
     method: str
+    """How it was found; `given` for the frame of the photographs, perhaps shifted."""
     transform: tuple[MatrixRow, MatrixRow, MatrixRow, MatrixRow]
+    """Similarity from the frame of the photographs to that of the .ply."""
     origin: Vector
+    """Origin of the result in the coordinates of the input; zero unless those are large."""
 
 
 @dataclass(frozen=True)
 class PosesRow:
-    """A refinement of poses; errors are median distances of kept-back matches, in pixels of 256."""
+    """A refinement of poses, as in `PoseRefinement`.
+
+    Errors are median distances of matches that were kept back from their epipolar lines, in pixels
+    of an image whose shorter side is 256.
+    """
 
     photographs: int
+    """Number of photographs that were refined together."""
     given_error: float
     refined_error: float
     moved: float
+    """Median move of a camera centre, in steps between neighbouring cameras."""
     splat_given: float | None = None
-    """Mean PSNR in dB of a given splat at the given poses; None without one."""
+    """Mean PSNR of an input splat at the given poses; None without one."""
     splat_refined: float | None = None
+    """The same at the refined poses."""
 
 
 @dataclass(frozen=True)
@@ -201,9 +235,13 @@ class OpenedSceneRow:
     """The opened scene."""
 
     format: str
+    """Name of the format in `data.formats`."""
     photographs: int
+    """Number of photographs in the scene."""
     used: int
+    """Number of photographs of the context."""
     splat: str | None = None
+    """Path of the input splat; None if the scene was reconstructed."""
     context: str | None = None
     """Path of the input splat that `context.ply` would repeat; None if that file is there."""
     renders_from: str | None = None
@@ -223,7 +261,7 @@ class OpenedSceneRow:
 
 @dataclass(frozen=True)
 class CompletionSummary:
-    """The parts of `summary.json` that pages show."""
+    """The entries of `summary.json` that pages show."""
 
     version: str
     settings: Mapping[str, Any]
@@ -240,13 +278,15 @@ class CompletionSummary:
     seconds: Mapping[str, float]
     held_out: tuple[HeldOutRow, ...] = ()
     checks: tuple[ContextRow, ...] = ()
-    """Small copies of further photographs that guarded a given scene; empty with targets."""
+    """Further photographs that guarded an input splat, in low resolution; empty with targets."""
     removal: RemovalRow | None = None
     """None if nothing was removed that a photograph shows."""
     kept: KeptRow | None = None
-    """What cameras that decided nothing still see of a splat without photographs."""
+    """What cameras that decided nothing still see of a splat without photographs; None for any
+    other scene, or if they see nothing opaque."""
     new_photographs: int | None = None
-    """Photographs that a splat was not trained on; None if the scene was reconstructed."""
+    """Number of photographs that an input splat does not reproduce, as it was not trained on them;
+    None under full trust, as of a reconstructed scene."""
     context_notes: tuple[str, ...] = ()
     """Sentences of the reconstructor about the context."""
 
@@ -262,28 +302,30 @@ class PairsRow:
 
 @dataclass(frozen=True)
 class CompletionRecord:
-    """All of `report.json`: cameras as lines, and depth pairs by target.
+    """All of `report.json`: a drawing of the cameras, and depth pairs by target.
 
-    Each text has the coordinates x y z of its points: right, up and back from the middle, in units
-    of the radius.
+    Each text is a line that draws one camera, as x y z of its corners in the frame of the drawing
+    (`DrawingFrame`): right, up and back from its centre, in units of its radius.
     """
 
     photographs: tuple[str, ...]
+    """All photographs, thinned evenly if they are many."""
     context: tuple[str, ...]
     targets: tuple[str, ...]
     pairs: tuple[PairsRow, ...]
 
 
 def find_completed(folder: Path) -> Path:
-    """Find the completed scene of a completion; the usual path if there is none."""
+    """Find the file of the completed scene in an output folder; its usual path if there is none."""
     paths = [folder / name for name in COMPLETED_FILES]
     return next((path for path in paths if os.path.lexists(path)), paths[0])
 
 
 def read_summary(folder: Path) -> CompletionSummary:
-    """Read `summary.json`, also of an early version; raise an InputError if it is of a later one.
+    """Read `summary.json`, also of an early version.
 
-    Likewise if it is missing, damaged or not of a completion.
+    Raises:
+        InputError: It is missing, damaged, of a later version, or not of a completion.
     """
     refuse_later_results(folder)
     command = read_command(folder)
@@ -292,6 +334,7 @@ def read_summary(folder: Path) -> CompletionSummary:
             f"{quote_value(folder)} holds a result of `{quote_value(command)}`, which is no "
             "completion; name the output folder of a completion."
         )
+    # A folder without a command is of unknown origin, and is refused by what its files lack.
     if command and not os.path.lexists(find_completed(folder)):
         raise InputError(
             f"{quote_value(folder)} holds no completed scene, but perhaps the plan of a dry run; "
