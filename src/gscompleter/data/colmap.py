@@ -1,5 +1,6 @@
 """Photographs with a COLMAP model, binary or text, in common folder layouts.
 
+A model is a folder with a reconstruction; the model of a camera is always a `CameraModel` here.
 Memory grows with what is read, not with the counts that a binary file claims. Other programs omit
 the feature lines of text files or add empty ones, so lines are classified by content.
 """
@@ -49,13 +50,12 @@ FEATURE_SIZE = 24
 SIGHTING_SIZE = 8
 """Bytes of a point's sighting: the numbers of the image and of the feature."""
 MAX_FEATURES_LINE = 1 << 22
-"""Longest line in characters: the features of an image."""
+"""Longest line of a text file, in characters: the features of an image."""
 MAX_MODEL_BYTES = 1 << 34
-"""Longest text file, in bytes."""
-
+"""Largest text file, in bytes."""
 
 CameraEntry = tuple[int, str | int, tuple[int, int], Sequence[float]]
-"""Number of a camera, name or number of its model, width and height, and parameters."""
+"""Number of a camera, name or number of its camera model, width and height, and parameters."""
 Track = tuple[tuple[float, ...], list[int]]
 """Position of a point, and the numbers of the images that show it."""
 Entry = TypeVar("Entry")
@@ -69,7 +69,8 @@ class PosedImage(NamedTuple):
     """Path below the folder of photographs, with forward slashes."""
     camera: int
     c2w: Float[np.ndarray, "4 4"]
-    """Camera-to-world in OpenCV axes; world-to-camera where that cannot be inverted."""
+    """Camera-to-world in OpenCV axes. A pose that cannot be inverted stays world-to-camera, and
+    leaves the photograph out later with its defect as the reason."""
 
 
 def build_posed_image(number: int, name: str, camera: int, numbers: Sequence[float]) -> PosedImage:
@@ -80,42 +81,45 @@ def build_posed_image(number: int, name: str, camera: int, numbers: Sequence[flo
     return PosedImage(number, name.replace("\\", "/"), camera, invert_viewmat(viewmat))
 
 
-class Model(NamedTuple):
-    """A camera model: its number in binary files, parameters and projection."""
+class CameraModel(NamedTuple):
+    """A camera model of COLMAP."""
 
     number: int
+    """Its number in binary files."""
     parameters: str
     """Names of the parameters, in the order of the files."""
     projection: Projection = "perspective"
 
 
 CAMERA_MODELS = {
-    "SIMPLE_PINHOLE": Model(0, "f cx cy"),
-    "PINHOLE": Model(1, "fx fy cx cy"),
-    "SIMPLE_RADIAL": Model(2, "f cx cy k1"),
-    "RADIAL": Model(3, "f cx cy k1 k2"),
-    "OPENCV": Model(4, "fx fy cx cy k1 k2 p1 p2"),
-    "OPENCV_FISHEYE": Model(5, "fx fy cx cy k1 k2 k3 k4", "equidistant"),
-    "FULL_OPENCV": Model(6, "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3"),
-    "FOV": Model(7, "fx fy cx cy omega", "field-of-view"),
-    "SIMPLE_RADIAL_FISHEYE": Model(8, "f cx cy k1", "equidistant"),
-    "RADIAL_FISHEYE": Model(9, "f cx cy k1 k2", "equidistant"),
-    "THIN_PRISM_FISHEYE": Model(10, "fx fy cx cy k1 k2 p1 p2 k3 k4 s1 s3", "equidistant"),
-    "SIMPLE_DIVISION": Model(12, "f cx cy k", "division"),
-    "DIVISION": Model(13, "fx fy cx cy k", "division"),
-    "SIMPLE_FISHEYE": Model(14, "f cx cy", "equidistant"),
-    "FISHEYE": Model(15, "fx fy cx cy", "equidistant"),
-    "EUCM": Model(16, "fx fy cx cy alpha beta", "unified"),
+    "SIMPLE_PINHOLE": CameraModel(0, "f cx cy"),
+    "PINHOLE": CameraModel(1, "fx fy cx cy"),
+    "SIMPLE_RADIAL": CameraModel(2, "f cx cy k1"),
+    "RADIAL": CameraModel(3, "f cx cy k1 k2"),
+    "OPENCV": CameraModel(4, "fx fy cx cy k1 k2 p1 p2"),
+    "OPENCV_FISHEYE": CameraModel(5, "fx fy cx cy k1 k2 k3 k4", "equidistant"),
+    "FULL_OPENCV": CameraModel(6, "fx fy cx cy k1 k2 p1 p2 k3 d1 d2 d3"),
+    "FOV": CameraModel(7, "fx fy cx cy omega", "field-of-view"),
+    "SIMPLE_RADIAL_FISHEYE": CameraModel(8, "f cx cy k1", "equidistant"),
+    "RADIAL_FISHEYE": CameraModel(9, "f cx cy k1 k2", "equidistant"),
+    "THIN_PRISM_FISHEYE": CameraModel(10, "fx fy cx cy k1 k2 p1 p2 k3 k4 s1 s3", "equidistant"),
+    "SIMPLE_DIVISION": CameraModel(12, "f cx cy k", "division"),
+    "DIVISION": CameraModel(13, "fx fy cx cy k", "division"),
+    "SIMPLE_FISHEYE": CameraModel(14, "f cx cy", "equidistant"),
+    "FISHEYE": CameraModel(15, "fx fy cx cy", "equidistant"),
+    "EUCM": CameraModel(16, "fx fy cx cy alpha beta", "unified"),
 }
-"""Models by COLMAP's names; k4 to k6 of FULL_OPENCV are d1 to d3, sx1 and sy1 are s1 and s3."""
+"""Camera models by COLMAP's names, without RAD_TAN_THIN_PRISM_FISHEYE (11). k4 to k6 of FULL_OPENCV
+are d1 to d3, and sx1 and sy1 are s1 and s3."""
 
 CAMERA_MODEL_NAMES = {model.number: name for name, model in CAMERA_MODELS.items()}
 
 _IN_PIXELS = ("f", "fx", "fy", "cx", "cy")
+"""Parameters in pixels; the others have no unit."""
 
 
-def find_model(name: str | int, title: str) -> Model:
-    """Return the model of a name or number."""
+def get_camera_model(name: str | int, title: str) -> CameraModel:
+    """Return the camera model of a name or number; `title` names the camera in errors."""
     known = CAMERA_MODEL_NAMES.get(name) if isinstance(name, int) else name
     if known not in CAMERA_MODELS:
         raise InputError(
@@ -126,9 +130,12 @@ def find_model(name: str | int, title: str) -> Model:
 
 
 def build_intrinsics(
-    model: Model, size: tuple[int, int], numbers: Sequence[float], title: str
+    model: CameraModel, size: tuple[int, int], numbers: Sequence[float], title: str
 ) -> Intrinsics:
-    """Build the intrinsics and distortion of a camera, and check their range."""
+    """Build the intrinsics and distortion of a camera, and check their range.
+
+    `size` is width and height, `numbers` are the parameters; `title` names the camera in errors.
+    """
     if not all(1 <= side <= MAX_IMAGE_SIDE for side in size):
         raise InputError(
             f"The size of {title} is {quote_value(size[0])} × {quote_value(size[1])}; sides from "
@@ -172,7 +179,7 @@ def read_intrinsics(path: Path) -> dict[int, Intrinsics]:
     cameras = {}
     for number, name, size, numbers in entries:
         title = f"camera {number} of {quote_value(path)}"
-        cameras[number] = build_intrinsics(find_model(name, title), size, numbers, title)
+        cameras[number] = build_intrinsics(get_camera_model(name, title), size, numbers, title)
     return cameras
 
 
@@ -186,14 +193,16 @@ def read_images(path: Path) -> list[PosedImage]:
 
 def read_points(path: Path) -> Float[np.ndarray, "n 3"]:
     """Read the points of a points3D.bin or points3D.txt in scene units."""
+    # A generator fills the array, since a list of tuples takes several times its memory.
     return np.fromiter((xyz for xyz, _ in _read_tracks(path)), dtype=np.dtype((np.float64, 3)))
 
 
 @lru_cache(maxsize=1)
 def read_seen_points(path: Path, changed: int) -> dict[int, Float[np.ndarray, "n 3"]]:
-    """Read the points that each image shows, by the number of the image.
+    """Read the points that each image shows, in scene units, by the number of the image.
 
-    `changed` is the time of the last change of the file.
+    `changed`, the time of the last change of the file, is a key of the cache: a file that is
+    written anew is read anew.
     """
     # A point may be seen by two features of one image, and counts once there.
     sightings = [(image, xyz) for xyz, images in _read_tracks(path) for image in set(images)]
@@ -205,6 +214,7 @@ def read_seen_points(path: Path, changed: int) -> dict[int, Float[np.ndarray, "n
 
 
 def _read_tracks(path: Path) -> Iterator[Track]:
+    """Read the points of a model with the images that show them."""
     if _is_text(path):
         return _parse_lines(path, "POINT3D_ID X Y Z …", _parse_point)
     return _read_binary_points(path)
@@ -219,7 +229,7 @@ def _read_binary_cameras(path: Path) -> Iterator[CameraEntry]:
         for _ in range(_read_count(content)):
             number, model, width, height = _unpack_struct(content, "<IiQQ")
             title = f"camera {number} of {quote_value(path)}"
-            count = len(find_model(model, title).parameters.split())
+            count = len(get_camera_model(model, title).parameters.split())
             yield number, model, (width, height), _unpack_struct(content, f"<{count}d")
 
 
@@ -316,27 +326,26 @@ def _parse_point(line: str) -> Track:
 
 def has_colmap(path: Path) -> bool:
     """Check whether `path` is a scene with a COLMAP model, a model, or its images file."""
-    return bool(_find_models(path))
+    return bool(_find_image_files(path))
 
 
 def open_colmap(path: Path) -> Iterator[Photographs]:
-    """Open the photographs of a scene, model or images file; the folder names it.
+    """Open the photographs of a scene, model or images file, which are one scene.
 
-    The model with most images is used. Frames are numbered by the sorted names of the photographs
-    that exist.
+    The model with most images is used, and the topmost folder of the scene gives the name. Frames
+    are numbered by the sorted names of the photographs that exist.
     """
     model, frames, notes = _select_largest(path)
     roots = _list_roots(path.parent if is_image_file(path) else path, model)
-    there, missing = keep_existing(locate_images(frames, roots), str(model))
-    there, depth_notes = attach_depth_maps(there, roots, model)
-    notes += (*missing, *depth_notes)
-    notes += _describe_orientation(there[0])
-    photographs = build_photographs(roots[-1].name, str(model), there)
+    existing, missing_notes = keep_existing(locate_images(frames, roots), str(model))
+    existing, depth_notes = attach_depth_maps(existing, roots, model)
+    notes += (*missing_notes, *depth_notes, *_describe_orientation(existing[0]))
+    photographs = build_photographs(roots[-1].name, str(model), existing)
     yield replace(photographs, notes=notes, sparse=_make_model_point_reader(model))
 
 
 def _describe_orientation(frame: Frame) -> tuple[str, ...]:
-    """Say what becomes of an EXIF rotation, if the first photograph has one."""
+    """Describe what becomes of the EXIF rotation of the first photograph, if it has one."""
     if frame.file is None or frame.file.orientation == 1:
         return ()
     if frame.find_turn() != 1:
@@ -345,15 +354,18 @@ def _describe_orientation(frame: Frame) -> tuple[str, ...]:
 
 
 def read_scene_cameras(path: Path) -> list[Frame]:
-    """Read the cameras of a scene's largest model in its order, with existing photographs."""
+    """Read the cameras of a scene's largest model in its order, with the photographs that exist.
+
+    `path` is the folder of the scene or of the model.
+    """
     model, frames, _ = _select_largest(path)
     return locate_images(frames, _list_roots(path, model))
 
 
 def _select_largest(path: Path) -> tuple[Path, list[Frame], tuple[str, ...]]:
-    """Find the largest model of a scene: its folder, frames, and notes on others."""
+    """Read the model of a scene with most images: its folder, frames, and notes on others."""
     # A mapper that cannot connect all photographs writes several models, sparse/0, sparse/1, …
-    models = [(images.parent, read_image_file(images)) for images in _find_models(path)]
+    models = [(images.parent, read_image_file(images)) for images in _find_image_files(path)]
     if not models:
         raise InputError(
             f"There is no COLMAP model in {quote_value(path)}; a folder sparse/0 with its cameras "
@@ -375,8 +387,8 @@ def is_image_file(path: Path) -> bool:
     return name in {f"images{ending}" for ending in MODEL_ENDINGS} and os.path.isfile(path)
 
 
-def _find_models(path: Path) -> list[Path]:
-    """List the images files of a scene's models, all from the first matching home."""
+def _find_image_files(path: Path) -> list[Path]:
+    """List the images files of a scene's models, all from the first of `MODEL_HOMES` with any."""
     if is_image_file(path):
         return [path]
     if not os.path.isdir(path):
@@ -388,14 +400,12 @@ def _find_models(path: Path) -> list[Path]:
         # A home may be a model itself, or hold numbered ones.
         numbered = sorted(entry for entry in os.listdir(home) if entry.isdecimal())
         folders = [home, *(home / entry for entry in numbered)]
-        image_files = [_find_model_file(folder, "images") for folder in folders]
-        models = [
-            images
-            for images in image_files
-            if images and _find_model_file(images.parent, "cameras")
+        candidates = [_find_model_file(folder, "images") for folder in folders]
+        image_files = [
+            images for images in candidates if images and _find_model_file(images.parent, "cameras")
         ]
-        if models:
-            return models
+        if image_files:
+            return image_files
     return []
 
 
@@ -405,8 +415,9 @@ def _find_model_file(folder: Path, name: str) -> Path | None:
 
 
 def read_image_file(path: Path) -> list[Frame]:
-    """Read the cameras of an images.txt or images.bin in its order, without photographs.
+    """Read the frames of an images.txt or images.bin in its order, with the cameras file beside it.
 
+    They have cameras, but no photographs yet.
     `rigs` and `frames` (COLMAP 3.12) beside it add nothing to the poses.
     """
     cameras_file = _find_model_file(path.parent, "cameras")
@@ -431,35 +442,40 @@ def read_image_file(path: Path) -> list[Frame]:
 
     def make_frame(image: PosedImage) -> Frame:
         title = f"image {quote_value(image.name)} of {quote_value(path)}"
-        shown = None if points is None else partial(_find_seen, points, image.number)
-        lens = cameras[image.camera]
-        return Frame(image.name, title, image.c2w, lens, None, seen_points=shown)
+        seen = None if points is None else partial(_find_seen_points, points, image.number)
+        intrinsics = cameras[image.camera]
+        return Frame(image.name, title, image.c2w, intrinsics, None, seen_points=seen)
 
     return [make_frame(image) for image in images]
 
 
-def _find_seen(path: Path, number: int) -> Float[np.ndarray, "n 3"]:
-    # The reader is cached by the time of change, so that a model that is written anew is read anew.
+def _find_seen_points(path: Path, number: int) -> Float[np.ndarray, "n 3"]:
+    """Find the points of a file that an image shows, by its number, in scene units."""
     seen = read_seen_points(path, path.stat().st_mtime_ns)
     return seen.get(number, np.zeros((0, 3)))
 
 
 def _list_roots(scene: Path, model: Path) -> list[Path]:
-    """List the folders from the model up to the scene; names decide if a model itself is given."""
-    # Photographs may lie beside the model, or beside any folder on the way up to the scene.
-    top = Path(os.path.abspath(scene))
+    """List the folders that may hold photographs: from the model up to the folder of the scene.
+
+    A user may give a folder inside of a scene. The scene is then above all folders that bear the
+    name of a home of models, such as room of room/sparse/0.
+    """
+    given = Path(os.path.abspath(scene))
     roots = [Path(os.path.abspath(model))]
-    parts = {part for home in MODEL_HOMES if home for part in home.split("/")}
+    home_names = {part for home in MODEL_HOMES if home for part in home.split("/")}
     while True:
         folder = roots[-1]
+        is_below_given = given in folder.parents
+        # A numbered model, 0, lies in a home of models.
         home = folder.parent if folder.name.isdecimal() else folder
-        if top not in folder.parents and home.name.casefold() not in parts:
+        if not is_below_given and home.name.casefold() not in home_names:
             return roots
         roots.append(folder.parent)
 
 
 def _make_model_point_reader(model: Path) -> partial[Float[np.ndarray, "n 3"]] | None:
-    """Return a reader of the model's points; None if it has no file of points."""
+    """Return a reader of the model's points, in scene units; None if it has no file of points."""
     path = _find_model_file(model, "points3D")
     if path is not None:
         return partial(read_points, path)
