@@ -1,9 +1,9 @@
 """Refined poses in a file of a result, which later commands and other programs read.
 
-The file has the keys of nerfstudio's `transforms.json`: OpenGL axes, the frame of the given
-photographs. Intrinsics are those of photographs without distortion. The photographs that it is of
-are known by their names and by a hash of the poses that were given. It has no frames where these
-are kept.
+The file has the keys of nerfstudio's `transforms.json`. Poses are camera-to-world in OpenGL axes
+and in the frame of the given poses; intrinsics are those of the photographs without distortion. A
+hash of the names and the given poses tells which photographs it belongs to. It lists the refined
+cameras alone, and none if the given poses are kept.
 """
 
 from __future__ import annotations
@@ -30,21 +30,23 @@ REFINED_POSES_ADVICE = "take it from its folder again, or move it away to use th
 
 @dataclass(frozen=True)
 class RefinedFrame:
-    """A photograph with its refined camera; other keys of a frame are for other programs."""
+    """A photograph with its refined pose; other keys of a frame are for other programs."""
 
     file_path: str
+    """File of the photograph, as in `Frame.file_name`."""
     transform_matrix: list[list[float]]
+    """Camera-to-world matrix [4, 4] in OpenGL axes."""
 
 
 @dataclass(frozen=True)
 class RefinedFile:
-    """What a later command reads of the file."""
+    """The keys of the file that a later command reads."""
 
     given: str
-    """Hash of the given poses."""
+    """Hash of the photographs as they were given (`hash_poses`)."""
     frames: list[RefinedFrame]
     refinement: PoseRefinement | None = None
-    """What was done; None where nothing was."""
+    """What the refinement did; None if none was tried."""
 
 
 def write_refined(
@@ -54,17 +56,21 @@ def write_refined(
     refinement: PoseRefinement | None,
     keep_existing: bool = False,
 ) -> None:
-    """Write the poses of photographs that differ from the given ones.
+    """Write the refined poses, those that differ from the given ones.
 
-    `keep_existing` is that of `replace_file`.
+    `refined` has the frames of `given`, and perhaps more after them. `keep_existing` is that of
+    `replace_file`.
     """
     frames: list[dict[str, Any]] = []
     # Photographs that were placed among the given ones come after these, in a file of their own.
     for number, (before, frame) in enumerate(zip(given.frames, refined.frames, strict=False)):
+        # A refinement makes a new array of a pose that it changes, and shares the others. Compared
+        # by value, a photograph without a pose, whose numbers are NaN, would count as changed.
         if frame.c2w is before.c2w:
             continue
         camera = refined.camera(number)
         (fl_x, _, cx), (_, fl_y, cy), _ = camera.K.double().tolist()
+        # The change of axes is its own inverse, so that reading applies it once more.
         matrix = (frame.c2w @ OPENCV_FROM_OPENGL).tolist()
         row = RefinedFrame(frame.file_name, matrix)
         size = {"w": camera.width, "h": camera.height}
@@ -83,9 +89,10 @@ def write_refined(
 def take_refined(
     photographs: Photographs, path: Path
 ) -> tuple[Photographs, PoseRefinement | None] | None:
-    """Return photographs with the poses of a file, and what was done to these.
+    """Return photographs with the poses of a file, and what the refinement did.
 
-    None if the file is of others, or of other poses.
+    The answer as a whole is None if the file belongs to other photographs, or to these with other
+    given poses; what the refinement did is None if none was tried.
     """
     content = read_typed_json(RefinedFile, path, REFINED_POSES_ADVICE)
     if content.given != hash_poses(photographs):
@@ -107,7 +114,7 @@ def take_refined(
 
 
 def hash_poses(photographs: Photographs) -> str:
-    """Hash the names and the poses of photographs."""
+    """Hash the names and the poses of photographs, in SHA-256."""
     digest = hashlib.sha256()
     for frame in photographs.frames:
         digest.update(frame.file_name.encode(errors="surrogateescape"))
