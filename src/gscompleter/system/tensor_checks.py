@@ -17,13 +17,15 @@ from torch import Tensor
 from gscompleter.system.errors import InputError, quote_value
 
 FLOATS = (torch.float32, torch.float64)
-"""Types of numbers that are stored; float64 is for files and comparisons."""
+"""Types of numbers that are stored; float64 is for files and comparisons. Errors ask for the first
+type of a group."""
 BOOLS = (torch.bool,)
 BYTE_DTYPES = (torch.uint8,)
 INTEGERS = (torch.int32, torch.int64)
 
 Form = tuple[tuple[torch.dtype, ...], tuple[int | str, ...]]
-"""Allowed dtypes and the shape of a tensor; a letter stands for any length, and names it."""
+"""Allowed dtypes and the shape of a tensor. A letter stands for any length, which errors call so;
+types compare the lengths of one letter themselves."""
 
 
 def check_tensors(value: object, owner: str, forms: Mapping[str, Form]) -> None:
@@ -34,11 +36,11 @@ def check_tensors(value: object, owner: str, forms: Mapping[str, Form]) -> None:
     """
     kind = type(value)
     device = None
-    dtype = None
+    float_dtype = None
     for name, (dtypes, shape) in forms.items():
         tensor = getattr(value, name)
-        # A default of None is an attribute of the class; a field without one is no attribute of it.
-        if tensor is None and getattr(kind, name, tensor) is None and hasattr(kind, name):
+        # The default of a field is an attribute of the class, which a field without one is not.
+        if tensor is None and hasattr(kind, name) and getattr(kind, name) is None:
             continue
         if not isinstance(tensor, Tensor) or not _has_form(tensor, dtypes, shape):
             raise InputError(
@@ -54,12 +56,13 @@ def check_tensors(value: object, owner: str, forms: Mapping[str, Form]) -> None:
             )
         if dtypes is not FLOATS:
             continue
-        if dtype is None:
-            dtype = tensor.dtype
-        elif tensor.dtype is not dtype:
+        if float_dtype is None:
+            float_dtype = tensor.dtype
+        elif tensor.dtype is not float_dtype:
             raise InputError(
                 f"The numbers of {owner} have to be of one type, and its {name} is "
-                f"{name_dtype(tensor.dtype)} while others are {name_dtype(dtype)}; convert it."
+                f"{name_dtype(tensor.dtype)} while others are {name_dtype(float_dtype)}; convert "
+                "it."
             )
 
 
@@ -70,23 +73,26 @@ def _has_form(
         return False
     if tensor.layout is not torch.strided or _lacks_values(tensor):
         return False
-    sides = zip(shape, tensor.shape, strict=True)
-    return all(isinstance(length, str) or length == side for length, side in sides)
+    lengths = zip(shape, tensor.shape, strict=True)
+    return all(isinstance(wanted, str) or wanted == length for wanted, length in lengths)
 
 
 def _lacks_values(tensor: Tensor) -> bool:
-    """Return True for a tensor that is a shape alone; subclasses may keep values of their own."""
+    """Return True for a tensor on the device "meta", a shape without values.
+
+    A subclass may say that it is there and keep values of its own, as fake tensors do.
+    """
     return type(tensor) is Tensor and tensor.is_meta
 
 
 def iterate_tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
-    """Yield every tensor inside nested dataclasses and tuples, with its attribute path."""
+    """Yield every tensor inside nested dataclasses and tuples, by paths as `name.field[0]`."""
     if isinstance(value, Tensor):
         yield name, value
     elif isinstance(value, tuple):
         for i, item in enumerate(value):
             yield from iterate_tensors(item, f"{name}[{i}]")
-    # A class in place of its value has the fields, but no values in them.
+    # A dataclass itself, given in place of an object of it, has the fields, but no values in them.
     elif is_dataclass(value) and not isinstance(value, type):
         for field in fields(value):
             yield from iterate_tensors(getattr(value, field.name), f"{name}.{field.name}")
