@@ -1,4 +1,7 @@
-"""Removal of something from a splat, and completion of its place, as the command `remove` does."""
+"""Removal of something from a splat in Python, with the completion of its place.
+
+The command `remove` does the same with a choice by boxes, masks or a file (`apps.completing`).
+"""
 
 from __future__ import annotations
 
@@ -38,10 +41,10 @@ def remove(
 
     Args:
         scene: Gaussians in the frame and unit of the cameras.
-        chosen: True for those to remove.
+        chosen: Mask of the Gaussians to remove.
         views: Posed photographs or renders of the scene; they still show what goes.
-        targets: Cameras to complete the place for. If there are none, up to four cameras of the
-            photographs that show it best.
+        targets: Cameras to complete the place for. If there are none, up to four are chosen among
+            those of `views`, as `PhotographPlanner` does.
         completer: Models and settings; the default ones if None.
         contains: Function from points [n, 3] to True for those in a region. Gaussians that reach
             out of it are cut at its border; if None, they go as a whole.
@@ -63,14 +66,17 @@ def remove(
     if not chosen.any():
         raise InputError("No Gaussian is chosen; set the mask for those that have to go.")
     begun = completer.begin(views, scene, targets=targets)
+    # The photographs that still show the object are masked there as well.
     with stage("removing"):
         begun = remove_gaussians(begun, chosen, contains or contain_nothing, completer.scenes)
     if targets:
-        done = completer.complete(begun, targets)
+        completion = completer.complete(begun, targets)
     else:
         cameras = [view.camera for view in views]
-        done, _ = PhotographPlanner(completer).explore(begun, cameras, MAX_REMOVAL_TARGETS)
-    return restore_surroundings(done, completer.renderer)
+        planner = PhotographPlanner(completer)
+        completion, _choices = planner.explore(begun, cameras, MAX_REMOVAL_TARGETS)
+    # What was removed behind the object returns where photographs need it.
+    return restore_surroundings(completion, completer.renderer)
 
 
 def contain_nothing(points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:
