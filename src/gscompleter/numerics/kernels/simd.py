@@ -5,6 +5,9 @@ LLVM does not find these vectors itself, so the loops over rows are intrinsics.
 A splat's falloff is `alpha = opacity * exp(-(s² + t²))` with whitened coordinates
 `s = u dx + v dy`, `t = w dy` of the offset (dx, dy) from its centre, and `U = [[u, v], [0, w]]`,
 `UᵀU = ½ Σ⁻¹` for the 2D covariance Σ. Unlike Σ⁻¹ it does not cancel for thin oblique splats.
+
+A tile is composited front to back along the list of its splats; the `position` of a splat is that
+in the list. A pixel is full when it has no transmittance left, and a row when its pixels are.
 """
 
 import numpy as np
@@ -17,8 +20,11 @@ TILE = 16
 """Side of a tile in pixels, and the number of lanes of a vector."""
 
 MIN_ALPHA = np.float32(1 / 255)
+"""Smallest alpha that is drawn."""
 MAX_ALPHA = np.float32(0.999)
+"""Largest alpha of a splat in a pixel."""
 MIN_TRANSMITTANCE = np.float32(1e-4)
+"""Transmittance at which a pixel is full."""
 
 _FLOAT = ir.FloatType()
 _INT = ir.IntType(32)
@@ -56,7 +62,7 @@ class _Lanes:
         return _Lanes(self.builder, self.builder.fsub(self._unwrap(other), self.value))
 
     def multiply_add(self, factor, plus):
-        """Compute self * factor + plus with a single rounding, the same in both passes."""
+        """Compute self * factor + plus, rounded once where the CPU can, in both passes alike."""
         multiply_add = cgutils.get_or_insert_function(
             self.builder.module,
             ir.FunctionType(_FLOATS, [_FLOATS, _FLOATS, _FLOATS]),
@@ -70,12 +76,13 @@ class _Lanes:
         return self.builder.fcmp_ordered(relation, self.value, self._unwrap(other))
 
     def where(self, mask, otherwise):
+        """Keep the lanes of a mask, and set the others."""
         value = self.builder.select(mask, self.value, self._unwrap(otherwise))
         return _Lanes(self.builder, value)
 
 
 def _sum_lanes(builder, vectors):
-    """Sum the lanes of each of up to sixteen vectors into one lane of the result."""
+    """Sum the lanes of each vector, of up to sixteen, into its own lane of the result."""
     # A tree of pairs: two vectors become one that holds the sums of both, with half as many lanes
     # each. Sixteen vectors take 15 additions instead of 16 times 4.
     values = [vector.value for vector in vectors]
@@ -109,8 +116,9 @@ def _broadcast(builder, scalar, vector_type=_FLOATS):
 
 
 def _exp_negative_lanes(values):
-    """Compute exp(-values) for values >= 0; beyond 80 it is practically 0."""
+    """Compute exp(-values) for values >= 0; those above 83 give 2**-120, practically 0."""
     builder = values.builder
+    # exp(-x) = 2**power, as the product of 2**whole and 2**fraction.
     power = values * -_LOG2_E
     power = power.where(power.compare(">", -120.0), -120.0)
     # Truncation leaves a fraction in (-1, 0], where the polynomial holds.
@@ -126,7 +134,7 @@ def _exp_negative_lanes(values):
 
 
 class _Rows:
-    """Rows of a tile's arrays, each of them several vectors."""
+    """An array of a tile, whose rows are several vectors each."""
 
     def __init__(self, context, builder, array_type, array, vector_type, vectors_per_row):
         self.builder, self.vector_type = builder, vector_type
@@ -139,6 +147,7 @@ class _Rows:
         pointer = self.builder.gep(self.data, [offset])
         return self.builder.bitcast(pointer, self.vector_type.as_pointer())
 
+    # NumPy aligns arrays to their elements, not to whole vectors: hence the 4 bytes.
     def load(self, row, index):
         value = self.builder.load(self._get_pointer(row, index), align=4)
         return _Lanes(self.builder, value)
@@ -174,7 +183,7 @@ class _Splat:
         self.opacity = _broadcast(builder, opacity)
 
     def compute_falloff(self, row):
-        """Return dy of a row, and alpha before and after capping, and its mask."""
+        """Return dy of a row, alpha before and after it is capped, and the mask of drawn lanes."""
         builder = self.builder
         dy = builder.fsub(builder.sitofp(row, _FLOAT), self.y)
         s = self.u_dx + _broadcast(builder, builder.fmul(self.v, dy))
@@ -206,15 +215,17 @@ def _blend(splat, state, row):
     after = alpha.multiply_add(0.0 - before, plus=before)
     passing = after.compare(">", MIN_TRANSMITTANCE)
     weight = (alpha * before).where(passing, 0.0)
+    # The transmittance of a full pixel is negative already, so that no further splat passes.
     closed = before.where(before.compare("<", 0.0), 0.0 - before)
     state.store(row, 0, after.where(passing, closed))
+    # The state has a sum for each of the first channels, three or four.
     for index, channel in enumerate(splat.channels[: state.stride // TILE - 1], start=1):
         state.store(row, index, weight.multiply_add(channel, plus=state.load(row, index)))
     return weight, visible, passing
 
 
 def _close_if_full(builder, passing, limits, row, filled):
-    """Set the limit of a row to -1 and count it once it has no transmittance left."""
+    """Set the limit of a row to -1 and count it in `filled` if no pixel let the splat pass."""
     any_passing = builder.bitcast(passing, ir.IntType(TILE))
     none = builder.icmp_unsigned("==", any_passing, ir.Constant(ir.IntType(TILE), 0))
     with builder.if_then(none, likely=False):
@@ -224,7 +235,7 @@ def _close_if_full(builder, passing, limits, row, filled):
 
 @intrinsic
 def composite_rows(typing, begin, end, position, state, last, row_limit, splat):
-    """Composite a splat over the rows begin..end of a tile; return how many it filled.
+    """Composite a splat over the rows begin..end (excluded) of a tile; return how many it filled.
 
     state [16, 5, 16]: transmittances of a row, negative in full pixels; sums of colour and depth.
     last [16, 16] int32: position of the last contribution. row_limit [16] int32: -1 in full rows.
@@ -255,7 +266,11 @@ def composite_rows(typing, begin, end, position, state, last, row_limit, splat):
 
 @intrinsic
 def weigh_rows(typing, begin, end, place, state, row_limit, kept, splat):
-    """Composite a splat, without depth, over rows and store its weights in `kept` at `place`."""
+    """Composite a splat, without depth, as `composite_rows`, and keep its weights.
+
+    state [16, 4, 16] has no sum of depth. kept [rows, 16] receives the weights of begin..end from
+    its row `place` on, zeros for full rows. row_limit [16] int32: 0, or -1 in full rows.
+    """
     signature = types.int64(types.int64, types.int64, types.int64, state, row_limit, kept, splat)
 
     def generate(context, builder, signature, arguments):
@@ -270,6 +285,7 @@ def weigh_rows(typing, begin, end, place, state, row_limit, kept, splat):
             at = builder.add(place, builder.sub(loop.index, begin))
             limit = builder.load(builder.gep(limits, [row]))
             is_open = builder.icmp_signed(">=", limit, ir.Constant(_INT, 0))
+            # Every row is written, since `kept` holds the weights of an earlier splat.
             with builder.if_else(is_open) as (open_row, full_row):
                 with open_row:
                     weight, _, passing = _blend(splat, state, row)
@@ -284,7 +300,11 @@ def weigh_rows(typing, begin, end, place, state, row_limit, kept, splat):
 
 @intrinsic
 def sum_weighted_rows(typing, begin, end, place, state, kept, sums):
-    """Sum kept weights times the colours in `state` [16, 4, 16], and kept weights, to `sums`."""
+    """Sum kept weights times the values in `state`, and kept weights, over rows begin..end.
+
+    state [16, 4, 16]: three values after the transmittance. kept [rows, 16]: the weights from row
+    `place` on. sums [16] receives the sums of the three channels, and that of the weights.
+    """
     signature = types.void(types.int64, types.int64, types.int64, state, kept, sums)
 
     def generate(context, builder, signature, arguments):
@@ -308,12 +328,17 @@ def sum_weighted_rows(typing, begin, end, place, state, kept, sums):
 
 
 def _make_revert(wanted):
-    """Make an intrinsic that reverts a splat, with sums for the `wanted` gradients."""
+    """Make an intrinsic that reverts a splat, with the sums of its `wanted` gradients.
+
+    "nothing" sums none, and "colour" only weight times dL/d red, green and blue.
+    """
 
     @intrinsic
     def undraw_rows(typing, begin, end, position, state, last, row_limit, sums, splat):
-        """Revert the rows begin..end of a splat, back to front.
+        """Revert the rows begin..end of the frontmost splat that is left.
 
+        Splats are reverted back to front. last [16, 16] int32: position of the last contribution to
+        a pixel; row_limit [16] int32: the largest of a row.
         state [16, 7, 16]: per row the transmittance and the sum of weight times gradient behind the
         splat, and dL/d of red, green, blue, depth sum and alpha. sums [16] receives the sums of q,
         q dx, q dy, q dx², q dx dy, q dy² (q = alpha dL/dalpha), and of weight times dL/d depth,
@@ -343,8 +368,8 @@ def _make_revert(wanted):
                 # Back to front, T before a splat is T behind it over 1 - alpha. With c the gradient
                 # of the loss along the splat's channels (`value`) and B the sum of weight times c
                 # behind it, dL/dalpha = T c - B / (1 - alpha).
-                opening = 1.0 / (1.0 - alpha)
-                before = state.load(row, 0) * opening
+                inverse_passing = 1.0 / (1.0 - alpha)
+                before = state.load(row, 0) * inverse_passing
                 weight = alpha * before
                 value = gradients[4]
                 for channel, gradient in zip(splat.channels, gradients[:4], strict=True):
@@ -359,7 +384,7 @@ def _make_revert(wanted):
                         total.store(weight.multiply_add(gradient, plus=total.load()))
                     return
 
-                q = (before * value - behind * opening) * alpha
+                q = (before * value - behind * inverse_passing) * alpha
                 # A capped alpha does not depend on the splat.
                 q = q.where(raw.compare("<=", MAX_ALPHA), 0.0)
                 dys = _broadcast(builder, dy)
@@ -386,6 +411,7 @@ def _make_revert(wanted):
     return undraw_rows
 
 
+# Splats of the context have no gradients, but those in front of them need the state before them.
 pass_rows = _make_revert("nothing")
 revert_rows_for_color = _make_revert("colour")
 revert_rows = _make_revert("all")
