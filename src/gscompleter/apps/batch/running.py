@@ -39,7 +39,7 @@ DecideRow = Callable[[Mapping[str, Any], Path], FillingRequest]
 """Makes the request of a row of a manifest, for an output folder."""
 
 OUTCOMES = {"nothing-gained": "nothing gained"}
-"""Words for outcomes of jobs that did not fail, where they are not `completed`."""
+"""Words for the outcomes of jobs that did not fail; any other is "completed"."""
 MAX_NAMED_FAILURES = 5
 """Most failures that the terminal names."""
 
@@ -49,25 +49,19 @@ def complete_batch(request: BatchRequest, decide_row: DecideRow) -> int:
 
     `decide_row` makes the request of a row in the process of a worker, which imports it by name.
     """
-    number, count = request.engine.share
+    share_number, num_shares = request.engine.share
     console = make_console(stderr=True, quiet=request.answer.quiet)
     with show_progress(console):
         with show_preparation("reading the manifest"):
             jobs = read_manifest(request.manifest, request.common, request.out)
-
-            # The results may not lie in what the rows read.
-            # A row whose path is no text, as JSON allows, fails by itself.
-            cells = [job.options.get(name) for job in jobs for name in PATH_COLUMNS]
-            paths = dict.fromkeys(cell for cell in cells if isinstance(cell, str) and cell)
-            inputs = [Path(path) for path in paths]
-            refuse_overlap(request.out, inputs)
+            refuse_overlap(request.out, list_input_paths(jobs))
 
             # Workers may run in another working folder, so they get an absolute path.
             out = request.out.resolve()
             engine = make_engine(request.engine, out)
             claim_folder(out, "batch", {"version": 1, "kind": "batch"})
 
-            share = jobs[number::count]
+            share = jobs[share_number::num_shares]
             left = find_missing_jobs(share, out, request.repeats_failures)
 
         # A folder of scenes can hold the results of earlier runs, which are no input.
@@ -87,18 +81,22 @@ def complete_batch(request: BatchRequest, decide_row: DecideRow) -> int:
             write_batch_results(out, jobs)
 
     # The exit code and the sentence count this share, with the jobs that failed in earlier runs.
-    failures = []
-    for job in share:
-        row = read_row(job, out)
-        if row is not None and row["state"] == "failed":
-            failures.append(f"{row['job']}: {row['reason']}")
-    print_failures(console, failures, len(share))
-    sentence = f"{summarize_rows(out, share, left)} All results: {request.out}/index.html"
-    console.print(sentence, soft_wrap=True)
+    rows = [row for job in share if (row := read_row(job, out)) is not None]
+    failed = [row for row in rows if row["state"] == "failed"]
+    print_failures(console, [f"{row['job']}: {row['reason']}" for row in failed], len(share))
+    summary = summarize_share({row["job"] for row in failed}, share, left)
+    console.print(f"{summary} All results: {request.out}/index.html", soft_wrap=True)
     if request.answer.json:
-        rows = [row for job in share if (row := read_row(job, out)) is not None]
-        print_json({"out": str(request.out), "failed": len(failures), "rows": rows})
-    return choose_exit_code(len(failures), len(share))
+        print_json({"out": str(request.out), "failed": len(failed), "rows": rows})
+    return choose_exit_code(len(failed), len(share))
+
+
+def list_input_paths(jobs: Sequence[Job]) -> list[Path]:
+    """List the files and folders that the rows of a manifest read, each once."""
+    cells = [job.options.get(name) for job in jobs for name in PATH_COLUMNS]
+    # A row whose path is no text, as JSON allows, fails by itself.
+    paths = dict.fromkeys(cell for cell in cells if isinstance(cell, str) and cell)
+    return [Path(path) for path in paths]
 
 
 def describe_state(row: Mapping[str, Any] | None) -> str:
@@ -111,9 +109,10 @@ def describe_state(row: Mapping[str, Any] | None) -> str:
 
 
 def print_failures(console: Console, failures: Sequence[str], num_cases: int) -> None:
-    """Print the first failures with their reasons, and the number of the others.
+    """Print the first failures of jobs or cases, and the number of the others.
 
-    A quiet console gets one line: an exit code other than 0 is never without a reason.
+    `failures` are sentences with names and reasons. A quiet console gets one line: an exit code
+    other than 0 is never without a reason.
     """
     if failures and console.quiet:
         counted = f"{len(failures)} of {num_cases} cases failed"
@@ -124,20 +123,10 @@ def print_failures(console: Console, failures: Sequence[str], num_cases: int) ->
         console.print(f"... and {len(failures) - MAX_NAMED_FAILURES} more failed.")
 
 
-def summarize_rows(out: Path, share: Sequence[Job], left: Sequence[Job]) -> str:
-    """Summarize the rows of a share, of which `left` were run now."""
-    names_left = {job.name for job in left}
-    failed_now = 0
-    failed_earlier = 0
-    for job in share:
-        row = read_row(job, out)
-        if row is None or row["state"] != "failed":
-            continue
-        if job.name in names_left:
-            failed_now += 1
-        else:
-            failed_earlier += 1
-
+def summarize_share(failed: set[str], share: Sequence[Job], left: Sequence[Job]) -> str:
+    """Summarize the jobs of a share, of which `left` were run now; `failed` are names."""
+    failed_now = len(failed & {job.name for job in left})
+    failed_earlier = len(failed) - failed_now
     before = f"done earlier {len(share) - len(left)}"
     if failed_earlier:
         before += f", {failed_earlier} of them failed (--rerun failures repeats them)"
@@ -177,7 +166,8 @@ def complete_job(job: Job, jobs: Path, decide_row: DecideRow) -> dict[str, Any]:
     cpu_start = time.process_time()
     make_folder(jobs)
     with measure_peak_memory() as peak:
-        # The batch gives each job to one worker, and a further one only if that is lost.
+        # The batch gives each job to one worker, and to a further one only if that is lost, whose
+        # reservation of the folder is then void.
         summary = complete_folder(decide_row(job.options, jobs / job.name), takes_over=True)
 
     # A scene that did not reconstruct counts as failed. Its folder stays, to look at.
