@@ -10,10 +10,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from gscompleter.apps.report.schema import (
-    CompletionRecord,
-    PairsRow,
-)
+from gscompleter.apps.report.schema import CompletionRecord, PairsRow
 from gscompleter.numerics.geometry import estimate_up
 from gscompleter.state import Completion
 from gscompleter.types import Camera
@@ -21,19 +18,22 @@ from gscompleter.types import Camera
 MAX_PHOTOGRAPHS = 200
 """Largest number of photographs in the drawing and for the path of the video."""
 FRUSTUM = ((-1, -1, 1), (1, -1, 1), (1, 1, 1), (-1, 1, 1))
-"""Image corners of a camera pyramid, whose apex is the origin."""
+"""Image corners of a camera pyramid in camera axes, whose apex is the origin."""
 FRUSTUM_DEPTH = 0.11
-"""Length of a camera pyramid, in radii."""
+"""Length of a camera pyramid, in radii of the drawing."""
+FRUSTUM_HALF_SIDE = 0.6
+"""Half of the longer side of its base, relative to its length."""
 
 
 @dataclass(frozen=True)
 class DrawingFrame:
-    """Coordinate frame of a drawing."""
+    """Coordinate frame of a drawing, in the frame of the result."""
 
     center: Float[Tensor, "3"]
     axes: Float[Tensor, "3 3"]
     """Unit axes as rows: right, up and back."""
     radius: float
+    """Length that is 1 in the drawing, in scene units."""
 
     def convert(self, points: Float[Tensor, "*n 3"]) -> Float[Tensor, "*n 3"]:
         """Convert world points to the drawing."""
@@ -46,11 +46,11 @@ def thin_evenly(items: Sequence[Camera], most: int) -> Sequence[Camera]:
 
 
 def make_record(completion: Completion, photographs: Sequence[Camera]) -> CompletionRecord:
-    """Draw all cameras, and list depth pairs."""
+    """Draw the cameras of `photographs`, the context and the targets, and list depth pairs."""
     context = [view.camera.to("cpu") for view in completion.views]
     targets = [result.target.to("cpu") for result in completion.targets]
-    others = [camera.to("cpu") for camera in photographs]
-    frame = fit_frame([*others, *context, *targets])
+    photographed = [camera.to("cpu") for camera in photographs]
+    frame = fit_frame([*photographed, *context, *targets])
 
     def draw(cameras: Sequence[Camera]) -> tuple[str, ...]:
         return tuple(draw_camera_lines(camera, frame) for camera in cameras)
@@ -61,30 +61,32 @@ def make_record(completion: Completion, photographs: Sequence[Camera]) -> Comple
         columns = pairs.predicted, pairs.context, pairs.inlier_mask
         points = zip(*(column.tolist() for column in columns), strict=True)
         rows.append(PairsRow(pairs.fit_view, tuple(points)))
-    return CompletionRecord(draw(others), draw(context), draw(targets), tuple(rows))
+    return CompletionRecord(draw(photographed), draw(context), draw(targets), tuple(rows))
 
 
 def fit_frame(cameras: Sequence[Camera]) -> DrawingFrame:
-    """Fit a frame around cameras whose up axis is that of most of them."""
+    """Fit a frame around cameras, whose up axis is that of most of them."""
     up = estimate_up(cameras)
-    # The most level camera gives the direction of the view; its axes are made level exactly.
+    # The drawing is seen as by the most level camera, whose y axis points down most exactly.
     level = min(cameras, key=lambda camera: (camera.c2w[:3, 1] @ up).item())
     back = normalize(torch.linalg.cross(level.c2w[:3, 0], up), dim=0)
     centers = torch.stack([camera.center for camera in cameras])
     middle = centers.median(dim=0).values
-    # At least a tiny radius: all cameras may stand in one place.
+    # A tenth more than the farthest camera, and never 0: all cameras may stand in one place.
     radius = max(1.1 * (centers - middle).norm(dim=1).max().item(), 1e-9)
     return DrawingFrame(middle, torch.stack([torch.linalg.cross(up, back), up, back]), radius)
 
 
 def draw_camera_lines(camera: Camera, frame: DrawingFrame) -> str:
-    """Write the corners of one line along the edges of a camera pyramid, centre first."""
-    # Half the image over the focal length at z = 1, with the longer side always as long.
+    """Draw the edges of a camera pyramid as one line: x y z of its points, the camera first."""
+    # Width and height of the view at z = 1. Only their ratio is drawn: pyramids of all lenses are
+    # as large.
     size = torch.tensor([camera.width, camera.height]) / camera.K.diagonal()[:2]
-    sides = torch.cat([0.6 * size / size.max(), torch.ones(1)])
-    a, b, c, d = torch.tensor(FRUSTUM) * sides @ camera.c2w[:3, :3].T @ frame.axes.T
-    # Edges from the apex to the corners and around, in a single line: some are drawn twice.
-    o = torch.zeros(3)
-    corners = FRUSTUM_DEPTH * torch.stack([o, a, b, c, d, a, b, o, c, d, o])
-    points = frame.convert(camera.center) + corners
+    scale = torch.cat([FRUSTUM_HALF_SIDE * size / size.max(), torch.ones(1)])
+    # From camera axes into those of the world, and from there into those of the drawing.
+    a, b, c, d = torch.tensor(FRUSTUM) * scale @ camera.c2w[:3, :3].T @ frame.axes.T
+    # From the apex to the corners and around them; a single line draws some edges twice.
+    apex = torch.zeros(3)
+    line = FRUSTUM_DEPTH * torch.stack([apex, a, b, c, d, a, b, apex, c, d, apex])
+    points = frame.convert(camera.center) + line
     return " ".join(f"{value:.3f}" for value in points.flatten().tolist())
