@@ -17,7 +17,7 @@ from torch import Tensor
 from gscompleter import __version__
 from gscompleter.apps.command_line.answers import print_answer
 from gscompleter.apps.completing.preparation import open_input, read_splat
-from gscompleter.apps.completing.run_info import describe_run_values, refuse_results
+from gscompleter.apps.completing.run_info import describe_run_values
 from gscompleter.apps.inputs.depth_range import apply_splat_range
 from gscompleter.apps.inputs.describing import describe_opening, print_lines
 from gscompleter.apps.inputs.reading import read_photographs
@@ -34,6 +34,7 @@ from gscompleter.apps.report.cleaning_picture import (
     see_removal,
 )
 from gscompleter.apps.report.scenes import save_changed, save_completed_splat
+from gscompleter.apps.report.schema import refuse_completed
 from gscompleter.apps.requests.cleaning import CleaningRequest
 from gscompleter.apps.requests.scene import PhotographsRequest
 from gscompleter.apps.requests.splat import SplatRequest
@@ -92,7 +93,7 @@ def clean_splat(request: CleaningRequest) -> None:
         reserve_output(results.out, results.overwrite, CLEAN_COMMAND, CLEANING_FILES) as output,
     ):
         if request.dry_run:
-            refuse_results(results.out)
+            refuse_completed(results.out)
         print_lines(console, *output.describe_others())
         if request.photographs is None:
             cleaning = clean_alone(request)

@@ -26,7 +26,7 @@ from gscompleter.apps.completing.printing import (
     answer_plan,
 )
 from gscompleter.apps.completing.remove import prepare_removal
-from gscompleter.apps.completing.run_info import describe_run_values, read_held_out, refuse_results
+from gscompleter.apps.completing.run_info import describe_run_values, read_held_out
 from gscompleter.apps.completing.update import prepare_update
 from gscompleter.apps.inputs.describing import describe_task, print_lines
 from gscompleter.apps.inputs.refined_poses import write_refined_poses
@@ -36,7 +36,7 @@ from gscompleter.apps.report.film import write_comparison_video
 from gscompleter.apps.report.page import write_completion_page
 from gscompleter.apps.report.pictures import IMAGES_FOLDER, write_images
 from gscompleter.apps.report.results import COMPLETE_COMMAND, COMPLETION_RESULTS
-from gscompleter.apps.report.schema import read_summary
+from gscompleter.apps.report.schema import read_summary, refuse_completed
 from gscompleter.apps.requests.completion import (
     ExportRequest,
     FillingRequest,
@@ -175,7 +175,7 @@ def plan_targets(request: PlanRequest) -> int:
             results.out, results.overwrite, COMPLETE_COMMAND, COMPLETION_RESULTS
         ) as output,
     ):
-        refuse_results(results.out)
+        refuse_completed(results.out)
         print_lines(console, *output.describe_others())
         ready = prepare(request.filling, console)
         print_lines(console, *describe_completion_plan(ready))

@@ -1,12 +1,10 @@
-"""Input of a run for `summary.json`."""
+"""The input of a run: its description for `summary.json`, and photographs that test the result."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import asdict
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
@@ -16,7 +14,6 @@ from jaxtyping import Float
 from gscompleter.apps.inputs.describing import describe_missing_photographs
 from gscompleter.apps.inputs.selection import select_closest
 from gscompleter.apps.inputs.task import CompletionTask, Opened
-from gscompleter.apps.report.schema import find_completed
 from gscompleter.apps.requests.scene import (
     NUM_VIDEO_FRAMES,
     AloneRequest,
@@ -26,10 +23,11 @@ from gscompleter.apps.requests.splat import SplatRequest
 from gscompleter.config import CleaningConfig, CompleterConfig
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.evaluation.verdict.held_out import HeldOut
-from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, View
 
 MAX_HELD_OUT = 8
+"""Most photographs that test a result, if none were kept back for it."""
 
 
 def describe_run_values(
@@ -43,9 +41,10 @@ def describe_run_values(
 ) -> dict[str, Any]:
     """Describe the input and all settings that determine the result, with further `settings`.
 
-    `inverts_masks` is True if masks were read the other way round, whichever they are.
+    `given` is the input splat. `inverts_masks` is True if masks were read the other way round,
+    whichever they are.
     """
-    camera = task.views[0].camera
+    camera = task.views[0].camera  # all have one depth range
     resolution = opened.request.resolution
     splat = None if given is None else str(given.path)
     reading = source.scene
@@ -97,10 +96,8 @@ def describe_run_values(
 
 
 def compute_frame_of_file(task: CompletionTask) -> Float[np.ndarray, "4 4"]:
-    """Compute the similarity from the frame of the photographs to that of the written files.
-
-    A splat with an origin is written in the coordinates of its file again.
-    """
+    """Compute the similarity from the frame of the photographs to that of the written files."""
+    # A splat with an origin is written in the coordinates of its file again.
     origin = None if task.scene is None else task.scene.origin
     if origin is None:
         return task.frame
@@ -119,29 +116,24 @@ def read_held_out(
     if opened.renders_from is not None:
         return []
     used = task.used_frames
-    others = {frame: camera for frame, camera in cameras.items() if frame not in used}
+    unused = {frame: camera for frame, camera in cameras.items() if frame not in used}
     # Check views of a splat guard its completion, so they test less than photographs that nothing
     # has read.
     checks = {view.frame for view in task.check_views or ()}
-    frames = opened.held_out or select_closest(task.goals, others, MAX_HELD_OUT)
+    frames = opened.held_out or select_closest(task.goals, unused, MAX_HELD_OUT)
     read: dict[int, View] = {}
     for frame in frames:
         # A photograph that cannot be read tests nothing; it is no input of this run.
         with suppress(InputError):
             (read[frame],) = opened.photographs.views([frame], opened.request.resolution)
     held_out = []
+    # A loop of its own, since an InputError from here on is a fault of ours and not suppressed.
     for frame, view in read.items():
-        # Its own camera is in the frame of the photographs. The other one is on the device of the
-        # task, where the image has to be as well. Outside of `suppress`, which would hide that.
-        there = view.to(task.device)
-        placed = View(there.image, others[frame], frame, ignore_mask=there.ignore_mask)
+        # The camera of the view is in the frame of the photographs. That in `cameras` is in the
+        # frame of the result, and on the device of the task, to which the image follows.
+        moved = view.to(task.device)
+        placed = View(moved.image, unused[frame], frame, ignore_mask=moved.ignore_mask)
         if task.taken_out is not None:
             placed = task.taken_out.hide(placed)
         held_out.append(HeldOut(placed, frame in checks))
     return held_out
-
-
-def refuse_results(out: Path) -> None:
-    """Refuse the output folder of a dry run that holds a scene, which would be replaced."""
-    if os.path.lexists(find_completed(out)):
-        raise InputError(f"{quote_value(out)} holds a result; name another folder.", "out")

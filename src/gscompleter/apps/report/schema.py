@@ -321,6 +321,12 @@ def find_completed(folder: Path) -> Path:
     return next((path for path in paths if os.path.lexists(path)), paths[0])
 
 
+def refuse_completed(out: Path) -> None:
+    """Refuse the output folder of a dry run if it holds a completed scene."""
+    if os.path.lexists(find_completed(out)):
+        raise InputError(f"{quote_value(out)} holds a result; name another folder.", "out")
+
+
 def read_summary(folder: Path) -> CompletionSummary:
     """Read `summary.json`, also of an early version.
 
