@@ -42,9 +42,10 @@ VIDEO_ENDINGS = (".mp4", ".mov", ".mkv", ".webm")
 
 
 def check_paintings(folder: Path, num_targets: int) -> None:
-    """Find and read all images of a folder, before the scene is opened.
+    """Check a folder of painted images as far as it can be before the scene is opened.
 
-    `num_targets` are those named on the command line; without any, `holes.json` has them.
+    `num_targets` is the number of those named on the command line. Without any, `holes.json` has
+    the targets, and all of their images are found and read.
     """
     if not os.path.isdir(folder):
         raise InputError(
@@ -68,9 +69,10 @@ def check_paintings(folder: Path, num_targets: int) -> None:
 def read_paintings(
     targets: Sequence[Target], photographs: Photographs, resolution: Resolution, folder: Path
 ) -> list[Target]:
-    """Add its painted image to each target, and to those of `holes.json` what is known of them.
+    """Add its painted image to each target, and the photograph that `holes.json` knows for it.
 
-    Cameras of the targets are as they were read, in the frame of the photographs.
+    Cameras of the targets are as they were read, in the frame of the photographs. Without a
+    `holes.json` images are named by the number of the target, from 1.
     """
     if not has_holes(folder):
         names = [f"target{number}.png" for number in range(1, len(targets) + 1)]
@@ -109,6 +111,7 @@ def read_video_frames(
 ) -> list[UInt8[np.ndarray, "h w 3"] | None]:
     """Read the frame of each target that is painted in the video; None for the others.
 
+    `sources` are the images or the video of the targets, and `path` describes the exported video.
     Raise InputError if the video has another number of frames than the one that was exported.
     """
     numbers = [
@@ -120,6 +123,7 @@ def read_video_frames(
         return [None] * len(sources)
 
     video = next(source for source in sources if source.suffix.lower() in VIDEO_ENDINGS)
+    # Only the wanted frames are kept, since all of them would fill the memory.
     frames = {}
     count = 0
     for frame in read_video(video, "null", is_grey=False):
@@ -149,7 +153,8 @@ def add_exported_photograph(
         return target
     frame = row.frame
     if frame is not None and frame in range(len(photographs)):
-        # A scene that got photographs since then numbers them in another way.
+        # A scene that got photographs since the export numbers them in another way: the camera
+        # tells whether the number is still that of the same photograph.
         camera = photographs.camera(frame, resolution)
         if is_same_camera(camera, target.camera):
             return add_photograph(replace(target, frame=frame), photographs, resolution)
@@ -164,7 +169,8 @@ def find_painted(
 ) -> Path:
     """Find the painted image that is named like `name`, or the repaired video.
 
-    What was exported is not painted; what is may lie beside it, with another ending.
+    The exported image itself, which the checksum of its row tells, is not painted. The painted one
+    may lie beside it, with another ending.
     """
     painted = find_by_stem(folder, name, PAINTING_ENDINGS, None if row is None else row.sha256)
     if painted is not None:
@@ -232,6 +238,6 @@ def read_painting(
     mask = path.with_name(row.hole_mask_path) if row else None
     if mask is None or not mask.is_file():
         return painting
-    # `read_mask` has what is black.
+    # `read_mask` marks black pixels, and what was asked for is white.
     asked = fit_mask(torch.from_numpy(~read_mask(mask)), camera, mask.name)
     return replace(painting, asked=asked)
