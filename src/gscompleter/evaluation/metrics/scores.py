@@ -50,8 +50,10 @@ class Truth:
     """Photographs to score against, in the depth range of the scene."""
 
     views: tuple[View, ...]
+    """Photographs of the context."""
     target: View
     neighbours: tuple[View, ...] = ()
+    """Photographs near the target that no method has seen."""
 
 
 @dataclass(frozen=True)
@@ -67,10 +69,12 @@ class Quality:
     """Scores of one image against its photograph."""
 
     psnr: float
+    """In dB."""
     ssim: float
     lpips_vgg: float | None
     """None if LPIPS is not available."""
     lpips_alex: float | None
+    """As for `lpips_vgg`."""
     st_lpips: float | None
     """None if the package with its weights is missing, and for a tiny image."""
 
@@ -80,6 +84,7 @@ class PartQuality:
     """Scores of a part of an image, most of which do not reward blur; None without a pixel."""
 
     psnr: float | None
+    """In dB."""
     flip: float | None
     """Mean of the FLIP map; None also if flip-evaluator is missing."""
     haarpsi: float | None
@@ -96,8 +101,9 @@ class Scores:
     target_before: Quality
     target_after: Quality
     hole: PartQuality
-    """Quality after completion in the hole; `observed` over all other pixels."""
+    """Quality after completion in the hole."""
     observed: PartQuality
+    """Quality after completion over all other pixels."""
     fitted: FittedQuality | None
     """Quality after one pose and one gain of the target camera were fitted to its photograph; None
     if too little lies outside of holes."""
@@ -105,8 +111,9 @@ class Scores:
     context_psnr: tuple[Change, ...]
     context_ssim: tuple[Change, ...]
     depth_observed: SurfaceAgreement | None
-    """Depth against the true one where the context covers it; `depth_hole` in the filled hole."""
+    """Completed z-depth against the true one where the context covers it."""
     depth_hole: SurfaceAgreement | None
+    """The same in the hole, where it is filled."""
     seam_step: float | None
     """Median relative depth difference of the added Gaussians to the context, where both cover."""
     added: SurfaceAgreement | None
@@ -116,6 +123,7 @@ class Scores:
     thin_gaps: Change
     """Share of thin gaps at the target (`thin_gaps.measure_thin_gaps`)."""
     neighbours_thin_gaps: tuple[Change, ...]
+    """The same at each neighbour."""
     flight_thin_gaps: Change | None
     """The same on the way from the nearest photograph to the target; None without photographs."""
 
@@ -142,10 +150,11 @@ def score(
 ) -> tuple[Scores, TargetRenders]:
     """Score a completion, and return what was rendered at and near the target.
 
-    `added` is None if existing Gaussians were changed; `registered` has all lifted Gaussians.
+    `before` and `after` are the scenes. `added` is None if existing Gaussians were changed;
+    `registered` has all lifted Gaussians.
     """
     target = truth.target
-    camera = truth.target.camera
+    camera = target.camera
     was = renderer.render(before, camera)
     now = renderer.render(after, camera)
     holes = compute_hole_mask(was.alpha)
@@ -156,8 +165,8 @@ def score(
             [renderer.render(scene, view.camera) for scene in (before, after)] for view in views
         ]
 
-    context = render_both(truth.views)
-    beside = render_both(truth.neighbours)
+    at_context = render_both(truth.views)
+    at_neighbours = render_both(truth.neighbours)
 
     # Where the photograph has a true depth: beside the hole, and in it.
     depth_observed = None
@@ -166,26 +175,29 @@ def score(
         depth_observed = compare_depths(now.depth, target.depth, ~holes & covered)
         depth_hole = compare_depths(now.depth, target.depth, holes & covered)
 
-    # Agreement of what was added with the scene before; a method may have added nothing.
+    # Agreement of new Gaussians with the scene before; a method may have added or lifted none.
     seam_step = None
-    agreement = None
+    added_agreement = None
     if added:
         seam_step = measure_seam_step(added, was, camera, renderer)
-        agreement = measure_alignment(added, before, camera, renderer)
-    # Where cracks open as the camera leaves the photographs.
-    flight = None
-    looks = {AT_TARGET: now}
-    for view, (_, completed) in zip(truth.neighbours, beside, strict=True):
-        looks[f"at neighbour {view.frame}"] = completed
+        added_agreement = measure_alignment(added, before, camera, renderer)
+    registered_agreement = None
+    if registered:
+        registered_agreement = measure_primitive_alignment(registered, before, camera, renderer)
+
+    # Cracks open as the camera leaves the photographs: at the target, its neighbours and on the way
+    # there.
+    flight_gaps = None
+    completed = {AT_TARGET: now}
+    for view, (_, render) in zip(truth.neighbours, at_neighbours, strict=True):
+        completed[f"at neighbour {view.frame}"] = render
     if truth.views:
         photographs = [view.camera for view in truth.views]
-        ways = [render_flight(scene, photographs, camera, renderer) for scene in (before, after)]
-        flight = Change(*map(measure_flight, ways))
-        looks |= ways[1]
+        flight_before = render_flight(before, photographs, camera, renderer)
+        flight_after = render_flight(after, photographs, camera, renderer)
+        flight_gaps = Change(measure_flight(flight_before), measure_flight(flight_after))
+        completed |= flight_after
 
-    lifted = None
-    if registered:
-        lifted = measure_primitive_alignment(registered, before, camera, renderer)
     scores = Scores(
         hole_fraction=holes.float().mean().item(),
         target_before=measure_quality(was.image, target),
@@ -193,21 +205,21 @@ def score(
         hole=measure_part(now.image, target, holes),
         observed=measure_part(now.image, target, ~holes),
         fitted=measure_fitted(after, target, holes, renderer),
-        neighbours_psnr=compare_views(beside, truth.neighbours, compute_view_psnr),
-        context_psnr=compare_views(context, truth.views, compute_view_psnr),
-        context_ssim=compare_views(context, truth.views, compute_view_ssim),
+        neighbours_psnr=compare_views(at_neighbours, truth.neighbours, compute_view_psnr),
+        context_psnr=compare_views(at_context, truth.views, compute_view_psnr),
+        context_ssim=compare_views(at_context, truth.views, compute_view_ssim),
         depth_observed=depth_observed,
         depth_hole=depth_hole,
         seam_step=seam_step,
-        added=agreement,
-        registered=lifted,
+        added=added_agreement,
+        registered=registered_agreement,
         thin_gaps=Change(measure_thin_gaps(was.alpha), measure_thin_gaps(now.alpha)),
         neighbours_thin_gaps=tuple(
-            Change(*(measure_thin_gaps(render.alpha) for render in pair)) for pair in beside
+            Change(*(measure_thin_gaps(render.alpha) for render in pair)) for pair in at_neighbours
         ),
-        flight_thin_gaps=flight,
+        flight_thin_gaps=flight_gaps,
     )
-    return scores, TargetRenders(was, now, holes, find_worst_gap(looks))
+    return scores, TargetRenders(was, now, holes, find_worst_gap(completed))
 
 
 def measure_quality(image: Image, photograph: View) -> Quality:
@@ -238,7 +250,7 @@ def compute_view_ssim(image: Image, photograph: View) -> float:
 
 
 def measure_part(image: Image, photograph: View, where: Bool[Tensor, "h w"]) -> PartQuality:
-    """Score an image over the valid pixels of `where`."""
+    """Score an image over the valid pixels of its photograph in `where`."""
     compared = photograph.fill_ignored(image)
     truth = photograph.image
     where = where & photograph.valid_mask
