@@ -38,8 +38,8 @@ def choose_local_origin(poses: Sequence[Float[np.ndarray, "4 4"]]) -> Float[np.n
     centers = np.stack([pose[:3, 3] for pose in poses])
     spread = np.abs(centers - centers[0]).max()
     # Where cameras are far from zero, relative to their distances, float32 loses the baselines.
-    remote = spread > 0 and np.abs(centers).max() > MAX_REMOTENESS * spread
-    return centers[0] if remote else np.zeros(3)
+    is_remote = spread > 0 and np.abs(centers).max() > MAX_REMOTENESS * spread
+    return centers[0] if is_remote else np.zeros(3)
 
 
 def is_near(middle: Float[np.ndarray, "3"], origin: Float[np.ndarray, "3"]) -> bool:

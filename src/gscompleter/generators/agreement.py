@@ -18,7 +18,7 @@ from gscompleter.system.errors import InputError
 COMPARED_BLUR = 2
 """Blur in pixels before colours are compared; edges may be a pixel off."""
 MAX_SHARE = 0.6
-"""Largest residual of a consistent image, relative to that of a constant colour."""
+"""Largest residual of a consistent image, relative to that of an image of one colour."""
 RESIDUAL_QUANTILE = 0.7
 """Quantile of the residuals; higher than the median, which may be a blank wall."""
 MIN_LIMIT = 0.03
@@ -26,23 +26,25 @@ MIN_LIMIT = 0.03
 MAX_SHIFT_GAIN = 1.6
 """Largest gain of a colour shift; its inverse is the smallest."""
 MAX_OFFSET = 0.25
+"""Largest offset of a colour shift, either way, for colours in [0, 1]."""
 MIN_OBSERVED_PIXELS = 200
 """Fewest observed pixels for a comparison."""
 
 
 @dataclass(frozen=True)
 class Agreement:
-    """Comparison of an image with the photographs: `kept_context = gain * image + offset`."""
+    """Comparison of an image with the photographs: `photographed = gain * image + offset`."""
 
     gain: Float[Tensor, "3"]
     offset: Float[Tensor, "3"]
     residual: float
     """Quantile of the colour difference after the correction."""
     limit: float
+    """Largest residual of a consistent image."""
     is_consistent: bool
     """True if the image is consistent with the photographs, or cannot be compared."""
     image: Float[Tensor, "h w 3"]
-    """The image, corrected if it is consistent."""
+    """The image; if it is consistent and correction is asked for, with the shift corrected."""
 
 
 def paint_consistently(
@@ -54,8 +56,9 @@ def paint_consistently(
 ) -> GeneratorOutput:
     """Paint an image from a seed, compare it with the photographs and correct its colours.
 
-    While it is inconsistent, up to `retries` further seeds are tried and the best image is kept.
-    Raise InputError if no seed gives finite colours.
+    `paint` makes the image of a seed; `observed` are the photographs warped to its camera. While it
+    is inconsistent, up to `retries` further seeds are tried and the best image is kept. Raise
+    InputError if no seed gives finite colours.
     """
     attempts: list[Agreement] = []
     for attempt in range(retries + 1):
@@ -92,7 +95,11 @@ def compare_with_observed(
     known: Bool[Tensor, "h w"],
     correct_color: bool = True,
 ) -> Agreement:
-    """Fit the colour shift of `image` to the `known` pixels and correct it if consistent."""
+    """Fit the colour shift of `image` to the `known` pixels, and correct a consistent image.
+
+    With `correct_color` off, a consistent image stays as it is, with a gain of 1. An image that the
+    photographs show too little of is consistent, and one with NaN or infinity never.
+    """
     ones = torch.ones(3).to(image)
     zeros = torch.zeros(3).to(image)
     if not image.isfinite().all():

@@ -43,9 +43,10 @@ class VolSplatConfig(DepthSplatConfig):
 
 @dataclass(frozen=True)
 class VoxelGaussians:
-    """One Gaussian per voxel of `grid`, with the conventions of `Gaussians`, and z-depth maps."""
+    """One Gaussian per voxel of `grid`, with the conventions of `Gaussians`."""
 
     depth: Float[Tensor, "v h w"]
+    """z-depth of each view, in scene units."""
     grid: Grid
     means: Float[Tensor, "n 3"]
     quats: Float[Tensor, "n 4"]
@@ -76,6 +77,7 @@ class VolSplat(PixelFeatures):
     def __init__(self, config: VolSplatConfig = VolSplatConfig()) -> None:
         super().__init__(config.depth)
         self.config = config
+        # Spelt as in the published weights, whose keys the attributes name.
         self.spare_unet = SparseUNet(self.channels)
         self.gaussian_head = GaussianHead(self.channels, sum(CHANNEL_GROUPS))
 
@@ -114,6 +116,7 @@ def create_voxel_gaussians(
     config: VolSplatConfig,
 ) -> VoxelGaussians:
     """Create the Gaussians of the voxels; the constant SH is the mean pixel colour."""
+    # Activations are those of the authors, whose quaternions are xyzw.
     opacity, offset, scale, rotation, sh = raw.split(CHANNEL_GROUPS, dim=1)
     reach = MAX_VOXEL_OFFSET * config.voxel_resolution
     return VoxelGaussians(

@@ -16,9 +16,10 @@ from gscompleter.types import View
 MIN_RANGE_MATCHES = 12
 """Fewest triangulated features for an estimate."""
 MARGINS = (0.5, 4.0)
-"""Near and far over the depths of the nearest and farthest features."""
+"""Near relative to the depth of the nearest features, and far to that of the farthest."""
 SHARE_OUTSIDE = 0.02
-"""Share of the features before the nearest and behind the farthest depth: they may be wrong."""
+"""Share of the features that lie before the nearest depth, and share behind the farthest: those
+may be wrong."""
 
 
 def estimate_depth_range(views: Sequence[View]) -> tuple[float, float]:
@@ -32,6 +33,7 @@ def estimate_depth_range(views: Sequence[View]) -> tuple[float, float]:
         shares = [SHARE_OUTSIDE, 1 - SHARE_OUTSIDE]
         low, high = np.quantile(views[0].known_depths.cpu(), shares).tolist()
         return MARGINS[0] * low, MARGINS[1] * high
+    # Stereo images are in units of the widest baseline, which is `unit` in scene units.
     images, unit = make_stereo_images(views)
     neighbours = find_neighbours(images)
     depths = measure_extreme_depths(images, neighbours)
@@ -55,7 +57,10 @@ def measure_feature_depths(views: Sequence[View]) -> tuple[float, float] | None:
 def measure_extreme_depths(
     images: Sequence[StereoImage], neighbours: Neighbours
 ) -> tuple[float, float] | None:
-    """Measure the depths of the nearest and farthest 2 %, per widest baseline; None for too few."""
+    """Measure the depths of the nearest and farthest 2 % of the features; None for too few.
+
+    Depths are z-depths in the unit of the images, their widest baseline.
+    """
     # Inverse z-depths of the matches of neighbouring views, seen from either view.
     inverses = [np.zeros(0)]
     for i, j in neighbours.pairs:
@@ -75,7 +80,7 @@ def get_depth_range(
     views: Sequence[View],
     estimate: Callable[[Sequence[View]], tuple[float, float]] = estimate_depth_range,
 ) -> tuple[float, float]:
-    """Return near and far z-depth of the first camera, estimated if unknown."""
+    """Return near and far z-depth of the first camera, in scene units, estimated if unknown."""
     near = views[0].camera.near
     far = views[0].camera.far
     if near is None or far is None:
@@ -98,10 +103,10 @@ def set_depth_range(views: Sequence[View], near: float, far: float) -> list[View
 def derive_range_from_baselines(
     images: Sequence[StereoImage], neighbours: Neighbours
 ) -> tuple[float, float]:
-    """Derive a depth range from a parallax of 0.4 image widths and of a third of a pixel.
+    """Derive near from a parallax of 0.4 image widths, and far from one of a third of a pixel.
 
-    A parallax of p pixels has the depth baseline · focal / p. Baseline is the median over each
-    view and its best neighbour, in units of the widest one.
+    A parallax of p pixels has the depth baseline · focal / p. The baseline is the median over each
+    view and its best neighbour, in the unit of the images, as is the result.
     """
     focal = float(np.median([image.K[0, 0] for image in images]))
     width = float(np.median([image.size[1] for image in images]))
