@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from gscompleter.apps.command_line import words as command_line
+from gscompleter.apps.commands.batch import decide_batch
 from gscompleter.apps.commands.batch_rows import decide_row
 from gscompleter.apps.commands.clean import decide_cleaning
 from gscompleter.apps.commands.complete import decide_completion
@@ -34,6 +35,7 @@ from gscompleter.system.errors import InputError
 from scenes import random_gaussians
 
 DECIDE = {
+    "batch": decide_batch,
     "complete": decide_completion,
     "remove": decide_removal,
     "repair": decide_repair,
@@ -192,6 +194,7 @@ def test_a_row_of_a_batch_is_the_request_of_its_command_line(decide, tmp_path):
         ("clean --scene SPLAT --near 1 --out out", "There are no photographs to apply this to"),
         ("convert SPLAT b.ply --decimate half", "is no number of Gaussians"),
         ("evaluate data --reconstructor a a --out out", "A reconstructor is named twice"),
+        ("batch SCENE --each near=1 near=2 --out out", "near is given twice; give it once"),
         ("view SPLAT --save page.txt", "is no .html file"),
     ],
 )

@@ -25,7 +25,7 @@ def decide_engine(options: EngineOptions) -> EngineRequest:
 
 
 def parse_pairs(words: Sequence[str], option: str) -> dict[str, str]:
-    """Parse `NAME=VALUE` words."""
+    """Parse `NAME=VALUE` words; `option`, which has them, is for errors."""
     pairs = {}
     for word in words:
         name, sign, value = word.partition("=")
@@ -33,5 +33,7 @@ def parse_pairs(words: Sequence[str], option: str) -> dict[str, str]:
             raise InputError(
                 f"'{quote_value(word)}' is not NAME=VALUE, as in resolution=256.", option
             )
+        if name in pairs:
+            raise InputError(f"{quote_value(name)} is given twice; give it once.", option)
         pairs[name] = value
     return pairs
