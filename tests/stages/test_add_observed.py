@@ -71,14 +71,21 @@ def test_a_hole_that_photographs_show_is_filled_from_them():
     assert torch.equal(state.scene.means[: len(CUT)], CUT.means)
 
 
-def test_additions_that_photographs_do_not_need_are_dropped(monkeypatch):
+def test_additions_in_one_place_are_dropped(monkeypatch):
     """Each of five photographs has a Gaussian for each of its pixels of the same box."""
     few = begin(CUT)
-    monkeypatch.setattr(add_observed, "drop_superfluous", lambda added, *_: added)
+    monkeypatch.setattr(add_observed, "drop_doubled", lambda added, *_: added)
     all_pixels = begin(CUT)
     assert 100 < few.num_observed < 0.7 * all_pixels.num_observed
     for before, after in zip(score(all_pixels.scene), score(few.scene), strict=True):
         assert after > before - 0.05
+
+
+def test_a_surface_that_is_thinned_out_has_no_holes_from_elsewhere():
+    elsewhere = camera_at(0.45, size=SIZE)
+    covered = RENDERER.render(WHOLE, elsewhere).alpha
+    thinned = RENDERER.render(begin(CUT).scene, elsewhere).alpha
+    assert (thinned > covered - 0.05).float().mean() > 0.99
 
 
 def test_what_stands_before_a_wall_that_the_scene_shows_is_added():

@@ -49,7 +49,8 @@ def find_superfluous(
     # One at a time they are superfluous; together they may not be. Photographs are compared at half
     # size as well.
     checks = [*views, *(halve_view(view) for view in views)]
-    max_errors = limit_errors(scene, checks, config.tolerance, renderer)
+    images = (renderer.render(scene, view.camera).image for view in checks)
+    max_errors = limit_errors(images, checks, config.tolerance)
     removed = exclude_needed(scene, removable, checks, max_errors, renderer)
     return {"harmful": removed & is_harmful, "not needed": removed & ~is_harmful}
 

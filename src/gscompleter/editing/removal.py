@@ -170,7 +170,8 @@ def find_needed_revealed(
     # The scene with all candidates, but without additions, sets the limit of each photograph.
     # Candidates are rows of the scene between what is known and what was added.
     whole = merge([known, candidates])
-    limits = limit_errors(whole, views, REVEALED_TOLERANCE, renderer)
+    images = (renderer.render(whole, view.camera).image for view in views)
+    limits = limit_errors(images, views, REVEALED_TOLERANCE)
     row = torch.arange(len(whole) + len(added), device=is_outside.device)
     is_candidate = (row >= len(known)) & (row < len(whole))
     superfluous = exclude_needed(merge([whole, added]), is_candidate, views, limits, renderer)

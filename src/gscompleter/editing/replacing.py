@@ -18,7 +18,7 @@ from torch import Tensor
 from gscompleter.config import CleaningConfig
 from gscompleter.numerics.image_ops import average_box
 from gscompleter.render.cache import SceneRenderer
-from gscompleter.render.protocols import Renderer
+from gscompleter.render.protocols import FrozenScene, Renderer
 from gscompleter.render.view_map import get_view_map
 from gscompleter.stages.add_observed import MIN_ADDED_SHARE, compare_colors, find_usable
 from gscompleter.stages.hole_masks import compute_hole_mask
@@ -161,26 +161,33 @@ def return_needed(
         return state
     given = contested.given
     candidates = given.source.rendered[contested.rows]
-    is_dropped = find_unneeded_candidates(state, candidates, scenes, config)
+    views = [photo.view for photo in state.photos]
+    frozen = scenes.freeze_at(state.parts, [view.camera for view in views])
+    is_dropped = find_unneeded_candidates(candidates, views, frozen, scenes.renderer, config)
 
     # No photograph may be worse than it was with all of them.
-    views = [photo.view for photo in state.photos]
-    limits = limit_errors(merge(given.parts), views, config.tolerance, scenes.renderer)
+    whole = merge(given.parts)
+    images = (scenes.renderer.render(whole, view.camera).image for view in views)
+    limits = limit_errors(images, views, config.tolerance)
+    plans = [scene.vary_opacities(candidates) for scene in frozen]
     dropped = exclude_needed_additions(
-        merge(state.parts), candidates, is_dropped, views, limits, scenes.renderer
+        lambda: plans, candidates.opacities, is_dropped, views, limits
     )
     return drop_rows(state, given, contested.rows.masked_scatter(contested.rows, dropped))
 
 
 def find_unneeded_candidates(
-    state: Completion, candidates: Gaussians, scenes: SceneRenderer, config: CleaningConfig
+    candidates: Gaussians,
+    views: Sequence[View],
+    frozen: Sequence[FrozenScene],
+    renderer: Renderer,
+    config: CleaningConfig,
 ) -> Bool[Tensor, "c"]:
     """Find candidates by which photographs lose, or that stand needlessly before what they show.
 
-    All of them are faint in the comparison: otherwise those that are behind others look needless.
+    `frozen` is the scene without them. All of them are faint in the comparison: otherwise those
+    that are behind others look needless.
     """
-    views = [photo.view for photo in state.photos]
-    frozen = scenes.freeze_at(state.parts, [view.camera for view in views])
     are_faint = torch.ones_like(candidates.opacities, dtype=torch.bool)
     changes = sum_error_changes(candidates, are_faint, views, frozen, config)
 
@@ -190,7 +197,7 @@ def find_unneeded_candidates(
     alone = torch.zeros_like(candidates.opacities)
     for view, scene in zip(views, frozen, strict=True):
         visible += sum_weights(scene.extend(faint))[-len(candidates) :]
-        alone += sum_weights(scenes.renderer.freeze(faint, view.camera))
+        alone += sum_weights(renderer.freeze(faint, view.camera))
     is_in_the_way = visible > MIN_VISIBLE * alone
     can_go = is_in_the_way | changes.find_harmful(config)
     return changes.are_observed & changes.find_removable(config) & can_go

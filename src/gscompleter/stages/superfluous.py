@@ -6,7 +6,7 @@ predicts the error without each.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -22,7 +22,7 @@ from gscompleter.stages.error_budgets import (
     select_fewest,
 )
 from gscompleter.trust.photometric import sum_weights
-from gscompleter.types import Gaussians, View, merge
+from gscompleter.types import Gaussians, View
 
 FADED_OPACITY = 0.02
 """Largest opacity of a faded Gaussian; at zero it would have no gradient."""
@@ -130,13 +130,15 @@ def estimate_squared_gradient(
 
 
 def limit_errors(
-    scene: Gaussians, views: Sequence[View], tolerance: float, renderer: Renderer
+    images: Iterable[Float[Tensor, "_ _ 3"]], views: Sequence[View], tolerance: float
 ) -> list[float]:
-    """Compute the mean squared error of each photograph after a loss of PSNR, in dB."""
+    """Compute the mean squared error of each photograph after a loss of PSNR, in dB.
+
+    `images` are the renders at their cameras now.
+    """
     limits = []
-    for view in views:
-        image = view.fill_ignored(renderer.render(scene, view.camera).image)
-        error = compute_squared_error(image, view.image).item()
+    for image, view in zip(images, views, strict=True):
+        error = compute_squared_error(view.fill_ignored(image), view.image).item()
         limits.append(add_psnr_loss(error, tolerance))
     return limits
 
@@ -150,37 +152,45 @@ def exclude_needed(
 ) -> Bool[Tensor, "n"]:
     """Remove needed Gaussians from a mask until every photograph is within its MSE limit.
 
-    Restored Gaussians may change other photographs, so all are checked until nothing changes.
+    The rest of the scene is frozen anew in each pass: for all photographs it would take too much
+    memory. Additions to a scene that is frozen already have `exclude_needed_additions`.
     """
     candidates = scene[removable]
     rest = scene[~removable]
-    missing = torch.ones_like(candidates.opacities, dtype=torch.bool)
-    while True:
-        missing_before = missing
-        for view, max_error in zip(views, max_errors, strict=True):
-            plan = renderer.freeze(rest, view.camera).vary_opacities(candidates)
-            missing = missing & ~find_needed_by_photographs(
-                plan, candidates.opacities, missing, view, max_error
-            )
-        if torch.equal(missing, missing_before):
-            return removable.masked_scatter(removable, missing)
+
+    def iterate_plans() -> Iterator[OpacityRender]:
+        for view in views:
+            yield renderer.freeze(rest, view.camera).vary_opacities(candidates)
+
+    everything = torch.ones_like(candidates.opacities, dtype=torch.bool)
+    missing = exclude_needed_additions(
+        iterate_plans, candidates.opacities, everything, views, max_errors
+    )
+    return removable.masked_scatter(removable, missing)
 
 
 def exclude_needed_additions(
-    scene: Gaussians,
-    added: Gaussians,
+    iterate_plans: Callable[[], Iterable[OpacityRender]],
+    opacities: Float[Tensor, "n"],
     removable: Bool[Tensor, "n"],
     views: Sequence[View],
     max_errors: Sequence[float],
-    renderer: Renderer,
 ) -> Bool[Tensor, "n"]:
-    """Remove needed ones from a mask of additions to a scene, of which nothing goes.
+    """Remove needed ones of n additions from a mask until every photograph is within its MSE limit.
 
-    As `exclude_needed` does: one at a time they are superfluous; together they may not be.
+    One at a time they are superfluous; together they may not be. A plan for each photograph renders
+    the scene with the additions, at other opacities than their own ones [n].
     """
-    among_all = torch.cat([removable.new_zeros(len(scene)), removable])
-    gone = exclude_needed(merge([scene, added]), among_all, views, max_errors, renderer)
-    return gone[len(scene) :]
+    missing = removable
+    # What returns for one photograph may change others, so all are checked until nothing changes.
+    while True:
+        missing_before = missing
+        for plan, view, max_error in zip(iterate_plans(), views, max_errors, strict=True):
+            missing = missing & ~find_needed_by_photographs(
+                plan, opacities, missing, view, max_error
+            )
+        if torch.equal(missing, missing_before):
+            return missing
 
 
 def find_needed_by_photographs(
