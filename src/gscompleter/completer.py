@@ -197,17 +197,19 @@ class GSCompleter:
         check_views: Sequence[View] | None = None,
         targets: Sequence[Camera] = (),
         invented: Bool[Tensor, "n"] | None = None,
+        lifted: Bool[Tensor, "n"] | None = None,
         geometry: GivenGeometry | None = None,
     ) -> Completion:
         """Initialize the context (stage 1; paper, Eq. 5); arguments and errors as in `__call__`.
 
         The LOD proxy of a large scene is made fine enough for photographs and known targets.
-        `invented` marks the Gaussians of `scene` that were invented earlier: they give way where
-        photographs show something else. By default nothing of a scene does, since a label does not
-        tell them from Gaussians that were only recoloured.
+        `invented` marks the Gaussians of `scene` that Φ invented earlier, and `lifted` those that Ψ
+        lifted from photographs: they give way where photographs show something else. By default
+        nothing of a scene does, since a label does not tell them from Gaussians of a user.
         """
         check_inputs(views, scene, check_views or (), targets)
         check_row_mask(invented, scene, "The mask of what was invented")
+        check_row_mask(lifted, scene, "The mask of what was lifted")
         config = choose_config(self.config, scene, check_views)
         if geometry is not None:
             check_geometry(geometry, config)
@@ -227,9 +229,9 @@ class GSCompleter:
                 geometry=geometry,
                 models=self.name_models(),
             )
-            # What was invented steps aside where photographs show something else, so that nobody
-            # takes it for a part of the scene that they contradict.
-            contested = find_contested(state, invented, self.scenes)
+            # What earlier commands made steps aside where photographs show something else, so that
+            # nobody takes it for a part of the scene that they contradict.
+            contested = find_contested(state, invented, lifted, self.scenes)
             state = let_step_aside(state, contested)
             # Guards measure the scene as it was given, so before anything changes.
             state = prepare_guards(state, self.scenes)

@@ -812,7 +812,7 @@ class ContextScene:
     revealed_mask: Bool[Tensor, "n"]
     """True for unseen Gaussians behind those, which are gone as well."""
     replaced_mask: Bool[Tensor, "n"]
-    """True for Gaussians that were invented earlier and gave way to what photographs show."""
+    """True for Gaussians that earlier commands made and that gave way to what photographs show."""
     removed: Gaussians
     """The Gaussians that were removed, cut where they reached out of the place that was chosen; to
     save memory, without their colours by direction."""

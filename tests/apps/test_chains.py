@@ -17,7 +17,7 @@ from torch import Tensor
 from command import run
 from gscompleter import load_camera, load_ply, save_ply
 from gscompleter.apps.commands.live import decide_live
-from gscompleter.apps.inputs.invented import mark_invented
+from gscompleter.apps.inputs.earlier_work import mark_earlier_work
 from gscompleter.apps.inputs.taken_out import describe_taken_out
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile
 from gscompleter.apps.live import saving
@@ -203,7 +203,7 @@ def test_photographs_replace_what_was_invented_before(room, tmp_path):
     # Most is farther to the right than any photograph shows.
     assert num_replaced > 0.05 * num_invented
     assert num_replaced == num_invented - int((load_ply(updated).generated == 1).sum())
-    told = f"{num_replaced:,} invented Gaussians gave way to what photographs show"
+    told = f"{num_replaced:,} Gaussians of earlier commands gave way to what photographs show"
     assert told in (updated.parent / "report.html").read_text()
     for row in summary["context"]:
         assert row["psnr_after"] > row["psnr_before"] + 3
@@ -223,7 +223,7 @@ def test_photographs_replace_what_was_invented_before(room, tmp_path):
     alone = tmp_path / "alone.ply"
     alone.write_bytes(completed.read_bytes())
     task = replace(TASK, scene=load_ply(alone), splat_file=InputSplatFile(alone))
-    task, (line,) = mark_invented(task)
+    task, (line,) = mark_earlier_work(task)
     assert task.invented is None
     assert line.endswith("that stays, also where photographs show something else.")
 

@@ -54,6 +54,11 @@ def make_board(z: float, x: float = -0.1, color: float = 0.9, width: float = 0.5
     return replace(board, generated=torch.ones_like(board.generated))
 
 
+def make_observed_again(board: Gaussians) -> Gaussians:
+    """Take the label of what was invented off."""
+    return replace(board, generated=torch.zeros_like(board.generated))
+
+
 def reconstruct_exactly(views: list[View]) -> Reconstruction:
     """Reconstruct photographs as an ideal Ψ: the true surface of each pixel."""
     return reconstruction_of(views, [view.depth for view in views])
@@ -99,7 +104,8 @@ def test_what_photographs_do_not_show_stays():
     beside = make_board(3.0, x=9.0)
     inside = make_board(2.6, width=0.15)
     scene = merge([WHOLE, beside, inside])
-    assert find_contested(begin(scene, marks=False), scene.generated != OBSERVED, SCENES) is None
+    begun = begin(scene, marks=False)
+    assert find_contested(begun, scene.generated != OBSERVED, None, SCENES) is None
 
 
 def test_what_only_one_place_shows_stays_where_nothing_else_is_known():
@@ -111,6 +117,29 @@ def test_what_only_one_place_shows_stays_where_nothing_else_is_known():
     # Its edge stood before what the scene shows.
     assert state.source.replaced_mask[len(CUT) :].float().mean() < 0.5
     assert score(state.scene)[2] > score(scene)[2] - 0.02
+
+
+def begin_lifted(scene: Gaussians, lifted: torch.Tensor | None) -> Completion:
+    completer = GSCompleter(reconstruct_exactly, config=SPLAT)
+    return completer.begin(PHOTOS[:2], scene, PHOTOS[2:], lifted=lifted)
+
+
+def test_what_was_lifted_to_a_wrong_place_gives_way():
+    """Ψ had one photograph of the box, and lifted it as a board before it."""
+    board = make_observed_again(make_board(1.6))
+    scene = merge([CUT, board])
+    is_board = torch.arange(len(scene)) >= len(CUT)
+    kept, replaced = begin_lifted(scene, None), begin_lifted(scene, is_board)
+    assert kept.source.replaced_mask.sum() == 0
+    assert replaced.source.replaced_mask[is_board].float().mean() > 0.5
+    assert not replaced.source.replaced_mask[~is_board].any()
+    for before, after in zip(score(kept.scene), score(replaced.scene), strict=True):
+        assert after > before + 3
+
+
+def test_what_was_lifted_stays_where_photographs_agree():
+    everything = torch.ones(len(WHOLE), dtype=torch.bool)
+    assert not begin_lifted(WHOLE, everything).source.replaced_mask.any()
 
 
 def test_what_photographs_confirm_is_still_there():
@@ -134,5 +163,7 @@ def test_a_wrong_mask_is_refused():
     completer = GSCompleter(reconstruct_exactly)
     with pytest.raises(InputError, match="needs a truth value for each of"):
         completer.begin(PHOTOS, WHOLE, invented=torch.zeros(3, dtype=torch.bool))
+    with pytest.raises(InputError, match="needs a truth value for each of"):
+        completer.begin(PHOTOS, WHOLE, lifted=torch.zeros(3, dtype=torch.bool))
     with pytest.raises(InputError, match="marks Gaussians of a scene"):
         completer.begin(PHOTOS, invented=torch.zeros(3, dtype=torch.bool))

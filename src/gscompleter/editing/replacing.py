@@ -1,9 +1,11 @@
-"""Replacement of what was invented by what photographs show (not in the paper).
+"""Replacement of what earlier commands made by what photographs show (not in the paper).
 
 Φ invents where no photograph looks. Photographs of that place may come later, and show something
-else: what was invented then stands in front of it, or in its place. So invented Gaussians that a
-photograph contests step aside while photographs are added (`add_observed`). Then those return that
-the photographs need, by the rule of the cleaning, or that are hidden by what they show.
+else: what was invented then stands in front of it, or in its place. What Ψ lifted from few
+photographs may be as wrong: where one of them shows a door alone, its depth is a guess. So
+Gaussians that photographs contest step aside while photographs are added (`add_observed`). Then
+those return that the photographs need, by the rule of the cleaning, or that are hidden by what they
+show. Gaussians of a user never step aside.
 """
 
 from __future__ import annotations
@@ -20,7 +22,12 @@ from gscompleter.numerics.image_ops import average_box
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.protocols import FrozenScene, Renderer
 from gscompleter.render.view_map import get_view_map
-from gscompleter.stages.add_observed import MIN_ADDED_SHARE, compare_colors, find_usable
+from gscompleter.stages.add_observed import (
+    MIN_ADDED_SHARE,
+    compare_colors,
+    find_usable,
+    keep_large_regions,
+)
 from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.stages.superfluous import (
     FADED_OPACITY,
@@ -30,10 +37,13 @@ from gscompleter.stages.superfluous import (
 )
 from gscompleter.state import Completion
 from gscompleter.trust.photometric import sum_weights
-from gscompleter.types import Gaussians, Render, View, merge
+from gscompleter.types import ContextScene, Gaussians, Render, View, merge
 
 MAX_ROUNDS = 8
-"""Layers of invented Gaussians that step aside behind each other."""
+"""Layers of Gaussians that step aside behind each other."""
+MIN_LAYER = 0.01
+"""Smallest layer, as a share of those that stepped aside before, behind which a further one is
+looked for. Of a fountain and a room five rounds after the third found 0.1 %."""
 MIN_WEIGHT = 0.5
 """Compositing weight of invented Gaussians from which on a pixel shows them."""
 MIN_SUM = 1e-3
@@ -46,58 +56,87 @@ ERROR_RADIUS = 2
 
 @dataclass(frozen=True)
 class Contested:
-    """Invented Gaussians that photographs contest, and the scene with them."""
+    """Gaussians that photographs contest, and the scene with them."""
 
     given: Completion
     rows: Bool[Tensor, "m"]
     """Those among the rendered Gaussians of `given`."""
 
 
+@dataclass(frozen=True)
+class ContestedPixels:
+    """The pixels of a photograph in which it contests what earlier commands made."""
+
+    of_invented: Bool[Tensor, "h w"]
+    """The scene is empty without what was invented, or fits the photograph better, or the
+    photograph shows something else."""
+    of_lifted: Bool[Tensor, "h w"]
+    """The photograph shows something else, in regions that are large enough."""
+
+
 def find_contested(
-    state: Completion, invented: Bool[Tensor, "n"] | None, scenes: SceneRenderer
+    state: Completion,
+    invented: Bool[Tensor, "n"] | None,
+    lifted: Bool[Tensor, "n"] | None,
+    scenes: SceneRenderer,
 ) -> Contested | None:
-    """Find invented Gaussians of a begun scene that stand where photographs show something else.
+    """Find Gaussians of a begun scene that stand where photographs show something else.
 
-    `invented` marks those of the context. A photograph contests them where the scene is empty
-    without them, or fits it better. Returns None if none are contested, as in the paper.
+    The masks mark those of the context that Φ invented, and that Ψ lifted from photographs. Returns
+    None if none are contested, as in the paper.
     """
-    if invented is None or not invented.any() or not state.config.add_observed:
+    if not state.config.add_observed:
         return None
-    source = state.source
-    # A rendered Gaussian that stands for several is invented if all of them are.
-    is_other = torch.zeros(len(source.rendered), dtype=torch.bool, device=invented.device)
-    is_invented = ~is_other.index_fill(0, source.stand_ins[~invented], True)
+    is_invented = mark_rendered(state.source, invented)
+    is_lifted = mark_rendered(state.source, lifted) & ~is_invented
+    if not (is_invented | is_lifted).any():
+        return None
 
-    masks = find_contested_pixels(state, source.rendered[~is_invented], scenes)
+    rendered = state.source.rendered
+    pixels = find_contested_pixels(state, rendered[~is_invented], scenes)
     gone = torch.zeros_like(is_invented)
     # A round lets the next layer step aside: what is behind the first was hidden until then.
     for _ in range(MAX_ROUNDS):
-        left = source.rendered[~gone]
-        found = find_contested_invented(left, is_invented[~gone], state, masks, scenes.renderer)
-        if not found.any():
+        there = ~gone
+        found = find_contested_rows(
+            rendered[there], is_invented[there], is_lifted[there], state, pixels, scenes.renderer
+        )
+        num_before = int(gone.sum())
+        gone = gone.masked_scatter(there, found)
+        if int(found.sum()) <= MIN_LAYER * num_before:
             break
-        gone = gone.masked_scatter(~gone, found)
     return Contested(state, gone) if gone.any() else None
+
+
+def mark_rendered(source: ContextScene, rows: Bool[Tensor, "n"] | None) -> Bool[Tensor, "m"]:
+    """Mark the rendered Gaussians that stand for some of the context alone; none for None."""
+    marked = torch.zeros(
+        len(source.rendered), dtype=torch.bool, device=source.rendered.means.device
+    )
+    return marked if rows is None else ~marked.index_fill(0, source.stand_ins[~rows], True)
 
 
 def find_contested_pixels(
     state: Completion, others: Gaussians, scenes: SceneRenderer
-) -> list[Bool[Tensor, "_ _"]]:
-    """Find the pixels of photographs in which they contest what was invented.
+) -> list[ContestedPixels]:
+    """Find the pixels of photographs in which they contest what earlier commands made.
 
-    The scene is empty there without it, or fits the photograph better, or the photograph shows
-    something else. `others` is that scene.
+    `others` is the scene without what was invented.
     """
     views = [photo.view for photo in state.photos]
     frozen = scenes.freeze_at(state.parts, [view.camera for view in views])
     renders = [scene.render for scene in frozen]
     differences, limit = compare_colors(views, renders)
 
-    def find(view: View, render: Render, difference: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
+    def find(view: View, render: Render, difference: Float[Tensor, "h w"]) -> ContestedPixels:
         rest = scenes.renderer.render(others, view.camera)
         is_empty = compute_hole_mask(rest.alpha, state.config.holes)
         is_worse = measure_error(render, view) > measure_error(rest, view)
-        return (is_empty | is_worse | (difference > limit)) & find_usable(view)
+        is_usable = find_usable(view)
+        is_other = (difference > limit) & is_usable
+        return ContestedPixels(
+            (is_empty | is_worse) & is_usable | is_other, keep_large_regions(is_other)
+        )
 
     return list(get_view_map(others.means, len(others))(find, views, renders, differences))
 
@@ -108,30 +147,32 @@ def measure_error(render: Render, view: View) -> Float[Tensor, "h w"]:
     return average_box(error, ERROR_RADIUS)
 
 
-def find_contested_invented(
+def find_contested_rows(
     scene: Gaussians,
     is_invented: Bool[Tensor, "m"],
+    is_lifted: Bool[Tensor, "m"],
     state: Completion,
-    masks: Sequence[Bool[Tensor, "_ _"]],
+    pixels: Sequence[ContestedPixels],
     renderer: Renderer,
 ) -> Bool[Tensor, "m"]:
-    """Find the invented Gaussians that photographs show mostly in their contested pixels."""
+    """Find the Gaussians that photographs show mostly in the pixels in which they contest them."""
 
-    def sum_shown(view: View, contested: Bool[Tensor, "h w"]) -> Float[Tensor, "m 3"]:
+    def sum_shown(view: View, contested: ContestedPixels) -> Float[Tensor, "m 3"]:
         frozen = renderer.freeze(scene, view.camera)
-        shown = contested & (frozen.splat(is_invented.to(scene.means)) > MIN_WEIGHT)
+        shown = contested.of_invented & (frozen.splat(is_invented.to(scene.means)) > MIN_WEIGHT)
         # Along its borders every photograph shows a little of what was added beside it.
         if shown.float().mean() < MIN_ADDED_SHARE:
             shown = torch.zeros_like(shown)
-        # A backprojection takes three channels.
-        layers = torch.stack([shown, ~shown, torch.zeros_like(shown)], dim=-1)
+        layers = torch.stack([shown, contested.of_lifted, torch.ones_like(shown)], dim=-1)
         return frozen.backproject(layers.to(scene.means))
 
     sums = torch.zeros_like(scene.means)
     views = [photo.view for photo in state.photos]
-    for part in get_view_map(scene.means, len(scene))(sum_shown, views, masks):
+    for part in get_view_map(scene.means, len(scene))(sum_shown, views, pixels):
         sums += part
-    return is_invented & (sums[:, 0] > sums[:, 1]) & (sums[:, 0] > MIN_SUM)
+    in_invented, in_lifted, total = sums.unbind(dim=1)
+    contested = torch.where(is_invented, in_invented, in_lifted)
+    return (is_invented | is_lifted) & (contested > total / 2) & (contested > MIN_SUM)
 
 
 def let_step_aside(state: Completion, contested: Contested | None) -> Completion:

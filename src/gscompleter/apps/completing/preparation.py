@@ -21,7 +21,7 @@ from gscompleter.apps.inputs.depth_range import (
 )
 from gscompleter.apps.inputs.describing import list_missing_photographs as list_missing_photographs
 from gscompleter.apps.inputs.describing import print_lines
-from gscompleter.apps.inputs.invented import mark_invented
+from gscompleter.apps.inputs.earlier_work import mark_earlier_work
 from gscompleter.apps.inputs.memory import check_scene
 from gscompleter.apps.inputs.named_photographs import check_target_files
 from gscompleter.apps.inputs.opening import choose_working_size, open_scene
@@ -127,6 +127,7 @@ class Prepared:
             task.check_views,
             task.target_cameras,
             invented=task.invented,
+            lifted=task.lifted,
             geometry=task.geometry,
         )
         guarding = tuple(begun.with_depth_range(camera) for camera in task.witnesses.guarding)
@@ -353,7 +354,7 @@ def load_models(
             task = apply_splat_range(task, task.scene, completer.renderer)
             # Renders of the splat itself show nothing that it lacks.
             if opened.renders_from is None:
-                task, notes = mark_invented(task)
+                task, notes = mark_earlier_work(task)
                 task, edited = take_over_edits(task, work.splat.forget_edits, completer.renderer)
                 notes = (*notes, *edited)
     print_lines(console, *notes)

@@ -151,6 +151,8 @@ class CompletionTask:
     invented: Bool[Tensor, "n"] | None = None
     """Mask of the Gaussians of `scene` that earlier commands invented, which give way to what
     photographs show; None for none."""
+    lifted: Bool[Tensor, "n"] | None = None
+    """Mask of those that earlier commands lifted from photographs, which give way likewise."""
 
     @property
     def device(self) -> torch.device:

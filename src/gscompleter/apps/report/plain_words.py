@@ -267,11 +267,11 @@ def describe_ignored(summary: CompletionSummary) -> str:
 
 
 def describe_replaced(count: int) -> str:
-    """Describe invented Gaussians that an update or a further completion replaced."""
-    gaussians = "1 invented Gaussian" if count == 1 else f"{count:,} invented Gaussians"
+    """Describe Gaussians of earlier commands that an update or a further completion replaced."""
+    gaussians = "1 Gaussian" if count == 1 else f"{count:,} Gaussians"
     return (
-        f"{gaussians} gave way to what photographs show; removed.ply has them, and strip puts them "
-        "back."
+        f"{gaussians} of earlier commands gave way to what photographs show; removed.ply has them, "
+        "and strip puts them back."
     )
 
 

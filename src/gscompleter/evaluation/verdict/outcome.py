@@ -186,7 +186,7 @@ def describe_work(completion: Completion) -> str:
     elif has_observed:
         return "What photographs show and the splat lacked is added"
     elif completion.source.replaced_mask.any():
-        return "What was invented and photographs contradict is taken out"
+        return "What earlier commands made and photographs contradict is taken out"
     else:
         return "Nothing was added to the splat; only colours changed"
     changed = count_changed(completion.targets)
