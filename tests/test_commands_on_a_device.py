@@ -162,6 +162,22 @@ def test_photographs_update_a_splat_and_others_are_kept_back(room, tmp_path, mon
     assert row["psnr_after"] > row["psnr_before"] + 3
 
 
+@pytest.mark.parametrize("source", ["photographs", "splat alone"])
+def test_a_splat_that_does_not_fit_on_the_gpu_is_refused_before_anything_is_computed(
+    room, tmp_path, monkeypatch, capsys, source
+):
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda *_: (10**6, 2 * 10**6))
+    words = {
+        "photographs": ("update", room, "--scene", room / "cut.ply", "--far", 20),
+        "splat alone": ("complete", room / "splat.ply", "--target", room / "beside.json"),
+    }
+    assert run(monkeypatch, *words[source], *COMMON, "--out", tmp_path / "out") == 2
+    sentence = capsys.readouterr().err
+    assert "on the GPU, and 1 GB are free there" in sentence
+    assert "--renderer-device" in sentence
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.slow
 def test_new_photographs_are_placed_and_update_a_splat(tmp_path, monkeypatch):
     pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")

@@ -17,6 +17,7 @@ import torch
 from fake_cuda import CUDA, Counts, FakeCudaTensor, get_device
 from fake_gsplat import WHEEL, fake_gsplat, find_gsplat
 from gscompleter import CompleterConfig, GSCompleter, load_renderer
+from gscompleter.apps.inputs.memory import estimate_gpu_memory
 from gscompleter.config import GapConfig
 from gscompleter.numerics.geometry import pad_camera
 from gscompleter.render.device import Devices, choose_devices
@@ -286,3 +287,8 @@ def test_a_given_splat_is_completed_with_photographs_that_check_it(device):
     done = complete(views[:2], target, scene, check_views=views)
     assert isinstance(done.scene.means, FakeCudaTensor)
     assert len(done.added) > 30
+    # What is added is not known when the memory is estimated, and is a third of this small scene.
+    memory = get_device().memory
+    estimate = estimate_gpu_memory(done.scene, [photo.view.camera for photo in done.photos])
+    peak = max(memory.peaks.values())
+    assert 0.7 * peak < estimate < 1.5 * peak

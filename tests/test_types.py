@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from gscompleter import GSCompleter, InputError
+from gscompleter import GSCompleter, InputError, merge
 from scenes import Room, camera_at, gaussians_of, random_gaussians, view_of
 
 
@@ -255,3 +255,8 @@ def unchecked(make, *arguments, **changes):
         return make(*arguments, **changes)
     finally:
         config.update("jaxtyping_disable", before)
+
+
+def test_a_scene_of_one_part_is_not_copied():
+    scene = random_gaussians(5)
+    assert merge([scene]) is scene

@@ -38,10 +38,12 @@ from gscompleter.cli import run
 try:
     run()
 finally:
+    import os
     from gscompleter.evaluation.memory import read_process_peak
-    print(read_process_peak() or "")
+    print(sum(os.times()[:4]), read_process_peak() or "")
 """
-"""Program of a process. It prints its own peak, because a child inherits its parent's."""
+"""Program of a process. It prints its CPU seconds, with those of its own processes, and its peak,
+because a child inherits its parent's."""
 
 Yardstick = Callable[[], object]
 T = TypeVar("T")
@@ -57,6 +59,8 @@ class Sample:
 
     seconds: Mapping[str, float]
     yardstick: float
+    cpu: float
+    """CPU seconds of all threads and further processes, which a busy machine changes least."""
     peak_bytes: int | None
     gaussians: Mapping[str, int]
 
@@ -131,16 +135,19 @@ def make_surface(camera: Camera) -> Gaussians:
 
 def measure_command(words: Sequence[str], out: Path, yardstick: Yardstick) -> Sample:
     """Measure one run of a command that writes to `out`, in a process of its own."""
-    (spent, peak_bytes), unit = measure_beside(yardstick, lambda: run_command(words))
+    (spent, cpu, peak_bytes), unit = measure_beside(yardstick, lambda: run_command(words))
     # The stages were timed by the command itself; what it needed besides is the rest.
     summary = json.loads((out / SUMMARY_FILE).read_bytes())
     stages = summary["seconds"]
     seconds = {**stages, REST: spent - stages["total"], PROCESS: spent}
-    return Sample(seconds, unit, peak_bytes, summary["gaussians"])
+    return Sample(seconds, unit, cpu, peak_bytes, summary["gaussians"])
 
 
-def run_command(words: Sequence[str]) -> tuple[float, int | None]:
-    """Return wall seconds and peak bytes of `gscompleter` in a process; raise its InputError."""
+def run_command(words: Sequence[str]) -> tuple[float, float, int | None]:
+    """Return wall seconds, CPU seconds and peak bytes of `gscompleter` in a process of its own.
+
+    Raises its InputError.
+    """
     start = time.perf_counter()
     done = run_python(PROGRAM, words)
     seconds = time.perf_counter() - start
@@ -148,24 +155,25 @@ def run_command(words: Sequence[str]) -> tuple[float, int | None]:
         raise InputError(done.stderr.strip().removeprefix("gscompleter: "))
     if done.returncode != 0:
         raise RuntimeError(f"gscompleter {' '.join(words)} failed:\n{done.stderr}")
-    peak = done.stdout.splitlines()[-1]
-    return seconds, int(peak) if peak else None
+    cpu, *peak = done.stdout.splitlines()[-1].split()
+    return seconds, float(cpu), int(peak[0]) if peak else None
 
 
 def measure_call(complete: Callable[[], Completion], device: str, yardstick: Yardstick) -> Sample:
     """Measure one completion within this process."""
 
-    def run() -> tuple[Completion, float, Peak]:
+    def run() -> tuple[Completion, float, float, Peak]:
         start = time.perf_counter()
+        cpu_start = time.process_time()
         with measure_peak_memory(device) as peak:
             done = complete()
-        return done, time.perf_counter() - start, peak
+        return done, time.perf_counter() - start, time.process_time() - cpu_start, peak
 
-    (done, spent, peak), unit = measure_beside(yardstick, run)
+    (done, spent, cpu, peak), unit = measure_beside(yardstick, run)
     added = sum(len(result.added) for result in done.targets)
     counts = {"context": len(done.scene) - added, "added": added}
     seconds = {**done.seconds, REST: spent - done.seconds["total"], PROCESS: spent}
-    return Sample(seconds, unit, peak.bytes, counts)
+    return Sample(seconds, unit, cpu, peak.bytes, counts)
 
 
 def measure_in_rounds(

@@ -36,6 +36,11 @@ class Measured:
         return median(sample.ratio for sample in self.samples)
 
     @property
+    def cpu(self) -> float:
+        """CPU seconds."""
+        return median(sample.cpu for sample in self.samples)
+
+    @property
     def peak_bytes(self) -> int:
         """Largest peak memory, or 0 if unknown."""
         return max(sample.peak_bytes or 0 for sample in self.samples)
@@ -96,6 +101,7 @@ def format_growth_table(axis: str, points: Mapping[int, Measured]) -> str:
     # The last row has an exponent below each column of `format_cells`.
     values = [[point.seconds[column] for point in measured] for column in columns]
     values.append([point.ratio for point in measured])
+    values.append([point.cpu for point in measured])
     values.append([float(point.peak_bytes) for point in measured])
     exponents = [fit_exponent(list(points), column) for column in values]
     rows.append(["exponent", *["–" if p is None else f"{p:.2f}" for p in exponents]])
@@ -106,7 +112,8 @@ def format_table(
     first: str, columns: Sequence[str], rows: Sequence[Sequence[str]], *last: str
 ) -> str:
     """Format rows of `format_cells` with further cells, whose columns are `last`."""
-    return format_markdown([first, *columns, "in yardsticks", "peak (GB)", *last], rows)
+    titles = ("in yardsticks", "CPU seconds", "peak (GB)")
+    return format_markdown([first, *columns, *titles, *last], rows)
 
 
 def select_columns(measured: Sequence[Measured], columns: Sequence[str]) -> list[str]:
@@ -119,7 +126,7 @@ def select_columns(measured: Sequence[Measured], columns: Sequence[str]) -> list
 
 
 def format_cells(measured: Measured, columns: Sequence[str]) -> list[str]:
-    """Format the name, the seconds of each column, the yardsticks, and the memory."""
+    """Format the name, the seconds of each column, yardsticks, CPU seconds, and the memory."""
     # Medians of all samples, computed once.
     seconds = measured.seconds
     ratios = [sample.ratio for sample in measured.samples]
@@ -128,5 +135,6 @@ def format_cells(measured: Measured, columns: Sequence[str]) -> list[str]:
         measured.name,
         *(f"{seconds[column]:.2f}" if column in seconds else "–" for column in columns),
         f"{measured.ratio:.1f}{spread}",
+        f"{measured.cpu:.1f}",
         f"{measured.peak_bytes / 1e9:.2f}" if measured.peak_bytes else "–",
     ]

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from gscompleter.planning.remove import remove as remove
     from gscompleter.reconstructors import DepthAware as DepthAware
     from gscompleter.reconstructors import Lifter as Lifter
+    from gscompleter.reconstructors import PartReconstructor as PartReconstructor
     from gscompleter.reconstructors import Reconstructor as Reconstructor
     from gscompleter.reconstructors import load_reconstructor as load_reconstructor
     from gscompleter.reconstructors.depth_predictors import DepthPredictor as DepthPredictor
@@ -90,6 +91,7 @@ _HOMES = {
     "make_observed": "types",
     "Reconstructor": "reconstructors",
     "Lifter": "reconstructors",
+    "PartReconstructor": "reconstructors",
     "DepthAware": "reconstructors",
     "DepthPredictor": "reconstructors.depth_predictors",
     "DepthModel": "reconstructors.from_depth",

@@ -351,7 +351,7 @@ class GSCompleter:
                 losses={"register": moved.losses, "refine": filled.losses},
                 registered=moved.gaussians if self.keep_registered else None,
                 num_outside=count_outside(added, target) if state.is_given else 0,
-                num_recolored=recolored.count,
+                num_recolored=len(recolored.rows),
                 synthesis_notes=image.notes,
                 lift_notes=lifted.notes,
                 geometry=count_on_geometry(use, added, image),

@@ -556,6 +556,8 @@ def merge(parts: Sequence[Gaussians]) -> Gaussians:
     if len({part.is_antialiased for part in parts}) > 1:
         raise InputError("Antialiased Gaussians cannot be merged with others; convert one of them.")
 
+    if len(parts) == 1:
+        return parts[0]
     origin = next((part.origin for part in parts if part.origin is not None), None)
     parts = [part if part.origin is None else part.move_origin(origin) for part in parts]
     k = max(part.sh.shape[1] for part in parts)

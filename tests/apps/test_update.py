@@ -7,6 +7,8 @@ import pytest
 
 from command import run
 from gscompleter import load_ply, save_ply
+from gscompleter.evaluation.verdict import held_out
+from gscompleter.evaluation.verdict.held_out import render_before_after as render
 from gscompleter.parts import NOT_INVENTED
 from gscompleter.system.files.image import write_image
 from gscompleter.types import merge
@@ -49,15 +51,20 @@ def test_photographs_fill_a_splat_and_others_confirm_it(room, cut, tmp_path, mon
     out = tmp_path / "out"
     words = ("update", room, "--scene", cut, "--far", 20, "--hold-out", 2, "--out", out)
     words += ("--resolution", 64)
+    drawn = []
+    monkeypatch.setattr(
+        held_out, "render_before_after", lambda *given: drawn.append(given[1]) or render(*given)
+    )
     assert run(monkeypatch, *words) == 0
+    # Scores and pictures are of the same renders.
+    assert len(drawn) == len({id(camera) for camera in drawn}) == 6
     summary = read_summary(out)
     assert summary["targets"] == []
     assert summary["gaussians"]["from_photographs"] == summary["gaussians"]["added"] > 100
     assert summary["settings"]["hold_out"] == 2
 
     # Photographs that were kept back are neither in the context nor among the checks.
-    held_out = [row["frame"] for row in summary["held_out"]]
-    assert held_out == [1, 4]
+    assert [row["frame"] for row in summary["held_out"]] == [1, 4]
     used = [row["frame"] for row in (*summary["context"], *summary["checks"])]
     assert sorted(used) == [0, 2, 3, 5]
     for row in (*summary["context"], *summary["held_out"]):

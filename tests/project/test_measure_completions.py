@@ -71,7 +71,7 @@ def quick(scene, tmp_path_factory):
 
 def sample(seconds: float, yardstick: float = 0.5) -> Sample:
     counts = {"context": 1, "added": 2}
-    return Sample({"lift": seconds / 4, PROCESS: seconds}, yardstick, 2**30, counts)
+    return Sample({"lift": seconds / 4, PROCESS: seconds}, yardstick, 2 * seconds, 2**30, counts)
 
 
 @pytest.mark.slow
@@ -183,7 +183,7 @@ def test_a_sample_in_yardsticks_is_its_seconds_over_theirs():
     assert measured.ratio == 5.0
     assert measured.peak_bytes == 2**30
     table = format_report(Report({}, {"repeats": 3}, (measured,), {}))
-    assert "| case | 0.75 | 3.00 | 5.0 (2.0–6.0) | 1.07 | 1 | 2 |" in table
+    assert "| case | 0.75 | 3.00 | 5.0 (2.0–6.0) | 6.0 | 1.07 | 1 | 2 |" in table
 
 
 def test_everything_has_its_turn_before_anything_has_two():
@@ -210,7 +210,7 @@ def test_a_case_that_several_series_share_is_measured_once():
 def test_growth_is_told_with_its_exponents():
     series = {n: Measured(f"{n}", [sample(0.1 * n)]) for n in (1, 2, 4)}
     report = Report({"cores": 2}, {"repeats": 1}, (series[1],), {"targets": series})
-    assert "| exponent | 1.00 | 1.00 | 1.00 | 0.00 |" in format_report(report)
+    assert "| exponent | 1.00 | 1.00 | 1.00 | 1.00 | 0.00 |" in format_report(report)
 
 
 def test_the_cases_of_the_documentation_can_be_read():
@@ -233,7 +233,8 @@ def test_a_process_that_refuses_its_input_says_why(tmp_path):
 
 def test_a_process_tells_its_own_memory_and_not_its_parents():
     ballast = torch.ones(2**28)  # 1 GiB
-    seconds, peak_bytes = run_command(["models", "--json"])
+    seconds, cpu, peak_bytes = run_command(["models", "--json"])
+    assert 0.05 < cpu < 60
     assert seconds > 0
     assert peak_bytes is None or 0 < peak_bytes < ballast.numel() * 4
 

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from gscompleter import View, load_renderer
-from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.numerics.geometry import project
+from gscompleter.evaluation.metrics.image import compute_masked_psnr, psnr
+from gscompleter.numerics.geometry import compute_sparse_depth, find_at_depth, look_up, project
 from gscompleter.numerics.kernels import stereo
 from gscompleter.reconstructors.features.neighbours import (
     NUM_COMPARED,
@@ -33,6 +33,7 @@ from gscompleter.reconstructors.plane_sweep.sweep import UNSEEN_COST, compute_co
 from scenes import Room, camera_at, gaussians_of, view_of
 
 SIZE = 64
+RENDERER = load_renderer("cpu")
 Matched = tuple[np.ndarray, np.ndarray]
 
 
@@ -265,3 +266,34 @@ def test_large_images_are_matched_at_half_their_size_first(monkeypatch, count, s
     depths = PlaneSweep().estimate_depths(row_of_views(count, size=size))
     assert matched == expected
     assert {tuple(depth.depth.shape) for depth in depths} == {(size, size)}
+
+
+def test_a_part_is_built_alone_and_as_in_the_whole(found):
+    """A scene that lacks little asks for that alone, and the fit takes most of the time."""
+    views, middle, whole = found
+    masks = [torch.zeros(SIZE, SIZE, dtype=torch.bool) for _ in views]
+    masks[1][20:40, 24:44] = True
+    part = PlaneSweep().reconstruct_part(views, masks)
+    for ours, theirs in zip(part.depths, whole.depths, strict=True):
+        assert torch.equal(ours.depth, theirs.depth)
+    assert 400 < len(part.gaussians) < 0.4 * len(whole.gaussians)
+
+    # All that the mask shows is there, also by pixels of other views.
+    def name_pixels(scene, rows):
+        names = torch.stack([scene.view_index[rows], scene.pixel_index[rows]], dim=1)
+        return set(map(tuple, names.tolist()))
+
+    camera = views[1].camera
+    is_shown = find_at_depth(whole.gaussians, whole.depths[1].depth, camera)
+    is_shown &= look_up(masks[1], whole.gaussians, camera)
+    shown = name_pixels(whole, is_shown)
+    assert {number for number, _ in shown} != {1}
+    assert shown <= name_pixels(part, slice(None))
+
+    # It looks as in the whole, in the view of the mask and in another one.
+    pixels = compute_sparse_depth(whole.gaussians.means[is_shown], middle.camera) > 0
+    assert pixels.sum() > 200
+    for view, mask in ((views[1], masks[1]), (middle, pixels)):
+        images = [RENDERER.render(scene.gaussians, view.camera).image for scene in (part, whole)]
+        alone, among_all = (compute_masked_psnr(image, view.image, mask) for image in images)
+        assert alone > among_all - 0.2

@@ -71,6 +71,34 @@ def test_a_hole_that_photographs_show_is_filled_from_them():
     assert torch.equal(state.scene.means[: len(CUT)], CUT.means)
 
 
+def test_a_reconstructor_of_parts_is_asked_for_what_is_lacking():
+    class Exact:
+        """An ideal Ψ, which returns the Gaussians of the pixels that are asked for."""
+
+        shares: tuple[float, ...] = ()
+
+        def __call__(self, views: list[View]) -> Reconstruction:
+            raise AssertionError("the whole is not needed")
+
+        def reconstruct_part(self, views: list[View], masks: list[torch.Tensor]) -> Reconstruction:
+            self.shares = tuple(mask.float().mean().item() for mask in masks)
+            whole = reconstruct_exactly(views)
+            rows = torch.cat([mask.flatten() for mask in masks])
+            return replace(
+                whole,
+                gaussians=whole.gaussians[rows],
+                view_index=whole.view_index[rows],
+                pixel_index=whole.pixel_index[rows],
+            )
+
+    psi = Exact()
+    state = GSCompleter(psi, config=SPLAT).begin(PHOTOS[:2], CUT, PHOTOS[2:])
+    assert len(psi.shares) == len(PHOTOS)
+    assert 0 < max(psi.shares) < 0.3
+    for before, after in zip(score(CUT), score(state.scene), strict=True):
+        assert after > before + 8
+
+
 def test_additions_in_one_place_are_dropped(monkeypatch):
     """Each of five photographs has a Gaussian for each of its pixels of the same box."""
     few = begin(CUT)

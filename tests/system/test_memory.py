@@ -5,8 +5,10 @@ import pytest
 from gscompleter import InputError
 from gscompleter.system.memory import (
     check_bytes,
+    check_gpu_bytes,
     check_memory,
     estimate_bytes,
+    estimate_gpu_bytes,
     estimate_scene_bytes,
     read_memory_bytes,
 )
@@ -84,3 +86,29 @@ def test_a_container_may_hold_less_than_the_machine(tmp_path, monkeypatch):
     whole = read_memory_bytes()
     assert whole is not None
     assert whole > 10**9
+
+
+# Gaussians at the end, harmonics, photographs of 32 x 32 pixels that show all of them: bytes.
+ON_A_GPU = [
+    (5139, 1, 2, 5_114_721),
+    (5077, 1, 6, 11_197_110),
+    # The normal equations of 4,096 Gaussians at a time are not counted: 15 MB for a scene of any
+    # size.
+    (5139, 16, 2, 22_276_769 - 7_953_280 - 7_485_440),
+]
+
+
+@pytest.mark.parametrize(("count", "harmonics", "photographs", "counted"), ON_A_GPU)
+def test_the_estimate_for_a_gpu_is_close_to_what_a_device_counted(
+    count, harmonics, photographs, counted
+):
+    pixels = photographs * 32 * 32
+    estimate = estimate_gpu_bytes(count, harmonics, [count] * photographs, pixels)
+    assert 0.95 * counted < estimate < 1.15 * counted
+
+
+def test_what_a_gpu_cannot_hold_is_refused_with_both_numbers():
+    needed = estimate_gpu_bytes(10**7, 16, [5 * 10**6] * 8, 8 * 1920 * 1080)
+    check_gpu_bytes(needed, 24 * 10**9, "They")
+    with pytest.raises(InputError, match=r"They need about .* GB on the GPU, and 12 GB are free"):
+        check_gpu_bytes(needed, 12 * 10**9, "They")

@@ -14,6 +14,9 @@ from torch.nn.functional import normalize
 
 from gscompleter.types import Camera, Gaussians, PaddedCamera
 
+SAME_SURFACE = 0.03
+"""Relative distance from a surface within which a Gaussian counts as what is seen of it."""
+
 
 def unproject(depth: Float[Tensor, "h w"], camera: Camera) -> Float[Tensor, "h w 3"]:
     """Lift z-depths at the pixel centres of `camera` to world points."""
@@ -302,6 +305,14 @@ def compute_spacing(cameras: Sequence[Camera]) -> float:
     apart.fill_diagonal_(torch.inf)
     nearest = apart.amin(dim=1)
     return nearest.median().item() if len(cameras) > 1 else 0.0
+
+
+def find_at_depth(
+    gaussians: Gaussians, depth: Float[Tensor, "h w"], camera: Camera
+) -> Bool[Tensor, "n"]:
+    """Find the Gaussians whose means are on the surfaces at `depth`, z-depth in scene units."""
+    surface = look_up(depth, gaussians, camera)
+    return (compute_z_depths(gaussians.means, camera) - surface).abs() < SAME_SURFACE * surface
 
 
 def project_mask(

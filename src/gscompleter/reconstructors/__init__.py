@@ -47,6 +47,16 @@ class Lifter(Protocol):
 
 
 @runtime_checkable
+class PartReconstructor(Protocol):
+    """Interface of a Ψ that can reconstruct only what some pixels of its views show."""
+
+    def reconstruct_part(
+        self, views: Sequence[View], masks: Sequence[Bool[Tensor, "_ _"]]
+    ) -> Reconstruction:
+        """Reconstruct the depth of `views`, and the Gaussians that any shows in its mask."""
+
+
+@runtime_checkable
 class NearPlaneFinder(Protocol):
     """Interface of a Ψ that tells from its matches that surfaces stand before the near plane."""
 
@@ -72,9 +82,24 @@ def run_reconstructor(
     With `pixel_mask`, only these pixels of the first view need Gaussians; Ψ may return more.
     """
     if pixel_mask is not None and isinstance(reconstructor, Lifter):
-        reconstruction = reconstructor.lift(views, pixel_mask)
-    else:
-        reconstruction = reconstructor(views)
+        return accept_reconstruction(reconstructor.lift(views, pixel_mask), views)
+    return accept_reconstruction(reconstructor(views), views)
+
+
+def run_part_reconstructor(
+    reconstructor: Reconstructor, views: Sequence[View], masks: Sequence[Bool[Tensor, "_ _"]]
+) -> Reconstruction:
+    """Run Ψ on `views`, of which only what any shows in its mask needs Gaussians.
+
+    Ψ may return more. Raises InputError as `run_reconstructor`.
+    """
+    if isinstance(reconstructor, PartReconstructor):
+        return accept_reconstruction(reconstructor.reconstruct_part(views, masks), views)
+    return accept_reconstruction(reconstructor(views), views)
+
+
+def accept_reconstruction(reconstruction: Reconstruction, views: Sequence[View]) -> Reconstruction:
+    """Check what Ψ returns for `views`, and detach it."""
     check_reconstruction(reconstruction, views)
     return replace(
         reconstruction,

@@ -57,8 +57,13 @@ class SceneRenderer:
     ) -> FrozenScene:
         """Extend a frozen scene if the new one begins with its parts, else freeze anew.
 
-        Parts are immutable, so that an identical object is an equal part.
+        Parts are immutable, so that an identical object is an equal part. A first one that was only
+        recoloured is repainted.
         """
+        if frozen is not None and known[0] is not parts[0] and differ_in_color(known[0], parts[0]):
+            rows = (known[0].sh != parts[0].sh).any(dim=(1, 2)).nonzero()[:, 0]
+            frozen = frozen.repaint(rows, parts[0][rows])
+            known = (parts[0], *known[1:])
         shared = 0
         while shared < min(len(known), len(parts)) and known[shared] is parts[shared]:
             shared += 1
@@ -75,6 +80,14 @@ class SceneRenderer:
             if pair[0] is part:
                 return pair
         return part, thin_gaussians(part, MAX_PREVIEW_GAUSSIANS)
+
+
+def differ_in_color(one: Gaussians, other: Gaussians) -> bool:
+    """Check whether two scenes are the same Gaussians in other colours."""
+    names = ("means", "quats", "scales", "opacities")
+    is_same = all(getattr(one, name) is getattr(other, name) for name in names)
+    has_same_form = one.sh.shape == other.sh.shape and one.is_antialiased == other.is_antialiased
+    return is_same and has_same_form
 
 
 def make_camera_key(camera: Camera) -> Hashable:

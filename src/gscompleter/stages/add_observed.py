@@ -18,14 +18,14 @@ from torch import Tensor
 
 from gscompleter.config import HoleConfig
 from gscompleter.numerics.geometry import (
-    compute_z_depths,
+    find_at_depth,
     look_up,
     measure_baseline,
     select_spread_cameras,
 )
 from gscompleter.numerics.image_ops import dilate, label_regions
 from gscompleter.parts import PartOrigin
-from gscompleter.reconstructors import Reconstructor, run_reconstructor
+from gscompleter.reconstructors import Reconstructor, run_part_reconstructor
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.fit_colors import RELAXATION, fit_colors
 from gscompleter.render.protocols import FrozenScene
@@ -63,8 +63,6 @@ NEARER = 0.97
 """Ratio to the depth of the scene below which a photograph shows something in front of it."""
 MIN_NEARER = 0.5
 """Smallest share of the measured pixels of a contradicted region that have to be nearer."""
-SAME_SURFACE = 0.03
-"""Relative distance from the depth of a photograph within which a Gaussian is what it shows."""
 OBSERVED_COLOR_ROUNDS = 5
 """Rounds in which colours are fitted to all photographs."""
 
@@ -214,11 +212,13 @@ def reconstruct_lacking(
     Returns the sentences of Ψ, too.
     """
     views = []
+    needed = []
     for photo in photos:
+        needed.append(dilate(photo.lack.mask, state.config.holes.dilation))
         known = photo.view.valid_mask & ~photo.lack.mask
         image = match_exposure(photo.view.image, photo.frozen.render.image, known)
         views.append(replace(photo.view, image=image))
-    reconstruction = run_reconstructor(reconstructor, views)
+    reconstruction = run_part_reconstructor(reconstructor, views, needed)
 
     # D_pred is Ψ's depth of a photograph, D_ctx that of the scene there, where it is not wrong.
     affines = []
@@ -282,9 +282,7 @@ def find_photographed(
     gaussians = reconstruction.gaussians
     shown = torch.zeros(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     for number, (view, mask) in enumerate(zip(views, masks, strict=True)):
-        z = compute_z_depths(gaussians.means, view.camera)
-        depth = look_up(reconstruction.depths[number].depth, gaussians, view.camera)
-        is_visible = (z - depth).abs() < SAME_SURFACE * depth
+        is_visible = find_at_depth(gaussians, reconstruction.depths[number].depth, view.camera)
         shown |= is_visible & look_up(mask, gaussians, view.camera)
         if reconstruction.view_index is not None and reconstruction.pixel_index is not None:
             own = reconstruction.view_index == number

@@ -8,6 +8,7 @@ the direction of the target, and held in the directions of photographs and of ea
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import torch
 from jaxtyping import Float, Float64, Int64
@@ -38,10 +39,17 @@ class Recolored:
     """The scene after recolouring."""
 
     state: Completion
-    frozen: FrozenScene
-    """The scene frozen at the padded target."""
-    count: int
-    """Number of rendered Gaussians with new colours."""
+    view: TargetView
+    """The scene before, at the padded target."""
+    rows: Int64[Tensor, "c"]
+    """Rows of the rendered Gaussians with new colours."""
+
+    @cached_property
+    def frozen(self) -> FrozenScene:
+        """The scene frozen at the padded target."""
+        if len(self.rows) == 0:
+            return self.view.frozen
+        return self.view.frozen.repaint(self.rows, self.state.rendered_context[self.rows])
 
 
 @timed_stage("integrate")
@@ -55,12 +63,13 @@ def recolor(reference: GeneratedView, view: TargetView, origin: PartOrigin) -> R
     state = view.state
     camera = view.camera.padded
     context = state.rendered_context
+    unchanged = Recolored(state, view, torch.empty(0, dtype=torch.int64))
     # Under full trust no pixel is distrusted; a GPU need not be asked.
     if view.alpha is view.render.alpha and not reference.is_photograph:
-        return Recolored(state, view.frozen, 0)
+        return unchanged
     weight = torch.ones_like(view.alpha) if reference.is_photograph else view.distrust
     if reference.is_inconsistent or not weight.any():
-        return Recolored(state, view.frozen, 0)
+        return unchanged
     rows, delta = fit_image_colors(
         merge(state.parts),
         context.sh.shape[1],
@@ -72,7 +81,7 @@ def recolor(reference: GeneratedView, view: TargetView, origin: PartOrigin) -> R
         state.config.recolor,
     )
     if len(rows) == 0:
-        return Recolored(state, view.frozen, 0)
+        return unchanged
 
     recolored = replace(
         context,
@@ -81,8 +90,7 @@ def recolor(reference: GeneratedView, view: TargetView, origin: PartOrigin) -> R
     )
     # Trusted at later targets: otherwise targets in a row compound their errors (decision 038).
     trust = state.trust.accept(view.frozen, camera, rows)
-    changed = replace(state, rendered_context=recolored, trust=trust)
-    return Recolored(changed, view.scenes.freeze(changed.parts, camera), len(rows))
+    return Recolored(replace(state, rendered_context=recolored, trust=trust), view, rows)
 
 
 def fit_image_colors(

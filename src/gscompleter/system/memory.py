@@ -28,6 +28,17 @@ BYTES_PER_SPLAT = 52
 BYTES_PER_PHOTO_PIXEL = 400
 """Bytes per pixel of each photograph of an input splat, for the fit to it."""
 
+# Counted on a device that is none, and not on a GPU: what compiled kernels allocate for themselves
+# is missing.
+GPU_BYTES_PER_GAUSSIAN = 390
+"""Bytes on a GPU per Gaussian of degree 0, apart from what each view holds of it."""
+GPU_BYTES_PER_SPLAT = 290
+"""Bytes per Gaussian in a view that is frozen there, while opacities are fitted to it."""
+GPU_COPIES = 2
+"""Copies of the harmonics beyond degree 0 at once, each with the scene."""
+GPU_BYTES_PER_PIXEL = 80
+"""Bytes per pixel of each image there."""
+
 # Of containers, for cgroup versions 2 and 1.
 _LIMIT_FILES = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
 
@@ -80,6 +91,28 @@ def estimate_scene_bytes(count: int, numbers: int, photographs: Sequence[int]) -
     observed = 2 * 4 * number * rendered  # areas and agreement of every Gaussian
     fitted = BYTES_PER_PHOTO_PIXEL * sum(photographs)
     return count * (4 * numbers + FREEZING_BYTES) + views + observed + fitted
+
+
+def estimate_gpu_bytes(count: int, harmonics: int, shown: Sequence[int], pixels: int) -> int:
+    """Estimate the peak memory of a GPU for `count` Gaussians with so many harmonics of a channel.
+
+    `shown` is the number that each photograph shows, and `pixels` are those of all together. What
+    will be added is not known before.
+    """
+    further = 4 * 3 * (harmonics - 1)
+    scene = count * (GPU_BYTES_PER_GAUSSIAN + GPU_COPIES * further)
+    return scene + GPU_BYTES_PER_SPLAT * sum(shown) + GPU_BYTES_PER_PIXEL * pixels
+
+
+def check_gpu_bytes(needed: int, available: int, number: str) -> None:
+    """Raise InputError if `needed` bytes, for what `number` says, exceed those free on the GPU."""
+    if needed > available:
+        raise InputError(
+            f"{number} need about {format_whole_gigabytes(needed)} on the GPU, and "
+            f"{format_whole_gigabytes(available)} are free there; draw on the CPU, choose a "
+            "smaller resolution, or give fewer photographs.",
+            "renderer-device",
+        )
 
 
 def count_fitting_gaussians(number: int) -> int:

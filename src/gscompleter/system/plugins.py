@@ -7,7 +7,6 @@ import sys
 from collections.abc import Callable
 from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
 from importlib.util import module_from_spec, spec_from_file_location
 from pathlib import Path
 from types import ModuleType
@@ -22,6 +21,9 @@ FILE_PATTERN = r"^(.+\.py):([A-Za-z_]\w*)$"
 @cache
 def load_plugins(group: str) -> dict[str, Any]:
     """Merge the tables that the entry points of a group name: from a model's name to its loader."""
+    # Help pages import this file and need none of it, which takes a tenth of their time.
+    from importlib.metadata import entry_points
+
     table: dict[str, Any] = {}
     for point in entry_points(group=group):
         table |= point.load()

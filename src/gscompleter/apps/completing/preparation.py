@@ -22,7 +22,7 @@ from gscompleter.apps.inputs.depth_range import (
 from gscompleter.apps.inputs.describing import list_missing_photographs as list_missing_photographs
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.inputs.earlier_work import mark_earlier_work
-from gscompleter.apps.inputs.memory import check_scene
+from gscompleter.apps.inputs.memory import check_gpu, check_scene
 from gscompleter.apps.inputs.named_photographs import check_target_files
 from gscompleter.apps.inputs.opening import choose_working_size, open_scene
 from gscompleter.apps.inputs.paintings import read_paintings
@@ -297,7 +297,10 @@ def read_inputs(
                     check_scene(task, given)
     if splat is None or given is None:
         return task
-    return add_splat(task, splat, given, opened)
+    task = add_splat(task, splat, given, opened)
+    if device == "cuda":
+        check_gpu(task)
+    return task
 
 
 def add_paintings(task: CompletionTask, targets: TargetRequest, opened: Opened) -> CompletionTask:
@@ -499,6 +502,8 @@ def read_splat_alone(
         alone = open_renders(request, splat_file, gaussians, renderer, device)
         if device == "cpu":
             check_scene(alone.task, gaussians)
+        else:
+            check_gpu(alone.task)
     config = work.config.choose_margin(alone.kind.is_lifted).for_holes(alone.kind.holes)
     return alone.opened, add_paintings(alone.task, targets, alone.opened), config
 

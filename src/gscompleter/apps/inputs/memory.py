@@ -2,11 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
+import torch
 from torch import Tensor
 
 from gscompleter.apps.inputs.task import CompletionTask
-from gscompleter.system.memory import check_bytes, estimate_bytes, estimate_scene_bytes
-from gscompleter.types import Gaussians
+from gscompleter.numerics.geometry import is_inside, project
+from gscompleter.system.memory import (
+    check_bytes,
+    check_gpu_bytes,
+    estimate_bytes,
+    estimate_gpu_bytes,
+    estimate_scene_bytes,
+)
+from gscompleter.types import Camera, Gaussians
+
+NUM_SAMPLED = 100_000
+"""Gaussians of which is counted what each photograph shows."""
 
 
 def check_scene(task: CompletionTask, scene: Gaussians) -> None:
@@ -15,6 +28,29 @@ def check_scene(task: CompletionTask, scene: Gaussians) -> None:
     what = f"The {len(scene):,} Gaussians of the scene and {photographs} photographs"
     remedy = "crop the scene, or give a folder with fewer photographs"
     check_bytes(estimate_memory(task, scene), what, remedy)
+
+
+def check_gpu(task: CompletionTask) -> None:
+    """Refuse a placed splat that does not fit on the GPU together with its photographs."""
+    assert task.scene is not None
+    views = [*task.views, *(task.check_views or ())]
+    needed = estimate_gpu_memory(task.scene, [view.camera for view in views])
+    free, _ = torch.cuda.mem_get_info()
+    what = f"The {len(task.scene):,} Gaussians of the scene and {len(views)} photographs"
+    check_gpu_bytes(needed, free, what)
+
+
+def estimate_gpu_memory(scene: Gaussians, cameras: Sequence[Camera]) -> int:
+    """Estimate the bytes that a completion of a placed splat needs on a GPU.
+
+    `cameras` are those of its photographs.
+    """
+    # Views on a GPU hold the Gaussians in their image, whatever hides them.
+    means = scene.means[:: max(1, len(scene) // NUM_SAMPLED)]
+    inside = [is_inside(*project(means, camera), camera).float().mean() for camera in cameras]
+    shown = [round(len(scene) * share) for share in torch.stack(inside).tolist()]
+    pixels = sum(camera.width * camera.height for camera in cameras)
+    return estimate_gpu_bytes(len(scene), scene.sh.shape[1], shown, pixels)
 
 
 def estimate_memory(task: CompletionTask, scene: Gaussians | None) -> int:

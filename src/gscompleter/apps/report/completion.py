@@ -14,8 +14,8 @@ from gscompleter.apps.inputs.task import InputSplatFile, Target
 from gscompleter.apps.report.pictures import (
     IMAGES_FOLDER,
     write_images,
-    write_photographs,
     write_pictures,
+    write_what_is_drawn,
 )
 from gscompleter.apps.report.record import MAX_PHOTOGRAPHS, make_record, thin_evenly
 from gscompleter.apps.report.removal_pictures import draw_removal
@@ -26,7 +26,7 @@ from gscompleter.apps.report.schema import (
 from gscompleter.apps.report.score_rows import count_changes, make_score_rows, measure_gaps
 from gscompleter.evaluation.gap_pictures import draw_gap
 from gscompleter.evaluation.metrics.coverage import RenderPair, compute_coverage
-from gscompleter.evaluation.verdict.held_out import HeldOut, render_before_after
+from gscompleter.evaluation.verdict.held_out import HeldOut, make_drawing, render_before_after
 from gscompleter.evaluation.verdict.kept import measure_kept
 from gscompleter.render.protocols import Renderer
 from gscompleter.splats.edits import EditDraft
@@ -37,7 +37,7 @@ from gscompleter.system.files.result_format import RESULT_MARK
 from gscompleter.system.files.writing import (
     SUMMARY_FILE,
 )
-from gscompleter.types import Camera, View
+from gscompleter.types import Camera
 
 
 def write_report(
@@ -68,21 +68,22 @@ def write_report(
         render_before_after(completion, result.target, renderer) for result in completion.targets
     ]
     gaps = measure_gaps(completion, renderer)
-    scores = make_score_rows(
-        completion, targets, at_targets, gaps, renderer, held_out, files, has_searched
-    )
+    (folder / IMAGES_FOLDER).mkdir()
+    draw = make_drawing(completion, renderer)
     # Without targets, the photographs are what there is to look at.
-    shown: list[View] = []
     if not completion.targets:
         photos = [photo.view for photo in completion.photos]
         shown = [*photos, *(photograph.view for photograph in held_out)]
+        draw = write_what_is_drawn(folder / IMAGES_FOLDER, shown, draw)
+    scores = make_score_rows(
+        completion, targets, at_targets, gaps, renderer, held_out, files, has_searched, draw
+    )
     write_scenes(folder, completion, input_splat, run, edit or EditDraft("complete"))
     around = render_around()
     name_view = "ignored" if run_info.get("scene", {}).get("renders_from") is None else "render"
     write_pictures(folder / IMAGES_FOLDER, completion, targets, at_targets, name_view)
     for number, found in enumerate(gaps, start=1):
         write_pixels(folder / IMAGES_FOLDER / f"target{number}_gaps.png", draw_gap(found.worst))
-    write_photographs(folder / IMAGES_FOLDER, completion, shown, renderer)
     removal = draw_removal(completion, renderer, files)
     if removal is not None:
         write_images(folder / IMAGES_FOLDER, "removal", removal.name_images())

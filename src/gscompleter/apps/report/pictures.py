@@ -12,10 +12,9 @@ from torch import Tensor
 from gscompleter.apps.inputs.task import Target
 from gscompleter.config.settings import COVERED
 from gscompleter.evaluation.metrics.coverage import RenderPair
-from gscompleter.evaluation.verdict.held_out import render_before_after
+from gscompleter.evaluation.verdict.held_out import Drawing
 from gscompleter.numerics.image_ops import dilate, paint_marked
 from gscompleter.numerics.kernels.parallel import map_in_parallel
-from gscompleter.render.protocols import Renderer
 from gscompleter.state import Completion
 from gscompleter.system.files.image import write_image
 from gscompleter.target_result import TargetResult
@@ -33,7 +32,6 @@ def write_pictures(
     name_view: str = "ignored",
 ) -> None:
     """Write `images/`: targets, and photographs with ignored regions, or all renders of a splat."""
-    folder.mkdir()
     results = zip(targets, completion.targets, at_targets, strict=True)
     for number, (target, result, pair) in enumerate(results, start=1):
         images = name_target_images(target, result, pair, completion.config.holes.dilation)
@@ -43,18 +41,24 @@ def write_pictures(
             write_images(folder, f"context{number}", {name_view: paint_ignored(view)})
 
 
-def write_photographs(
-    folder: Path, completion: Completion, views: Sequence[View], renderer: Renderer
-) -> None:
-    """Write photographs and the scene before and after at their cameras, numbered from 1."""
-    for number, view in enumerate(views, start=1):
-        pair = render_before_after(completion, view.camera, renderer)
+def write_what_is_drawn(folder: Path, views: Sequence[View], draw: Drawing) -> Drawing:
+    """Return a `draw` that also writes photographs, and the scene before and after there.
+
+    They are numbered from 1. So no image has to be kept, or rendered twice.
+    """
+
+    def draw_and_write(view: View) -> RenderPair:
+        pair = draw(view)
+        number = 1 + next(index for index, other in enumerate(views) if other is view)
         images = {
             "before": pair.before.image,
             "after": pair.after.image,
             "truth": paint_ignored(view),
         }
         write_images(folder, f"photograph{number}", images)
+        return pair
+
+    return draw_and_write
 
 
 def paint_ignored(view: View) -> Float[Tensor, "h w 3"]:

@@ -29,7 +29,12 @@ from gscompleter.evaluation.metrics.thin_gaps import (
     measure_thin_gaps,
     render_flight,
 )
-from gscompleter.evaluation.verdict.held_out import HeldOut, render_before_after, score_held_out
+from gscompleter.evaluation.verdict.held_out import (
+    Drawing,
+    HeldOut,
+    make_drawing,
+    score_held_out,
+)
 from gscompleter.evaluation.verdict.outcome import judge_completion
 from gscompleter.evaluation.verdict.rows import ScoreRow
 from gscompleter.numerics.image_ops import compute_mask_fraction
@@ -70,19 +75,22 @@ def make_score_rows(
     held_out: Sequence[HeldOut] = (),
     files: Mapping[int | None, str] = MappingProxyType({}),
     has_searched: bool = True,
+    draw: Drawing | None = None,
 ) -> dict[str, Any]:
     """Return the verdict and the rows of all photographs and targets, as in `summary.json`.
 
-    `at_targets` are the renders at the targets, and `gaps` their thin gaps; the rest is as in
-    `write_report`.
+    `at_targets` are the renders at the targets, and `gaps` their thin gaps; `draw` renders each
+    photograph once, by default as `make_drawing`. The rest is as in `write_report`.
     """
-    held_out_rows = score_held_out(completion, held_out, renderer)
+    draw = draw or make_drawing(completion, renderer)
+    held_out_rows = score_held_out(completion, held_out, renderer, draw)
     gains = completion.exposure_gains
     gain_rows = [None] * len(completion.views) if gains is None else gains.tolist()
     rows: dict[str, Sequence[ScoreRow]] = {
         "held_out": held_out_rows,
         "context": add_pose_errors(
-            score_photographs(completion, completion.views, gain_rows, renderer), completion.views
+            score_photographs(completion, completion.views, gain_rows, renderer, draw),
+            completion.views,
         ),
         "targets": [
             replace(
@@ -96,7 +104,7 @@ def make_score_rows(
     # Where no target was completed, the photographs that check the splat tell what changed.
     if not completion.targets:
         checks = [photo.view for photo in completion.photos[completion.num_context :]]
-        rows["checks"] = score_photographs(completion, checks, [None] * len(checks), renderer)
+        rows["checks"] = score_photographs(completion, checks, [None] * len(checks), renderer, draw)
     scores = {
         key: [asdict(replace(row, file=files.get(row.frame))) for row in group]
         for key, group in rows.items()
@@ -119,13 +127,13 @@ def compute_scores(pair: RenderPair, photograph: View | None) -> ScoreValues:
 
 
 def score_views(
-    completion: Completion, views: Sequence[View], renderer: Renderer
+    completion: Completion, views: Sequence[View], renderer: Renderer, draw: Drawing
 ) -> list[ScoreValues]:
     """Score the scene before and after at photographs, except where they show what was removed."""
 
     def score(view: View) -> ScoreValues:
         shown = hide_removed(view, completion.source, renderer)
-        return compute_scores(render_before_after(completion, view.camera, renderer), shown)
+        return compute_scores(draw(view), shown)
 
     map_views = get_view_map(completion.context.means, len(completion.context))
     return list(map_views(score, views))
@@ -136,9 +144,10 @@ def score_photographs(
     views: Sequence[View],
     exposure_gains: Sequence[Any],
     renderer: Renderer,
+    draw: Drawing,
 ) -> list[ContextRow]:
     """Make the rows of photographs of the context, or of those that checked a splat."""
-    scores = score_views(completion, views, renderer)
+    scores = score_views(completion, views, renderer, draw)
     return [
         ContextRow(
             view.frame,

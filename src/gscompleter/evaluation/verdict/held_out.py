@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 
 import torch
@@ -19,6 +19,8 @@ from gscompleter.render.view_map import get_view_map
 from gscompleter.state import Completion
 from gscompleter.types import Camera, View
 
+Drawing = Callable[[View], RenderPair]
+"""Renders the context and the completed scene at the camera of a photograph."""
 COPIED_BLOCK = 1_000_000
 """Gaussians of a changed context that are copied at a time."""
 
@@ -49,16 +51,25 @@ def render_before_after(completion: Completion, camera: Camera, renderer: Render
         return RenderPair(before, frozen.composite(completion.added))
 
 
+def make_drawing(completion: Completion, renderer: Renderer) -> Drawing:
+    """Return what renders the context and the completed scene at the camera of a photograph."""
+    return lambda view: render_before_after(completion, view.camera, renderer)
+
+
 def score_held_out(
-    completion: Completion, held_out: Sequence[HeldOut], renderer: Renderer
+    completion: Completion,
+    held_out: Sequence[HeldOut],
+    renderer: Renderer,
+    draw: Drawing | None = None,
 ) -> list[HeldOutRow]:
-    """Make the rows of held-out photographs."""
+    """Make the rows of held-out photographs; `draw` is by default that of `make_drawing`."""
+    draw = draw or make_drawing(completion, renderer)
     # Photographs in use, as they are: what a reconstruction has to be better than (decision 048).
     used = [shrink_view(view).image for view in completion.views]
 
     def score(photograph: HeldOut) -> HeldOutRow:
         view = hide_removed(photograph.view, completion.source, renderer)
-        row = score_photograph(completion, view, renderer)
+        row = score_photograph(draw(photograph.view), view)
         small = shrink_view(view)
         with torch.no_grad():
             render = renderer.render(completion.source.rendered, small.camera)
@@ -88,9 +99,8 @@ def score_context(completion: Completion, renderer: Renderer) -> list[ScoreRow]:
     return list(map_views(score, completion.views))
 
 
-def score_photograph(completion: Completion, view: View, renderer: Renderer) -> HeldOutRow:
+def score_photograph(pair: RenderPair, view: View) -> HeldOutRow:
     """Score a held-out photograph where the completed scene covers it."""
-    pair = render_before_after(completion, view.camera, renderer)
     truth = view.image
     valid = view.valid_mask
     # Both scores over what the completed scene covers: their difference is then a gain.

@@ -9,7 +9,13 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gscompleter.numerics.geometry import rotations_to_quats
+from gscompleter.numerics.geometry import (
+    compute_sparse_depth,
+    find_at_depth,
+    look_up,
+    rotations_to_quats,
+)
+from gscompleter.numerics.image_ops import dilate
 from gscompleter.numerics.sky import extend_sky, is_sky, restore_sky_colors
 from gscompleter.reconstructors.plane_sweep.directional_colors import fit_directional_colors
 from gscompleter.reconstructors.plane_sweep.fit import fit_jointly, fit_opacities
@@ -45,6 +51,8 @@ DISC_SIGMA = 0.55
 """Standard deviation of a disc across the viewing ray, in pixels."""
 OPACITY = 0.98
 """Initial opacity of every disc."""
+FIT_MARGIN = 8
+"""Pixels around a part that is built alone in which it is built, too, as Gaussians overlap."""
 IMAGE_COLOR_ROUNDS = 4
 """Rounds of the colour fit to a synthesized image."""
 
@@ -63,6 +71,7 @@ class Splatter:
         depths: Sequence[DepthMap],
         layers: Sequence[DepthLayer],
         transforms: Transforms,
+        masks: Sequence[Bool[Tensor, "_ _"]] | None = None,
     ) -> Reconstruction:
         """Build the Gaussians of `views` and fit them to the photographs.
 
@@ -70,7 +79,8 @@ class Splatter:
         that resolves it best, and observed free space stays empty, because merged views contradict
         each other (decision 031). Clearly different exposures are normalized to their mean.
         `depths` are in scene units. `layers` hold the inverse depths, with the widest baseline as
-        unit of length, and `transforms` relate the views of these layers.
+        unit of length, and `transforms` relate the views of these layers. With `masks`, only what
+        any view shows in its mask is built and fitted.
         """
         gains = torch.from_numpy(estimate_gains(layers, transforms)).float()
         device = views[0].image.device
@@ -86,6 +96,9 @@ class Splatter:
         kept = self.select_pixels(candidates, on_cpu, layers, transforms)
         # Nothing is reconstructed from masked pixels.
         kept &= flatten_masks([view.valid_mask for view in on_cpu])
+        if masks is not None:
+            on_cpu = ignore_elsewhere(candidates[kept], on_cpu, depths, masks)
+            kept &= find_in_valid(candidates, on_cpu)
         skies = self.extend_skies(normalized, depths)
         scene = merge([candidates[kept], *(gaussians.to("cpu") for _, gaussians, _ in skies)])
 
@@ -186,6 +199,42 @@ class Splatter:
                 gaussians, pixels = extend_sky(view, sky, self.disc_sigma)
                 extended.append((number, gaussians, pixels))
         return extended
+
+
+def ignore_elsewhere(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    depths: Sequence[DepthMap],
+    masks: Sequence[Bool[Tensor, "_ _"]],
+) -> list[View]:
+    """Ignore the pixels of each view that show nothing of what the masks of all views show.
+
+    `gaussians` are those of the pixels, of which a surface has one for all views; all on the CPU.
+    """
+    maps = [depth.depth.cpu() for depth in depths]
+    masks = [mask.cpu() for mask in masks]
+    visible = [
+        find_at_depth(gaussians, depth, view.camera)
+        for depth, view in zip(maps, views, strict=True)
+    ]
+    shown = torch.zeros(len(gaussians), dtype=torch.bool)
+    for is_visible, mask, view in zip(visible, masks, views, strict=True):
+        shown |= is_visible & look_up(mask, gaussians, view.camera)
+
+    ignoring = []
+    for is_visible, mask, view in zip(visible, masks, views, strict=True):
+        pixels = compute_sparse_depth(gaussians.means[shown & is_visible], view.camera) > 0
+        near = dilate(mask | pixels, FIT_MARGIN)
+        ignoring.append(replace(view, ignore_mask=~(near & view.valid_mask)))
+    return ignoring
+
+
+def find_in_valid(gaussians: Gaussians, views: Sequence[View]) -> Bool[Tensor, "n"]:
+    """Find the Gaussians whose means project onto a valid pixel of any view, hidden or not."""
+    found = torch.zeros(len(gaussians), dtype=torch.bool)
+    for view in views:
+        found |= look_up(view.valid_mask, gaussians, view.camera)
+    return found
 
 
 def flatten_masks(masks: Sequence[Mask | Tensor]) -> Bool[Tensor, "n"]:

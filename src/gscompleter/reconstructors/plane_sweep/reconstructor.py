@@ -74,6 +74,16 @@ class PlaneSweep(Splatter):
     @run_in_plain_torch
     def __call__(self, views: Sequence[View]) -> Reconstruction:
         """Reconstruct the scene and the depth of every pixel."""
+        return self.reconstruct_part(views, None)
+
+    @run_in_plain_torch
+    def reconstruct_part(
+        self, views: Sequence[View], masks: Sequence[Bool[Tensor, "_ _"]] | None
+    ) -> Reconstruction:
+        """Reconstruct the depth of every pixel, and what any view shows in its mask; None for all.
+
+        Most of the time is that of the fit to the photographs, which grows with what is fitted.
+        """
         check_given_views(views)
         views = set_depth_range(views, *get_depth_range(views))
         rig = build_rig(views)
@@ -82,12 +92,14 @@ class PlaneSweep(Splatter):
         name = partial(name_photographs, views)
         measured, skies = measure_views(rig, views)
         parts = self.support(rig, views, measured, skies)
-        scene = self.build(rig, views, complete_layers(rig, measured, measured, skies))
+        scene = self.build(rig, views, complete_layers(rig, measured, measured, skies), masks)
         if any(part.share for part in parts):
             observed = [part.measured for part in parts]
-            supported = self.build(rig, views, complete_layers(rig, observed, measured, skies))
+            layers = complete_layers(rig, observed, measured, skies)
+            supported = self.build(rig, views, layers, masks)
             # Surfaces that are right do not hide what another photograph shows.
-            losses = self.measure_losses(views, scene, supported)
+            judged = views if masks is None else ignore_outside(views, masks)
+            losses = self.measure_losses(judged, scene, supported)
             worst = max(range(len(views)), key=losses.__getitem__)
             if losses[worst] > MAX_LOSS:
                 loss = f"{name([worst])} would be reproduced {losses[worst]:.2f} dB worse with it"
@@ -181,11 +193,15 @@ class PlaneSweep(Splatter):
         return map_in_parallel(add_prediction, measured, predictions, images, skies)
 
     def build(
-        self, rig: Rig, views: Sequence[View], layers: Sequence[DepthLayer]
+        self,
+        rig: Rig,
+        views: Sequence[View],
+        layers: Sequence[DepthLayer],
+        masks: Sequence[Bool[Tensor, "_ _"]] | None,
     ) -> Reconstruction:
         """Build the Gaussians of completed depths, and fit them to the photographs."""
         depths = make_depth_maps(layers, rig.unit, views)
-        return self.build_scene(views, depths, layers, rig.transforms)
+        return self.build_scene(views, depths, layers, rig.transforms, masks)
 
     def measure_losses(
         self, views: Sequence[View], before: Reconstruction, after: Reconstruction
@@ -208,6 +224,14 @@ class PlaneSweep(Splatter):
             image = image * scene.exposure_gains[number].cpu()
         error = (image - seen.image)[seen.valid_mask].double().square()
         return float(error.mean()) if error.numel() else 0.0
+
+
+def ignore_outside(views: Sequence[View], masks: Sequence[Bool[Tensor, "_ _"]]) -> list[View]:
+    """Ignore the pixels of each view that are not in its mask."""
+    return [
+        replace(view, ignore_mask=~(mask & view.valid_mask))
+        for view, mask in zip(views, masks, strict=True)
+    ]
 
 
 def find_contradicted(rig: Rig, views: Sequence[View]) -> list[bool]:
