@@ -209,8 +209,8 @@ def place_copies(
     """Write `images` and `sparse/0` of the photographs that can be placed into `draft`."""
     with tempfile.TemporaryDirectory(dir=draft) as work:
         home = Path(work)
-        known, sources = write_known(photographs, home)
-        new = write_new(given, photographs, home, reading)
+        known, sources = write_known_copies(photographs, home)
+        new = write_new_copies(given, photographs, home, reading)
         job = {
             "images": str(home / COPIES_FOLDER),
             "masks": str(home / MASKS),
@@ -249,7 +249,9 @@ def explain_unplaced(row: Mapping[str, Any], sources: Mapping[str, str]) -> str:
     return f"{matches} features in common with {like} fit no single camera"
 
 
-def write_known(photographs: Photographs, home: Path) -> tuple[list[KnownCopy], dict[str, str]]:
+def write_known_copies(
+    photographs: Photographs, home: Path
+) -> tuple[list[KnownCopy], dict[str, str]]:
     """Write undistorted copies of photographs with known cameras; return their files by copy."""
     frames = choose_known(photographs)
     copies = []
@@ -304,13 +306,13 @@ def read_pinhole(view: View) -> PinholeNumbers:
     return K[0][0], K[1][1], K[0][2], K[1][2]
 
 
-def write_new(
+def write_new_copies(
     given: Sequence[GivenPhotograph], photographs: Photographs, home: Path, reading: MaskReading
 ) -> list[NewCopy]:
     """Write copies of new photographs, undistorted if their lens is a known one."""
     lenses = collect_lenses(photographs)
     return [
-        write_copy(photograph, lenses, home, reading)
+        write_new_copy(photograph, lenses, home, reading)
         for photograph in track(given, "Reading new photographs")
     ]
 
@@ -331,7 +333,7 @@ def get_lens_key(photograph: StoredPhotograph) -> LensKey:
     return *photograph.upright_size, photograph.optics.lens
 
 
-def write_copy(
+def write_new_copy(
     given: GivenPhotograph, lenses: Mapping[LensKey, Intrinsics], home: Path, reading: MaskReading
 ) -> NewCopy:
     """Write the copy of a new photograph, which is undistorted if its lens is known."""
