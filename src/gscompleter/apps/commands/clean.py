@@ -15,7 +15,7 @@ from gscompleter.apps.commands.shared_decisions import (
     decide_results,
     decide_splat,
 )
-from gscompleter.apps.commands.shared_options import DeviceOptions, ChosenPhotographs, SceneOptions
+from gscompleter.apps.commands.shared_options import ChosenPhotographs, DeviceOptions, SceneOptions
 from gscompleter.apps.requests.cleaning import CleaningRequest
 from gscompleter.config import CleaningConfig
 from gscompleter.system.errors import InputError
