@@ -277,7 +277,7 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
     [
         (("--near", 5, "--far", 1), "near"),
         (("--auto", 2), "--target and --auto are both given; use one of them"),
-        (("--auto",), "again with the other (--auto)."),
+        (("--auto",), "again with the other.\n"),
         (("--near", 0), "near"),
         (("--generator", "oracle", "--generator=oracle"), "--generator is given twice"),
         (("--near", -1), "near"),

@@ -74,7 +74,7 @@ def test_white_is_left_out_in_place_of_masks_beside_photographs(home, scene, mas
         (("complete", "scene", "--ignore", "black"), "where what is white is ignored; if it is t"),
         (("complete", "scene", "--ignore", "white", "--invert-masks"), "what is black is ignored"),
         (("complete", "scene", "--ignore", "none"), "has no mask that is named as a photograph"),
-        (("complete", "scene", "--ignore", "white", "--no-masks"), "give one of both (--ignore)"),
+        (("complete", "scene", "--ignore", "white", "--no-masks"), "give one of both.\n"),
         (("complete", "splat.ply", "--ignore", "white"), "There are no photographs to apply this"),
         (("clean", "--scene", "splat.ply", "--ignore", "white"), "There are no photographs to ap"),
         (("update", "scene", "--scene", "splat.ply", "--ignore", "black"), "Masks hide 75 %"),

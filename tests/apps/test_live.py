@@ -496,7 +496,7 @@ def test_only_what_changed_is_sent(splat_begun, repaired_spot, tmp_path):
 
 @pytest.fixture
 def journal(splat_ready, tmp_path) -> Journal:
-    return Journal(tmp_path / "kept", splat_ready.began)
+    return Journal(tmp_path / "kept", splat_ready.start)
 
 
 @pytest.fixture

@@ -190,7 +190,7 @@ def test_what_a_session_saved_and_did_since_is_told_apart(saved, program, begun)
     files = json.loads((saved / "summary.json").read_text())["files"]
     assert "images/stroke2.png" not in files
     steps = opening.steps
-    journal = Journal(saved, program.journal._began, opening.saved)
+    journal = Journal(saved, program.journal._start, opening.saved)
     assert not journal.is_saved(begun)
     assert journal.is_saved(replace(begun, steps=steps[:1]))
     assert not journal.is_saved(replace(begun, steps=steps))
@@ -198,7 +198,7 @@ def test_what_a_session_saved_and_did_since_is_told_apart(saved, program, begun)
     assert "Not saved" in state
     assert command == f"To go on: gscompleter live {saved}"
     assert serving.describe_end(replace(begun, steps=steps[:1]), journal)[0].startswith("Saved")
-    assert serving.describe_end(begun, Journal(saved / "other", program.journal._began)) == []
+    assert serving.describe_end(begun, Journal(saved / "other", program.journal._start)) == []
 
 
 def copy_of(saved: Path, tmp_path: Path) -> Path:
@@ -318,8 +318,8 @@ def test_a_session_is_not_begun_over(saved, splat, tmp_path, monkeypatch, capsys
 
 def test_a_program_that_is_killed_while_it_writes_leaves_whole_steps(begun, tmp_path, monkeypatch):
     """Another mask takes the place of one that was undone."""
-    began = saving.Began({}, None, None, None, None, None)
-    journal = Journal(tmp_path / "out", began)
+    start = saving.SessionStart({}, None, None, None, None, None)
+    journal = Journal(tmp_path / "out", start)
     two = begun.extended(begun.latest, STEPS[1]).extended(begun.latest, STEPS[2])
     journal.write(two)
     back = undo_step(two)

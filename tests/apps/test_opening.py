@@ -7,7 +7,7 @@ import pytest
 
 from command import run
 from exact_room import make_cameras, write_photographs, write_transforms
-from gscompleter.apps.commands.shared_decisions import is_splat
+from gscompleter.apps.commands.shared_decisions import names_splat
 from gscompleter.apps.inputs.opening import describe_cameras_above
 from gscompleter.data.sfm.poses import has_photographs, list_all_photographs
 from gscompleter.splats.formats import save_splat
@@ -94,7 +94,7 @@ def write_packed(folder):
 def test_an_unpacked_sog_is_a_splat_and_no_folder_of_photographs(tmp_path, monkeypatch, capsys):
     folder = write_packed(tmp_path / "scene")
     assert len(list(folder.glob("*.webp"))) >= 4
-    assert is_splat(folder)
+    assert names_splat(folder)
     assert not has_photographs(folder)
     out = ("--out", tmp_path / "out")
     assert run(monkeypatch, "poses", folder, *out) == 2
@@ -123,9 +123,9 @@ def test_the_model_folder_of_a_trainer_is_a_splat_unless_it_has_photographs(tmp_
     save_splat(folder / "point_cloud/iteration_7/point_cloud.ply", random_gaussians(4))
     write_camera_list(folder / "cameras.json")
     write_photographs(folder / "train/ours_7/renders", CAMERAS)
-    assert is_splat(folder)
+    assert names_splat(folder)
     write_photographs(folder / "images", CAMERAS)
-    assert not is_splat(folder)
+    assert not names_splat(folder)
 
 
 def test_depth_that_is_not_used_is_named_where_the_scene_is_opened(tmp_path, monkeypatch, capsys):

@@ -19,7 +19,7 @@ from gscompleter.data.one_photograph import open_photograph
 from gscompleter.data.photograph import Photograph, StoredPhotograph
 from gscompleter.data.photographs import build_photographs
 from gscompleter.data.scene import open_photographs
-from gscompleter.data.sfm.placing import write_new
+from gscompleter.data.sfm.placing import write_new_copies
 from gscompleter.render.loading import load_renderer
 from gscompleter.system.files.image import ORIENTATION, convert_to_pixels
 from gscompleter.virtual_capture.render_views import render_views
@@ -69,7 +69,7 @@ def test_a_new_photograph_is_asked_for_each_fact_once(tmp_path, asked):
         save_turned(new / f"{number}.jpg", orientation)
     asked.clear()
     given = find_given(new, ["0.jpg", "1.jpg"])
-    copies = write_new(given, known, tmp_path / "work", MaskReading())
+    copies = write_new_copies(given, known, tmp_path / "work", MaskReading())
     of_new = {question: n for question, n in asked.items() if question[1].endswith(".jpg")}
     assert set(of_new) == {
         (name, f"{number}.jpg")

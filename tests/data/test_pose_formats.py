@@ -11,9 +11,9 @@ from PIL import Image
 
 from gscompleter import InputError, load_cameras
 from gscompleter.data.formats import SCENE_FORMATS, open_photographs
-from gscompleter.data.local_origin import read_dataparser_transforms
 from gscompleter.data.points import MIN_RANGE_POINTS, add_depth_range, compute_depth_range
 from gscompleter.data.scene import write_cameras
+from gscompleter.data.transforms import read_dataparser_transforms
 from gscompleter.types import Camera
 from pose_files import (
     CAMERAS,

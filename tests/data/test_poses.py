@@ -107,6 +107,16 @@ def test_the_next_run_keeps_what_was_found(tmp_path, monkeypatch):
     assert find_poses_summary(out)["poses"]["missing"] == ["1.png"]  # what was there survives
 
 
+def test_masks_of_the_user_are_not_taken_for_those_of_an_earlier_run(tmp_path, monkeypatch):
+    given, out = blank(tmp_path / "photos", 4), tmp_path / "poses"
+    stand_in(monkeypatch, tmp_path, model_script(["0.png", "2.png", "3.png"]))
+    (out / "masks").mkdir(parents=True)
+    (out / "masks" / "0.png.png").write_bytes(b"mine")
+    with pytest.raises(InputError, match=r"masks/0\.png\.png"):
+        find_poses(given, out, overwrite=True)
+    assert (out / "masks" / "0.png.png").read_bytes() == b"mine"
+
+
 def find_poses_summary(out: Path) -> dict:
     return json.loads((out / "summary.json").read_text())
 

@@ -8,7 +8,12 @@ import pytest
 
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
-from gscompleter.data.sfm.refining import PoseRefinement, bring_back, pair_near, refine_poses
+from gscompleter.data.sfm.refining import (
+    PoseRefinement,
+    move_to_given_frame,
+    pair_near,
+    refine_poses,
+)
 from scenes import camera_at, photographed
 
 CAMERAS = [
@@ -100,7 +105,7 @@ def test_a_moved_turned_and_scaled_model_is_brought_back():
     moved = given.copy()
     moved[:, :3, :3] = turn @ given[:, :3, :3]
     moved[:, :3, 3] = 3.0 * given[:, :3, 3] @ turn.T + [5.0, -2.0, 1.0]
-    assert np.abs(bring_back(moved, given) - given).max() < 1e-12 * np.abs(given).max()
+    assert np.abs(move_to_given_frame(moved, given) - given).max() < 1e-12 * np.abs(given).max()
 
 
 def test_a_straight_drive_keeps_its_roll():
@@ -109,7 +114,7 @@ def test_a_straight_drive_keeps_its_roll():
     moved = given.copy()
     moved[:, :3, :3] = turn @ given[:, :3, :3]
     moved[:, :3, 3] = given[:, :3, 3] @ turn.T
-    assert np.abs(bring_back(moved, given) - given).max() < 1e-12 * np.abs(given).max()
+    assert np.abs(move_to_given_frame(moved, given) - given).max() < 1e-12 * np.abs(given).max()
 
 
 def test_each_camera_is_paired_with_near_ones_of_its_direction():

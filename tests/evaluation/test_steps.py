@@ -25,10 +25,10 @@ from gscompleter.evaluation.protocols import Task, make_tasks, parse_protocol
 from gscompleter.evaluation.runner import RowCounts, RunConfig, evaluate, prepare_task
 from gscompleter.evaluation.steps import (
     PreparedTask,
-    Progress,
+    TaskProgress,
     complete_task,
     compute_scale_drift,
-    get_metric_depth,
+    find_expected_depth,
 )
 from gscompleter.evaluation.store import read_run_file
 from gscompleter.evaluation.tables import write_tables
@@ -108,7 +108,7 @@ def begun(tmp_path_factory) -> PreparedTask:
 
 
 @pytest.fixture(scope="module")
-def ours(begun, tmp_path_factory) -> Progress:
+def ours(begun, tmp_path_factory) -> TaskProgress:
     return complete_task(begun, "full", tmp_path_factory.mktemp("full"))
 
 
@@ -252,7 +252,7 @@ def test_the_baseline_adds_all_that_it_lifts_and_the_context_adds_nothing(finish
 
 def test_the_depth_scale_is_how_much_too_far_what_fills_the_holes_stands(begun):
     view, renderer = begun.targets[0], begun.models.renderer
-    expected = get_metric_depth(view, view, begun.models)
+    expected = find_expected_depth(view, view, begun.models)
 
     def scale(ratio, holes):
         moved = slide(gaussians_of(view), view.camera, ratio.flatten(), "constant")
@@ -273,7 +273,7 @@ def test_the_depth_scale_is_how_much_too_far_what_fills_the_holes_stands(begun):
 def test_without_measured_depth_the_scale_is_relative_to_the_model(begun):
     truth = begun.targets[0].depth
     blind = replace(begun.targets[0], depth=None)
-    depth = get_metric_depth(blind, begun.views[0], begun.models)
+    depth = find_expected_depth(blind, begun.views[0], begun.models)
     assert 0.2 < depth.valid.float().mean() < 1
     assert ((depth.depth - truth).abs() / truth)[depth.valid].median() < 0.05
 

@@ -18,7 +18,7 @@ from gscompleter.splats.conversion import convert_splat
 from gscompleter.splats.formats import describe_oddities
 from gscompleter.splats.layout import find_layout, save_like, strip
 from gscompleter.splats.ply import read_scene
-from gscompleter.splats.properties import find_further
+from gscompleter.splats.properties import find_further_properties
 from scenes import random_gaussians
 
 COUNT = 200
@@ -98,7 +98,7 @@ def test_our_own_files_have_nothing_further(tmp_path):
 
 
 def test_names_that_tell_a_kind_come_first():
-    found = find_further(["x", "y", "z", "odd", "omega_0", "red"])
+    found = find_further_properties(["x", "y", "z", "odd", "omega_0", "red"])
     assert found.names == ("omega_0", "odd")
     assert found.kind is not None
 

@@ -61,6 +61,18 @@ def test_whatever_an_error_is_made_of_it_is_one_line(message, argument):
     assert "\n" not in shown
 
 
+@pytest.mark.parametrize(
+    ("sentence", "shown"),
+    [
+        ("Leave it out.", "Leave it out (--large-masks)."),
+        ("There are none; leave --large-masks out.", "There are none; leave --large-masks out."),
+        ("--large-masks-too is another.", "--large-masks-too is another (--large-masks)."),
+    ],
+)
+def test_an_option_is_named_once(sentence, shown):
+    assert format_error(InputError(sentence, "large_masks")) == shown
+
+
 def test_what_matters_of_a_long_error_is_kept():
     error = InputError(f"{'/folder' * 60}/a.png is not an image; copy it again.")
     assert str(error).startswith("/folder")

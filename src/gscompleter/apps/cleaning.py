@@ -27,11 +27,11 @@ from gscompleter.apps.inputs.taken_out import take_over_edits
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened
 from gscompleter.apps.report.cleaning_picture import (
     REMOVED_PICTURE_FILE,
-    RemovalSeen,
-    choose_cameras,
+    RemovalVisibility,
+    choose_most_removed,
+    choose_outside_cameras,
     draw_removal_rows,
-    look_at_removal,
-    see_removal,
+    measure_removal_visibility,
 )
 from gscompleter.apps.report.scenes import save_changed, save_completed_splat
 from gscompleter.apps.report.schema import refuse_completed
@@ -195,7 +195,7 @@ def clean_by_photographs(
     run_info = {**run_info, "reasons": counts, "photographs": scores, "seconds": seconds}
     assert task.splat_file is not None
     return Cleaning(
-        given, removed, task.splat_file, run_info, choose_cameras(seen), renderer, opened
+        given, removed, task.splat_file, run_info, choose_most_removed(seen), renderer, opened
     )
 
 
@@ -216,7 +216,7 @@ def clean_alone(request: CleaningRequest) -> Cleaning:
     # Of an empty splat there is no picture, and it is refused.
     if removed.any() and not removed.all():
         with stage("looking from outside"):
-            cameras, share = look_at_removal(given, removed, renderer)
+            cameras, share = choose_outside_cameras(given, removed, renderer)
     run_info = {
         "settings": {
             "scene": str(splat.path),
@@ -248,7 +248,7 @@ def score_cleaning(
     taken: Bool[Tensor, "n"],
     renderer: Renderer,
     files: Mapping[int | None, str],
-) -> tuple[list[dict[str, Any]], list[RemovalSeen]]:
+) -> tuple[list[dict[str, Any]], list[RemovalVisibility]]:
     """Compute PSNR (dB) of each photograph before and after, without the pixels of its mask.
 
     `taken` are the Gaussians that go; `files` has the file of each photograph by frame. Also
@@ -258,7 +258,7 @@ def score_cleaning(
     rows = []
     seen = []
     for view in track(views, "scores"):
-        seen.append(see_removal(given, taken, view.camera, renderer))
+        seen.append(measure_removal_visibility(given, taken, view.camera, renderer))
         before = renderer.render(given, view.camera).image
         after = renderer.render(kept, view.camera).image
         rows.append(

@@ -21,13 +21,15 @@ from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.frame import Frame
 from gscompleter.data.json_fields import get_array, get_number, get_part, get_size
 from gscompleter.data.limits import require
-from gscompleter.data.local_origin import read_dataparser_transforms
-from gscompleter.data.transforms import OPENCV_FROM_OPENGL, TRANSFORMS_FILE
+from gscompleter.data.transforms import (
+    DATAPARSER_FILE,
+    OPENCV_FROM_OPENGL,
+    TRANSFORMS_FILE,
+    read_dataparser_transforms,
+)
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.reading import read_json
 
-DATAPARSER_FILE = "dataparser_transforms.json"
-"""File of a nerfstudio run with the transform that it applied to the scene."""
 CAMERA_PATH_ADVICE = "export the camera path again"
 FOV_RANGE = (1.0, 179.0)
 """Range of a field of view, in degrees."""

@@ -8,20 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Float
 
-from gscompleter.data.cameras import find_pose_defect
-from gscompleter.data.json_fields import get_array, get_number
 from gscompleter.data.limits import require
-from gscompleter.system.files.reading import read_json
 from gscompleter.types import Camera, Gaussians
 
-SCALE_RANGE = (1e-9, 1e9)
-"""Accepted range of the `scale` in a file of nerfstudio."""
 MAX_REMOTENESS = 1e3
 """Ratio of the largest coordinate to the camera spread above which a local origin is used."""
 MAX_CAMERA_STEP = 1e-3
@@ -88,16 +82,3 @@ def shift_to_origin(
     # In float64: the difference of two large coordinates is small.
     means = scene.means.double() - torch.from_numpy(origin).to(scene.means.device)
     return replace(scene, means=means.float())
-
-
-def read_dataparser_transforms(path: Path) -> Float[np.ndarray, "4 4"]:
-    """Read nerfstudio's similarity from the reconstruction's frame to that of the trained scene.
-
-    The file holds a rigid 3×4 `transform` and a `scale` that multiplies its result.
-    """
-    content = read_json(path, "copy it from the folder of the nerfstudio run again")
-    rigid = np.vstack([get_array(content, "transform", str(path), (3, 4)), [0, 0, 0, 1]])
-    defect = find_pose_defect(rigid)
-    require(not defect, f"The `transform` of {path} cannot be used: {defect}; copy it again.")
-    scale = get_number(content, "scale", str(path), *SCALE_RANGE)
-    return np.diag([scale, scale, scale, 1.0]) @ rigid

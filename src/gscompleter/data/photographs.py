@@ -61,8 +61,8 @@ MAX_FOV = 100.0
 MAX_TRANSLATION = 1e3
 """Largest camera coordinate that benchmarks keep, in scene units from the origin."""
 
-MAX_MASK_FOLDERS = 2
-"""Folders of masks that a sentence names."""
+MAX_NAMED_PATHS = 2
+"""Most folders of masks, or photographs, that a sentence names."""
 MAX_MAP_COORDINATE = 100.0
 """Largest vehicle coordinate without a local origin, in metres."""
 
@@ -86,13 +86,14 @@ class Photographs:
     """Phrases on depth, poses and photographs that lie there and are not used."""
     format: str | None = None
     sparse: Callable[[], Float[np.ndarray, "n 3"]] | None = None
-    """Reads points on the scene's surfaces, in the files' frame."""
+    """Reads sparse points on the scene's surfaces, in the frame of the files."""
     front: str | None = None
     """Name of the front camera of a vehicle with several cameras."""
     has_moving_boxes_ignored: bool = False
     """True if boxes of moving objects are ignored like masks."""
-    is_masked: bool = True
-    """True if masks and alpha channels say what is ignored; else alpha is over black."""
+    uses_masks: bool = True
+    """True to ignore what masks and alpha channels hide. Else photographs with alpha are composited
+    over black."""
     regions: IgnoredRegions | None = None
     """What is ignored in every photograph, besides masks; None for nothing."""
 
@@ -135,7 +136,7 @@ class Photographs:
 
     def list_masks(self) -> list[Path]:
         """List the mask images that hide something, without alpha channels."""
-        return [f.mask for f in self.frames if f.mask is not None] if self.is_masked else []
+        return [f.mask for f in self.frames if f.mask is not None] if self.uses_masks else []
 
     def take_masks_of(self, folder: Path) -> Photographs:
         """Return a copy with the masks of a folder in place of its own; alpha stays as it is.
@@ -156,8 +157,8 @@ class Photographs:
         return replace(self, frames=tuple(frames))
 
     def describe_masks(self, frames: Sequence[int]) -> str | None:
-        """Say which of some photographs have masks, or None if none has; reads no pixels."""
-        if not self.is_masked:
+        """Describe the masks and alpha channels of photographs, without pixels; None for none."""
+        if not self.uses_masks:
             return None
         chosen = [self.frame(number) for number in frames]
         named = [frame.mask for frame in chosen if frame.mask is not None]
@@ -166,7 +167,7 @@ class Photographs:
         if named:
             places = list(dict.fromkeys(path.parent for path in named))
             kinds.append(
-                f"masks of {len(named)} photographs ({join_names(places, MAX_MASK_FOLDERS)})"
+                f"masks of {len(named)} photographs ({join_names(places, MAX_NAMED_PATHS)})"
             )
         if num_transparent:
             kinds.append(f"the alpha channel of {num_transparent} photographs")
@@ -182,7 +183,7 @@ class Photographs:
 
     def leave_out_masks(self) -> Photographs:
         """Return a copy in which masks and alpha channels hide nothing."""
-        return replace(self, is_masked=False)
+        return replace(self, uses_masks=False)
 
     def leave_out_masks_in(self, folder: Path) -> Photographs:
         """Return a copy without the masks in a folder, which mean something else."""
@@ -196,7 +197,7 @@ class Photographs:
     def is_hidden(self, frame: int) -> bool:
         """Check whether a mask or the alpha channel hides all of a photograph."""
         chosen = self.frame(frame)
-        if not self.is_masked or (chosen.mask is None and not _has_alpha_channel(chosen)):
+        if not self.uses_masks or (chosen.mask is None and not _has_alpha_channel(chosen)):
             return False
         hidden = self._load_colors(chosen)[1]
         return hidden is not None and bool(hidden.all())
@@ -234,7 +235,7 @@ class Photographs:
         for any.
         """
         for number, frame in enumerate(self.frames):
-            reason = _find_skip_reason(frame, self.origin, max_translation)
+            reason = _explain_skip(frame, self.origin, max_translation)
             if reason is not None:
                 return f"frame {number}: {reason}"
         return None
@@ -263,7 +264,7 @@ class Photographs:
         if len(numbers) > 1:
             raise InputError(
                 f"{len(numbers)} photographs of {self.title} are called {quote_value(word)}: "
-                f"{join_names(names, MAX_MASK_FOLDERS)}; name the path of one of them."
+                f"{join_names(names, MAX_NAMED_PATHS)}; name the path of one of them."
             )
         if not numbers:
             example = self.frame(0).file_name
@@ -351,7 +352,7 @@ class Photographs:
         colors, alpha, orientation = frame.load_pixels()
         size = colors.shape[1], colors.shape[0]
         hidden = None
-        if self.is_masked:
+        if self.uses_masks:
             hidden = find_masked(frame, alpha, size, orientation)
         elif alpha is not None:
             colors = composite_over_black(colors, alpha)
@@ -382,7 +383,11 @@ def build_photographs(
 def build_drive(
     name: str, title: str, frames: Sequence[Frame], front: str | None = None
 ) -> Photographs:
-    """Build the photographs of a vehicle, with the first camera as origin if far from zero."""
+    """Build the photographs of a vehicle, with the first camera as origin if far from zero.
+
+    `choose_local_origin` compares coordinates with the spread of the cameras, which a long drive
+    makes far larger than the baselines that float32 has to resolve.
+    """
     built = build_photographs(name, title, frames, front)
     valid = (frame.c2w[:3, 3] for frame in frames if find_pose_defect(frame.c2w) is None)
     first = next(valid, np.zeros(3))
@@ -399,17 +404,17 @@ def undistort_and_resize(
     """Undistort and resize the photograph of a frame, or a map [h, w] of depth or mask values.
 
     Maps are resized to `size` (width, height) first. Colours (uint8, [h, w, 3]) are interpolated,
-    values of maps never.
+    values of maps never, since a mean of two depths is no surface.
     """
-    is_colour = pixels.ndim == 3
-    if not is_colour:
+    is_color = pixels.ndim == 3
+    if not is_color:
         pixels = resize(pixels, size, Image.Resampling.NEAREST)
     if frame.intrinsics.distortion:
         pinhole, new = frame.compute_pinholes(*size)
         source = compute_undistortion_map(pinhole, frame.intrinsics.distortion, new)
-        pixels = remap(pixels, source, cv2.INTER_CUBIC if is_colour else cv2.INTER_NEAREST)
+        pixels = remap(pixels, source, cv2.INTER_CUBIC if is_color else cv2.INTER_NEAREST)
     # Colours need a window function to shrink without aliasing; values of a map must not be mixed.
-    filtering = Image.Resampling.LANCZOS if is_colour else Image.Resampling.NEAREST
+    filtering = Image.Resampling.LANCZOS if is_color else Image.Resampling.NEAREST
     framing = compute_framing(*size, resolution)
     left, top = framing.corner
     width, height = framing.size
@@ -444,7 +449,7 @@ def _has_alpha_channel(frame: Frame) -> bool:
     return frame.file is not None and frame.file.has_alpha
 
 
-def _find_skip_reason(
+def _explain_skip(
     frame: Frame, origin: Float[np.ndarray, "3"], max_translation: float | None
 ) -> str | None:
     # The size in the camera file needs no image to be opened.

@@ -1,4 +1,7 @@
-"""Validated reading of nerfstudio's `transforms.json`, without opening images."""
+"""Validated reading of nerfstudio's `transforms.json`, without opening images.
+
+A trained model has its scene in another frame: `dataparser_transforms.json` leads to it.
+"""
 
 from __future__ import annotations
 
@@ -12,11 +15,12 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.cameras import Distortion, Intrinsics
+from gscompleter.data.cameras import Distortion, Intrinsics, find_pose_defect
 from gscompleter.data.file_names import FolderListings, list_endings, locate
 from gscompleter.data.frame import Frame, find_file, find_image
 from gscompleter.data.json_fields import (
     get_array,
+    get_number,
     get_optional_number,
     get_part,
     get_size,
@@ -32,6 +36,8 @@ from gscompleter.system.files.result_format import is_marked, refuse_later
 
 TRANSFORMS_FILE = "transforms.json"
 TRANSFORMS_ADVICE = "export the scene again"
+DATAPARSER_FILE = "dataparser_transforms.json"
+"""File of a nerfstudio run with the transform that it applied to the scene."""
 SPLITS = tuple(f"transforms_{split}.json" for split in ("train", "val", "test"))
 """Files of a scene in parts, as in NeRF's synthetic scenes."""
 TRANSFORMS_HOMES = ("", "nerfstudio")
@@ -45,6 +51,8 @@ FISHEYE_MODELS = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 
 ANGLE_RANGE = (1e-5, 3.14159)
 """Range of fields of view in radians, below π."""
+SCALE_RANGE = (1e-9, 1e9)
+"""Accepted range of the `scale` in a file of a nerfstudio run."""
 DEPTH_UNITS = ("depth_unit_scale_factor", "integer_depth_scale")
 
 NumberPair = tuple[float | None, float | None]
@@ -214,3 +222,19 @@ def _parse_distortion(entry: Mapping[str, Any], title: str) -> Distortion:
         f"{model}; set it to 0, or undistort the images first.",
     )
     return Distortion(radial=(k1, k2, k3), tangential=(p1, p2))
+
+
+def read_dataparser_transforms(path: Path) -> Float[np.ndarray, "4 4"]:
+    """Read nerfstudio's similarity from the reconstruction's frame to that of the trained scene.
+
+    The file holds a rigid 3×4 `transform` and a `scale` that multiplies its result.
+    """
+    content = read_json(path, "copy it from the folder of the nerfstudio run again")
+    rigid = np.vstack([get_array(content, "transform", str(path), (3, 4)), [0, 0, 0, 1]])
+    defect = find_pose_defect(rigid)
+    require(
+        not defect,
+        f"The `transform` of {quote_value(path)} cannot be used: {defect}; copy it again.",
+    )
+    scale = get_number(content, "scale", str(path), *SCALE_RANGE)
+    return np.diag([scale, scale, scale, 1.0]) @ rigid

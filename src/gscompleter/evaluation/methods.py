@@ -83,7 +83,8 @@ def make_completion_method(config: str) -> Method:
 
     def method(state: Completion, target: Camera, models: Models) -> Prediction:
         completer = replace(models.make_completer(config), keep_registered=True)
-        views = [replace(view, dynamic_mask=None) for view in state.views]  # another config's
+        # `state` was begun with another config, whose guard may have masked the photographs.
+        views = [replace(view, dynamic_mask=None) for view in state.views]
         return predict(completer.advance(completer.begin(views, state.scene), target))
 
     return method
@@ -93,12 +94,12 @@ def predict(done: Completion) -> Prediction:
     """Return what the completion of a single target leaves."""
     (result,) = done.targets
     return Prediction(
-        done.scene,
-        result.added,
-        done.seconds,
-        result.anchor,
-        result.anchor_fallback,
-        result.registered,
+        scene=done.scene,
+        added=result.added,
+        seconds=done.seconds,
+        anchor=result.anchor,
+        anchor_fallback=result.anchor_fallback,
+        registered=result.registered,
     )
 
 
@@ -179,16 +180,15 @@ def mark_target(prediction: Prediction, number: int, before: Gaussians) -> Predi
     return replace(prediction, added=added, scene=merge([before, added]))
 
 
-BASELINES: dict[str, Method] = {
+SCENE_CHANGING: dict[str, Method] = {
     "densify-100": make_optimization_method(OptimizationConfig(iterations=100)),
     "densify-800": make_optimization_method(OptimizationConfig(iterations=800)),
     "distill": make_optimization_method(OptimizationConfig(iterations=800, density_rounds=0)),
-    "reggs": complete_by_similarity,
 }
-"""Methods of others."""
-
-SCENE_CHANGING = ("densify-100", "densify-800", "distill")
 """Methods that change existing Gaussians and therefore cannot run a sequence."""
+
+BASELINES: dict[str, Method] = {**SCENE_CHANGING, "reggs": complete_by_similarity}
+"""Methods of others."""
 
 # Method name to config name. Three degrees of freedom are no ablation: the paper compares the ray
 # constraint with them.
@@ -211,7 +211,8 @@ METHOD_GROUPS: dict[str, tuple[str, ...]] = {
     "baselines": tuple(BASELINES),
     "all": ("context", "full", "paper", *_ABLATIONS, *BASELINES),
 }
-"""Names that stand for several methods."""
+"""Names that stand for several methods. `all` leaves out those with another input (bare), another
+generator (steps-N), or the paper's settings with a change (paper/NAME)."""
 
 
 def expand_methods(names: Sequence[str]) -> tuple[str, ...]:
@@ -221,8 +222,8 @@ def expand_methods(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(chosen)
 
 
-def check_methods(names: Sequence[str], steps: int = 1) -> None:
-    """Raise InputError for no or unknown names and methods that cannot do `steps`."""
+def check_methods(names: Sequence[str], num_targets: int = 1) -> None:
+    """Raise InputError for no or unknown names, and methods that cannot do that many targets."""
     known = ", ".join(
         [*METHOD_GROUPS, *(name for name in METHODS if not name.startswith(("paper/", "steps-")))]
     )
@@ -234,7 +235,7 @@ def check_methods(names: Sequence[str], steps: int = 1) -> None:
                 f"There is no method '{quote_value(name)}'; choose one of {known} (paper/no-sa for "
                 "an ablation of the paper's settings)."
             )
-        if steps > 1 and name in SCENE_CHANGING:
+        if num_targets > 1 and name in SCENE_CHANGING:
             raise InputError(
                 f"The method {name!r} changes existing Gaussians, and a sequence can only add new "
                 "ones; choose one of context, full, paper, an ablation of these, and reggs."

@@ -1,6 +1,7 @@
 """What a run was made with: Ψ, Φ, the code, and whether cases that are kept apart were used.
 
-It stands above every table, so that tables of two models cannot be confused.
+Cases that are kept apart are test cases on which no setting may be decided (`apart`). The line
+stands above every table, so that tables of two models cannot be confused.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ WEIGHT_FILES = (".ckpt", ".onnx", ".pt", ".pth", ".safetensors")
 """Endings of files of weights."""
 MAX_NAMED = 5
 """Most scenes of which the line says how their poses were refined."""
-SETTING = "generator_"
-"""Beginning of the names of the generator's settings."""
+GENERATOR_PREFIX = "generator_"
+"""Beginning of the names of the generator's settings among those of the run."""
 
 
 @dataclass(frozen=True)
@@ -34,12 +35,12 @@ class RunFacts:
     """Name of Φ, with those of its settings that were given."""
     seed: int
     num_apart: int
-    """Number of cases that are kept apart."""
+    """Number of cases that are kept apart, and were used."""
     commits: tuple[str, ...]
     """Commits of the code that computed the rows; none outside of a checkout."""
     poses: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
-    """What was done to the poses of the scenes where they were refined, by the name of the scene;
-    all others are as given."""
+    """`PoseRefinement` as a dict, by the name of each scene with refined poses; those of all others
+    are as given."""
 
     @property
     def sentence(self) -> str:
@@ -67,14 +68,18 @@ def read_run_facts(out: Path, rows: Sequence[RunRow]) -> RunFacts:
         "weights": settings["weights"],
         "depth weights": settings.get("depth_weights"),
     }
-    given = {k.removeprefix(SETTING): v for k, v in settings.items() if k.startswith(SETTING)}
+    generator_settings = {
+        name.removeprefix(GENERATOR_PREFIX): value
+        for name, value in settings.items()
+        if name.startswith(GENERATOR_PREFIX)
+    }
     return RunFacts(
-        name_model_with_settings(settings["reconstructor"], extras),
-        name_model_with_settings(settings["generator"], given),
-        settings["seed"],
-        settings["source"].get("apart", 0),
-        tuple(sorted({row["commit"] for row in rows if row.get("commit")})),
-        {
+        reconstructor=name_model_with_settings(settings["reconstructor"], extras),
+        generator=name_model_with_settings(settings["generator"], generator_settings),
+        seed=settings["seed"],
+        num_apart=settings["source"].get("apart", 0),
+        commits=tuple(sorted({row["commit"] for row in rows if row.get("commit")})),
+        poses={
             row["task"]["scene"]: row["refined_poses"]
             for row in rows
             if row.get("refined_poses") is not None
@@ -110,11 +115,12 @@ def strip_folder(name: str) -> str:
 
 
 def describe_facts(facts: Mapping[str, RunFacts]) -> list[str]:
-    """Describe the facts of several runs by name, in a line for each that differs."""
-    lines = dict.fromkeys(of.sentence for of in facts.values())
-    if len(lines) == 1:
-        return [*lines]
-    return [f"{name}: {of.sentence}" for name, of in facts.items()]
+    """Describe the facts of several runs: in one line if all agree, else in one for each."""
+    sentences = {name: of_run.sentence for name, of_run in facts.items()}
+    different = list(dict.fromkeys(sentences.values()))
+    if len(different) == 1:
+        return different
+    return [f"{name}: {sentence}" for name, sentence in sentences.items()]
 
 
 def spell_greek(text: str) -> str:

@@ -38,12 +38,12 @@ class PreparedTask:
     views: tuple[View, ...]
     targets: tuple[View, ...]
     neighbours: tuple[View, ...]
-    """Photographs beside the target, for scoring only."""
+    """Photographs beside the targets, for scoring only."""
     models: Models
     seconds: float
     """Wall time of the reconstruction of the context."""
     context_notes: tuple[str, ...] = ()
-    """Sentences of Ψ about the photographs, such as on a depth that it did not use."""
+    """Sentences of Ψ on the photographs, such as on a depth that it did not use."""
     poses: PoseRefinement | None = None
     """What was done to the poses of the scene; None for nothing."""
 
@@ -73,7 +73,7 @@ class SequenceStep:
 
 
 @dataclass(frozen=True)
-class Progress:
+class TaskProgress:
     """The steps of a task so far, and the reason why it stopped."""
 
     scene: Gaussians
@@ -82,9 +82,9 @@ class Progress:
     error: str | None = None
 
 
-def complete_task(task: PreparedTask, method: str, folder: Path) -> Progress:
+def complete_task(task: PreparedTask, method: str, folder: Path) -> TaskProgress:
     """Complete targets in order until a step fails; saved steps in `folder` are read back."""
-    progress = Progress(task.context, task.views)
+    progress = TaskProgress(task.context, task.views)
     for number, view in enumerate(task.views, start=1):
         write_image(store.get_photograph_path(folder, number), view.image)
     for target in task.targets:
@@ -104,11 +104,12 @@ def complete_task(task: PreparedTask, method: str, folder: Path) -> Progress:
 
 
 def advance_task(
-    progress: Progress, target: View, task: PreparedTask, method: str, folder: Path
-) -> Progress:
+    progress: TaskProgress, target: View, task: PreparedTask, method: str, folder: Path
+) -> TaskProgress:
     """Complete one more target and save its prediction and images."""
     number = len(progress.steps) + 1
-    # Always with the scene as it is, so that an anchor may be the photograph of an earlier target.
+    # Begun anew from the scene and the photographs so far, so that the photograph of an earlier
+    # target may be the anchor.
     state = task.models.make_completer().begin(progress.views, progress.scene)
     path = store.get_step_path(folder, method, number)
     if not store.is_complete(path):
@@ -124,7 +125,7 @@ def advance_task(
     write_image(path.with_name(f"holes-{number:03d}.png"), seen.holes)
     write_pixels(path.with_name(f"gaps-{number:03d}.png"), draw_gap(seen.worst_gap))
     write_image(store.get_truth_path(folder, number), target.image)
-    return Progress(prediction.scene, (*progress.views, target), (*progress.steps, step))
+    return TaskProgress(prediction.scene, (*progress.views, target), (*progress.steps, step))
 
 
 def score_step(
@@ -142,7 +143,7 @@ def score_step(
     scale = None
     # In a sequence, an error of scale would grow from step to step; one step cannot show that.
     if len(task.targets) > 1 and anchor is not None and prediction.added is not None:
-        expected = get_metric_depth(target, anchor, task.models)
+        expected = find_expected_depth(target, anchor, task.models)
         scale = scoring.compute_depth_scale(
             prediction.added, seen.holes, target.camera, expected, task.models.renderer
         )
@@ -160,15 +161,16 @@ def score_step(
         seconds=dict(prediction.seconds),
         peak_bytes=prediction.peak_bytes,
     )
-    # NaN and infinity have no place in JSON: they fail this step instead of the file of the row.
+    # Only for its error: NaN and infinity have no place in JSON, and fail this step here instead
+    # of the file of all steps later.
     json.dumps(asdict(step), allow_nan=False)
     return step, seen
 
 
-def get_metric_depth(target: View, anchor: View, models: Models) -> DepthMap:
-    """Return the measured depth of `target`, or an estimate of Ψ if the data have none.
+def find_expected_depth(target: View, anchor: View, models: Models) -> DepthMap:
+    """Find the depth that an added surface should have: measured, or else as Ψ estimates it.
 
-    With an estimate the scale is not absolute: it is relative to that of the model.
+    A scale against an estimate is not absolute, but relative to that of the model.
     """
     if target.depth is not None:
         return DepthMap(target.depth, target.depth > 0)

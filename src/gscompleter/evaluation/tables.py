@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import statistics
+from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
@@ -33,15 +34,15 @@ from gscompleter.evaluation.store import (
     read_run_file,
     read_run_settings,
 )
-from gscompleter.system.errors import InputError
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import read_image
 from gscompleter.system.files.writing import encode_text, replace_file
 from gscompleter.system.timing import STAGES
 
 Fids = dict[str, float] | str
-"""The Fréchet inception distance of each method, or the reason why there is none."""
+"""The Fréchet inception distance (FID) of each method, or the reason why there is none."""
 
-ORDER = ("reconstruct", *STAGES, "optimize")
+STAGE_ORDER = ("reconstruct", *STAGES, "optimize")
 """Order of stages in the tables."""
 FEW_PIXELS_NOTE = (
     f"A geometry score counts if it is measured over at least {MIN_GEOMETRY_PIXELS} pixels."
@@ -139,15 +140,15 @@ class RunSummary:
 
 def read_run_rows(out: Path) -> list[RunRow]:
     """Read the rows of a run."""
-    read_run_settings(out)
+    read_run_settings(out)  # for its error: the folder may hold no run
     rows = {path: read_run_file(path) for path in list_row_paths(out)}
     if not rows:
         raise InputError(
-            f"The run in {out} has no finished case; run `gscompleter evaluate` first."
+            f"The run in {quote_value(out)} has no finished case; run `gscompleter evaluate` first."
         )
     for path, row in rows.items():
         if not isinstance(row, dict) or not {"task", "method", "steps", "error"} <= row.keys():
-            raise InputError(f"{path} is no row of scores; delete it and run again.")
+            raise InputError(f"{quote_value(path)} is no row of scores; delete it and run again.")
     return list(rows.values())
 
 
@@ -157,30 +158,32 @@ def rank_name(order: Iterable[str], name: str) -> tuple[int, str]:
 
 
 rank_method = partial(rank_name, METHODS)
-rank_stage = partial(rank_name, ORDER)
+rank_stage = partial(rank_name, STAGE_ORDER)
 
 
 def summarize_run(rows: Sequence[RunRow]) -> RunSummary:
-    """Average over the tasks that all methods finished, for a fair comparison."""
+    """Collect the rows of the tasks that all methods finished, for a fair comparison."""
     rows = sorted(rows, key=lambda row: (row["task"]["name"], rank_method(row["method"])))
     by_pair = {(row["task"]["name"], row["method"]): row for row in rows}
     methods = tuple(sorted({method for _, method in by_pair}, key=rank_method))
     tasks = tuple(dict.fromkeys(task for task, _ in by_pair))
-    done = {pair: row for pair, row in by_pair.items() if row["error"] is None}
+    finished = {pair: row for pair, row in by_pair.items() if row["error"] is None}
     # A method that failed at hard cases would otherwise gain by its failures.
-    common = tuple(task for task in tasks if all((task, method) in done for method in methods))
+    common = tuple(task for task in tasks if all((task, method) in finished for method in methods))
     sequences: dict[str, dict[str, Sequence[StepRow]]] = {}
     for (task, method), row in by_pair.items():
         if len(row["task"]["targets"]) > 1:
             sequences.setdefault(task, {})[method] = row["steps"]
     return RunSummary(
-        methods,
-        tasks,
-        common,
-        {method: tuple(done[task, method] for task in common) for method in methods},
-        sequences,
-        {method: sum(of == method for _, of in done) for method in methods},
-        tuple((*pair, row["error"]) for pair, row in by_pair.items() if pair not in done),
+        methods=methods,
+        tasks=tasks,
+        common_tasks=common,
+        rows={method: tuple(finished[task, method] for task in common) for method in methods},
+        sequences=sequences,
+        finished=Counter(method for _, method in finished),
+        failures=tuple(
+            (*pair, row["error"]) for pair, row in by_pair.items() if row["error"] is not None
+        ),
     )
 
 
@@ -230,7 +233,7 @@ def format_score_cells(summary: RunSummary, columns: Sequence[Column]) -> list[l
     """Format a table of scores, one row per method; a number of tasks other than all is added."""
 
     def format_cell(method: str, column: Column) -> str:
-        # A row has as many values as its tasks; fewer are said beside the number.
+        # A method has as many values as common tasks; if fewer, their number stands beside.
         value, count = summary.compute_cell(method, column)
         number = format_score(value, column.digits)
         return number if count in (0, len(summary.common_tasks)) else f"{number} ({count})"

@@ -86,8 +86,9 @@ class Comparison:
     """Surfaces of one photograph, reprojected into another and compared with it."""
 
     pixels: Float[Tensor, "h w 2"]
-    """Positions in the other photograph."""
+    """Positions in the other photograph, in its pixels."""
     z: Float[Tensor, "h w"]
+    """z-depth at the other camera, in scene units."""
     in_frame_mask: Bool[Tensor, "h w"]
     valid_mask: Bool[Tensor, "h w"]
     """True where both photographs have a known surface."""
@@ -121,6 +122,7 @@ class DynamicMasks(Guard):
         frozen = scenes.freeze_at(state.parts, [view.camera for view in state.views])
         renders = [scene.render for scene in frozen]
         masks = find_dynamic_masks(state.views, renders, state.config.dynamic_masks)
+        # The context photographs are the first; check photographs follow, and are left as they are.
         masked = tuple(
             replace(photo, view=replace(photo.view, dynamic_mask=mask)) if mask.any() else photo
             for photo, mask in zip(state.photos, masks, strict=False)
@@ -303,8 +305,8 @@ def keep_shared_parts(
     pixels: Float[Tensor, "h w 2"],
 ) -> Bool[Tensor, "h w"]:
     """Keep the parts of a region that project onto regions of the other photograph."""
-    # With a tolerance of two pixels around the regions of the other photograph.
-    reached = dilate(others, 2)[..., None].float()
+    # With the tolerance of the comparison around the regions of the other photograph.
+    reached = dilate(others, MAX_DISPLACEMENT)[..., None].float()
     is_shared = (sample(reached, pixels, "nearest")[..., 0] > 0).cpu().numpy()
     kept = np.zeros(region.shape, bool)
     for part in split_parts(region.cpu().numpy().astype(np.uint8)):

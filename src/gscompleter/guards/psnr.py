@@ -1,4 +1,4 @@
-"""PSNR and SSIM guard of stage 4: additions make no photograph worse."""
+"""Guard of stage 4: additions make no photograph worse, by the error budgets in PSNR and SSIM."""
 
 from __future__ import annotations
 
@@ -62,13 +62,13 @@ class PsnrGuard(Guard):
 
         # What a photograph sees of the additions takes the colours of the photograph first, so that
         # less of it has to fade. At the target the image counts as much as each photograph.
-        objecting = find_exceeding(budgets, view.frozen_photos, attempt.refined.plans, added)
-        if not objecting:
+        worsened = find_exceeding(budgets, view.frozen_photos, attempt.refined.plans, added)
+        if not worsened:
             return added
-        frozen = [view.frozen, *(view.frozen_photos[index] for index in objecting)]
-        images = [attempt.reference, *(state.photos[index].view for index in objecting)]
-        # Ignored pixels show the additions themselves, and so say nothing about their colours.
-        # Painted as the scene is without them, the black of its holes would be wanted there.
+        frozen = [view.frozen, *(view.frozen_photos[index] for index in worsened)]
+        images = [attempt.reference, *(state.photos[index].view for index in worsened)]
+        # Where a photograph is ignored, the render with the additions is wanted, so that they keep
+        # their colours there. A render without them would ask for the black of the holes.
         wanted = [
             image
             if image.ignore_mask is None

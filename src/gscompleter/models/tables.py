@@ -10,6 +10,8 @@ from typing import Any
 
 from gscompleter.config.generators import GeneratorSettings
 from gscompleter.generators import Generator, as_generator
+
+# The third table, which an entry point finds in this module, too.
 from gscompleter.models.depth_predictors import DEPTH_PREDICTORS as DEPTH_PREDICTORS
 from gscompleter.models.settings import (
     DiffusersInpaintSettings,
@@ -22,7 +24,7 @@ from gscompleter.reconstructors import Reconstructor
 from gscompleter.types import View
 
 FFGS_VARIANT = "FAMILY/VARIANT"
-"""Placeholder of the models of ffgs in the list of names."""
+"""Placeholder in the list of names; `find_loader` passes what the user gives as `variant`."""
 
 
 # Imports are local, so that naming a model imports neither torch nor the packages of the others.
@@ -52,6 +54,7 @@ class GeneratorLoader:
     """Loads a generator, and names the class of its settings."""
 
     load: Callable[[Any, int, str], Any]
+    """Called with settings, seed and device: a learned generator needs no true image."""
     settings: type[GeneratorSettings]
 
     def __call__(
@@ -103,4 +106,4 @@ GENERATORS = {
     "migan": GeneratorLoader(_load_migan, FileSettings),
     "lama": GeneratorLoader(_load_lama, FileSettings),
 }
-"""Loaders of the learned generators, called with settings, seed, true images and a device."""
+"""Loaders of the learned generators, called with settings, seed, photographs and a device."""

@@ -41,7 +41,7 @@ from gscompleter.splats.ply import (
     require_finite,
     save_ply,
 )
-from gscompleter.splats.properties import describe_further, refuse_other_kinds
+from gscompleter.splats.properties import describe_further_properties, refuse_other_kinds
 from gscompleter.splats.provenance import (
     KEY,
     NOTHING_KNOWN,
@@ -167,7 +167,7 @@ def load_splat_at(path: Path, origin: Origin | None, drop_nonfinite: bool = Fals
 def describe_oddities(path: Path) -> list[str]:
     """Describe in sentences what a file has that plain 3DGS does not, and how it is read."""
     path = resolve_splat(path)
-    further = describe_further(list_property_names(path))
+    further = describe_further_properties(list_property_names(path))
     lines = [] if further is None else [further]
     if detect_splat_format(path) == "ply":
         # As in `list_property_names`.

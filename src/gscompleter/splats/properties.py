@@ -1,7 +1,7 @@
 """Properties of a .ply beyond those of plain 3DGS: harmless, unknown, or of another kind of splat.
 
-What is no plain 3DGS may still have all of its properties. Where the others decide what is seen, as
-in a moving splat, the picture would be wrong without a word.
+A splat of another kind may have all properties of plain 3DGS, too. Where its further ones decide
+what is seen, as in a moving splat, the picture would be wrong without a word.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _HARMLESS = re.compile(
 
 @dataclass(frozen=True)
 class SplatKind:
-    """A kind of splat that has the properties of plain 3DGS and is none."""
+    """A kind of splat that has the properties of plain 3DGS, and further ones that it needs."""
 
     description: str
     """What it is, after "is"."""
@@ -46,7 +46,7 @@ class SplatKind:
     """What the picture would show."""
     remedy: str
     names: re.Pattern[str]
-    """Properties that tell it."""
+    """Names of properties by which it is known."""
 
 
 MOVING = SplatKind(
@@ -82,15 +82,15 @@ class FurtherProperties:
 
     names: tuple[str, ...]
     kind: SplatKind | None = None
-    """Kind of splat that some of them tell."""
+    """Kind of splat that is known by some of them."""
 
 
-def find_further(names: Sequence[str]) -> FurtherProperties:
+def find_further_properties(names: Sequence[str]) -> FurtherProperties:
     """Find the properties of a .ply that are neither used nor harmless."""
     further = tuple(
         name for name in names if not (_PLAIN.fullmatch(name) or _HARMLESS.fullmatch(name))
     )
-    # The names that tell a kind are named first.
+    # Names by which a kind is known come first, since sentences name the first few.
     for kind in WRONG_KINDS:
         telling = tuple(name for name in further if kind.names.fullmatch(name))
         if telling:
@@ -101,7 +101,7 @@ def find_further(names: Sequence[str]) -> FurtherProperties:
 
 def refuse_other_kinds(names: Sequence[str], path: Path) -> None:
     """Raise InputError for a file whose picture is surely wrong without its own properties."""
-    further = find_further(names)
+    further = find_further_properties(names)
     if further.kind is not None:
         kind = further.kind
         raise InputError(
@@ -112,9 +112,9 @@ def refuse_other_kinds(names: Sequence[str], path: Path) -> None:
         )
 
 
-def describe_further(names: Sequence[str]) -> str | None:
+def describe_further_properties(names: Sequence[str]) -> str | None:
     """Describe in a sentence the properties that are not used; None if all others are harmless."""
-    further = find_further(names)
+    further = find_further_properties(names)
     if not further.names:
         return None
     shown = join_names(further.names, MAX_NAMED_PROPERTIES)

@@ -35,7 +35,7 @@ class InputError(ValueError):
     """
 
     def __init__(self, message: str, argument: str | None = None) -> None:
-        """Create the error; the command line adds the option named `argument` to its sentence."""
+        """Create the error; the command line names the option `argument` if `message` does not."""
         super().__init__(message)
         self.argument = None if argument is None else quote_value(argument)
 

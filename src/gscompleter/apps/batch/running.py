@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from gscompleter.system.errors import InputError, join_names, print_error
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.jobs.jobs import (
     JOBS,
+    Engine,
     Job,
     claim_folder,
     find_missing_jobs,
@@ -44,51 +46,78 @@ MAX_NAMED_FAILURES = 5
 """Most failures that the terminal names."""
 
 
+@dataclass(frozen=True)
+class PreparedBatch:
+    """A manifest that was read, and the jobs of it that this process has to do."""
+
+    out: Path
+    """Absolute output folder: workers may run in another working folder."""
+    engine: Engine | None
+    """Runs the jobs; None for this process."""
+    jobs: Sequence[Job]
+    """A job for each row."""
+    share: Sequence[Job]
+    """Those of this process; all without `--shard`."""
+    left: Sequence[Job]
+    """Those of the share without a result, and failures that are repeated."""
+
+
 def complete_batch(request: BatchRequest, decide_row: DecideRow) -> int:
     """Complete the scenes of a manifest, write the table and the page, and return the exit code.
 
     `decide_row` makes the request of a row in the process of a worker, which imports it by name.
     """
-    share_number, num_shares = request.engine.share
     console = make_console(stderr=True, quiet=request.answer.quiet)
     with show_progress(console):
         with show_preparation("reading the manifest"):
-            jobs = read_manifest(request.manifest, request.common, request.out)
-            refuse_overlap(request.out, list_input_paths(jobs))
-
-            # Workers may run in another working folder, so they get an absolute path.
-            out = request.out.resolve()
-            engine = make_engine(request.engine, out)
-            claim_folder(out, "batch", {"version": 1, "kind": "batch"})
-
-            share = jobs[share_number::num_shares]
-            left = find_missing_jobs(share, out, request.repeats_failures)
+            batch = prepare_batch(request)
 
         # A folder of scenes can hold the results of earlier runs, which are no input.
         if results := list_results(request.manifest, request.out):
             names = join_names([path.name for path in results], MAX_NAMED_FAILURES)
             console.print(f"Left out, as results and no scenes: {names}.", soft_wrap=True)
 
-        perform = partial(perform_job, out=out, retries=request.retries, decide_row=decide_row)
-        ended = run_jobs(left, perform, partial(has_row, out=out), engine, request.retries)
-        counted = track(ended, "completing", len(left), has_lines=False)
-        for number, job in enumerate(counted, start=1):
-            state = read_row(job, out)
-            console.print(
-                f"{number} of {len(left)}: {job.name}, {describe_state(state)}", soft_wrap=True
-            )
+        run_left_jobs(batch, request.retries, decide_row, console)
         with show_preparation("table"):
-            write_batch_results(out, jobs)
+            write_batch_results(batch.out, batch.jobs)
 
     # The exit code and the sentence count this share, with the jobs that failed in earlier runs.
-    rows = [row for job in share if (row := read_row(job, out)) is not None]
+    rows = [row for job in batch.share if (row := read_row(job, batch.out)) is not None]
     failed = [row for row in rows if row["state"] == "failed"]
-    print_failures(console, [f"{row['job']}: {row['reason']}" for row in failed], len(share))
-    summary = summarize_share({row["job"] for row in failed}, share, left)
+    print_failures(console, [f"{row['job']}: {row['reason']}" for row in failed], len(batch.share))
+    summary = summarize_share({row["job"] for row in failed}, batch.share, batch.left)
     console.print(f"{summary} All results: {request.out}/index.html", soft_wrap=True)
     if request.answer.json:
         print_json({"out": str(request.out), "failed": len(failed), "rows": rows})
-    return choose_exit_code(len(failed), len(share))
+    return choose_exit_code(len(failed), len(batch.share))
+
+
+def prepare_batch(request: BatchRequest) -> PreparedBatch:
+    """Read the manifest, claim the output folder, and find the jobs that are left."""
+    share_number, num_shares = request.engine.share
+    jobs = read_manifest(request.manifest, request.common, request.out)
+    refuse_overlap(request.out, list_input_paths(jobs))
+
+    out = request.out.resolve()
+    engine = make_engine(request.engine, out)
+    claim_folder(out, "batch", {"version": 1, "kind": "batch"})
+
+    share = jobs[share_number::num_shares]
+    left = find_missing_jobs(share, out, request.repeats_failures)
+    return PreparedBatch(out=out, engine=engine, jobs=jobs, share=share, left=left)
+
+
+def run_left_jobs(
+    batch: PreparedBatch, retries: int, decide_row: DecideRow, console: Console
+) -> None:
+    """Run the jobs that are left, and print a line as each of them ends."""
+    out = batch.out
+    perform = partial(perform_job, out=out, retries=retries, decide_row=decide_row)
+    ended = run_jobs(batch.left, perform, partial(has_row, out=out), batch.engine, retries)
+    total = len(batch.left)
+    for number, job in enumerate(track(ended, "completing", total, has_lines=False), start=1):
+        state = describe_state(read_row(job, out))
+        console.print(f"{number} of {total}: {job.name}, {state}", soft_wrap=True)
 
 
 def list_input_paths(jobs: Sequence[Job]) -> list[Path]:

@@ -47,10 +47,14 @@ HINTS = {"Argument helptext:": "give", "Perhaps you meant:": NEAREST_WORD}
 
 
 def format_error(error: InputError) -> str:
-    """Add the option that can correct it to the sentence of an error."""
+    """Add the option that can correct an error to its sentence, unless the sentence names it."""
+    sentence = str(error)
     if error.argument is None:
-        return str(error)
-    return f"{str(error).removesuffix('.')} (--{error.argument.replace('_', '-')})."
+        return sentence
+    option = f"--{error.argument.replace('_', '-')}"
+    if re.search(rf"{re.escape(option)}(?![\w-])", sentence):
+        return sentence
+    return f"{sentence.removesuffix('.')} ({option})."
 
 
 def parse_words(words: Sequence[str], kinds: Mapping[str, type]) -> Any:

@@ -15,7 +15,7 @@ from gscompleter.apps.commands.shared_decisions import (
     decide_results,
     decide_splat,
 )
-from gscompleter.apps.commands.shared_options import DeviceOptions, SceneOptions, Words
+from gscompleter.apps.commands.shared_options import ChosenPhotographs, DeviceOptions, SceneOptions
 from gscompleter.apps.requests.cleaning import CleaningRequest
 from gscompleter.config import CleaningConfig
 from gscompleter.system.errors import InputError
@@ -51,7 +51,7 @@ class CleanOptions(SceneOptions, DeviceOptions):
     and summary.json."""
     scene: Path
     """File of Gaussians (a splat) to work on. It is cleaned."""
-    context: Words = None
+    context: ChosenPhotographs = None
     """Photographs to work with: file names, or numbers from 0 in the order of the file paths. The
     splat is compared with them; all of them if not given."""
     dry_run: bool = False

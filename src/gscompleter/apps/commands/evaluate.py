@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 from annotated_types import Interval
@@ -37,6 +37,9 @@ from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.jobs.engine_names import EngineName
 from gscompleter.system.process import import_without_collection
+
+if TYPE_CHECKING:
+    from gscompleter.evaluation.paper import DataSet
 
 # fmt: off
 TableName = Literal[
@@ -225,34 +228,13 @@ def decide_evaluation(
     if not options.paths:
         raise InputError("No data is given; name a cases.json, or scenes with --protocol.")
 
-    first = reconstructors[0]
     weights = assign_weights(reconstructors, options.weights)
     depth_weights = assign_weights(options.depth, options.depth_weights, "depth", "depth-weights")
-    synthesis = replace(options.synthesis, generator=generators)
-    # A single generator refuses a setting that it does not have in a sentence of its own.
-    shared = synthesis.share_settings() if len(generators) > 1 else {generators[0]: synthesis}
-    models = {
-        generator: decide_run_models(options, first, weights[first], depth_weights, own)
-        for generator, own in shared.items()
-    }
+    models = decide_models_by_generator(
+        options, generators, reconstructors[0], weights[reconstructors[0]], depth_weights
+    )
     run = EvaluationRequest(
-        cases=CasesRequest(
-            paths=options.paths,
-            protocol=options.protocol,
-            preset=options.preset,
-            resolution=preset.resolution if options.resolution is None else options.resolution,
-            near=preset.near if options.near is None else options.near,
-            far=preset.far if options.far is None else options.far,
-            uses_masks=not options.no_masks,
-            masks=MaskReading(options.invert_masks, options.large_masks),
-            ignore_moving=options.ignore_moving,
-            one_per_scene=options.one_per_scene,
-            ego_mask=not options.no_ego_mask,
-            # Numbers of others stand beside those of the paper, whose data are as they were given.
-            refines_poses=not (options.no_refine_poses or is_reproduction),
-            limit=options.limit,
-            apart=options.apart,
-        ),
+        cases=decide_cases(options, preset, is_reproduction),
         methods=options.methods,
         models=models[generators[0]],
         out=options.out,
@@ -279,6 +261,47 @@ def decide_evaluation(
         has_outlines=options.outlines,
         has_crops=options.crops,
     )
+
+
+def decide_cases(options: EvaluateOptions, preset: DataSet, is_reproduction: bool) -> CasesRequest:
+    """Decide which cases are evaluated, and how their data are read."""
+    return CasesRequest(
+        paths=options.paths,
+        protocol=options.protocol,
+        preset=options.preset,
+        resolution=preset.resolution if options.resolution is None else options.resolution,
+        near=preset.near if options.near is None else options.near,
+        far=preset.far if options.far is None else options.far,
+        uses_masks=not options.no_masks,
+        masks=MaskReading(options.invert_masks, options.large_masks),
+        ignore_moving=options.ignore_moving,
+        one_per_scene=options.one_per_scene,
+        ego_mask=not options.no_ego_mask,
+        # Numbers of others stand beside those of the paper, whose data are as they were given.
+        refines_poses=not (options.no_refine_poses or is_reproduction),
+        limit=options.limit,
+        apart=options.apart,
+    )
+
+
+def decide_models_by_generator(
+    options: EvaluateOptions,
+    generators: tuple[str, ...],
+    reconstructor: str,
+    weights: Path | None,
+    depth_weights: Mapping[str, Path | None],
+) -> dict[str, ModelRequest]:
+    """Decide on the models that run with each generator, by its name.
+
+    The other arguments are those of `decide_run_models`.
+    """
+    synthesis = replace(options.synthesis, generator=generators)
+    # A single generator refuses a setting that it does not have in a sentence of its own.
+    shared = synthesis.share_settings() if len(generators) > 1 else {generators[0]: synthesis}
+    return {
+        generator: decide_run_models(options, reconstructor, weights, depth_weights, own)
+        for generator, own in shared.items()
+    }
 
 
 def refuse_repeated(

@@ -37,7 +37,7 @@ class RemoveOptions(CompleteOptions):
     """Rotation of the boxes about their centres, as a quaternion w x y z."""
     sphere: tuple[float, float, float, float] | None = None
     """Remove Gaussians inside of a sphere: x, y, z of its centre, and its radius."""
-    mask: Path | None = None  # type: ignore[assignment]
+    mask: Path | None = None  # type: ignore[assignment]  # one folder, and not files by target
     """Masks of what goes, white there. A folder of images named as photographs; if the object is
     cut out, what is opaque goes."""
     select: Path | None = None
@@ -47,9 +47,10 @@ class RemoveOptions(CompleteOptions):
 def decide_removal(options: RemoveOptions) -> Request:
     """Decide what is removed, and how its hole is filled."""
     reading = MaskReading(options.invert_masks, options.large_masks)
+    # With masks of what goes, `--invert-masks` is for them instead of for masks of photographs.
     has_marks = options.mask is not None
     completion = decide_holes(options, has_marks, CompleterConfig.for_removal)
-    # Masks of the removal may lie in the scene, and are not those of what to ignore.
+    # Masks of what goes may lie beside photographs, where masks of what to ignore are looked for.
     source = completion.source
     scene = replace(source.scene, removal_masks=options.mask, removal_reading=reading)
     completion = replace(completion, source=replace(source, scene=scene))

@@ -27,7 +27,7 @@ from gscompleter.apps.commands.shared_options import (
 )
 from gscompleter.apps.live.opening import SessionRequest
 from gscompleter.apps.live.strokes import (
-    OF_STROKES,
+    SEPARATE_OPTIONS,
     STROKES_ADVICE,
     StrokesFile,
     find_strokes_file,
@@ -129,7 +129,7 @@ def begin_with(options: CompletingOptions) -> SessionRequest:
 
 def add_saved_options(options: Known, saved: StrokesFile) -> Known:
     """Return the options with those of the session where they are not given."""
-    given = {name: getattr(options, name) for name in OF_STROKES}
+    given = {name: getattr(options, name) for name in SEPARATE_OPTIONS}
     missing = {name: getattr(saved, name) for name, value in given.items() if value is None}
     return replace(options, **missing)
 
@@ -146,7 +146,7 @@ def describe_session(options: CompletingOptions, completion: CompletionRequest) 
 def describe_options(options: CompletingOptions) -> dict[str, Any]:
     """Describe the options that a session goes on with, without those of a machine."""
     names = [field.name for field in fields(CompletingOptions)]
-    chosen = [name for name in names if name not in (*OF_STROKES, *OF_MACHINE)]
+    chosen = [name for name in names if name not in (*SEPARATE_OPTIONS, *OF_MACHINE)]
     return {name: describe_value(name, getattr(options, name)) for name in chosen}
 
 
@@ -211,8 +211,11 @@ def restore_options(options: Known, saved: StrokesFile, path: Path) -> Known:
         )
     kind = type(options)
     given = {**describe_options(options), "config": describe_config(options)}
-    known = {**saved.session, **{name: getattr(saved, name) for name in OF_STROKES}}
-    asked = {**given, **{name: describe_value(name, getattr(options, name)) for name in OF_STROKES}}
+    known = {**saved.session, **{name: getattr(saved, name) for name in SEPARATE_OPTIONS}}
+    asked = {
+        **given,
+        **{name: describe_value(name, getattr(options, name)) for name in SEPARATE_OPTIONS},
+    }
     for name, value in known.items():
         refuse_other_value(name, asked.get(name), value, kind)
         refuse_code(name, asked.get(name), value)

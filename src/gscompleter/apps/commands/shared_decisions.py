@@ -66,12 +66,15 @@ def decide_filling(
 ) -> CompletionRequest:
     """Decide which holes of which scene are filled, and by what.
 
-    `context` and `synthesis` are those of the options, or of the painted images. Where `has_marks`,
-    masks say what goes, and `--invert-masks` is for them. `adapt` is for what a command does.
+    `context` and `synthesis` are those of the options, or of the painted images. `has_marks` is
+    True if the command is given masks of its own, such as of what goes: `--invert-masks` is then
+    for them. `geometry` is a file with surfaces from elsewhere. `adapt` changes the config for what
+    a command does.
     """
-    check_presence(options, has_marks)
+    check_photograph_options(options, has_marks)
     models = decide_models(options, synthesis)
     lacks_photographs = has_splat_alone(options)
+    # A splat without photographs may be SCENE itself.
     path = options.folder if lacks_photographs and options.scene is None else options.scene
     splat = None if path is None else decide_splat(options, path)
     config = options.config.decide(splat is not None, not lacks_photographs, adapt)
@@ -108,7 +111,10 @@ def decide_results(options: SceneOptions) -> ResultsRequest:
 def decide_scene(
     options: SceneOptions, folder: Path, masks: MaskReading, has_splat: bool
 ) -> SceneRequest:
-    """Decide how the photographs in a folder are read."""
+    """Decide how the photographs in a folder are read.
+
+    With a splat the default resolution is that of its training if smaller (`has_splat`).
+    """
     return SceneRequest(
         folder,
         options.format,
@@ -172,10 +178,10 @@ def stop_recoloring(config: CompleterConfig) -> CompleterConfig:
 
 def has_splat_alone(options: CompletingOptions) -> bool:
     """Return True for a splat without photographs: SCENE is left out, or is the splat itself."""
-    return options.folder is None or is_splat(options.folder)
+    return options.folder is None or names_splat(options.folder)
 
 
-def is_splat(path: Path) -> bool:
+def names_splat(path: Path) -> bool:
     """Check whether a path names an existing file of Gaussians, or a folder of nothing else."""
     if os.path.isdir(path):
         from gscompleter.splats.foreign import holds_splat_alone
@@ -188,8 +194,8 @@ def is_splat(path: Path) -> bool:
     return has_splat_extension(path)
 
 
-def check_presence(options: CompletingOptions, has_marks: bool) -> None:
-    """Refuse what does not fit the photographs or their absence."""
+def check_photograph_options(options: CompletingOptions, has_marks: bool) -> None:
+    """Refuse options of photographs without them, and with them those of a splat alone."""
     if not has_splat_alone(options):
         if options.cameras is not None:
             raise InputError(

@@ -18,7 +18,8 @@ from gscompleter.config.settings import Device, Seed, Settings
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.jobs.engine_names import EngineName
 
-Words = Annotated[Names | None, tyro.conf.arg(metavar="PHOTO [PHOTO ...]")]
+ChosenPhotographs = Annotated[Names | None, tyro.conf.arg(metavar="PHOTO [PHOTO ...]")]
+"""File names of photographs, or their numbers."""
 Threads = Annotated[int, Interval(ge=1, le=1024)]
 Port = Annotated[int, Interval(ge=0, le=65535)]
 NumFrames = Annotated[int, Interval(ge=3, le=1000)]
@@ -140,7 +141,7 @@ class SceneOptions(ComputeOptions, WritingOptions, MaskOptions):
     """Folder of the photographs of the splat, in any layout that `complete` reads."""
     frames: NumFrames = NUM_VIDEO_FRAMES
     """Most frames of a video to take as photographs, sharp ones at even steps of the camera."""
-    context: Words = None
+    context: ChosenPhotographs = None
     """Photographs to work with: file names, or numbers from 0 in the order of the file paths. If
     not given, those that help most; photographs of targets are never used."""
     out: Path
@@ -150,7 +151,7 @@ class SceneOptions(ComputeOptions, WritingOptions, MaskOptions):
     """Format of SCENE: colmap, nerfstudio, cameras-json, llff, kitti, kitti-raw, dgp, waymo,
     mmdet3d, pandaset, chunks, real-estate-10k, polycam, record3d, 3d-scanner-app or photograph.
     Detected if not given."""
-    scene: Path | None
+    scene: Path | None  # each command has its own help and default
     resolution: Size | None = None
     """Size of images in pixels. The working size: longest side (photographs are never enlarged),
     or height and width (scaled and cropped), or `full`. If not given, 640, or that of the splat's
@@ -183,6 +184,7 @@ class SceneOptions(ComputeOptions, WritingOptions, MaskOptions):
 class CompletingOptions(SceneOptions, ModelOptions):
     """Options of the commands that complete one scene."""
 
+    # May be left out, unlike that of `SceneOptions`.
     folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = None  # type: ignore[assignment]
     """Folder of the photographs: COLMAP, nerfstudio, cameras.json, LLFF, KITTI, DGP, Waymo,
     PandaSet, a pixelSplat chunk, a RealEstate10K camera file, or what Polycam, Record3D or 3d
@@ -214,7 +216,7 @@ class CompletingOptions(SceneOptions, ModelOptions):
 class EngineOptions(Options):
     """Options of every command that can run on several machines."""
 
-    engine: EngineName | None
+    engine: EngineName | None  # each command has its own help and default
     workers: Annotated[int, Interval(ge=1, le=100_000)] | None = None
     """Number of workers; as many as fit if not given (one with SLURM)."""
     threads: Threads | None = None
@@ -246,8 +248,8 @@ def list_inputs(options: Settings) -> list[Path]:
 
 
 def replace_by_scenes(inputs: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
-    """Replace folders of scenes by their scenes, beside which results may lie."""
+    """Replace `folders` among the inputs by the scenes in them, beside which results may lie."""
     from gscompleter.evaluation.cases import list_scenes  # it needs torch, for which no help waits
 
     scenes = {path: list_scenes(path) for path in folders}
-    return [place for path in inputs for place in scenes.get(path, [path])]
+    return [scene for path in inputs for scene in scenes.get(path, [path])]

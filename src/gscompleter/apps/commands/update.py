@@ -16,7 +16,7 @@ from gscompleter.apps.commands.shared_decisions import (
     decide_photographs,
     decide_results,
     decide_splat,
-    is_splat,
+    names_splat,
     stop_recoloring,
 )
 from gscompleter.apps.commands.shared_options import ReconstructorOptions, SceneOptions
@@ -52,7 +52,7 @@ class UpdateOptions(SceneOptions, ReconstructorOptions):
 def decide_update(options: UpdateOptions) -> UpdateRequest:
     """Decide which splat is updated, by which photographs."""
     check_context(options.context)
-    if is_splat(options.folder):
+    if names_splat(options.folder):
         raise InputError(
             f"Two splats are named, {quote_value(options.folder, 80)} and "
             f"{quote_value(options.scene, 80)}; name one, and as SCENE only its photographs.",

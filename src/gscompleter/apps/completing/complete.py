@@ -12,7 +12,7 @@ from rich.console import Console
 
 from gscompleter.apps.command_line.exit_codes import DONE, ERROR
 from gscompleter.apps.completing.holes import EXPORTED, refuse_painted, write_holes
-from gscompleter.apps.completing.keeping import keep_small
+from gscompleter.apps.completing.keeping import save_compactly
 from gscompleter.apps.completing.maker import describe_maker
 from gscompleter.apps.completing.marking import prepare_repair
 from gscompleter.apps.completing.preparation import (
@@ -158,7 +158,7 @@ def write_completion(folder: Path, ready: Prepared) -> dict[str, Any]:
         # An earlier result in OUT may be the input, and is replaced.
         if given is not None and results.out.resolve() in given.resolve().parents:
             given = None
-        summary = keep_small(folder, results.suffix, summary, given)
+        summary = save_compactly(folder, results.suffix, summary, given)
     return summary
 
 

@@ -18,23 +18,24 @@ LARGE_BYTES = 100 * 10**6
 """Size of results, in bytes, from which on the terminal says how to keep them smaller."""
 
 
-def keep_small(
+def save_compactly(
     folder: Path, suffix: str, summary: Mapping[str, Any], given: Path | None
 ) -> dict[str, Any]:
-    """Write the completed scene in the format of a suffix, with its labels; return the summary.
+    """Replace what is large in an output folder, and return the summary with the changes.
 
-    `given` is the file of the input splat if it outlasts the run: if it holds the Gaussians of
-    `context.ply`, the summary names it instead.
+    The completed scene becomes a file with the ending `suffix`, with its labels. `given` is the
+    file of the input splat if it outlasts the run: if it holds the Gaussians of `context.ply`, that
+    copy is removed and the summary names the file instead.
     """
-    if suffix != COMPLETED_FILE.removeprefix("completed"):
+    small = folder / f"completed{suffix}"
+    if small.name != COMPLETED_FILE:
         # The input was read as it is, whatever further properties it has.
-        small = folder / f"completed{suffix}"
         losses = convert_splat(folder / COMPLETED_FILE, small, ignore_properties=True).notes
         if losses:
             notes = [*summary["scene"]["notes"], " ".join(losses)]
             summary = {**summary, "scene": {**summary["scene"], "notes": notes}}
         (folder / COMPLETED_FILE).unlink()
-        rename_edited(folder, folder / f"completed{suffix}")
+        rename_edited(folder, small)
     context = None
     if given is not None and is_same_scene(given, folder / CONTEXT_FILE):
         (folder / CONTEXT_FILE).unlink()
@@ -45,7 +46,10 @@ def keep_small(
 
 
 def describe_size(out: Path, can_be_smaller: bool) -> str:
-    """Write the sentence on the size of the results, and if they are large on what to do."""
+    """Write the sentence on the size of the results, and on what to do if they are large.
+
+    `can_be_smaller` is False if the user chose the format.
+    """
     sizes = [(out / name).stat().st_size for name in read_listing(out)]
     total = sum(sizes)
     sentence = f"The results take {max(round(total / 1e6), 1):,} MB."

@@ -57,20 +57,22 @@ def plan_path(
 ) -> CameraPath:
     """Plan a smooth path from the nearest camera of the context through all targets.
 
-    It follows `photographs`. All cameras have the lens of the first target, at an even size.
+    It follows `photographs`. All cameras have the lens of the first target, at an even size, which
+    video encoders need.
     """
     first = targets[0]
     lens = resize_camera(first, first.width + first.width % 2, first.height + first.height % 2)
     nearest = min(context, key=lambda camera: measure_baseline(camera, first))
     stops = [replace(lens, c2w=camera.c2w.to(lens.c2w)) for camera in (nearest, *targets)]
+    # One leg leads to each target, in a multiple of `FRAME_STEP` frames; the last camera is added.
     seconds = max(ONE_WAY_SECONDS / len(targets), MIN_LEG_SECONDS)
-    count = FRAME_STEP * round(FRAMES_PER_SECOND * seconds / FRAME_STEP)
-    cameras = plan_camera_path(stops, thin_evenly(photographs, MAX_PHOTOGRAPHS), count)
-    frames = [
-        count * number if has_same_lens(target, first) else None
+    leg_frames = FRAME_STEP * round(FRAMES_PER_SECOND * seconds / FRAME_STEP)
+    cameras = plan_camera_path(stops, thin_evenly(photographs, MAX_PHOTOGRAPHS), leg_frames)
+    target_frames = [
+        leg_frames * number if has_same_lens(target, first) else None
         for number, target in enumerate(targets, start=1)
     ]
-    return CameraPath(cameras, frames)
+    return CameraPath(cameras, target_frames)
 
 
 def has_same_lens(a: Camera, b: Camera) -> bool:
@@ -92,12 +94,16 @@ def write_path(
         sha256=hash_file(folder / PATH_VIDEO),
         num_frames=len(path.cameras),
     )
-    back = np.linalg.inv(ready.task.frame)
+    # The file has cameras in the frame of the photographs, as every file of cameras has.
+    to_photographs = np.linalg.inv(ready.task.frame)
     return {
         **asdict(row),
         "hole_mask_path": PATH_MASK,
         "frames_per_second": FRAMES_PER_SECOND,
-        "cameras": [describe_camera(transform_camera_exactly(c, back)) for c in path.cameras],
+        "cameras": [
+            describe_camera(transform_camera_exactly(camera, to_photographs))
+            for camera in path.cameras
+        ],
     }
 
 
@@ -109,6 +115,7 @@ def render_path(
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """Render the scene along a path, and append the mask of each frame to `masks`.
 
+    Frames are written while they are rendered, and the masks, a video of their own, after them.
     What a hole is, is decided as at a target: marked, enclosed by an object, or empty.
     """
     for camera in track(cameras, "video"):

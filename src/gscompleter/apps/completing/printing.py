@@ -76,7 +76,7 @@ def make_score_table(summary: CompletionSummary) -> Table:
         before = format_number(row.psnr_before)
         after = format_number(row.psnr_after)
         table.add_row(f"{kind} {row.photograph}", "", before, after, "")
-    # Without targets, what was not used tests the result.
+    # Without targets, the photographs that were not used test the result.
     for held_out in () if summary.targets else summary.held_out:
         before = format_number(held_out.psnr_before)
         after = format_number(held_out.psnr_after)
@@ -126,7 +126,7 @@ def describe_geometry_use(summary: CompletionSummary) -> Iterator[str]:
 def answer_plan(
     results: ResultsRequest, opened: Opened, targets: Sequence[Target], holes: Sequence[float]
 ) -> None:
-    """Print the targets and their holes for people, or as JSON."""
+    """Print the targets and the share of holes in each image, for people or as JSON."""
     if results.answer.json:
         print_json(describe_plan(results.out, opened, targets, holes))
     elif not results.answer.quiet:
@@ -187,15 +187,15 @@ def print_export(request: ExportRequest, lines: Sequence[str]) -> None:
     for row in holes.frames:
         table.add_row(row.image_path, format_percent(row.hole_fraction))
     console.print(table)
-    replaced = ["--export-holes"]
-    replaced += ["--path"] if request.has_path else []
-    replaced += ["--auto"] if request.names_number else []
+    given = ["--export-holes"]
+    given += ["--path"] if request.has_path else []
+    given += ["--auto"] if request.names_number else []
     sentences = [
         *lines,
         f"Nothing was completed. The holes are in {quote_value(folder)}: paint each image where "
         "its mask is white, and save it by the same name (.png, .jpg or .webp).",
         f"Then run the same command with --images {quote_value(folder)} --painter NAME in place of "
-        f"{' and '.join(replaced)}.",
+        f"{' and '.join(given)}.",
     ]
     for sentence in sentences:
         console.print(sentence, soft_wrap=True)

@@ -18,7 +18,7 @@ from gscompleter.types import Gaussians, merge
 def load_taken_out(splat_file: InputSplatFile) -> Gaussians | None:
     """Load what earlier edits took out of a splat, without colours by direction.
 
-    It is relative to the origin of the splat. None if nothing was taken out.
+    The means are relative to the origin of the splat. None if nothing was taken out.
     """
     edits = splat_file.edits
     names = [edit.taken_out for edit in edits.edits if edit.taken_out is not None]
@@ -36,7 +36,7 @@ def take_over_edits(
 ) -> tuple[CompletionTask, tuple[str, ...]]:
     """Hide what earlier edits took out in all photographs of a task, unless it `forgets` them.
 
-    Also returns the lines about it.
+    Also returns the lines for the user. The task has an input splat.
     """
     assert task.scene is not None
     assert task.splat_file is not None
@@ -49,7 +49,7 @@ def take_over_edits(
 
 
 def describe_taken_out(splat_file: InputSplatFile, forgets: bool) -> tuple[str, ...]:
-    """Write the lines on what earlier edits of a splat took out of it."""
+    """Write the lines on what earlier edits took out of a splat, and on edits without a record."""
     path = splat_file.path
     edits = splat_file.edits
     count = sum(edit.taken_out is not None for edit in edits.edits)
@@ -78,7 +78,7 @@ def count_runs(path: Path) -> int:
 
 
 def hide_taken_out(task: CompletionTask) -> CompletionTask:
-    """Hide what was taken out in all photographs of a task; nothing if nothing was."""
+    """Hide what was taken out in all photographs of a task with a splat; nothing if nothing was."""
     taken_out = task.taken_out
     if taken_out is None:
         return task
@@ -91,7 +91,10 @@ def hide_taken_out(task: CompletionTask) -> CompletionTask:
 
 
 def hide_in_target(target: Target, taken_out: TakenOut) -> Target:
-    """Leave out the pixels of the photograph of a target that show it, where it scores."""
+    """Ignore the pixels that show it in the photograph of a target.
+
+    Unlike `TakenOut.hide` it paints nothing over: the photograph only scores the result.
+    """
     if target.photograph is None:
         return target
     mask = taken_out.find(target.camera.to(taken_out.scene.means.device))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from gscompleter.apps.live.session import Session, SessionStep
 from gscompleter.apps.live.strokes import (
-    Began,
+    SessionStart,
     digest_steps,
     encode_strokes,
     list_steps,
@@ -26,37 +26,46 @@ class Journal:
     def __init__(
         self,
         folder: Path,
-        began: Began,
+        start: SessionStart,
         saved: str | None = None,
         known: tuple[SessionStep, ...] = (),
     ) -> None:
-        """Begin with the steps that the folder has already, and the digest of those saved there."""
+        """Begin with what the folder has already.
+
+        `known` are the steps of its `strokes.json`, `saved` is the digest of those that its
+        completed scene has; None without one.
+        """
         self.folder = folder
-        self._began = began
+        self._start = start
         self._saved = saved
         self._known = known
 
     def write(self, session: Session) -> None:
-        """Write the steps of a session; a program that is killed meanwhile leaves those before."""
+        """Write the steps of a session, so that at any time the file has masks for all its steps.
+
+        A program that is killed meanwhile leaves the steps that both states begin with, or more.
+        """
         steps = list_steps(session)
-        same = count_same(self._known, steps)
+        num_same = count_same(self._known, steps)
         path = self.folder / STROKES_FILE
         with convert_write_errors(path):
             self.folder.mkdir(parents=True, exist_ok=True)
-            # A mask takes the place of another one only once no step has that one. Without the
-            # file beside them, masks would be taken for files of somebody else.
-            if same < len(self._known) or not path.exists():
-                self._write_file(encode_strokes(session, self._began, self._saved, same))
-                self._known = steps[:same]
-            write_masks(self.folder, steps, same)
-            self._write_file(encode_strokes(session, self._began, self._saved))
+            # Masks are numbered by step, so a new one may replace that of a step which is gone:
+            # the file drops those steps first. It is also written before the first mask, since
+            # masks without it would be taken for files of somebody else.
+            if num_same < len(self._known) or not path.exists():
+                self._write_file(encode_strokes(session, self._start, self._saved, num_same))
+                self._known = steps[:num_same]
+            write_masks(self.folder, steps, num_same)
+            self._write_file(encode_strokes(session, self._start, self._saved))
             self._known = steps
+            # Masks that no step has any more.
             named = {name_mask(index) for index in range(len(steps))}
             for name in list_session(self.folder) - {STROKES_FILE, *named}:
                 (self.folder / name).unlink(missing_ok=True)
 
     def set_saved(self, session: Session) -> None:
-        """Remember that the completed scene in the folder has the steps of a session."""
+        """Remember that the folder has a session as it was saved there, with its `strokes.json`."""
         self._saved = digest_steps(session.steps)
         self._known = list_steps(session)
 
@@ -77,7 +86,7 @@ class Journal:
 
 
 def count_same(before: tuple[SessionStep, ...], after: tuple[SessionStep, ...]) -> int:
-    """Count the steps at the beginning that are the same values in both."""
+    """Count the steps at the beginning that are the same objects in both: steps never change."""
     pairs = zip(before, after, strict=False)
     different = (index for index, (one, other) in enumerate(pairs) if one is not other)
     return next(different, min(len(before), len(after)))

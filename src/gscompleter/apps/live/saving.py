@@ -14,7 +14,7 @@ from gscompleter.apps.inputs.describing import describe_opening, print_lines
 from gscompleter.apps.inputs.task import Target
 from gscompleter.apps.live.opening import SessionRequest
 from gscompleter.apps.live.session import Session
-from gscompleter.apps.live.strokes import STROKES, Began, write_strokes
+from gscompleter.apps.live.strokes import STROKES, SessionStart, write_strokes
 from gscompleter.apps.report.results import COMPLETE_COMMAND, COMPLETION_RESULTS
 from gscompleter.apps.requests.completion import TargetRequest
 from gscompleter.data.scene import write_cameras
@@ -34,7 +34,7 @@ class PreparedSession:
     request: SessionRequest
     scene: Prepared
     """As for `complete`, with what the session chose in place of what was left to it."""
-    began: Began
+    start: SessionStart
 
 
 def prepare_session(request: SessionRequest, console: Console) -> PreparedSession:
@@ -49,7 +49,7 @@ def prepare_session(request: SessionRequest, console: Console) -> PreparedSessio
     source = replace(ready.source, context=ready.task.context_frames)
     targets = TargetRequest((str(results.out / TARGETS_FILE),))
     scene = replace(ready, source=source, targets=targets)
-    return PreparedSession(request, scene, describe_began(request, ready))
+    return PreparedSession(request, scene, describe_session_start(request, ready))
 
 
 def begin_session(prepared: PreparedSession) -> Session:
@@ -65,14 +65,14 @@ def begin_session(prepared: PreparedSession) -> Session:
     )
 
 
-def describe_began(request: SessionRequest, ready: Prepared) -> Began:
+def describe_session_start(request: SessionRequest, ready: Prepared) -> SessionStart:
     """Describe what a session began with, so that it can begin again; reads its splat."""
     splat = ready.work.splat
     known = None if splat is None or not splat.path.is_file() else hash_file(splat.path)
     reading = ready.source.scene
     config = ready.completer.config
     assert config is not None
-    return Began(
+    return SessionStart(
         {**request.record, "config": asdict(config)},
         request.resolution,
         reading.near,
@@ -89,7 +89,7 @@ def save_session(prepared: PreparedSession, session: Session) -> str:
     if len(session.completions) == 1:
         raise InputError("There is nothing to save; complete or repair something first.")
     out = prepared.request.out
-    # Whether it may be replaced was decided when the session began.
+    # Whether it may be replaced was decided when the session start.
     with open_output_folder(out, overwrite=True, command=COMPLETE_COMMAND) as folder:
         summary = write_session(folder, prepared, session)
     return f"Saved in {quote_value(out)}. {summary['outcome']['headline']}"
@@ -103,5 +103,5 @@ def write_session(folder: Path, prepared: PreparedSession, session: Session) -> 
     summary = write_done(folder, with_targets, session.latest, "live")
     if session.cameras:
         write_cameras(folder / TARGETS_FILE, session.cameras)
-    write_strokes(folder, session, prepared.began)
+    write_strokes(folder, session, prepared.start)
     return summary

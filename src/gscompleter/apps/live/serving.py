@@ -71,7 +71,7 @@ def open_session(prepared: PreparedSession, console: Console) -> Session:
 
 def open_journal(prepared: PreparedSession, session: Session) -> Journal:
     """Open the journal of a session, which has what was done again."""
-    journal = Journal(prepared.request.out, prepared.began, prepared.request.saved)
+    journal = Journal(prepared.request.out, prepared.start, prepared.request.saved)
     if list_steps(session):
         journal.write(session)
     return journal

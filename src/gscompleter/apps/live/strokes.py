@@ -38,8 +38,8 @@ from gscompleter.types import Camera
 STROKES = (STROKES_FILE, f"{STROKES_FOLDER}/stroke*.png")
 """Globs of the files that are written."""
 STROKES_ADVICE = "save the session again"
-OF_STROKES = ("resolution", "near", "far", "context")
-"""Options that `repair --strokes` reads, too, which are entries of their own."""
+SEPARATE_OPTIONS = ("resolution", "near", "far", "context")
+"""Options with an entry of their own beside `session`, since `repair --strokes` reads them, too."""
 
 FourNumbers = tuple[float, float, float, float]
 
@@ -84,7 +84,7 @@ class StrokesFile:
     """Frames of the photographs of the session, or of the cameras of a file; None if its cameras
     were found."""
     saved: str | None = None
-    """Digest of the steps that the completed scene beside the file has; None without one."""
+    """`digest_steps` of those that the completed scene beside the file has; None without one."""
     session: dict[str, Any] | None = None
     """Options that the session began with; None in files of early versions."""
     scene_sha256: str | None = None
@@ -94,7 +94,7 @@ class StrokesFile:
 
 
 @dataclass(frozen=True)
-class Began:
+class SessionStart:
     """What a session began with, for its `strokes.json`."""
 
     options: Mapping[str, Any]
@@ -108,10 +108,10 @@ class Began:
     """SHA-256 of the splat; None if the scene was reconstructed."""
 
 
-def write_strokes(folder: Path, session: Session, began: Began) -> None:
+def write_strokes(folder: Path, session: Session, start: SessionStart) -> None:
     """Write the steps of a session that is saved, and their masks, to a folder."""
     write_masks(folder, list_steps(session))
-    content = encode_strokes(session, began, digest_steps(session.steps))
+    content = encode_strokes(session, start, digest_steps(session.steps))
     (folder / STROKES_FILE).write_bytes(content)
 
 
@@ -134,11 +134,11 @@ def name_mask(index: int) -> str:
 
 
 def encode_strokes(
-    session: Session, began: Began, saved: str | None, count: int | None = None
+    session: Session, start: SessionStart, saved: str | None, count: int | None = None
 ) -> bytes:
-    """Encode `strokes.json`, with the first `count` steps alone or all.
+    """Encode `strokes.json`, with the first `count` steps of `list_steps` alone or all.
 
-    `saved` is the digest of the steps that the completed scene in the folder has.
+    `saved` is the digest of the steps that the completed scene in the folder has; None without one.
     """
     steps = list_steps(session)[:count]
     rows = [
@@ -148,13 +148,13 @@ def encode_strokes(
     content = {
         **RESULT_MARK,
         "version": __version__,
-        "resolution": began.resolution,
-        "near": began.near,
-        "far": began.far,
-        "context": began.context,
+        "resolution": start.resolution,
+        "near": start.near,
+        "far": start.far,
+        "context": start.context,
         "saved": saved,
-        "session": began.options,
-        "scene_sha256": began.scene_sha256,
+        "session": start.options,
+        "scene_sha256": start.scene_sha256,
         "camera_model": "PINHOLE",
         "frames": rows[: len(session.steps)],
         "undone": rows[len(session.steps) :],
@@ -217,7 +217,7 @@ def read_steps(rows: Sequence[StrokeRow], folder: Path) -> tuple[SessionStep, ..
 
 
 def is_beside(name: str) -> bool:
-    """Return True if a relative path leads to a file below its folder."""
+    """Return True if a path is relative and leads to a file below the folder it is relative to."""
     path = PurePosixPath(name)
     is_plain = "\\" not in name and "\0" not in name and path.parts != ()
     return is_plain and not path.is_absolute() and ".." not in path.parts

@@ -36,8 +36,8 @@ DIMMING = 0.5
 
 
 @dataclass(frozen=True)
-class RemovalSeen:
-    """What a camera sees of what goes."""
+class RemovalVisibility:
+    """How much a camera sees of what goes."""
 
     camera: Camera
     removed: float
@@ -46,39 +46,39 @@ class RemovalSeen:
     """Sum over the pixels of alpha."""
 
 
-def see_removal(
+def measure_removal_visibility(
     given: Gaussians, removed: Bool[Tensor, "n"], camera: Camera, renderer: Renderer
-) -> RemovalSeen:
-    """Measure what a camera sees of what goes."""
+) -> RemovalVisibility:
+    """Measure how much a camera sees of what goes: True in `removed`."""
     frozen = renderer.freeze(given, camera)
     weights = frozen.splat(removed.to(given.means))
-    return RemovalSeen(camera, weights.sum().item(), frozen.render.alpha.sum().item())
+    return RemovalVisibility(camera, weights.sum().item(), frozen.render.alpha.sum().item())
 
 
-def look_at_removal(
+def choose_outside_cameras(
     given: Gaussians, removed: Bool[Tensor, "n"], renderer: Renderer
 ) -> tuple[list[Camera], float]:
     """Choose cameras outside of a splat that see most of what goes.
 
-    Of a room they see a section, without the walls in front. Also returns the share of what is seen
-    from twelve directions that goes.
+    Of a room they see a section, without the walls in front. Also returns which share of the alpha
+    in the images of all cameras around the splat, without a section, is of what goes.
     """
     kept, gone = split_thinned(given, removed, MAX_PREVIEW_GAUSSIANS)
     both = merge([kept, gone])
-    goes = torch.arange(len(both)).to(removed.device) >= len(kept)
+    goes = mark_last(both, len(gone))
     extent = measure_extent(kept)
     cameras = list_outside_cameras(extent, PREVIEW_SIDE)
-    # Renderers draw nothing nearer than a hundredth of the near plane.
+    # The section lies `CUT` radii before the middle; renderers clip at a hundredth of `near`.
     section = 100 * (DISTANCE - CUT) * extent.radius
     cut = [replace(camera, near=section) for camera in cameras]
 
-    def see(camera: Camera) -> RemovalSeen:
-        return see_removal(both, goes, camera, renderer)
+    def measure(camera: Camera) -> RemovalVisibility:
+        return measure_removal_visibility(both, goes, camera, renderer)
 
     view_map = get_view_map(given.means)
-    whole = list(view_map(see, cameras))
-    pairs = zip(whole, view_map(see, cut), strict=True)
-    best = choose_cameras([max(pair, key=lambda seen: seen.removed) for pair in pairs])
+    whole = list(view_map(measure, cameras))
+    pairs = zip(whole, view_map(measure, cut), strict=True)
+    best = choose_most_removed([max(pair, key=lambda seen: seen.removed) for pair in pairs])
     share = sum(seen.removed for seen in whole) / max(sum(seen.shown for seen in whole), 1e-12)
     return [enlarge(camera) for camera in best], share
 
@@ -93,7 +93,13 @@ def split_thinned(
     return kept, gone
 
 
-def choose_cameras(seen: Sequence[RemovalSeen]) -> list[Camera]:
+def mark_last(gaussians: Gaussians, count: int) -> Bool[Tensor, "n"]:
+    """Mark the last `count` Gaussians."""
+    rows = torch.arange(len(gaussians), device=gaussians.means.device)
+    return rows >= len(gaussians) - count
+
+
+def choose_most_removed(seen: Sequence[RemovalVisibility]) -> list[Camera]:
     """Choose the cameras that see most of what goes; the first of equals."""
     order = sorted(range(len(seen)), key=lambda number: -seen[number].removed)
     return [seen[number].camera for number in order[:NUM_ROWS]]
@@ -114,7 +120,7 @@ def draw_removal_rows(
     """Draw a row for each camera: before, what goes in red over a dim grey, and after."""
     kept, gone = split_thinned(given, removed, MAX_GAUSSIANS)
     both = merge([kept, gone])
-    goes = (torch.arange(len(both)) >= len(kept)).to(both.means)
+    goes = mark_last(both, len(gone)).to(both.means)
     rows = []
     for camera in cameras:
         frozen = renderer.freeze(both, camera)

@@ -78,9 +78,11 @@ def load_page(request: ViewRequest) -> tuple[Iterator[bytes], Sequence[str]]:
 
 def load_content(request: ViewRequest) -> ViewerContent:
     """Read the scenes and cameras of the request."""
-    # A folder is that of a completion, of a trainer's model, or an unpacked .sog.
+    # A folder is that of a completion, of a trainer's model, or an unpacked .sog. The second is
+    # replaced by its newest splat.
     scene = request.scene
-    if not (scene / SUMMARY_FILE).is_file():
+    is_completion = (scene / SUMMARY_FILE).is_file()
+    if not is_completion:
         scene = resolve_splat(scene)
 
     reading = request.drop_nonfinite, request.ignore_properties
@@ -88,26 +90,30 @@ def load_content(request: ViewRequest) -> ViewerContent:
         # B is the scene after, A the one before.
         content = load_viewer_files(request.other, scene, *reading)
     elif os.path.isdir(scene) and not os.path.isfile(scene / META):
+        # Also a folder of something else, which is refused there for its missing summary.
         content = load_viewer_completion(scene, request.drop_nonfinite)
     else:
         content = load_viewer_files(scene, None, *reading)
 
     if request.cameras is not None:
         content = add_file_cameras(content, request.cameras, request.resolution)
-    is_completion = (scene / SUMMARY_FILE).is_file()
-    return set_upward(content, request.up, find_completed(scene) if is_completion else scene)
+    splat_file = find_completed(scene) if is_completion else scene
+    return set_upward(content, request.up, splat_file)
 
 
-def set_upward(content: ViewerContent, up: Direction | None, path: Path) -> ViewerContent:
-    """Set what is up on the page, which the cameras show otherwise; a note says what was found."""
+def set_upward(content: ViewerContent, up: Direction | None, splat_file: Path) -> ViewerContent:
+    """Set the upward direction of the page: `up`, or if there are no cameras, that of the splat.
+
+    The page itself derives it from cameras that it shows. A note says how one was found.
+    """
     if up is not None:
         require_direction(up)
         return replace(content, up=up)
     if content.cameras:
         return content
-    beside = find_cameras_beside(path)
+    beside = find_cameras_beside(splat_file)
     cameras = [] if beside is None else load_cameras(beside)
-    upward = find_upward(path, content.after, load_renderer("cpu"), cameras=cameras)
+    upward = find_upward(splat_file, content.after, load_renderer("cpu"), cameras=cameras)
     x, y, z = upward.direction.tolist()
     return replace(content, up=(x, y, z), notes=(*content.notes, *upward.describe()))
 

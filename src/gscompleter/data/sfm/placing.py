@@ -48,7 +48,7 @@ from gscompleter.system.files.image import convert_to_pixels
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.files.writing import SUMMARY_FILE
 from gscompleter.system.progress import track
-from gscompleter.types import View
+from gscompleter.types import Camera, View
 
 MAX_KNOWN = 200
 """Most photographs with known cameras that new ones are compared with; of more, those far apart."""
@@ -58,7 +58,10 @@ MAX_UNPLACED_PHOTOGRAPHS = 5
 """Most photographs that a sentence names."""
 KNOWN_FOLDER = "known"
 """Folder of the copies with known cameras, among those that COLMAP reads."""
-NEW = "new"
+NEW_FOLDER = "new"
+"""Folder of the copies of new photographs, among those that COLMAP reads."""
+DEFAULT_HOME = "new"
+"""First part of the names of new photographs whose folder has a usual name."""
 PLACING_PROCESS = "gscompleter.data.sfm.placing_process"
 
 LensKey = tuple[int, int, str]
@@ -79,6 +82,7 @@ class KnownCopy:
     viewmat: list[list[float]]
     """World to camera, as the rows of a 3 × 4 matrix."""
     is_masked: bool
+    """True if a mask for it lies in the folder of masks."""
 
 
 @dataclass(frozen=True)
@@ -96,6 +100,7 @@ class NewCopy:
     pinhole: PinholeNumbers | None
     """Intrinsics of the undistorted copy, if a known photograph was taken by the same lens."""
     is_masked: bool
+    """As for `KnownCopy`."""
 
 
 @dataclass(frozen=True)
@@ -117,14 +122,18 @@ class Placed:
         count = self.total - len(self.failures)
         notes = [f"{count} of {self.total} new photographs were placed among those of the scene."]
         if self.failures:
-            listed = list(self.failures.items())[:MAX_UNPLACED_PHOTOGRAPHS]
-            reasons = "; ".join(f"{quote_value(name)} ({reason})" for name, reason in listed)
-            more = len(self.failures) - len(listed)
-            rest = f"; and {more} more" if more else ""
-            notes.append(f"Not placed, and left out: {reasons}{rest}.")
+            notes.append(self.describe_failures())
         if self.skipped:
             notes.append(f"{self.skipped} of the photographs have cameras in SCENE already.")
         return notes
+
+    def describe_failures(self) -> str:
+        """Describe in a sentence which photographs were not placed, and why."""
+        listed = list(self.failures.items())[:MAX_UNPLACED_PHOTOGRAPHS]
+        reasons = "; ".join(f"{quote_value(name)} ({reason})" for name, reason in listed)
+        more = len(self.failures) - len(listed)
+        rest = f"; and {more} more" if more else ""
+        return f"Not placed, and left out: {reasons}{rest}."
 
 
 def place_photographs(
@@ -183,7 +192,7 @@ def name_new(frame: Frame, folder: Path) -> Frame:
     A folder of the usual names, which lines leave out, would not tell it from those of the scene.
     """
     home = folder.resolve().name
-    home = NEW if home.casefold() in (*FOLDERS, "") else home
+    home = DEFAULT_HOME if home.casefold() in (*FOLDERS, "") else home
     return replace(frame, name=f"{home}/{frame.name}")
 
 
@@ -207,10 +216,11 @@ def place_copies(
     reading: MaskReading,
 ) -> Placed:
     """Write `images` and `sparse/0` of the photographs that can be placed into `draft`."""
+    # In the draft, so that copies are moved within one file system.
     with tempfile.TemporaryDirectory(dir=draft) as work:
         home = Path(work)
-        known, sources = write_known(photographs, home)
-        new = write_new(given, photographs, home, reading)
+        known, sources = write_known_copies(photographs, home)
+        new = write_new_copies(given, photographs, home, reading)
         job = {
             "images": str(home / COPIES_FOLDER),
             "masks": str(home / MASKS),
@@ -229,7 +239,7 @@ def place_copies(
         if len(failures) == len(given):
             raise InputError(
                 f"No photograph in {quote_value(folder)} could be placed among those of SCENE. "
-                + placed.notes[1],
+                + placed.describe_failures(),
                 "photos",
             )
         for copy, row in zip(new, result["new"], strict=True):
@@ -249,7 +259,9 @@ def explain_unplaced(row: Mapping[str, Any], sources: Mapping[str, str]) -> str:
     return f"{matches} features in common with {like} fit no single camera"
 
 
-def write_known(photographs: Photographs, home: Path) -> tuple[list[KnownCopy], dict[str, str]]:
+def write_known_copies(
+    photographs: Photographs, home: Path
+) -> tuple[list[KnownCopy], dict[str, str]]:
     """Write undistorted copies of photographs with known cameras; return their files by copy."""
     frames = choose_known(photographs)
     copies = []
@@ -262,7 +274,12 @@ def write_known(photographs: Photographs, home: Path) -> tuple[list[KnownCopy], 
         viewmat = np.linalg.inv(camera.c2w.double().numpy())[:3]
         copies.append(
             KnownCopy(
-                name, camera.width, camera.height, read_pinhole(view), viewmat.tolist(), is_masked
+                name=name,
+                width=camera.width,
+                height=camera.height,
+                pinhole=get_pinhole_numbers(camera),
+                viewmat=viewmat.tolist(),
+                is_masked=is_masked,
             )
         )
         sources[name] = photographs.frame(number).file_name
@@ -283,7 +300,7 @@ def choose_known(photographs: Photographs) -> list[int]:
 
 
 def write_view(view: View, home: Path, name: str) -> bool:
-    """Write the photograph of a view, and its mask if it has one (True)."""
+    """Write the photograph of a view, and its mask; return False if it needs none."""
     save_pixels(home / COPIES_FOLDER / name, convert_to_pixels(view.image))
     if view.ignore_mask is None or not bool(view.ignore_mask.any()):
         return False
@@ -298,19 +315,19 @@ def save_pixels(path: Path, pixels: np.ndarray) -> None:
     Image.fromarray(pixels).save(path, compress_level=1)
 
 
-def read_pinhole(view: View) -> PinholeNumbers:
-    """Return the intrinsics of a view."""
-    K = view.camera.K.tolist()
+def get_pinhole_numbers(camera: Camera) -> PinholeNumbers:
+    """Return the intrinsics of a camera."""
+    K = camera.K.tolist()
     return K[0][0], K[1][1], K[0][2], K[1][2]
 
 
-def write_new(
+def write_new_copies(
     given: Sequence[GivenPhotograph], photographs: Photographs, home: Path, reading: MaskReading
 ) -> list[NewCopy]:
     """Write copies of new photographs, undistorted if their lens is a known one."""
     lenses = collect_lenses(photographs)
     return [
-        write_copy(photograph, lenses, home, reading)
+        write_new_copy(photograph, lenses, home, reading)
         for photograph in track(given, "Reading new photographs")
     ]
 
@@ -331,7 +348,7 @@ def get_lens_key(photograph: StoredPhotograph) -> LensKey:
     return *photograph.upright_size, photograph.optics.lens
 
 
-def write_copy(
+def write_new_copy(
     given: GivenPhotograph, lenses: Mapping[LensKey, Intrinsics], home: Path, reading: MaskReading
 ) -> NewCopy:
     """Write the copy of a new photograph, which is undistorted if its lens is known."""
@@ -351,11 +368,11 @@ def write_copy(
     )
     (view,) = build_photographs(given.name, title, [frame]).views([0], MAX_COPY_SIDE)
 
-    # Two photographs may differ in their endings alone.
+    # Two photographs may differ in their endings alone; then the second copy has both endings.
     plain = re.sub(SEPARATORS, "_", given.name)
-    copy = f"{NEW}/{Path(plain).with_suffix('.png').as_posix()}"
+    copy = f"{NEW_FOLDER}/{Path(plain).with_suffix('.png').as_posix()}"
     if (home / COPIES_FOLDER / copy).exists():
-        copy = f"{NEW}/{plain}.png"
+        copy = f"{NEW_FOLDER}/{plain}.png"
     if (home / COPIES_FOLDER / copy).exists():
         raise InputError(f"Two photographs would be called {quote_value(copy)}; rename one.")
     is_masked = write_view(view, home, copy)
@@ -363,13 +380,13 @@ def write_copy(
     lens, focal = given.stored.optics
     # From image diagonals to pixels of the copy.
     focal = None if focal is None else focal * math.hypot(camera.width, camera.height)
-    pinhole = None if known is None else read_pinhole(view)
+    pinhole = None if known is None else get_pinhole_numbers(camera)
     return NewCopy(copy, camera.width, camera.height, lens, focal, pinhole, is_masked)
 
 
 def keep_copy(home: Path, draft: Path, copy: NewCopy) -> None:
     """Move the copy of a placed photograph, and its mask, to their place in `draft`."""
-    name = copy.name.partition("/")[2]
+    name = copy.name.removeprefix(f"{NEW_FOLDER}/")
     moves = [(home / COPIES_FOLDER / copy.name, draft / COPIES_FOLDER / name)]
     if copy.is_masked:
         moves.append((home / MASKS / f"{copy.name}.png", draft / MASKS / f"{name}.png"))

@@ -96,7 +96,7 @@ MAX_THREADS = 4
 MAX_LEFT_OUT_PHOTOGRAPHS = 5
 """Most photographs that a note names."""
 POSES_COMMAND = "poses"
-POSES_FILES = ("images/**/*", "sparse/0/*", SUMMARY_FILE)
+POSES_FILES = ("images/**/*", f"{MASKS}/**/*", "sparse/0/*", SUMMARY_FILE)
 """Globs of the files that it may write. A foreign photograph would count as one of the copies."""
 SIFT = "SIFT"
 LEARNED = "XFeat"

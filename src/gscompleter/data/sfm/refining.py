@@ -2,8 +2,8 @@
 
 Poses of phones, SLAM and drives are off by a fraction of a pixel or more, which blurs whatever is
 made from several photographs. All photographs are refined together (`refining_process`), those of
-targets too: refining one pair alone moves the scene against the frame of everything else. The
-result is brought back into the given frame by a similarity.
+targets too: refining one pair alone moves the scene against the frame of everything else. A bundle
+adjustment leaves the frame of the scene free, so a similarity moves the result into the given one.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from jaxtyping import Float
 
 from gscompleter.data.cameras import Poses
 from gscompleter.data.photographs import Photographs
-from gscompleter.data.sfm.placing import write_known
+from gscompleter.data.sfm.placing import write_known_copies
 from gscompleter.data.sfm.poses import require_pycolmap, run_colmap
 from gscompleter.numerics.geometry import compute_spacing
 from gscompleter.numerics.two_views import ERROR_SIDE, find_near_pairs
@@ -34,15 +34,16 @@ NUM_MATCHED = 8
 POSITION_SIGMA = 0.1
 """Standard deviation of a given camera centre, in steps between cameras."""
 MAX_ERROR_SHARE = 0.8
-"""Largest error of the matches that were kept back, of that of the given poses, to accept."""
+"""Largest error of refined poses that is accepted, as a share of the error of given ones."""
 
 
 @dataclass(frozen=True)
 class PoseRefinement:
     """What a refinement of poses did.
 
-    Errors are median distances of matches that were kept back from their epipolar lines, in pixels
-    of an image of `ERROR_SIDE` pixels.
+    Errors are those of the given and the refined poses: median distances, from their epipolar
+    lines, of matches that the refinement did not use. They are in pixels of an image whose shorter
+    side has `ERROR_SIDE`.
     """
 
     photographs: int
@@ -91,15 +92,15 @@ class PoseRefinement:
 
 
 def refine_poses(photographs: Photographs) -> tuple[Photographs, PoseRefinement | None]:
-    """Refine the poses of photographs together; keep them where matches do not agree better.
+    """Refine the poses of photographs together; keep all as given if matches agree no better.
 
-    Returns the photographs in the given frame and scale, and what was done; None of it with fewer
-    than `MIN_REFINED` photographs, or where cameras stand in one place.
+    Returns the photographs in the given frame and scale, and what was done: None if fewer than
+    `MIN_REFINED` photographs can be refined, or if all cameras stand in one place.
     """
     require_pycolmap()
     with tempfile.TemporaryDirectory() as work:
         home = Path(work)
-        copies, _ = write_known(photographs, home)
+        copies, _ = write_known_copies(photographs, home)
         numbers = [int(Path(copy.name).stem) for copy in copies]
         cameras = [photographs.camera(number) for number in numbers]
         step = compute_spacing(cameras)
@@ -119,24 +120,26 @@ def refine_poses(photographs: Photographs) -> tuple[Photographs, PoseRefinement 
     found = [row is not None for row in result["viewmats"]]
     if sum(found) < MIN_REFINED:
         return photographs, None
+    # Photographs that COLMAP could not refine keep their poses.
     refined = given.copy()
-    refined[found] = bring_back(
+    refined[found] = move_to_given_frame(
         np.stack([invert_pose_rows(row) for row in result["viewmats"] if row is not None]),
         given[found],
     )
+    # From pixels of the copies, most of which have the size of the first.
     scale = ERROR_SIDE / min(copies[0].width, copies[0].height)
-    shift = np.linalg.norm(refined[found][:, :3, 3] - given[found][:, :3, 3], axis=1)
+    moves = np.linalg.norm(refined[found][:, :3, 3] - given[found][:, :3, 3], axis=1)
     done = PoseRefinement(
-        sum(found),
-        result["given_error"] * scale,
-        result["refined_error"] * scale,
-        float(np.median(shift)) / step,
+        photographs=sum(found),
+        given_error=result["given_error"] * scale,
+        refined_error=result["refined_error"] * scale,
+        moved=float(np.median(moves)) / step,
     )
     if not done.is_accepted:
         return photographs, done
     frames = list(photographs.frames)
     for number, pose in zip(numbers, refined, strict=True):
-        pose[:3, 3] += photographs.origin
+        pose[:3, 3] += photographs.origin  # cameras are relative to it, and frames are not
         frames[number] = replace(frames[number], c2w=pose)
     return replace(photographs, frames=tuple(frames)), done
 
@@ -158,21 +161,22 @@ def invert_pose_rows(viewmat: Sequence[Sequence[float]]) -> Float[np.ndarray, "4
     return np.linalg.inv(np.vstack([viewmat, [0.0, 0.0, 0.0, 1.0]]))
 
 
-def bring_back(refined: Poses, given: Poses) -> Poses:
-    """Bring refined cameras into the given frame, by the similarity that fits all of them.
+def move_to_given_frame(refined: Poses, given: Poses) -> Poses:
+    """Move refined cameras into the given frame, by the similarity that fits all of them.
 
-    The rotation is that of their directions, since the centres of a straight drive determine none
-    about its own line; scale and shift are those of the centres.
+    The rotation is fitted to their rotations, since the centres of a straight drive determine none
+    about its own line; scale and shift are fitted to the centres. All are least squares.
     """
+    # Orthogonal Procrustes: the rotation R with the largest sum of trace(givenᵀ R refined).
     covariance = np.einsum("nij,nkj->ik", given[:, :3, :3], refined[:, :3, :3])
     u, _, v = np.linalg.svd(covariance)
     rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u @ v)]) @ v
-    before = refined[:, :3, 3] - refined[:, :3, 3].mean(axis=0)
-    turned = before @ rotation.T
-    wanted = given[:, :3, 3] - given[:, :3, 3].mean(axis=0)
-    scale = (wanted * turned).sum() / (turned * turned).sum()
+    middle = given[:, :3, 3].mean(axis=0)
+    offsets = (refined[:, :3, 3] - refined[:, :3, 3].mean(axis=0)) @ rotation.T
+    given_offsets = given[:, :3, 3] - middle
+    scale = (given_offsets * offsets).sum() / (offsets * offsets).sum()
 
     result = refined.copy()
     result[:, :3, :3] = rotation @ refined[:, :3, :3]
-    result[:, :3, 3] = scale * turned + given[:, :3, 3].mean(axis=0)
+    result[:, :3, 3] = scale * offsets + middle
     return result

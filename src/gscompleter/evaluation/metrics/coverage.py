@@ -1,4 +1,4 @@
-"""Coverage: share of pixels with trusted alpha of at least 0.5, over held-out cameras.
+"""Coverage: share of pixels whose trusted alpha is at least `COVERED`, over held-out cameras.
 
 The cameras are random, near the path of the context cameras, rotated by some degrees. Under full
 trust, trusted alpha is alpha; of a trained splat it counts what photographs confirm, and afterwards
@@ -30,6 +30,7 @@ from gscompleter.trust.photometric import PhotometricTrust
 from gscompleter.types import Camera, Render, merge
 
 NUM_COVERAGE_CAMERAS = 32
+"""Held-out cameras, unless a caller gives another number."""
 COVERAGE_SIDE = 96
 """Longer side of the rendered images, in pixels."""
 TURN_DEGREES = 5.0
@@ -120,15 +121,19 @@ def sample_held_out_cameras(
 def sample_held_out_camera(
     cameras: Sequence[Camera], step: float, generator: torch.Generator
 ) -> Camera:
-    """Sample a camera between a random one of `cameras` and its nearest neighbour."""
+    """Sample a camera between a random one of `cameras` and its nearest neighbour.
+
+    It is shifted in all directions and turned; `step` is in scene units.
+    """
     first = cameras[int(torch.randint(len(cameras), (), generator=generator))]
     share = torch.rand((), generator=generator).item()
-    # The mean squared length of the shift is step².
+    # The step is the spacing of the cameras; the mean squared length of the shift is step².
     shift = step * torch.randn(3, generator=generator) / 3**0.5
-    right, down = (TURN_DEGREES * torch.randn(2, generator=generator)).tolist()
+    yaw, pitch = (TURN_DEGREES * torch.randn(2, generator=generator)).tolist()
     others = [other for other in cameras if other is not first]
     nearest = min(others, key=lambda other: measure_baseline(first, other), default=first)
     between = interpolate_camera(first, nearest, share)
-    turn = axis_angle_to_matrix(between.c2w[:3, 1], math.radians(right))
-    turn = axis_angle_to_matrix(between.c2w[:3, 0], math.radians(down)) @ turn
+    # About the down and the right axis of the camera (OpenCV), in world axes.
+    turn = axis_angle_to_matrix(between.c2w[:3, 1], math.radians(yaw))
+    turn = axis_angle_to_matrix(between.c2w[:3, 0], math.radians(pitch)) @ turn
     return move_camera(between, turn, shift.to(between.c2w))

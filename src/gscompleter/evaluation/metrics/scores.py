@@ -168,36 +168,20 @@ def score(
     at_context = render_both(truth.views)
     at_neighbours = render_both(truth.neighbours)
 
-    # Where the photograph has a true depth: beside the hole, and in it.
-    depth_observed = None
-    depth_hole = None
-    if target.depth is not None:
-        depth_observed = compare_depths(now.depth, target.depth, ~holes & covered)
-        depth_hole = compare_depths(now.depth, target.depth, holes & covered)
+    def compare_depths_in(region: Bool[Tensor, "h w"]) -> SurfaceAgreement | None:
+        if target.depth is None:
+            return None
+        return compare_depths(now.depth, target.depth, region & covered)
 
-    # Agreement of new Gaussians with the scene before; a method may have added or lifted none.
-    seam_step = None
-    added_agreement = None
-    if added:
-        seam_step = measure_seam_step(added, was, camera, renderer)
-        added_agreement = measure_alignment(added, before, camera, renderer)
-    registered_agreement = None
-    if registered:
-        registered_agreement = measure_primitive_alignment(registered, before, camera, renderer)
-
-    # Cracks open as the camera leaves the photographs: at the target, its neighbours and on the way
-    # there.
-    flight_gaps = None
+    # Thin gaps open as the camera leaves the photographs: at the target, its neighbours and on the
+    # way there.
+    flight_gaps, flight = measure_flight_gaps(before, after, truth, renderer)
     completed = {AT_TARGET: now}
     for view, (_, render) in zip(truth.neighbours, at_neighbours, strict=True):
         completed[f"at neighbour {view.frame}"] = render
-    if truth.views:
-        photographs = [view.camera for view in truth.views]
-        flight_before = render_flight(before, photographs, camera, renderer)
-        flight_after = render_flight(after, photographs, camera, renderer)
-        flight_gaps = Change(measure_flight(flight_before), measure_flight(flight_after))
-        completed |= flight_after
+    completed |= flight
 
+    # New Gaussians are compared with the scene before; a method may have added or lifted none.
     scores = Scores(
         hole_fraction=holes.float().mean().item(),
         target_before=measure_quality(was.image, target),
@@ -208,11 +192,15 @@ def score(
         neighbours_psnr=compare_views(at_neighbours, truth.neighbours, compute_view_psnr),
         context_psnr=compare_views(at_context, truth.views, compute_view_psnr),
         context_ssim=compare_views(at_context, truth.views, compute_view_ssim),
-        depth_observed=depth_observed,
-        depth_hole=depth_hole,
-        seam_step=seam_step,
-        added=added_agreement,
-        registered=registered_agreement,
+        depth_observed=compare_depths_in(~holes),
+        depth_hole=compare_depths_in(holes),
+        seam_step=measure_seam_step(added, was, camera, renderer) if added else None,
+        added=measure_alignment(added, before, camera, renderer) if added else None,
+        registered=(
+            measure_primitive_alignment(registered, before, camera, renderer)
+            if registered
+            else None
+        ),
         thin_gaps=Change(measure_thin_gaps(was.alpha), measure_thin_gaps(now.alpha)),
         neighbours_thin_gaps=tuple(
             Change(*(measure_thin_gaps(render.alpha) for render in pair)) for pair in at_neighbours
@@ -220,6 +208,21 @@ def score(
         flight_thin_gaps=flight_gaps,
     )
     return scores, TargetRenders(was, now, holes, find_worst_gap(completed))
+
+
+def measure_flight_gaps(
+    before: Gaussians, after: Gaussians, truth: Truth, renderer: Renderer
+) -> tuple[Change | None, dict[str, Render]]:
+    """Measure thin gaps on the way from the nearest photograph to the target.
+
+    Also returns the renders after completion, by where they are; without photographs None and none.
+    """
+    if not truth.views:
+        return None, {}
+    photographs = [view.camera for view in truth.views]
+    flight_before = render_flight(before, photographs, truth.target.camera, renderer)
+    flight_after = render_flight(after, photographs, truth.target.camera, renderer)
+    return Change(measure_flight(flight_before), measure_flight(flight_after)), flight_after
 
 
 def measure_quality(image: Image, photograph: View) -> Quality:

@@ -96,7 +96,8 @@ class AnyViewVit(nn.Module):
     """A vision transformer over the views of a scene.
 
     The first blocks process single views. From `first_multi_view_block` on, a camera token replaces
-    the class token, and odd blocks process all views jointly.
+    the class token, and odd blocks process all views jointly. If that is None (monocular models),
+    all blocks process single views.
     """
 
     def __init__(self, config: VitConfig) -> None:
@@ -127,7 +128,7 @@ class AnyViewVit(nn.Module):
     def forward(
         self, images: Float[Tensor, "b v 3 h w"], cameras: Float[Tensor, "b v c"] | None = None
     ) -> list[Tokens]:
-        """Compute the tokens of the four output blocks; `cameras` is None if poses are unknown."""
+        """Compute the tokens of the output blocks; `cameras` are encoded poses, None if unknown."""
         scenes, views = images.shape[:2]
         x = self.embed_views(images)
         size = (images.shape[3] // PATCH, images.shape[4] // PATCH)
@@ -143,7 +144,8 @@ class AnyViewVit(nn.Module):
         # Tokens after the last block that looked at each view alone; heads get these as well.
         local = x
         for number, block in enumerate(self.blocks):
-            # Without poses, the first view is the reference; a central one is chosen for it.
+            # Without poses, the first view is the reference of all; a central one is moved to its
+            # place, chosen by the class tokens before the last single-view block.
             if start is not None and number == start - 1 and cameras is None and views > 2:
                 order = order_views(select_reference_view(x[:, :, 0].float()), views)
                 x = reorder_views(x, order)
@@ -186,7 +188,11 @@ class AnyViewVit(nn.Module):
         return tokens[:, :, None].expand(scenes, -1, -1, -1)
 
     def join_tokens(self, local: Float[Tensor, "b v t c"], x: Float[Tensor, "b v t c"]) -> Tokens:
-        """Join the tokens of a block with those of the last single-view block."""
+        """Join the tokens of a block with `local`, those of the last block on single views.
+
+        Only the patch tokens of the block itself are normalized. Without a multi-view part there is
+        nothing to join.
+        """
         normed = self.norm(x)
         if self.config.first_multi_view_block is None:
             return Tokens(normed[:, :, 1:], x[:, :, 0])

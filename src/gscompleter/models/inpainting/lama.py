@@ -12,12 +12,16 @@ from gscompleter.models.onnx_network import OnnxNetwork, load_network
 from gscompleter.models.weights.published import PUBLISHED
 
 SIGNATURE = {"image": ("tensor(float)", 3), "mask": ("tensor(float)", 1)}
+"""Type and number of channels of each input of the network."""
 MULTIPLE = 32
 """Divisor of the side lengths that the network accepts if they are not fixed."""
 
 
 class LaMa:
-    """Network that takes colours in [0, 1] and a mask, 1 in the hole, and returns [0, 255]."""
+    """Fills holes with the network of LaMa.
+
+    The network takes colours in [0, 1] and a mask, 1 in the hole, and returns colours in [0, 255].
+    """
 
     def __init__(self, network: OnnxNetwork) -> None:
         self.network = network
@@ -25,9 +29,12 @@ class LaMa:
     def __call__(
         self, image: Float[Tensor, "h w 3"], hole: Bool[Tensor, "h w"]
     ) -> Float[Tensor, "h w 3"]:
-        """Fill the hole of an image in [0, 1], reflected beyond its border to a valid size."""
+        """Fill the hole of an image in [0, 1], which is a window of `fill_windows`.
+
+        It is no larger than the size that a file of LaMa fixes, and is reflected beyond its right
+        and lower border to that size, or to the next valid one.
+        """
         height, width = hole.shape
-        # To the size that the file fixes, or up to the next multiple.
         rows, columns = self.network.fixed_size or (
             -(-height // MULTIPLE) * MULTIPLE,
             -(-width // MULTIPLE) * MULTIPLE,

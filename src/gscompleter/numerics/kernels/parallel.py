@@ -17,10 +17,11 @@ PIECES_PER_THREAD = 4
 """Number of pieces per thread, which balances pieces of different cost."""
 
 _thread = threading.local()
+"""Has the attribute `is_alone` on threads of `map_small_tasks`, whose kernels use no others."""
 
 
 def count_threads(threads):
-    """Return how many threads a kernel called here uses, if `threads` are available."""
+    """Return how many threads a kernel called here uses: `threads`, or all if None; 1 if alone."""
     return 1 if hasattr(_thread, "is_alone") else threads or numba.config.NUMBA_NUM_THREADS
 
 
@@ -40,7 +41,9 @@ def run_calls(kernel, calls, threads=None):
     if threads == 1 or len(calls) == 1:
         return [kernel(*arguments) for arguments in calls]
     results = [None] * len(calls)
-    waiting = iter(enumerate(calls))
+    # All threads take their next call from this one iterator. `next` of enumerate is a single step
+    # under the interpreter's lock, so that no call is taken twice.
+    waiting = enumerate(calls)
 
     def work():
         for number, arguments in waiting:
@@ -51,6 +54,8 @@ def run_calls(kernel, calls, threads=None):
     try:
         work()
     finally:
+        # This thread has done what was left, so a helper that did not start is not waited for: the
+        # pool may be busy with callers that wait for helpers themselves.
         for helper in helpers:
             if not helper.cancel():
                 helper.result()
@@ -99,5 +104,5 @@ def split_range(count, pieces):
 
 @lru_cache(maxsize=8)
 def get_thread_pool(threads, process):
-    """Return the thread pool of a process; a forked one makes its own."""
+    """Return the thread pool of the process with that ID: threads do not survive a fork."""
     return ThreadPoolExecutor(threads, thread_name_prefix="gscompleter")

@@ -6,7 +6,7 @@ from gscompleter.numerics.kernels.cache import njit
 from gscompleter.numerics.kernels.parallel import share
 
 SAFE_DEPTH = 1e-12
-"""Smallest z-depth, relative to the farthest corner, of a corner whose pixel says where it is."""
+"""Smallest z-depth of a corner, relative to the farthest one, whose pixel can be computed."""
 
 
 def draw_depth(corners, faces, width, height):
@@ -29,7 +29,8 @@ def _draw_rows(begin, end, corners, faces, depth):
         if farthest <= 0:
             continue
 
-        # The box around the triangle. One that reaches behind the camera may cover any pixel.
+        # The range of pixels around the triangle, with one to spare. A triangle that reaches behind
+        # the camera may cover any pixel.
         left = 0
         right = width
         top = begin
@@ -62,6 +63,7 @@ def _draw_rows(begin, end, corners, faces, depth):
                 u = sign * (ux * x + uy * y + uz)
                 v = sign * (vx * x + vy * y + vz)
                 w = sign * (wx * x + wy * y + wz)
+                # Barycentric coordinates times `total`, which is normal · r.
                 total = u + v + w
                 if u < 0 or v < 0 or w < 0 or total <= 0:
                     continue

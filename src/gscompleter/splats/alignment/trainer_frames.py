@@ -17,10 +17,10 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.camera_files import has_camera_list, read_camera_list
-from gscompleter.data.camera_paths import DATAPARSER_FILE
 from gscompleter.data.cameras import Poses, find_pose_defect
-from gscompleter.data.local_origin import compute_frame_from_photographs, read_dataparser_transforms
+from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.photographs import Photographs
+from gscompleter.data.transforms import DATAPARSER_FILE, read_dataparser_transforms
 from gscompleter.splats.alignment.similarity import (
     Matrix,
     fit_pose_similarity,

@@ -1,7 +1,7 @@
 """Results of versions that did not yet list their files: which command wrote them, and which files.
 
-A summary of that time is told by its entries. Its files are told by their names, and only by names
-that no user would choose: others in the folder stay.
+A summary of that time is known by its entries, and the files beside it by their names. Only names
+that no user would choose count: other files in the folder stay.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ COMPLETION_ENTRIES = frozenset(
 )
 CLEANING_ENTRIES = frozenset(("version", "settings", "gaussians", "seconds"))
 CLEANING_COUNTS = frozenset(("given", "kept", "removed"))
+"""Keys of the entry `gaussians` of a cleaning."""
 POSES_ENTRIES = frozenset(("poses", "photographs"))
 
 COMPLETION_FILES = re.compile(

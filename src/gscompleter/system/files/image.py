@@ -15,7 +15,8 @@ from PIL import Image, features
 from torch import Tensor
 
 from gscompleter.system.damage import DamagedError, describe_damage
-from gscompleter.system.errors import InputError, join_names, quote_value, refuse_pointer
+from gscompleter.system.errors import InputError, quote_value, refuse_pointer
+from gscompleter.system.files.mask_labels import refuse_labels
 from gscompleter.system.files.reading import check_file, make_read_error, read_head
 from gscompleter.system.files.writing import replace_file
 
@@ -44,14 +45,6 @@ QUARTER_TURNS = (5, 6, 7, 8)
 
 HALF_OPAQUE = 128
 """Smallest alpha, of 255, of a pixel that counts as opaque."""
-LEVEL_TOLERANCE = 0.1
-"""Difference, relative to the range of a mask, below which two levels count as one: JPEG."""
-MIN_LABEL_SHARE = 0.002
-"""Smallest share of a mask that the flat pixels of a label fill."""
-MAX_LABELS = 64
-"""Most labels of a map; a soft gradient has more levels."""
-MAX_LEVELS_NAMED = 4
-"""Most labels that a sentence names."""
 ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
 
 
@@ -146,7 +139,7 @@ def read_colors_and_alpha(
 
 
 def read_mask(stored: Path | bytes, name: str = "") -> Bool[np.ndarray, "h w"]:
-    """Read the black or transparent pixels of a mask: those below half of its largest value.
+    """Read a mask as True where it is black or transparent: below half of its largest value.
 
     So a mask of 0 and 1 means the same as one of 0 and 255, and soft or JPEG edges end halfway. A
     mask without any white is black everywhere. Of something that was cut out, over transparency,
@@ -174,53 +167,8 @@ def read_mask(stored: Path | bytes, name: str = "") -> Bool[np.ndarray, "h w"]:
 
 
 def leave_out_constant(alpha: UInt8[np.ndarray, "h w"]) -> UInt8[np.ndarray, "h w"] | None:
-    """Return an alpha channel, or None if it is the same everywhere, which tells nothing."""
+    """Return an alpha channel, or None if it is the same everywhere and so marks no part."""
     return None if alpha.min() == alpha.max() else alpha
-
-
-def refuse_labels(values: Shaped[np.ndarray, "h w c"], name: str) -> None:
-    """Refuse a mask of more than two levels: nothing says which of the labels is meant.
-
-    `name` is that of the mask, for the error.
-    """
-    levels = find_levels_between(values)
-    if len(levels):
-        shown = join_names([quote_value(level) for level in levels], MAX_LEVELS_NAMED)
-        raise InputError(
-            f"{name} is no mask of black and white but a map of labels: beside its "
-            f"darkest and its brightest level it has {shown}; save what is meant in white, and all "
-            "else in black."
-        )
-
-
-def find_levels_between(values: Shaped[np.ndarray, "h w c"]) -> list[object]:
-    """Find the levels or colours of flat regions that are neither the darkest nor the brightest.
-
-    Soft edges, and those of a JPEG, are no flat regions; a mask with more than `MAX_LABELS` of them
-    is a gradient.
-    """
-    # Differences need a sign; large masks of 8 bits get no more than they need.
-    wider = {"u": np.int64, "i": np.int64, "f": np.float64}[values.dtype.kind]
-    exact = values.astype(np.int16 if values.dtype == np.uint8 else wider)
-    brightness = exact.max(axis=-1)
-    places = np.unravel_index([brightness.argmin(), brightness.argmax()], brightness.shape)
-    darkest, brightest = exact[places]
-    limit = LEVEL_TOLERANCE * (brightness.max() - brightness.min())
-    is_dark = (np.abs(exact - darkest) <= limit).all(axis=-1)
-    is_bright = (np.abs(exact - brightest) <= limit).all(axis=-1)
-    between = ~(is_dark | is_bright)
-    if between.mean() < MIN_LABEL_SHARE:
-        return []
-    # Flat: equal to the pixels on the left, on the right, above and below.
-    inner = exact[1:-1, 1:-1]
-    neighbours = (exact[1:-1, :-2], exact[1:-1, 2:], exact[:-2, 1:-1], exact[2:, 1:-1])
-    is_flat = np.all([(inner == near).all(axis=-1) for near in neighbours], axis=0)
-    colors, counts = np.unique(inner[is_flat & between[1:-1, 1:-1]], axis=0, return_counts=True)
-    large = colors[counts >= MIN_LABEL_SHARE * between.size].tolist()
-    if len(large) > MAX_LABELS:
-        return []
-    # A grey of three channels is named by one number.
-    return [color[0] if len(set(color)) == 1 else tuple(color) for color in large]
 
 
 def read_pixels(stored: Path | str | bytes, name: str = "") -> UInt8[np.ndarray, "h w 3"]:
@@ -279,7 +227,10 @@ def _read_npy(path: Path) -> np.ndarray:
 
 @contextmanager
 def open_image(stored: Path | str | bytes, name: str = "") -> Iterator[Image.Image]:
-    """Open an image file, or its bytes; any failure while it is read becomes an InputError."""
+    """Open an image file, or its bytes; any failure in the `with` block becomes an InputError.
+
+    `name` stands for bytes in errors.
+    """
     file = io.BytesIO(stored) if isinstance(stored, bytes) else Path(stored)
     shown = quote_value(name) if isinstance(file, io.BytesIO) else f"The image {quote_value(file)}"
     if isinstance(file, Path):
@@ -335,6 +286,7 @@ def _has_alpha(image: Image.Image) -> bool:
 
 def _read_over_black(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
     if image.mode == "F":
+        # As any error inside of `open_image`, it becomes the reason in an InputError.
         raise ValueError("it holds floating-point values, not colours")
     if image.mode == "I" or image.mode.startswith("I;16"):
         # 65535 / 257 is 255.
