@@ -73,7 +73,7 @@ def test_geometry_in_a_frame_of_its_own_comes_to_its_place(kind):
     assert placement.scale == pytest.approx(5, rel=0.01)
     assert placement.degrees == pytest.approx(120, abs=0.5)
     assert placement.deviation < 0.005
-    assert placement.describe("a.ply").startswith("a.ply was moved to where the scene shows")
+    assert placement.describe().startswith(f"{geometry.name} was moved to where the scene shows")
 
 
 @pytest.mark.parametrize("geometry", [make_mesh(OTHER_ROOM), move_elsewhere(make_mesh(OTHER_ROOM))])

@@ -30,6 +30,8 @@ MAX_POINTS = 4_000_000
 class GeometryPlacement:
     """How geometry was moved from its own frame to that of a scene, and how well it fits there."""
 
+    name: str
+    """Name of the geometry for sentences."""
     scale: float
     """Factor of its lengths."""
     degrees: float
@@ -41,11 +43,11 @@ class GeometryPlacement:
     agreement: float
     """Share of the compared pixels at which both are the same surface."""
 
-    def describe(self, name: str) -> str:
-        """Write the sentence on the geometry of a name."""
+    def describe(self) -> str:
+        """Write the sentence for people."""
         length = float(np.linalg.norm(self.shift))
         return (
-            f"{name} was moved to where the scene shows the same: scaled by {self.scale:.4g}, "
+            f"{self.name} was moved to where the scene shows the same: scaled by {self.scale:.4g}, "
             f"turned by {self.degrees:.1f}°, shifted by {length:.3g}; its depth then differs by "
             f"{100 * self.deviation:.1f} % (median)."
         )

@@ -346,6 +346,8 @@ def fit_closest_points(
     """
     # The unknowns are a turn, a shift and a growth about the middle of what is seen, whose size is
     # the unit of lengths.
+    if len(surface.points) == 0 or len(seen.points) == 0:
+        return similarity, 0.0
     weights = seen.size / seen.depths
     for gate in GATES:
         closest, distances = find_closest(similarity, surface, seen)
@@ -368,7 +370,7 @@ def fit_closest_points(
         step = axes @ (axes.T @ (rows.T @ (trusted * gaps)) / (values + DAMPING * values[-1]))
         similarity = make_step(step, seen) @ similarity
     distances = find_closest(similarity, surface, seen)[1]
-    return similarity, float((distances <= GATES[-1]).sum()) / max(1, len(distances))
+    return similarity, float((distances <= GATES[-1]).mean())
 
 
 def find_closest(

@@ -215,6 +215,7 @@ def move_to(geometry: GivenGeometry, similarity: Similarity, compared: Compariso
     cosine = (np.trace(similarity[:3, :3]) / scale - 1) / 2
     shift = np.median(moved.vertices, axis=0) - np.median(geometry.vertices, axis=0)
     placement = GeometryPlacement(
+        geometry.name,
         scale,
         float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))),
         (float(shift[0]), float(shift[1]), float(shift[2])),

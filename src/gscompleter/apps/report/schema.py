@@ -15,6 +15,7 @@ from gscompleter.data.photograph_names import name_photograph, name_target
 from gscompleter.evaluation.metrics.coverage import Coverage
 from gscompleter.evaluation.verdict.kept import KeptRow
 from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow, ScoreRow
+from gscompleter.numerics.given_geometry import GeometryPlacement
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import read_command, refuse_later_results
 from gscompleter.system.files.typed_json import read_typed_json
@@ -247,6 +248,8 @@ class CompletionSummary:
     """What cameras that decided nothing still see of a splat without photographs."""
     new_photographs: int | None = None
     """Photographs that a splat was not trained on; None if the scene was reconstructed."""
+    placed_geometry: GeometryPlacement | None = None
+    """How geometry from elsewhere was moved to the scene; None if it stood there, or without it."""
     context_notes: tuple[str, ...] = ()
     """Sentences of the reconstructor about the context."""
 
