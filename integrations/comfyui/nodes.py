@@ -42,6 +42,7 @@ PAINTER = "ComfyUI"
 """Name of the painter unless the user names another."""
 NAME = "The painted image"
 """Name of the image in sentences."""
+GEOMETRY = {"default": "", "tooltip": "Scan or mesh that gives depth in holes"}
 OUT = {"default": "output/gscompleter", "tooltip": "Folder for a new folder per result"}
 SIDE = {"default": 512, "min": 64, "max": 4096, "step": 8}
 
@@ -156,6 +157,7 @@ class FindHoles:
             "optional": {
                 "splat": ("STRING", {"default": "", "tooltip": "Splat to complete"}),
                 "camera": ("INT", {"default": 0, "min": 0, "tooltip": "Number of the target"}),
+                "geometry": ("STRING", GEOMETRY),
                 "invert_masks": ("BOOLEAN", {"default": False, "tooltip": "White is ignored"}),
                 "large_masks": ("BOOLEAN", {"default": False, "tooltip": "Masks hide that much"}),
             },
@@ -170,6 +172,7 @@ class FindHoles:
         width: int,
         splat: str = "",
         camera: int = 0,
+        geometry: str = "",
         invert_masks: bool = False,
         large_masks: bool = False,
     ) -> tuple[Tensor, Tensor, Holes, Tensor, Tensor, Tensor]:
@@ -179,6 +182,7 @@ class FindHoles:
             options = CompleteOptions(
                 folder=choose_path(scene),
                 scene=choose_path(splat),
+                geometry=choose_path(geometry),
                 context=parse_frames(context) or None,
                 target=(word,) if word else (),
                 auto=None if word else camera + 1,
@@ -299,6 +303,7 @@ class Repair:
             },
             "optional": {
                 "scene": ("STRING", {"default": "", "tooltip": photographs}),
+                "geometry": ("STRING", GEOMETRY),
                 "invert_masks": ("BOOLEAN", {"default": False, "tooltip": "Black is wrong"}),
                 "large_masks": ("BOOLEAN", {"default": False, "tooltip": "It is that much"}),
             },
@@ -311,6 +316,7 @@ class Repair:
         mask: Tensor,
         out: str,
         scene: str = "",
+        geometry: str = "",
         invert_masks: bool = False,
         large_masks: bool = False,
     ) -> tuple[str, Tensor]:
@@ -327,6 +333,7 @@ class Repair:
             options = RepairOptions(
                 folder=choose_path(scene),
                 scene=choose_path(splat),
+                geometry=choose_path(geometry),
                 target=(target.strip(),),
                 mask=(path,),
                 resolution=(height, width),

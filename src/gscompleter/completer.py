@@ -52,16 +52,17 @@ from gscompleter.stages.fade_border import fade_border
 from gscompleter.stages.filter_holes import filter_holes
 from gscompleter.stages.find_unfilled import find_unfilled
 from gscompleter.stages.given_geometry import (
+    ContradictedError,
     add_geometry_depth,
     check_geometry,
     count_on_geometry,
     give_depth_before_scene,
     give_photographs_depth,
-    require_same_scene,
     require_uncontradicted,
 )
 from gscompleter.stages.lift import lift
 from gscompleter.stages.new_photos import find_new_photos, recolor_to_photos
+from gscompleter.stages.place_geometry import place_geometry
 from gscompleter.stages.recolor import recolor
 from gscompleter.stages.refine import keep_as_it_is, refine
 from gscompleter.stages.refusals import explain_skip
@@ -79,7 +80,7 @@ from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.trust import Trust
 from gscompleter.trust.photometric import load_trust
-from gscompleter.types import Camera, DepthAffine, Gaussians, PaddedCamera, View, merge
+from gscompleter.types import Camera, DepthAffine, Gaussians, PaddedCamera, Render, View, merge
 
 MAX_SEED = 2**62
 """Levels and rounds add to the seed, which has 64 bits."""
@@ -158,8 +159,9 @@ class GSCompleter:
                 reconstructs the context from `views`.
             check_views: Further photographs of `scene` that must not get worse. With them the scene
                 is trusted only as far as the photographs confirm it.
-            geometry: A scan or mesh in the frame and unit of the cameras (`load_geometry`). It
-                gives depth where photographs show none, as far as it agrees with what they show.
+            geometry: A scan or mesh (`load_geometry`), in the frame and unit of the cameras or in
+                one of its own, from which it is moved to where the scene shows the same. It gives
+                depth where photographs show none, as far as it agrees with what they show.
 
         Raises:
             InputError: Too few views, no baseline, too many targets, no view sees the scene, no
@@ -226,7 +228,7 @@ class GSCompleter:
                 is_given=scene is not None,
                 seed=self.seed,
                 context_notes=context.notes,
-                geometry=geometry,
+                geometry=context.geometry,
                 models=self.name_models(),
             )
             # What earlier commands made steps aside where photographs show something else, so that
@@ -265,7 +267,7 @@ class GSCompleter:
         """Initialize the context, whose photographs get the depth of geometry if there is any.
 
         Before Ψ makes the scene of them, so that it uses it; a scene that is given tells first
-        whether the geometry lies.
+        where the geometry belongs.
         """
 
         def init(photographs: Sequence[View]) -> InitialContext:
@@ -276,19 +278,37 @@ class GSCompleter:
         if geometry is None:
             return init(views)
         if scene is not None:
-            return self.give_depth(geometry, init(views))
-        given, notes = give_depth_before_scene(geometry, views)
-        context = init(given)
-        require_uncontradicted(geometry, given, context.views)
-        return replace(context, notes=(*notes, *context.notes))
+            context = init(views)
+            placed, renders = self.place(geometry, context)
+            given = give_photographs_depth(placed, context.views, renders)
+            return replace(context, views=given, geometry=placed)
 
-    def give_depth(self, geometry: GivenGeometry, context: InitialContext) -> InitialContext:
-        """Give the photographs of a given scene the depth of geometry; refuse one that lies."""
+        def init_with(placed: GivenGeometry) -> InitialContext:
+            given, notes = give_depth_before_scene(placed, views)
+            context = init(given)
+            require_uncontradicted(placed, given, context.views)
+            return replace(context, notes=(*notes, *context.notes), geometry=placed)
+
+        try:
+            return init_with(geometry)
+        except ContradictedError:
+            # It may be in a frame of its own, which the scene that Ψ makes without it tells.
+            placed, _ = self.place(geometry, init(views))
+            if placed is geometry:
+                raise
+            return init_with(placed)
+
+    def place(
+        self, geometry: GivenGeometry, context: InitialContext
+    ) -> tuple[GivenGeometry, list[Render]]:
+        """Move geometry to where the photographs of a context show it; return their renders, too.
+
+        Raises InputError if they show something else.
+        """
         cameras = [view.camera for view in context.views]
         frozen = self.scenes.freeze_at((context.source.rendered,), cameras)
         renders = [scene.render for scene in frozen]
-        require_same_scene(geometry, context.views, renders)
-        return replace(context, views=give_photographs_depth(geometry, context.views, renders))
+        return place_geometry(geometry, context.views, renders), renders
 
     def name_models(self) -> dict[str, str]:
         """Name Ψ, the depth that helps it, and Φ, for the record of what is invented."""

@@ -16,6 +16,15 @@ from scenes import Room, camera_at, cast
 SIDES = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
 """Corners of the sides of a box, of which x, then y, then z is low (0) or high (1)."""
 
+OTHER_ROOM = Room(
+    (
+        ((-2.0, -1.3, -2.0), (4.0, 1.3, 6.0)),
+        ((1.5, 0.1, 1.0), (2.2, 1.3, 2.5)),
+        ((-1.8, -0.4, 3.0), (-1.0, 1.3, 4.4)),
+    )
+)
+"""A room of nearly the size of the default one, with other furniture."""
+
 Mesh = tuple[Float[ndarray, "n 3"], Int[ndarray, "m 4"]]
 
 

@@ -27,6 +27,33 @@ MAX_POINTS = 4_000_000
 
 
 @dataclass(frozen=True)
+class GeometryPlacement:
+    """How geometry was moved from its own frame to that of a scene, and how well it fits there."""
+
+    name: str
+    """Name of the geometry for sentences."""
+    scale: float
+    """Factor of its lengths."""
+    degrees: float
+    """Angle of its turn."""
+    shift: tuple[float, float, float]
+    """Move of the middle of its vertices, in scene units."""
+    deviation: float
+    """Median deviation of its depth from what the scene shows, relative, after the move."""
+    agreement: float
+    """Share of the compared pixels at which both are the same surface."""
+
+    def describe(self) -> str:
+        """Write the sentence for people."""
+        length = float(np.linalg.norm(self.shift))
+        return (
+            f"{self.name} was moved to where the scene shows the same: scaled by {self.scale:.4g}, "
+            f"turned by {self.degrees:.1f}°, shifted by {length:.3g}; its depth then differs by "
+            f"{100 * self.deviation:.1f} % (median)."
+        )
+
+
+@dataclass(frozen=True)
 class GivenGeometry:
     """Triangles of a mesh, or of squares in place of points, in the frame of a scene."""
 
@@ -36,6 +63,8 @@ class GivenGeometry:
     """Indices of the corners of each triangle."""
     name: str = "geometry"
     """Name for sentences, such as that of its file."""
+    placement: GeometryPlacement | None = None
+    """How it was moved to the scene; None if it stands as it was given."""
 
     def __post_init__(self) -> None:
         """Raise InputError for values that are no triangles."""
@@ -62,6 +91,11 @@ class GivenGeometry:
     def move(self, shift: Float[np.ndarray, "3"]) -> GivenGeometry:
         """Return the geometry shifted by a vector in scene units."""
         return replace(self, vertices=self.vertices + shift)
+
+    def transform(self, similarity: Float[np.ndarray, "4 4"]) -> GivenGeometry:
+        """Return the geometry moved by a similarity, without a placement."""
+        moved = transform_points(similarity, self.vertices)
+        return replace(self, vertices=moved, placement=None)
 
     def draw_depth(self, camera: Camera) -> Float[Tensor, "h w"]:
         """Draw its z-depth at the pixels of a camera, in scene units; 0 where there is none."""
@@ -101,11 +135,7 @@ def replace_points(
     spacing = distances[:, SPACING_NEIGHBOUR]
     spacing = np.minimum(spacing, MAX_SPACING * np.median(spacing[neighbours[:, 1:]], axis=1))
 
-    # The plane of least squares: its normal is the direction in which neighbours spread least, and
-    # eigenvectors are in ascending order of that.
-    offsets = points[neighbours] - points[:, None]
-    offsets -= offsets.mean(axis=1, keepdims=True)
-    axes = np.linalg.eigh(offsets.transpose(0, 2, 1) @ offsets).eigenvectors
+    axes = fit_planes(points, neighbours)
     along, across = (HALF_SIDE * spacing[:, None] * axes[:, :, i] for i in (1, 2))
     corners = points[:, None] + np.stack(
         [-along - across, along - across, along + across, across - along], axis=1
@@ -113,3 +143,24 @@ def replace_points(
     first = 4 * np.arange(len(points), dtype=np.int64)[:, None]
     halves = [first + np.array(half) for half in ((0, 1, 2), (0, 2, 3))]
     return corners.reshape(-1, 3), np.concatenate(halves)
+
+
+def fit_planes(
+    points: Float[np.ndarray, "n 3"], neighbours: Int[np.ndarray, "n k"]
+) -> Float[np.ndarray, "n 3 3"]:
+    """Fit the plane of each point's neighbours, which are given by their rows.
+
+    Returns three axes, as columns: the normal, and two in the plane.
+    """
+    # The plane of least squares: its normal is the direction in which neighbours spread least, and
+    # eigenvectors are in ascending order of that.
+    offsets = points[neighbours] - points[:, None]
+    offsets -= offsets.mean(axis=1, keepdims=True)
+    return np.linalg.eigh(offsets.transpose(0, 2, 1) @ offsets).eigenvectors
+
+
+def transform_points(
+    similarity: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]
+) -> Float[np.ndarray, "n 3"]:
+    """Move points by a similarity."""
+    return points @ similarity[:3, :3].T + similarity[:3, 3]

@@ -13,6 +13,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 
 from gscompleter.config import CompleterConfig, get_named_config
 from gscompleter.numerics.geometry import add_near_plane, compute_z_depths, project_mask
+from gscompleter.numerics.given_geometry import GivenGeometry
 from gscompleter.numerics.image_ops import MIN_CONTRAST
 from gscompleter.reconstructors import (
     DepthAware,
@@ -46,6 +47,8 @@ class InitialContext:
     """Exposure gain per channel of each original photograph relative to the context, or None."""
     notes: tuple[str, ...] = ()
     """Sentences of Ψ for the user."""
+    geometry: GivenGeometry | None = None
+    """Geometry from elsewhere, in the frame of the context; None for none."""
 
 
 def choose_config(

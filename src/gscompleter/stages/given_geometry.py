@@ -42,6 +42,10 @@ surfaces a render mixes the depth of two, and agrees with neither."""
 ADVICE = "give it in the frame and unit of the scene"
 
 
+class ContradictedError(InputError):
+    """Geometry is not what the photographs show, where it stands."""
+
+
 def check_geometry(geometry: object, config: CompleterConfig) -> None:
     """Raise InputError for a value that is no geometry, or if the config can use none."""
     if not isinstance(geometry, GivenGeometry):
@@ -55,34 +59,6 @@ def check_geometry(geometry: object, config: CompleterConfig) -> None:
             "config of the paper out.",
             "geometry",
         )
-
-
-def require_same_scene(
-    geometry: GivenGeometry, views: Sequence[View], renders: Sequence[Render]
-) -> None:
-    """Raise InputError if geometry contradicts a scene as its photographs see it."""
-    ratios = []
-    num_pixels = 0
-    for view, render in zip(views, renders, strict=True):
-        surface = mask_out_sky(render, view.camera)
-        drawn = geometry.draw_depth(view.camera)
-        compared = surface.valid & (drawn > 0)
-        ratios.append((drawn[compared] / surface.depth[compared]).log())
-        num_pixels += compared.numel()
-    ratio = torch.cat(ratios).cpu()
-    require_overlap(geometry, len(ratio), num_pixels)
-    deviation = ratio.abs().median().expm1().item()
-    if deviation <= MAX_DEVIATION:
-        return
-    factor = ratio.median()
-    is_scaled = (ratio - factor).abs().median().expm1().item() <= MAX_DEVIATION
-    scale = f", about {factor.exp().item():.3g} times as far away" if is_scaled else ""
-    raise InputError(
-        f"The depth of {geometry.name} differs by {100 * deviation:.0f} % from what the scene "
-        f"shows at the photographs{scale}, and at most {100 * MAX_DEVIATION:.0f} % count as the "
-        f"same surfaces; {ADVICE}.",
-        "geometry",
-    )
 
 
 def give_photographs_depth(
@@ -108,11 +84,18 @@ def give_depth_before_scene(
 ) -> tuple[list[View], tuple[str, ...]]:
     """Give photographs the depth of geometry before a scene is made of them, and say what is so.
 
-    Raises InputError if what they measure by their matches contradicts it.
+    Raises ContradictedError if what they measure by their matches contradicts it.
     """
     drawn = [geometry.draw_depth(view.camera) for view in views]
     num_pixels = sum(depth.numel() for depth in drawn)
-    require_overlap(geometry, sum(int((depth > 0).sum()) for depth in drawn), num_pixels)
+    num_drawn = sum(int((depth > 0).sum()) for depth in drawn)
+    if num_drawn < MIN_COMPARED * num_pixels:
+        raise ContradictedError(
+            f"{geometry.name} covers hardly anything that the photographs show ({num_drawn:,} of "
+            f"{num_pixels:,} pixels), so that nothing tells whether they belong together; "
+            f"{ADVICE}.",
+            "geometry",
+        )
     given = []
     for view, depth in zip(views, drawn, strict=True):
         if view.depth is None and len(view.known_depths) == 0:
@@ -129,7 +112,7 @@ def give_depth_before_scene(
     # The test of every given depth: a pair with errors of its poses measures no better than that.
     if not fit.is_consistent or fit.factor != 1.0:
         scale = f" by a factor of {1 / fit.factor:.3g}" if fit.is_consistent else ""
-        raise InputError(
+        raise ContradictedError(
             f"The depth of {geometry.name} differs{scale} from what the photographs measure at "
             f"{len(samples):,} compared pixels ({fit.agreement:.0%} agree"
             f"{' with that factor' if scale else ''}); {ADVICE}.",
@@ -141,7 +124,7 @@ def give_depth_before_scene(
 def require_uncontradicted(
     geometry: GivenGeometry, given: Sequence[View], used: Sequence[View]
 ) -> None:
-    """Raise InputError if Ψ left out the depth of geometry in half the photographs, or more.
+    """Raise ContradictedError if Ψ left out the depth of geometry in half the photographs, or more.
 
     `given` are the photographs before the scene was made of them, `used` those after it, which have
     no depth any more where stereo contradicts it.
@@ -149,20 +132,9 @@ def require_uncontradicted(
     num_given = sum(view.given_depth is not None for view in given)
     num_dropped = num_given - sum(view.given_depth is not None for view in used)
     if num_given and 2 * num_dropped >= num_given:
-        raise InputError(
+        raise ContradictedError(
             f"The surfaces of {geometry.name} contradict what stereo measures in {num_dropped} of "
             f"{num_given} photographs; {ADVICE}.",
-            "geometry",
-        )
-
-
-def require_overlap(geometry: GivenGeometry, num_compared: int, num_pixels: int) -> None:
-    """Raise InputError if geometry and photographs hardly show one place."""
-    if num_compared < MIN_COMPARED * num_pixels:
-        raise InputError(
-            f"{geometry.name} covers hardly anything that the photographs show ({num_compared:,} "
-            f"of {num_pixels:,} pixels), so that nothing tells whether they belong together; "
-            f"{ADVICE}.",
             "geometry",
         )
 

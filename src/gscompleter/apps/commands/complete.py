@@ -67,9 +67,6 @@ class CompleteOptions(CompletingOptions):
     generator. Without `--target`, its holes.json has the targets."""
     painter: str | None = None
     """Name of their painter, for the report."""
-    geometry: Path | None = None
-    """Mesh or points in the frame of the scene, such as a laser scan (.ply, .obj, .glb). They give
-    depth where photographs show none, as far as they agree with what these show."""
     out: Path
     """Write results here. A folder, for completed.ply, the report (report.html), images and
     summary.json."""
@@ -149,7 +146,6 @@ def decide_holes(
         context=cameras.context,
         synthesis=synthesis,
         has_marks=has_marks,
-        geometry=options.geometry,
         adapt=adapt,
     )
 

@@ -61,7 +61,6 @@ def decide_filling(
     context: Names | None,
     synthesis: GeneratorOptions,
     has_marks: bool,
-    geometry: Path | None = None,
     adapt: Adapt = lambda config: config,
 ) -> CompletionRequest:
     """Decide which holes of which scene are filled, and by what.
@@ -99,7 +98,7 @@ def decide_filling(
         source = PhotographsRequest(scene, poses, context)
         # With photographs, a scene is what they show, unless the user says otherwise.
         config = config if options.holes == "auto" else config.for_holes(options.holes)
-    work = WorkRequest(splat=splat, geometry=geometry, models=models, config=config)
+    work = WorkRequest(splat=splat, geometry=options.geometry, models=models, config=config)
     return CompletionRequest(source=source, work=work, targets=targets, results=results)
 
 

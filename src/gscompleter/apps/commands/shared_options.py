@@ -134,6 +134,16 @@ class MaskOptions(Settings):
 
 
 @dataclass(frozen=True, kw_only=True)
+class GeometryOptions(Settings):
+    """The option of every command that takes depth from elsewhere."""
+
+    geometry: Path | None = None
+    """Mesh or points, such as a laser scan (.ply, .obj, .glb), in the frame of the scene or in one
+    of its own, from which it is moved to where the scene shows the same. It gives depth where
+    photographs show none, as far as it agrees with what these show."""
+
+
+@dataclass(frozen=True, kw_only=True)
 class SceneOptions(ComputeOptions, WritingOptions, MaskOptions):
     """Options of every command that opens photographs with cameras."""
 
@@ -181,7 +191,7 @@ class SceneOptions(ComputeOptions, WritingOptions, MaskOptions):
 
 
 @dataclass(frozen=True, kw_only=True)
-class CompletingOptions(SceneOptions, ModelOptions):
+class CompletingOptions(SceneOptions, ModelOptions, GeometryOptions):
     """Options of the commands that complete one scene."""
 
     # May be left out, unlike that of `SceneOptions`.

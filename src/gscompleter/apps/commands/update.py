@@ -19,7 +19,11 @@ from gscompleter.apps.commands.shared_decisions import (
     names_splat,
     stop_recoloring,
 )
-from gscompleter.apps.commands.shared_options import ReconstructorOptions, SceneOptions
+from gscompleter.apps.commands.shared_options import (
+    GeometryOptions,
+    ReconstructorOptions,
+    SceneOptions,
+)
 from gscompleter.apps.requests.completion import UpdateRequest, WorkRequest
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.system.errors import InputError, quote_value
@@ -27,7 +31,7 @@ from gscompleter.system.process import import_without_collection
 
 
 @dataclass(frozen=True, kw_only=True)
-class UpdateOptions(SceneOptions, ReconstructorOptions):
+class UpdateOptions(SceneOptions, ReconstructorOptions, GeometryOptions):
     """Add to a splat what its photographs show and it lacks, and correct what they contradict.
 
     Nothing is invented. The report shows every photograph before and after.
@@ -70,7 +74,7 @@ def decide_update(options: UpdateOptions) -> UpdateRequest:
     splat = decide_splat(options, options.scene)
     return UpdateRequest(
         source=decide_photographs(options, options.folder),
-        work=WorkRequest(splat=splat, models=models, config=config),
+        work=WorkRequest(splat=splat, geometry=options.geometry, models=models, config=config),
         photos=options.photos,
         hold_out=options.hold_out,
         results=decide_results(options),

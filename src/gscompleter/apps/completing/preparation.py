@@ -53,6 +53,7 @@ from gscompleter.editing.cutting import Region
 from gscompleter.editing.removal import remove_gaussians
 from gscompleter.generators import load_generator
 from gscompleter.generators.painted import Painting
+from gscompleter.numerics.given_geometry import GivenGeometry
 from gscompleter.planning.planner import Choice, ViewPlanner
 from gscompleter.reconstructors import DepthAware, load_reconstructor
 from gscompleter.reconstructors.depth_predictors import StoredDepth
@@ -188,6 +189,7 @@ def prepare_completion(
     work = request.work
     targets = request.targets
     check_models(work)
+    geometry = read_geometry(work)
     if isinstance(source, AloneRequest):
         opened, task, config = read_splat_alone(work, source, targets, marks, place)
         print_lines(console, *opened.photographs.notes)
@@ -195,7 +197,7 @@ def prepare_completion(
         config = work.config if work.splat is None else work.config.for_photographs()
         opened = open_for_completion(work, source, targets, console)
         opened, task = read_opened(work, source, targets, opened, console)
-    loaded = load_models(work, config, targets, opened, task, console)
+    loaded = load_models(work, config, targets, opened, task, geometry, console)
     return make_prepared(request, targets, loaded)
 
 
@@ -318,11 +320,13 @@ def load_models(
     targets: TargetRequest,
     opened: Opened,
     task: CompletionTask,
+    geometry: GivenGeometry | None,
     console: Console,
 ) -> Loaded:
     """Load the models, and set the depth range of the photographs.
 
-    `config` is that of the request, with what was found of a splat alone.
+    `config` is that of the request, with what was found of a splat alone; `geometry` is what
+    `read_geometry` read.
     """
     models = work.models
     # Only here, because the oracle is given the photographs of the targets.
@@ -330,8 +334,8 @@ def load_models(
         known = [t.view if targets.images is None else t.placed_painting for t in task.targets]
         completer = load_completer(models, config, [image for image in known if image is not None])
     completer, task = use_predicted_depth(models, completer, task)
-    if work.geometry is not None:
-        task = add_geometry(task, work.geometry)
+    if geometry is not None:
+        task = add_geometry(task, geometry)
     reconstructor = completer.reconstructor
 
     # A single photograph has no stereo, so a network predicts its depth; a splat needs neither.
@@ -364,10 +368,16 @@ def load_models(
     return Loaded(opened, task, completer, collect_cameras(opened, task), seconds)
 
 
-def add_geometry(task: CompletionTask, path: Path) -> CompletionTask:
-    """Add geometry from a file, whose frame is that of the splat, or of the photographs."""
+def read_geometry(work: WorkRequest) -> GivenGeometry | None:
+    """Read geometry from elsewhere, before photographs: it takes seconds, and they may minutes."""
+    if work.geometry is None:
+        return None
     with show_preparation("reading the geometry"):
-        geometry = load_geometry(path)
+        return load_geometry(work.geometry)
+
+
+def add_geometry(task: CompletionTask, geometry: GivenGeometry) -> CompletionTask:
+    """Add geometry, which was given in the frame of the splat's file, or of the photographs."""
     # Both are read relative to an origin.
     origin = task.origin if task.splat_file is None else task.splat_file.origin
     return replace(task, geometry=geometry.move(-origin))
@@ -428,8 +438,6 @@ def check_completion_inputs(
     """
     load_completer(work.models, work.config, ())
     check_target_files(targets.named, photographs.scene.resolution)
-    if work.geometry is not None:
-        load_geometry(work.geometry)
     if work.splat is not None:
         read_splat(work.splat)
 

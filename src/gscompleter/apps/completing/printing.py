@@ -102,6 +102,8 @@ def describe_completion(summary: CompletionSummary, results: ResultsRequest) -> 
     )
     if counts.get("replaced"):
         yield describe_replaced(counts["replaced"])
+    if summary.placed_geometry is not None:
+        yield summary.placed_geometry.describe()
     yield from describe_geometry_use(summary)
     yield describe_size(results.out, results.suffix is None)
     yield f"Report: {results.out / REPORT_FILE}"

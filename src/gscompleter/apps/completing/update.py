@@ -17,6 +17,7 @@ from gscompleter.apps.completing.preparation import (
     load_models,
     make_prepared,
     open_for_completion,
+    read_geometry,
     read_opened,
     use_predicted_depth,
 )
@@ -59,6 +60,7 @@ def prepare_update(request: UpdateRequest, console: Console) -> Prepared:
     work = request.work
     source = request.source
     check_models(work)
+    geometry = read_geometry(work)
     # Cameras for all of SCENE would be searched for minutes, in the folder meant for the new ones.
     scene = source.scene
     if request.photos is not None and (scene.format or find_format(scene.folder)) is None:
@@ -75,7 +77,7 @@ def prepare_update(request: UpdateRequest, console: Console) -> Prepared:
     opened = hold_out(opened, request.hold_out, source.context, new)
 
     opened, task = read_opened(work, source, NO_TARGETS, opened, console, num_known)
-    loaded = load_models(work, work.config, NO_TARGETS, opened, task, console)
+    loaded = load_models(work, work.config, NO_TARGETS, opened, task, geometry, console)
     loaded = choose_evidence(work.models, source.context, loaded, new)
     settings = {
         "photos": None if request.photos is None else str(request.photos),

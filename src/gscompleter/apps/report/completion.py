@@ -95,6 +95,8 @@ def write_report(
     left = {} if removal is None else {"removal": asdict(removal.row)}
     kept = measure_kept(completion, testing, renderer)
     left |= {} if kept is None else {"kept": asdict(kept)}
+    placed = None if completion.geometry is None else completion.geometry.placement
+    left |= {} if placed is None else {"placed_geometry": asdict(placed)}
     notes = {"context_notes": completion.context_notes} if completion.context_notes else {}
     counts = {**count_changes(completion), **notes, **left, "seconds": dict(completion.seconds)}
     summary = {

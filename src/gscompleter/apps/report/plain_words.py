@@ -135,6 +135,8 @@ def list_notes(summary: CompletionSummary) -> Iterator[Note]:
         yield from list_photograph_notes(summary)
     for text in summary.context_notes:
         yield Note("depth", text)
+    if summary.placed_geometry is not None:
+        yield Note("depth", summary.placed_geometry.describe())
     if scene.renders_from is None and summary.settings.get("context") is None:
         text = f"{scene.used} of {scene.photographs} photographs were chosen as the context."
         yield Note("context", text)

@@ -18,6 +18,7 @@ from gscompleter.data.photograph_names import name_photograph, name_target
 from gscompleter.evaluation.metrics.coverage import Coverage
 from gscompleter.evaluation.verdict.kept import KeptRow
 from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow, ScoreRow
+from gscompleter.numerics.given_geometry import GeometryPlacement
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import read_command, refuse_later_results
 from gscompleter.system.files.typed_json import read_typed_json
@@ -287,6 +288,8 @@ class CompletionSummary:
     new_photographs: int | None = None
     """Number of photographs that an input splat does not reproduce, as it was not trained on them;
     None under full trust, as of a reconstructed scene."""
+    placed_geometry: GeometryPlacement | None = None
+    """How geometry from elsewhere was moved to the scene; None if it stood there, or without it."""
     context_notes: tuple[str, ...] = ()
     """Sentences of the reconstructor about the context."""
 

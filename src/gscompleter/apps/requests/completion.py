@@ -28,7 +28,7 @@ class WorkRequest:
     splat: SplatRequest | None = None
     """The splat to complete; None to reconstruct the scene from its photographs."""
     geometry: Path | None = None
-    """Mesh or points in the frame of the scene, whose depth is used in holes; None for none."""
+    """Mesh or points whose depth is used where photographs show none; None for none."""
     models: ModelRequest = ModelRequest()
     config: CompleterConfig = CompleterConfig()
     """Settings. For a splat without photographs, its Gaussians tell later what a hole of it is, and
