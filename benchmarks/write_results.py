@@ -1,6 +1,7 @@
 """Write the figures of docs/reproduce.md and docs/results.md from the outputs of evaluations.
 
     python benchmarks/write_results.py [--reproduced OUT] [--held-out OUT] [--check]
+    python benchmarks/write_results.py --tables NAME OUT
     python benchmarks/write_results.py --measured NAME COMMIT
 
 `make reproduce` and `make held-out` make the two outputs. Tables and scores are copied to
@@ -17,9 +18,10 @@ golden scenes prove it (`make check-golden` lists the method in golden.json). --
 commit of figures that a script of their own printed.
 
 The comment names what is written:
-    table NAME COLUMN ...    a table of the paper, a row for each method
+    table NAME COLUMN ...    a table of the paper, a row for each method; FOLDER/NAME of --tables
     spans NAME COLUMN        a table with a row for each protocol
     claims                   the verdicts on the claims
+    claims FOLDER            those that the tables of a folder can judge
     scores FILE COLUMN ...   means of `evaluate` of docs/results/FILE.json
     headline FILE ...        the three lines of the README, for each of these files
     measured NAME            the commit of a set of figures, and whether the method changed since
@@ -75,10 +77,13 @@ def main() -> None:
     parser.add_argument("--reproduced", type=Path, help="output of make reproduce")
     parser.add_argument("--held-out", type=Path, help="output of make held-out")
     parser.add_argument("--check", action="store_true", help="only compare the pages")
+    parser.add_argument("--tables", nargs=2, metavar=("NAME", "OUT"))
     parser.add_argument("--measured", nargs=2, metavar=("NAME", "COMMIT"))
     options = parser.parse_args()
     if options.measured is not None:
         note_measured(*options.measured)
+    if options.tables is not None:
+        copy_tables(*options.tables)
     if options.reproduced is not None:
         copy_reproduction(options.reproduced)
     if options.held_out is not None:
@@ -110,6 +115,15 @@ def copy_reproduction(out: Path) -> None:
     shutil.copyfile(scores, STORED / "development.json")
     stored = [STORED / "development.json", *(STORED / "tables").glob("*.json")]
     note_measured("reproduced", find_one_commit(stored))
+
+
+def copy_tables(name: str, out: str) -> None:
+    """Copy the tables of an output beside those of a reproduction."""
+    folder = STORED / "tables" / name
+    folder.mkdir(exist_ok=True)
+    for path in sorted(Path(out, "tables").glob("*.json")):
+        shutil.copyfile(path, folder / path.name)
+    note_measured(name, find_one_commit(folder.glob("*.json")))
 
 
 def find_one_commit(paths: Iterable[Path]) -> str:
@@ -200,7 +214,7 @@ def write_table(name: str, *columns: str) -> str:
     """Write a table with the paper's numbers before ours."""
     table = read_table(name)
     paper = yaml.safe_load(Path(__file__).with_name("paper_values.yaml").read_text("utf-8"))
-    known: dict[str, dict[str, str]] = paper.get(name, {})
+    known: dict[str, dict[str, str]] = paper.get(Path(name).name, {})
     shared = [key for key in columns if any(key in values for values in known.values())]
     head = ["method", *(f"{BY_KEY[key].title}, paper" for key in shared)]
     ending = ", ours" if known else ""
@@ -232,9 +246,13 @@ def write_spans(name: str, key: str) -> str:
     return format_markdown(head, [[f"`{p}`", *of, counts[p]] for p, of in rows.items()])
 
 
-def write_claims() -> str:
-    """Write the verdicts on all claims of the paper."""
-    return format_markdown(CLAIM_COLUMNS, tabulate_claims(STORED / "tables", load_paper().claims))
+def write_claims(folder: str = "") -> str:
+    """Write the verdicts on the claims of the paper: all, or those that a folder has tables of."""
+    tables = STORED / "tables" / folder
+    claims = load_paper().claims
+    if folder:
+        claims = [claim for claim in claims if (tables / f"{claim.table}.json").is_file()]
+    return format_markdown(CLAIM_COLUMNS, tabulate_claims(tables, claims))
 
 
 def write_scores(file: str, *columns: str) -> str:

@@ -167,3 +167,22 @@ def test_each_section_with_measured_figures_names_their_commit(page):
 @pytest.mark.parametrize("page", ["docs/reproduce.md", "docs/generators.md"])
 def test_pages_with_figures_of_one_measurement_name_its_commit(page):
     assert COMMIT.search((ROOT / page).read_text("utf-8"))
+
+
+def test_tables_of_another_reconstructor_stand_in_a_folder_of_their_own(monkeypatch, tmp_path):
+    monkeypatch.setattr(write_results, "STORED", tmp_path / "stored")
+    monkeypatch.setattr(write_results, "MEASURED", tmp_path / "measured.json")
+    (tmp_path / "stored" / "tables").mkdir(parents=True)
+    (tmp_path / "out" / "tables").mkdir(parents=True)
+    table = json.loads((ROOT / "docs" / "results" / "tables" / "dof.json").read_text())
+    commit = write_results.run_git("rev-parse", "--short=8", "HEAD").decode().strip()
+    table["made_with"] = {"commits": [commit]}
+    (tmp_path / "out" / "tables" / "dof.json").write_text(json.dumps(table))
+    write_results.copy_tables("other", str(tmp_path / "out"))
+    assert write_results.read_table("other/dof") == table
+    assert json.loads((tmp_path / "measured.json").read_text())["other"]["commit"] == commit
+    # The paper's numbers stand beside it as beside ours, and only its claims are judged.
+    assert "| `paper/unconstrained` | 22.39 |" in write_results.write_table("other/dof", "psnr")
+    claims = write_results.write_claims("other")
+    assert "| dof |" in claims
+    assert "not measured" not in claims
