@@ -192,7 +192,7 @@ def read_strokes(path: Path) -> StrokesFile:
     strokes = read_typed_json(StrokesFile, path, STROKES_ADVICE)
     for row in (*strokes.frames, *strokes.undone):
         # What is read lies beside the file, whatever it says.
-        if row.mask_path is not None and not is_beside(row.mask_path):
+        if row.mask_path is not None and not is_below_folder(row.mask_path):
             raise InputError(
                 f"{quote_value(path)} names the mask '{quote_value(row.mask_path)}', and only "
                 f"files beside it are read; {STROKES_ADVICE}."
@@ -216,7 +216,7 @@ def read_steps(rows: Sequence[StrokeRow], folder: Path) -> tuple[SessionStep, ..
     )
 
 
-def is_beside(name: str) -> bool:
+def is_below_folder(name: str) -> bool:
     """Return True if a path is relative and leads to a file below the folder it is relative to."""
     path = PurePosixPath(name)
     is_plain = "\\" not in name and "\0" not in name and path.parts != ()
