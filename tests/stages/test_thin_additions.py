@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gscompleter.stages.thin_additions import REACH, find_doubled
+from gscompleter.stages.thin_additions import PLACE_REACH, find_doubled
 from gscompleter.types import Gaussians, merge
 from scenes import Room, camera_at, gaussians_of, view_of
 
@@ -43,7 +43,7 @@ def test_each_that_goes_has_one_that_stays_in_its_place(factor):
     gone = find_doubled(scene, all_of(scene), lost)
     assert gone.any()
     distances = torch.cdist(scene.means[gone], scene.means[~gone])
-    reach = REACH * scene.scales.amax(dim=1)
+    reach = PLACE_REACH * scene.scales.amax(dim=1)
     both = torch.minimum(reach[gone][:, None], reach[~gone][None])
     assert (distances <= both * (1 + 1e-6)).any(dim=1).all()
 

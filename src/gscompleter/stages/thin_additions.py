@@ -27,10 +27,10 @@ from gscompleter.types import Gaussians, View
 THINNING = CleaningConfig(probes=2)
 """What photographs may lose by additions that are dropped: that of the cleaning. Its probes are
 fewer, as photographs are compared again afterwards."""
-REACH = 2.0
+PLACE_REACH = 2.0
 """Distance, in multiples of the largest scale of each of two additions, up to which one stands in
 the place of the other. Scales of a pixel's Gaussian are about half of the pixel."""
-NUM_NEIGHBOURS = 8
+MAX_STAND_INS = 8
 """Nearest additions that may stand in the place of one."""
 
 
@@ -64,9 +64,9 @@ def find_doubled(
     if len(added) < 2:
         return torch.zeros_like(removable)
     means = added.means.cpu().double().numpy()
-    reach = REACH * added.scales.amax(dim=1).cpu().double().numpy()
+    reach = PLACE_REACH * added.scales.amax(dim=1).cpu().double().numpy()
     # The first neighbour of each is itself.
-    count = min(NUM_NEIGHBOURS + 1, len(added))
+    count = min(MAX_STAND_INS + 1, len(added))
     distances, neighbours = cKDTree(means).query(means, count)
     is_near = distances <= np.minimum(reach[:, None], reach[neighbours])
     near = [row[is_close] for row, is_close in zip(neighbours, is_near, strict=True)]
