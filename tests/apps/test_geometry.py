@@ -63,6 +63,7 @@ def test_the_summary_and_the_terminal_say_what_geometry_gave(folder, tmp_path, m
     assert edits["edits"][-1]["settings"]["geometry"] == "scan.ply"
 
 
+@pytest.mark.slow
 def test_geometry_that_lies_is_refused_and_nothing_is_written(
     folder, tmp_path, monkeypatch, capsys
 ):

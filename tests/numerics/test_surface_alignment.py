@@ -5,7 +5,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from gscompleter.numerics.given_geometry import GivenGeometry, make_geometry, transform_points
+from gscompleter.numerics.given_geometry import GivenGeometry, make_geometry, move_points
 from gscompleter.numerics.surface_alignment import (
     align_surface,
     fit_closest_points,
@@ -44,7 +44,7 @@ def see_room(noise: float = 0.0):
 
 def measure_error(similarity, moved: GivenGeometry) -> float:
     """Measure the mean distance of corners from where they were, relative to the room's 6 m."""
-    gaps = transform_points(similarity, moved.vertices) - MESH.vertices
+    gaps = move_points(similarity, moved.vertices) - MESH.vertices
     return float(np.linalg.norm(gaps, axis=1).mean()) / 6
 
 

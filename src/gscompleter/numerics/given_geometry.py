@@ -94,7 +94,7 @@ class GivenGeometry:
 
     def transform(self, similarity: Float[np.ndarray, "4 4"]) -> GivenGeometry:
         """Return the geometry moved by a similarity, without a placement."""
-        moved = transform_points(similarity, self.vertices)
+        moved = move_points(similarity, self.vertices)
         return replace(self, vertices=moved, placement=None)
 
     def draw_depth(self, camera: Camera) -> Float[Tensor, "h w"]:
@@ -159,7 +159,7 @@ def fit_planes(
     return np.linalg.eigh(offsets.transpose(0, 2, 1) @ offsets).eigenvectors
 
 
-def transform_points(
+def move_points(
     similarity: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3"]
 ) -> Float[np.ndarray, "n 3"]:
     """Move points by a similarity."""

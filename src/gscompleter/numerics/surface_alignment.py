@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float, Int
 from numpy import ndarray
 
-from gscompleter.numerics.given_geometry import GivenGeometry, fit_planes, transform_points
+from gscompleter.numerics.given_geometry import GivenGeometry, fit_planes, move_points
 from gscompleter.numerics.kernels import surface_agreement as kernels
 
 if TYPE_CHECKING:
@@ -39,7 +39,7 @@ MIN_SEEN = 100
 """Fewest seen points by which a surface is aligned."""
 
 # How similarities are proposed.
-NUM_CORNERS = 300
+NUM_PAIRED_POINTS = 300
 """Points of the surface whose pairs are tried: of a room of 6 m, one every 0.7 m."""
 NUM_PAIRS = 80
 """Seen pairs that are looked up among them."""
@@ -51,9 +51,9 @@ SEEN_SIZES = (0.1, 2.0)
 """Smallest and largest size of what is seen, relative to that of the surface."""
 NUM_SCORED = 128
 """Seen points by which each proposal is scored."""
-NUM_KEPT = 5
+NUM_BEST_PROPOSALS = 5
 """Proposals of each pair that are scored by all seen points."""
-NUM_STARTS = 16
+NUM_REFINED_PROPOSALS = 16
 """Proposals that are refined."""
 NUM_CELLS = 96
 """Cells along the longest side of the grid that tells how far the surface is."""
@@ -79,7 +79,7 @@ DAMPING = 1e-4
 """Damping relative to the best determined direction, so that no other one runs away."""
 
 
-Similarity = Float[ndarray, "4 4"]
+SurfaceSimilarity = Float[ndarray, "4 4"]
 
 
 @dataclass(frozen=True)
@@ -118,14 +118,14 @@ class SeenPoints(SurfacePoints):
     @cached_property
     def size(self) -> float:
         """Measure the distance of most points from their middle."""
-        return measure_size(self.points)
+        return measure_spread_of_points(self.points)
 
     def choose(self, rows: Int[ndarray, "k"]) -> SeenPoints:
         """Return some of the points."""
         return SeenPoints(self.points[rows], self.normals[rows], self.depths[rows])
 
 
-def measure_size(points: Float[ndarray, "n 3"]) -> float:
+def measure_spread_of_points(points: Float[ndarray, "n 3"]) -> float:
     """Measure the distance of most points from their middle, which stray points do not change."""
     distances = np.linalg.norm(points - np.median(points, axis=0), axis=1)
     return float(np.quantile(distances, 0.9))
@@ -165,7 +165,7 @@ def sample_surface(geometry: GivenGeometry, rng: np.random.Generator) -> Surface
 
 def align_surface(
     surface: SurfacePoints, seen: SeenPoints, rng: np.random.Generator
-) -> list[Similarity]:
+) -> list[SurfaceSimilarity]:
     """Find similarities by which much of what is seen lies on a surface, the best first.
 
     Several are found if the surface is symmetric, or what is seen tells too little.
@@ -180,14 +180,14 @@ def align_surface(
 
 def propose_similarities(
     surface: SurfacePoints, seen: SeenPoints, rng: np.random.Generator
-) -> list[Similarity]:
+) -> list[SurfaceSimilarity]:
     """Propose similarities by pairs of points with equal angles, the best first."""
     from scipy.spatial import cKDTree
 
     field = DistanceField.make(surface)
-    sizes = measure_size(surface.points) * np.array(SEEN_SIZES)
-    corners = SurfacePoints(surface.points[:NUM_CORNERS], surface.normals[:NUM_CORNERS])
-    pairs = PointPairs.make(corners.with_both_signs(), *list_pairs(NUM_CORNERS))
+    sizes = measure_spread_of_points(surface.points) * np.array(SEEN_SIZES)
+    corners = SurfacePoints(surface.points[:NUM_PAIRED_POINTS], surface.normals[:NUM_PAIRED_POINTS])
+    pairs = PointPairs.make(corners.with_both_signs(), *list_pairs(NUM_PAIRED_POINTS))
     tree = cKDTree(pairs.cosines)
     few = seen.choose(rng.choice(len(seen.points), min(NUM_SCORED, len(seen.points)), False))
     own = choose_far_pairs(seen, rng)
@@ -206,11 +206,13 @@ def propose_similarities(
         proposed[:, :3, :3] = scale[sized, None, None] * turns
         moved = np.einsum("nij,nj->ni", proposed[:, :3, :3], pairs.middles[equal])
         proposed[:, :3, 3] = own.middles[pair] - moved
-        best = np.argsort(-field.measure_agreement(proposed, few), kind="stable")[:NUM_KEPT]
+        best = np.argsort(-field.measure_agreement(proposed, few), kind="stable")[
+            :NUM_BEST_PROPOSALS
+        ]
         proposals.append(proposed[best])
     kept = np.concatenate(proposals) if proposals else np.empty((0, 4, 4))
     order = np.argsort(-field.measure_agreement(kept, seen), kind="stable")
-    return keep_distinct(list(kept[order]), seen, SAME_START, NUM_STARTS)
+    return keep_distinct(list(kept[order]), seen, SAME_START, NUM_REFINED_PROPOSALS)
 
 
 def list_pairs(count: int) -> tuple[Int[ndarray, "m"], Int[ndarray, "m"]]:
@@ -304,7 +306,7 @@ class DistanceField:
         # From the scene to cells.
         linear = np.linalg.inv(similarities[:, :3, :3])
         shift = np.einsum("mij,mj->mi", linear, similarities[:, :3, 3])
-        return kernels.measure_agreement(
+        return kernels.measure_shares_on_surface(
             linear / self.cell,
             -(shift + self.low) / self.cell,
             seen.points,
@@ -317,18 +319,18 @@ class DistanceField:
 
 
 def keep_distinct(
-    similarities: Sequence[Similarity], seen: SeenPoints, same: float, most: int
-) -> list[Similarity]:
+    similarities: Sequence[SurfaceSimilarity], seen: SeenPoints, same: float, most: int
+) -> list[SurfaceSimilarity]:
     """Keep the first of all similarities that bring a surface to about one place, of `most` places.
 
     `same` is the largest move between these, relative to the size of what is seen.
     """
     ends = np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
     marks = seen.middle + seen.size * ends
-    kept: list[Similarity] = []
+    kept: list[SurfaceSimilarity] = []
     for similarity in similarities:
-        back = transform_points(np.linalg.inv(similarity), marks)
-        moves = (transform_points(other, back) - marks for other in kept)
+        back = move_points(np.linalg.inv(similarity), marks)
+        moves = (move_points(other, back) - marks for other in kept)
         if all(np.linalg.norm(move, axis=1).max() > same * seen.size for move in moves):
             kept.append(similarity)
         if len(kept) == most:
@@ -337,8 +339,8 @@ def keep_distinct(
 
 
 def fit_closest_points(
-    similarity: Similarity, surface: SurfacePoints, seen: SeenPoints
-) -> tuple[Similarity, float]:
+    similarity: SurfaceSimilarity, surface: SurfacePoints, seen: SeenPoints
+) -> tuple[SurfaceSimilarity, float]:
     """Refine a similarity by iterated closest points.
 
     Distances count along the normals of the surface, relative to the depth of each seen point. Also
@@ -354,7 +356,7 @@ def fit_closest_points(
         near = np.flatnonzero(distances <= gate)
         if len(near) < MIN_SEEN:
             break
-        points = transform_points(similarity, surface.points[closest[near]])
+        points = move_points(similarity, surface.points[closest[near]])
         normals = surface.normals[closest[near]] @ np.linalg.inv(similarity[:3, :3])
         normals /= np.linalg.norm(normals, axis=1, keepdims=True)
         arms = (points - seen.middle) / seen.size
@@ -374,21 +376,19 @@ def fit_closest_points(
 
 
 def find_closest(
-    similarity: Similarity, surface: SurfacePoints, seen: SeenPoints
+    similarity: SurfaceSimilarity, surface: SurfacePoints, seen: SeenPoints
 ) -> tuple[Int[ndarray, "n"], Float[ndarray, "n"]]:
     """Find the closest point of a surface to each seen one, and its distance over the depth."""
-    distances, closest = surface.tree.query(
-        transform_points(np.linalg.inv(similarity), seen.points)
-    )
+    distances, closest = surface.tree.query(move_points(np.linalg.inv(similarity), seen.points))
     return closest, get_similarity_scale(similarity) * distances / seen.depths
 
 
-def get_similarity_scale(similarity: Similarity) -> float:
+def get_similarity_scale(similarity: SurfaceSimilarity) -> float:
     """Get the factor of lengths."""
     return float(np.cbrt(np.linalg.det(similarity[:3, :3])))
 
 
-def make_step(step: Float[ndarray, "7"], seen: SeenPoints) -> Similarity:
+def make_step(step: Float[ndarray, "7"], seen: SeenPoints) -> SurfaceSimilarity:
     """Make the similarity of a turn, a shift and a growth about the middle of what is seen."""
     from scipy.spatial.transform import Rotation
 

@@ -19,13 +19,13 @@ from gscompleter.numerics.geometry import unproject
 from gscompleter.numerics.given_geometry import (
     GeometryPlacement,
     GivenGeometry,
-    transform_points,
+    move_points,
 )
 from gscompleter.numerics.sky import mask_out_sky
 from gscompleter.numerics.surface_alignment import (
     SeenPoints,
-    Similarity,
     SurfacePoints,
+    SurfaceSimilarity,
     align_surface,
     fit_closest_points,
     get_similarity_scale,
@@ -36,7 +36,7 @@ from gscompleter.stages.given_geometry import ADVICE, MAX_DEVIATION, MIN_COMPARE
 from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, DepthMap, Render, View
 
-MAX_PHOTOGRAPHS = 8
+MAX_COMPARED_VIEWS = 8
 """Most photographs, at even steps, at which places are compared."""
 NUM_SEEN = 2000
 """About how many points of what they see are aligned."""
@@ -62,7 +62,7 @@ MAX_ELSEWHERE = 0.05
 
 
 @dataclass(frozen=True)
-class Comparison:
+class SurfaceComparison:
     """Geometry against what a scene shows, at pixels that were kept back from the fit."""
 
     deviations: Float[Tensor, "n"]
@@ -100,12 +100,12 @@ class SeenScene:
     @classmethod
     def make(cls, views: Sequence[View], renders: Sequence[Render]) -> SeenScene:
         """Take photographs at even steps."""
-        step = -(-len(views) // MAX_PHOTOGRAPHS)
+        step = -(-len(views) // MAX_COMPARED_VIEWS)
         cameras = tuple(view.camera for view in views[::step])
         pairs = zip(renders[::step], cameras, strict=True)
         return cls(cameras, tuple(mask_out_sky(render, camera) for render, camera in pairs))
 
-    def compare(self, geometry: GivenGeometry) -> Comparison:
+    def compare(self, geometry: GivenGeometry) -> SurfaceComparison:
         """Compare geometry with what is seen, where it was kept back."""
         deviations = []
         num_seen = 0
@@ -115,7 +115,7 @@ class SeenScene:
             both = seen & (drawn > 0)
             deviations.append((drawn[both] / surface.depth[both]).log().cpu())
             num_seen += int(seen.sum())
-        return Comparison(torch.cat(deviations), num_seen)
+        return SurfaceComparison(torch.cat(deviations), num_seen)
 
     def choose_points(self) -> SeenPoints:
         """Choose points for the fit, at even steps of each image."""
@@ -193,7 +193,7 @@ def search_place(
 
 
 def are_same_place(
-    first: Similarity, second: Similarity, surface: SurfacePoints, seen: SeenPoints
+    first: SurfaceSimilarity, second: SurfaceSimilarity, surface: SurfacePoints, seen: SeenPoints
 ) -> bool:
     """Return True if two similarities bring nearly all of a surface to the same place.
 
@@ -201,14 +201,16 @@ def are_same_place(
     """
     # Where the second brings the surface, seen from the frame of the surface that the first brings
     # there. Distances along the normals do not depend on how dense its points are.
-    points = transform_points(np.linalg.inv(first) @ second, surface.points)
+    points = move_points(np.linalg.inv(first) @ second, surface.points)
     closest = surface.tree.query(points)[1]
     gaps = np.einsum("ni,ni->n", points - surface.points[closest], surface.normals[closest])
     limit = MAX_SAME * seen.size / get_similarity_scale(first)
     return float((np.abs(gaps) > limit).mean()) <= MAX_ELSEWHERE
 
 
-def move_to(geometry: GivenGeometry, similarity: Similarity, compared: Comparison) -> GivenGeometry:
+def move_to(
+    geometry: GivenGeometry, similarity: SurfaceSimilarity, compared: SurfaceComparison
+) -> GivenGeometry:
     """Move geometry by a similarity, and keep what is to be told about it."""
     moved = geometry.transform(similarity)
     scale = get_similarity_scale(similarity)

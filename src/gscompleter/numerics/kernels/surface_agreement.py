@@ -6,7 +6,9 @@ from gscompleter.numerics.kernels.cache import njit
 from gscompleter.numerics.kernels.parallel import share
 
 
-def measure_agreement(linear, shifts, points, normals, reaches, distances, directions, min_cosine):
+def measure_shares_on_surface(
+    linear, shifts, points, normals, reaches, distances, directions, min_cosine
+):
     """Measure the share of points within their reach of a surface, for each similarity.
 
     `linear` [m, 3, 3] is a rotation times a scale, and with `shifts` [m, 3] takes `points` [n, 3]
