@@ -1,10 +1,11 @@
-"""Validated reading of nerfstudio's `transforms.json`, without opening images.
+"""Validated reading and writing of nerfstudio's `transforms.json`, without opening images.
 
 A trained model has its scene in another frame: `dataparser_transforms.json` leads to it.
 """
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -29,10 +30,11 @@ from gscompleter.data.json_fields import (
 from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_NUMBER, require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import read_point_cloud
-from gscompleter.system.errors import quote_value
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import read_depth
 from gscompleter.system.files.reading import is_json_list, read_json
 from gscompleter.system.files.result_format import is_marked, refuse_later
+from gscompleter.system.files.writing import replace_file
 
 TRANSFORMS_FILE = "transforms.json"
 TRANSFORMS_ADVICE = "export the scene again"
@@ -222,6 +224,75 @@ def _parse_distortion(entry: Mapping[str, Any], title: str) -> Distortion:
         f"{model}; set it to 0, or undistort the images first.",
     )
     return Distortion(radial=(k1, k2, k3), tangential=(p1, p2))
+
+
+def write_transforms(path: Path, photographs: Photographs, home: Path) -> None:
+    """Write the cameras of photographs as nerfstudio reads them, in the frame of their files.
+
+    Paths of photographs and masks are relative to `home`, the folder that the file is for. Depth
+    and points are not named. Raises InputError for photographs inside a container, masks whose
+    white hides, and lenses that the format does not have.
+    """
+    frames = [describe_frame(photographs.frame(number), home) for number in photographs.posed]
+    models = {frame["camera_model"] for frame in frames}
+    require(
+        len(models) == 1,
+        f"The photographs of {photographs.title} have fisheye and other lenses, which programs do "
+        "not read in one transforms.json; undistort the images first.",
+    )
+    content = {"camera_model": models.pop(), "frames": frames}
+    with replace_file(path) as file:
+        file.write((json.dumps(content, indent=1) + "\n").encode())
+
+
+def describe_frame(frame: Frame, home: Path) -> dict[str, Any]:
+    """Describe a photograph and its camera, as `write_transforms` does."""
+    if frame.file is None or frame.file.path is None:
+        raise InputError(
+            f"The photograph of {frame.title} is no file of its own, which transforms.json cannot "
+            "name; export the images first."
+        )
+    width, height = frame.size()
+    pinhole = frame.intrinsics.compute_pinhole(width, height)
+    content = {
+        "file_path": os.path.relpath(frame.file.path, home),
+        # The change of axes is its own inverse.
+        "transform_matrix": (frame.c2w @ OPENCV_FROM_OPENGL).tolist(),
+        "w": width,
+        "h": height,
+        "fl_x": pinhole.fl_x,
+        "fl_y": pinhole.fl_y,
+        "cx": pinhole.cx,
+        "cy": pinhole.cy,
+        **describe_distortion(frame),
+    }
+    if frame.mask is not None:
+        require(
+            not frame.has_inverted_mask,
+            "The masks hide what is white, and other programs read them the other way round; "
+            "invert the images, or leave out --invert-masks.",
+        )
+        content["mask_path"] = os.path.relpath(frame.mask, home)
+    return content
+
+
+def describe_distortion(frame: Frame) -> dict[str, Any]:
+    """Describe the lens of a photograph by the keys of nerfstudio."""
+    lens = frame.intrinsics.distortion
+    is_fisheye = lens.projection == "equidistant"
+    is_known = is_fisheye or lens.projection == "perspective"
+    num_radial = 4 if is_fisheye else 3
+    has_more = any((*lens.denominator, *lens.prism, *lens.radial[num_radial:]))
+    require(
+        is_known and not has_more and not (is_fisheye and any(lens.tangential)),
+        f"The lens of {frame.title} has a distortion that transforms.json does not hold; undistort "
+        "the images first.",
+    )
+    radial = {f"k{number}": value for number, value in enumerate(lens.radial, start=1)}
+    if is_fisheye:
+        return {"camera_model": "OPENCV_FISHEYE", **radial}
+    p1, p2 = lens.tangential
+    return {"camera_model": "OPENCV", **radial, "p1": p1, "p2": p2}
 
 
 def read_dataparser_transforms(path: Path) -> Float[np.ndarray, "4 4"]:

@@ -1,4 +1,4 @@
-"""The command `poses`: find the cameras of photographs."""
+"""The command `poses`: find the cameras of photographs, or refine those that they have."""
 
 from __future__ import annotations
 
@@ -23,29 +23,34 @@ from gscompleter.system.process import import_without_collection
 class PosesOptions(ComputeOptions, WritingOptions, MaskOptions):
     """Find the cameras of photographs with COLMAP, and write a COLMAP folder.
 
-    A second run with the same photographs or video keeps the result.
+    A second run with the same photographs or video keeps the result. Photographs that have cameras
+    get them refined, as far as features that were kept back agree, in a transforms.json.
 
     Example: gscompleter poses photographs --out cameras
     """
 
     photographs: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTOS")]
     """Folder of overlapping photographs or 360° panoramas (2:1) of one scene, or a video. They are
-    not changed."""
+    not changed. Of a scene with cameras, its folder or camera file: its images alone have none."""
     frames: NumFrames = 40
     """Most frames of a video to take as photographs, sharp ones at even steps of the camera."""
     out: Path
     """Write results here. A folder, for upright copies in images, and cameras and points in
-    sparse/0."""
+    sparse/0; or for transforms.json, which names the photographs where they lie."""
 
 
 def run_poses(options: PosesOptions) -> None:
     """Find and write the cameras, and print their number and error."""
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
+        from gscompleter.data.given_poses import has_cameras
         from gscompleter.data.sfm.poses import find_poses
         from gscompleter.system.console import make_console
         from gscompleter.system.progress import show_progress
 
+    if has_cameras(options.photographs):
+        refine_cameras(options)
+        return
     reading = MaskReading(options.invert_masks, options.large_masks)
     with show_progress(make_console(stderr=True, quiet=options.quiet)):
         poses = find_poses(
@@ -66,3 +71,25 @@ def run_poses(options: PosesOptions) -> None:
         "notes": list(poses.notes),
     }
     print_answer(options.answer, content, [*poses.notes, sentence])
+
+
+def refine_cameras(options: PosesOptions) -> None:
+    """Refine and write the cameras that photographs have, and print by how much they gained."""
+    from gscompleter.data.given_poses import refine_given_poses
+    from gscompleter.system.console import make_console
+    from gscompleter.system.progress import show_progress
+
+    reading = MaskReading(options.invert_masks, options.large_masks)
+    with show_progress(make_console(stderr=True, quiet=options.quiet)):
+        refined = refine_given_poses(options.photographs, options.out, options.overwrite, reading)
+    notes = [refined.kept] if refined.kept else []
+    content = {
+        "out": str(options.out),
+        "cameras": len(refined.photographs.posed),
+        "photographs": len(refined.photographs),
+        "is_refined": refined.refinement.is_accepted,
+        "given_error_px": refined.refinement.given_error,
+        "refined_error_px": refined.refinement.refined_error,
+        "notes": notes,
+    }
+    print_answer(options.answer, content, [*notes, refined.describe(options.out)])

@@ -1,0 +1,85 @@
+"""Refinement of photographs that have cameras, into a file that trainers read.
+
+Poses of phones, SLAM and drives gain by it for every program. The result is nerfstudio's
+`transforms.json`, whose paths lead to the photographs where they lie: nothing is copied.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from gscompleter.data.formats import SCENE_FORMATS, open_photographs
+from gscompleter.data.limits import require
+from gscompleter.data.mask_checks import read_masks_as_asked, refuse_nothing_to_invert
+from gscompleter.data.mask_reading import MaskReading
+from gscompleter.data.photographs import Photographs
+from gscompleter.data.sfm.poses import POSES_COMMAND
+from gscompleter.data.sfm.refining import MIN_REFINED, PoseRefinement, refine_poses
+from gscompleter.data.transforms import TRANSFORMS_FILE, write_transforms
+from gscompleter.numerics.two_views import ERROR_SIDE
+from gscompleter.system.errors import quote_value
+from gscompleter.system.files.output_folder import reserve_output
+from gscompleter.system.files.writing import SUMMARY_FILE
+
+
+@dataclass(frozen=True)
+class RefinedCameras:
+    """Photographs that had cameras, after a refinement."""
+
+    photographs: Photographs
+    """With the refined poses, or the given ones if matches agree no better with others."""
+    refinement: PoseRefinement
+    kept: str
+    """Sentence on what else lies in the folder; empty if there is nothing."""
+
+    @property
+    def is_refined(self) -> bool:
+        """True if the poses are not the given ones."""
+        return self.refinement.is_accepted
+
+    def describe(self, out: Path) -> str:
+        """Describe the result in a sentence for the user."""
+        errors = (
+            f"given poses miss matches by {self.refinement.given_error:.2f} px (of {ERROR_SIDE}), "
+            f"refined ones by {self.refinement.refined_error:.2f}"
+        )
+        count = len(self.photographs.posed)
+        if self.is_refined:
+            return f"The cameras of {count} photographs are refined: {errors}: {out}"
+        return f"The cameras of {count} photographs stay as they are: {errors}: {out}"
+
+
+def has_cameras(path: Path) -> bool:
+    """Return True if a path holds photographs with cameras, by names and first bytes."""
+    formats = (row for name, row in SCENE_FORMATS.items() if name != "photograph")
+    return any(bool(row.detect(path)) for row in formats)
+
+
+def refine_given_poses(
+    path: Path, out: Path, overwrite: bool = False, reading: MaskReading = MaskReading()
+) -> RefinedCameras:
+    """Refine the cameras of photographs that have some, and write them for other programs.
+
+    Raises InputError if they cannot be refined, or if the file cannot hold their lenses.
+    """
+    given = open_photographs(path)
+    refuse_nothing_to_invert(given.list_masks(), reading)
+    given = read_masks_as_asked(given, reading)
+    patterns = (TRANSFORMS_FILE, SUMMARY_FILE)
+    with (
+        reserve_output(out, overwrite, POSES_COMMAND, patterns) as output,
+        output.write() as folder,
+    ):
+        photographs, refinement = refine_poses(given)
+        require(
+            refinement is not None,
+            f"The cameras of {quote_value(path)} cannot be refined: COLMAP used fewer than "
+            f"{MIN_REFINED} photographs, or all were taken at one place.",
+        )
+        assert refinement is not None
+        write_transforms(folder / TRANSFORMS_FILE, photographs, out)
+        content = {"poses": asdict(refinement), "scene": str(path)}
+        (folder / SUMMARY_FILE).write_bytes(json.dumps(content, indent=1).encode())
+    return RefinedCameras(photographs, refinement, " ".join(output.describe_others()))

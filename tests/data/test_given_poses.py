@@ -1,0 +1,129 @@
+"""The command `poses` on photographs that have cameras."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from command import run
+from gscompleter.data import given_poses
+from gscompleter.data.cameras import Distortion, Intrinsics
+from gscompleter.data.formats import open_photographs
+from gscompleter.data.photographs import Photographs
+from gscompleter.data.sfm.refining import PoseRefinement
+from gscompleter.data.transforms import write_transforms
+from gscompleter.system.errors import InputError
+from scenes import camera_at, photographed
+from shaken_room import CAMERAS, DONE, SHAKEN, correct, write_shaken
+
+KEPT = PoseRefinement(8, given_error=0.1, refined_error=0.1, moved=0.0)
+
+
+@pytest.fixture
+def scene(tmp_path) -> Path:
+    """Write photographs of the room, one of them with a wrong pose."""
+    return write_shaken(tmp_path / "scene")
+
+
+def test_refined_cameras_are_written_for_other_programs(scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(given_poses, "refine_poses", correct)
+    out = tmp_path / "out"
+    assert run(monkeypatch, "poses", scene, "--out", out, "--json") == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer["is_refined"]
+    assert (answer["given_error_px"], answer["refined_error_px"]) == (
+        DONE.given_error,
+        DONE.refined_error,
+    )
+    given, refined = open_photographs(scene), open_photographs(out)
+    for number, (before, after) in enumerate(zip(given.frames, refined.frames, strict=True)):
+        # The photographs themselves, where they lie.
+        assert after.file.path.samefile(before.file.path)
+        assert refined.camera(number).K.equal(given.camera(number).K)
+        if number != SHAKEN:
+            assert np.allclose(after.c2w, before.c2w, rtol=0, atol=1e-12)
+    true = CAMERAS[SHAKEN].c2w.double().numpy()
+    assert np.allclose(refined.frames[SHAKEN].c2w, true, rtol=0, atol=1e-6)
+
+
+def test_cameras_that_agree_stay(scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(given_poses, "refine_poses", lambda photographs: (photographs, KEPT))
+    out = tmp_path / "out"
+    assert run(monkeypatch, "poses", scene, "--out", out) == 0
+    assert "stay as they are" in capsys.readouterr().out.replace("\n", " ")
+    pairs = zip(open_photographs(scene).frames, open_photographs(out).frames, strict=True)
+    for before, after in pairs:
+        assert np.allclose(after.c2w, before.c2w, rtol=0, atol=1e-12)
+
+
+def test_photographs_that_cannot_be_refined_are_refused(scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(given_poses, "refine_poses", lambda photographs: (photographs, None))
+    assert run(monkeypatch, "poses", scene, "--out", tmp_path / "out") == 2
+    assert "cannot be refined" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.slow
+def test_colmap_refines_given_cameras(scene, tmp_path, monkeypatch):
+    pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
+    assert run(monkeypatch, "poses", scene, "--out", tmp_path / "out") == 0
+    done = json.loads((tmp_path / "out" / "summary.json").read_text())["poses"]
+    assert done["refined_error"] < 0.8 * done["given_error"]
+
+
+LENSES = {
+    "radial": Distortion(radial=(0.1, -0.02, 0.003), tangential=(0.001, -0.002)),
+    "fisheye": Distortion("equidistant", radial=(0.1, -0.02, 0.003, 0.001)),
+}
+
+
+def with_lens(photographs: Photographs, lens: Distortion) -> Photographs:
+    """Return photographs that were taken through a lens."""
+    intrinsics = Intrinsics((32, 32), (30.0, 31.0), (15.5, 16.5), distortion=lens)
+    frames = [replace(frame, intrinsics=intrinsics) for frame in photographs.frames]
+    return replace(photographs, frames=tuple(frames))
+
+
+@pytest.fixture
+def room(tmp_path) -> Photographs:
+    cameras = [camera_at(x=x, size=32) for x in (0.0, 0.5)]
+    return open_photographs(photographed(tmp_path / "room", cameras))
+
+
+@pytest.mark.parametrize("name", LENSES)
+def test_lenses_come_back(room, tmp_path, name):
+    written = with_lens(room, LENSES[name])
+    path = tmp_path / "transforms.json"
+    write_transforms(path, written, tmp_path)
+    for before, after in zip(written.frames, open_photographs(path).frames, strict=True):
+        assert after.intrinsics.distortion == before.intrinsics.distortion
+        assert after.intrinsics.compute_pinhole(32, 32) == before.intrinsics.compute_pinhole(32, 32)
+
+
+@pytest.mark.parametrize(
+    "lens", [Distortion("division", (0.1,)), Distortion(denominator=(0.1, 0.0, 0.0))]
+)
+def test_a_lens_that_the_file_does_not_hold_is_refused(room, tmp_path, lens):
+    with pytest.raises(InputError, match="does not hold; undistort"):
+        write_transforms(tmp_path / "transforms.json", with_lens(room, lens), tmp_path)
+
+
+def test_fisheye_lenses_beside_others_are_refused(room, tmp_path):
+    fisheye = with_lens(room, LENSES["fisheye"]).frames[0]
+    mixed = replace(room, frames=(fisheye, *room.frames[1:]))
+    with pytest.raises(InputError, match="fisheye and other lenses"):
+        write_transforms(tmp_path / "transforms.json", mixed, tmp_path)
+
+
+def test_masks_are_named_unless_they_are_the_other_way_round(room, tmp_path):
+    mask = tmp_path / "room" / "mask.png"
+    mask.write_bytes(room.frames[0].file.path.read_bytes())
+    frames = [replace(frame, mask=mask) for frame in room.frames]
+    path = tmp_path / "transforms.json"
+    masked = replace(room, frames=tuple(frames))
+    write_transforms(path, masked, tmp_path)
+    assert all(frame.mask.samefile(mask) for frame in open_photographs(path).frames)
+    with pytest.raises(InputError, match="the other way round"):
+        write_transforms(path, masked.invert_masks(), tmp_path)
