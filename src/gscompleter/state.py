@@ -71,6 +71,9 @@ class Completion(Displayed):
     """Sentences of Ψ about the context."""
     geometry: GivenGeometry | None = None
     """Geometry from elsewhere, whose depth is used in holes; None for none."""
+    confirmation: Trust | None = None
+    """How far photographs confirm what a removal left, although all of it has full trust; None if
+    they do not decide what stays (`keeps_confirmed`)."""
     models: Mapping[str, str] = field(default_factory=dict)
     """Names of the `reconstructor`, its `depth` and the `generator`, for those who read files."""
 

@@ -28,7 +28,7 @@ from gscompleter.stages.superfluous import exclude_needed, limit_errors
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
 from gscompleter.trust import Trust
-from gscompleter.trust.photometric import PhotoObservations, gather_observations
+from gscompleter.trust.photometric import PhotoObservations, gather_observations, load_trust
 from gscompleter.types import ContextScene, Gaussians, View, merge
 
 REVEALED_TOLERANCE = 0.003
@@ -94,7 +94,14 @@ def remove_gaussians(
         replace(photo, view=view.paint_ignored(scene.render.image.clamp(0, 1)), budgets=())
         for photo, view, scene in zip(state.photos, views, shown, strict=True)
     )
-    return prepare_guards(replace(changed, photos=photos), scenes)
+    changed = replace(changed, photos=photos)
+    if state.config.holes.keeps_confirmed:
+        # As a trained splat is trusted: a part of the hole may show a wall that photographs know.
+        config = replace(state.config, trust="photometric")
+        painted = [photo.view for photo in photos]
+        confirmation = load_trust(config, changed.parts, painted, scenes)
+        changed = replace(changed, confirmation=confirmation)
+    return prepare_guards(changed, scenes)
 
 
 def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:

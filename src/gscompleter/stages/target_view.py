@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 from jaxtyping import Bool, Float
@@ -22,7 +22,6 @@ from gscompleter.stages.hole_masks import (
     find_hole_masks,
 )
 from gscompleter.state import Completion
-from gscompleter.trust.photometric import load_trust
 from gscompleter.types import Camera, ErrorBudget, PaddedCamera, Render, View, merge
 
 FULL_TRUST = 1.0
@@ -139,27 +138,14 @@ def find_hole_edits(
     opened = add_border(removed) if config.completes_removals_only else None
     if not config.holes.forces_removed:
         return HoleEdits(opened)
-    if config.holes.keeps_confirmed:
-        removed = removed & ~find_confirmed_surface(state, camera, frozen, scenes)
+    if state.confirmation is not None:
+        trusted_alpha = state.confirmation.compute_alpha(frozen, camera.padded)
+        is_covered = ~compute_hole_mask(frozen.render.alpha, config.holes)
+        # A surface beside what was removed, which photographs confirm.
+        removed = removed & ~(is_covered & (trusted_alpha >= COVERED))
     # What an earlier target filled is no hole any more.
     filled = [part.gaussians for part in state.added_parts if part.origin.is_invented]
     if sum(map(len, filled)) == 0:
         return HoleEdits(opened, removed)
     alpha = scenes.renderer.render(merge(filled), camera.padded).alpha
     return HoleEdits(opened, removed & compute_hole_mask(alpha, config.holes))
-
-
-def find_confirmed_surface(
-    state: Completion, camera: PaddedCamera, frozen: FrozenScene, scenes: SceneRenderer
-) -> Bool[Tensor, "h w"]:
-    """Find the pixels of a target whose surface photographs confirm, beside what was removed.
-
-    `frozen` is the scene at the padded target. It is trusted as a trained splat is, although all of
-    it counts as trusted after a removal.
-    """
-    views = [photo.view for photo in state.photos]
-    config = replace(state.config, trust="photometric")
-    trust = load_trust(config, state.parts, views, scenes)
-    trusted_alpha = trust.compute_alpha(frozen, camera.padded)
-    is_covered = ~compute_hole_mask(frozen.render.alpha, config.holes)
-    return is_covered & (trusted_alpha >= COVERED)
