@@ -141,4 +141,5 @@ def test_the_loss_falls_and_the_weights_complete_a_scene(folder, clip, tmp_path,
     words = ("complete", folder / "room", *frames, *model, "--device", "cpu", "--out", out)
     assert run(monkeypatch, *words) == 0
     summary = json.loads((out / "summary.json").read_text())
-    assert summary["gaussians"]["context"] == 2 * (2 * SIZE) ** 2
+    assert summary["settings"]["weights"] == str(tmp_path / "mvsplat.ckpt")
+    assert 0 < summary["gaussians"]["context"] <= 2 * (2 * SIZE) ** 2
