@@ -381,6 +381,7 @@ def load_labels(path: Path, count: int) -> UInt8[Tensor, "n"]:
         fits = False
     if not fits:
         raise InputError(
-            f"{place} does not hold the labels of {path.name}; remove it to go on without them."
+            f"{quote_value(place)} does not hold the labels of {quote_value(path.name)}; remove it "
+            "to go on without them."
         )
     return torch.from_numpy(np.repeat(runs[:, 0].astype(np.uint8), runs[:, 1]))
