@@ -173,7 +173,10 @@ def _parse_supersplat_pose(pose: Any, title: str, resolution: tuple[int, int]) -
 def _build_upright_c2w(
     position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Build camera-to-world of an upright camera that points at a target; NaN along y."""
+    """Build camera-to-world of an upright camera that points at a target.
+
+    NaN if it looks along y, where nothing tells what is upright.
+    """
     # In the splat y points down, as in the camera: x is level, and y completes the axes.
     with np.errstate(all="ignore"):
         z = (target - position) / np.linalg.norm(target - position)

@@ -188,8 +188,9 @@ def parse_camera_frame(entry: Any, title: str, content: Mapping[str, Any] | None
 
 
 def _parse_intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
-    def read_pair(*keys: str, low: float = -MAX_NUMBER, high: float = MAX_NUMBER) -> NumberPair:
-        x_key, y_key = keys
+    def read_pair(
+        x_key: str, y_key: str, low: float = -MAX_NUMBER, high: float = MAX_NUMBER
+    ) -> NumberPair:
         x = get_optional_number(entry, x_key, title, low, high)
         y = get_optional_number(entry, y_key, title, low, high)
         return x, y

@@ -151,7 +151,7 @@ FRAME_RULES: dict[str, Callable[..., tuple[Split, ...]]] = {
 
 
 def build_index(protocol: EvaluationProtocol, clips: Iterable[Photographs]) -> EvaluationIndex:
-    """Write down the splits of each clip; raise InputError for equal names or a sequence."""
+    """Collect the splits of each clip; raise InputError for equal names or a sequence."""
     scenes: dict[str, tuple[Split, ...]] = {}
     for clip in clips:
         if clip.name in scenes:
