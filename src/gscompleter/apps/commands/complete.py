@@ -12,7 +12,6 @@ from gscompleter.apps.commands.shared_decisions import (
     Adapt,
     check_context,
     check_generator,
-    check_photograph_options,
     decide_filling,
     decide_results,
     has_splat_alone,
@@ -121,7 +120,6 @@ def decide_holes(
     `has_marks` and `adapt` are those of `decide_filling`.
     """
     check_context(options.context)
-    check_photograph_options(options, has_marks)
     if options.target and options.auto is not None:
         raise InputError(
             "--target and --auto are both given; use one of them, and complete the result again "
