@@ -107,9 +107,9 @@ def open_camera_list(path: Path) -> Iterator[Photographs]:
     """
     file = path / INRIA_CAMERAS_FILE if os.path.isdir(path) else path
     frames = locate_images(read_camera_list(file), [file.parent])
-    there, notes = keep_existing(frames, str(file))
+    there, notes = keep_existing(frames, quote_value(file))
     name = file.resolve().parent.name if file.name == INRIA_CAMERAS_FILE else file.stem
-    yield replace(build_photographs(name, str(file), there), notes=notes)
+    yield replace(build_photographs(name, quote_value(file), there), notes=notes)
 
 
 def read_camera_list(path: Path) -> list[Frame]:

@@ -48,7 +48,7 @@ def read_camera_file(path: Path) -> Photographs:
         lines, f"{quote_value(path)} lists no frames; below the address, each frame needs a line."
     )
     frames = [_parse_line(line, number, path) for number, line in enumerate(lines)]
-    return build_photographs(path.stem, str(path), frames)
+    return build_photographs(path.stem, quote_value(path), frames)
 
 
 def parse_camera_row(

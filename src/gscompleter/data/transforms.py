@@ -80,7 +80,7 @@ def open_transforms(path: Path) -> Iterator[Photographs]:
     name = (folder.parent if folder.name in TRANSFORMS_HOMES else folder).name
     if len(files) == 1 and files[0].name not in (TRANSFORMS_FILE, *SPLITS):
         name = files[0].stem
-    scene = build_photographs(name, str(files[0] if len(files) == 1 else path), frames)
+    scene = build_photographs(name, quote_value(files[0] if len(files) == 1 else path), frames)
     yield replace(scene, sparse=_make_cloud_reader(files))
 
 

@@ -114,7 +114,7 @@ def build_recording(
         frame = Frame(name, title, c2w @ OPENCV_FROM_OPENGL, lens, stored, depth)
         frames.append(frame.with_rigid_pose())
     require(frames, f"No photograph of {quote_value(path)} has a camera; {PHONE_EXPORT_ADVICE}.")
-    return build_photographs(path.resolve().stem, str(path), frames)
+    return build_photographs(path.resolve().stem, quote_value(path), frames)
 
 
 def _read_depth(
