@@ -192,13 +192,13 @@ def keep_change(session: Session, completion: Completion) -> tuple[Completion, s
 
 
 def describe_outcome(result: TargetResult) -> str:
-    """Describe what was added at a camera: one sentence, then one line per note."""
+    """Describe what was added or recoloured at a camera: one sentence, then one line per note."""
     if not result.has_changed_scene:
         return "\n".join(result.notes or (NOTHING_ADDED,))
-    text = (
-        f"{len(result.added):,} Gaussians are added in a hole of "
-        f"{100 * result.hole_fraction:.1f} % of the image."
-    )
+    changed = f"{len(result.added):,} Gaussians are added"
+    if not len(result.added):
+        changed = f"{result.num_recolored:,} Gaussians are recoloured"
+    text = f"{changed} in a hole of {100 * result.hole_fraction:.1f} % of the image."
     return "\n".join((text, *result.notes))
 
 
