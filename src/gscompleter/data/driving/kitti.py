@@ -118,7 +118,7 @@ def open_kitti_raw(path: Path) -> Iterator[Photographs]:
     frames = []
     for image, reading in zip(images, readings, strict=True):
         laser = _compute_imu_pose(reading, scale) @ imu_from_laser
-        title = f"photograph {image.stem} of {quote_value(path)}"
+        title = f"photograph {quote_value(image.stem)} of {quote_value(path)}"
         lasers = _find_sweep(path / "velodyne_points" / "data" / f"{image.stem}.bin", laser)
         c2w = laser @ laser_from_first @ first_from_camera
         frames.append(Frame(image.stem, title, c2w, intrinsics, image, laser_points=lasers))

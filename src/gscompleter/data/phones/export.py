@@ -106,7 +106,7 @@ def build_recording(
     for name, (c2w, lens) in cameras.items():
         if name not in images:
             continue
-        title = f"frame {name} of {quote_value(path)}"
+        title = f"frame {quote_value(name)} of {quote_value(path)}"
         depth = None
         if name in depths:
             depth = partial(_read_depth, depths[name], confidences.get(name), decoders, title)
