@@ -147,6 +147,11 @@ class TargetResult(Displayed):
         return {"before": self.before.image, "after": self.after.image}
 
     @property
+    def has_changed_scene(self) -> bool:
+        """True if Gaussians were added or recoloured."""
+        return len(self.added) > 0 or self.num_recolored > 0
+
+    @property
     def hole_fraction(self) -> float:
         """Fraction of the image in holes."""
         return self.hole_mask.float().mean().item()

@@ -322,6 +322,29 @@ def test_manifests_of_all_kinds_name_the_same_jobs(tmp_path):
     assert options[0][1] == parse_batch_row(by_folder[1].options, tmp_path / "o")
 
 
+def test_all_that_a_row_names_lies_beside_its_manifest(tmp_path):
+    """Also what may be a word: weights, and functions of the user's own."""
+    (tmp_path / "weights").mkdir()
+    row = {
+        "folder": "room",
+        "reconstructor": "own.py:reconstruct",
+        "depth": "moge-2",
+        "generator": "own.py:paint",
+        "generator_weights": "weights",
+        "generator_depth": "user/depth",
+    }
+    (tmp_path / "m.jsonl").write_text(json.dumps(row))
+    (job,) = read_manifest(tmp_path / "m.jsonl", {})
+    assert job.options == {
+        "folder": str(tmp_path / "room"),
+        "reconstructor": str(tmp_path / "own.py:reconstruct"),
+        "depth": "moge-2",
+        "generator": str(tmp_path / "own.py:paint"),
+        "generator_weights": str(tmp_path / "weights"),
+        "generator_depth": "user/depth",
+    }
+
+
 def test_rows_of_one_scene_need_names(tmp_path):
     manifest = tmp_path / "m.jsonl"
     rows = [{"folder": "room"}, {"folder": "room", "seed": 1, "name": "a/b"}]

@@ -38,6 +38,7 @@ from gscompleter.apps.live.session import (
     Session,
     SessionStep,
     apply_step,
+    describe_outcome,
     redo_step,
     save_camera,
     undo_step,
@@ -130,6 +131,12 @@ def test_undo_goes_back_and_the_same_camera_leads_to_the_same_scene(begun, compl
     again, _ = complete_camera(undo_step(two), HOLES[1])
     for name in FIELDS:
         assert torch.equal(getattr(again.latest.scene, name), getattr(two.latest.scene, name)), name
+
+
+def test_a_step_that_only_recolours_says_so(completed):
+    result = completed[0].latest.targets[-1]
+    recoloured = replace(result, added=result.added[:0], num_recolored=1234)
+    assert describe_outcome(recoloured).startswith("1,234 Gaussians are recoloured in a hole of ")
 
 
 def test_what_is_undone_is_done_again_until_something_else_is_done(twice):

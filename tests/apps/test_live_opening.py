@@ -23,6 +23,7 @@ from rich.console import Console
 from command import run
 from gscompleter import save_ply
 from gscompleter.apps.commands.live import decide_live
+from gscompleter.apps.commands.sessions import describe_value
 from gscompleter.apps.live import saving, serving
 from gscompleter.apps.live.journal import Journal
 from gscompleter.apps.live.opening import SessionRequest
@@ -31,6 +32,7 @@ from gscompleter.apps.live.session import Session, SessionStep, apply_step, redo
 from gscompleter.apps.live.strokes import list_steps
 from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.cli import parse_command
+from gscompleter.config.generators import GeneratorOptions
 from gscompleter.data.scene import describe_camera
 from gscompleter.splats.edits import read_edits
 from gscompleter.system.errors import InputError
@@ -430,3 +432,16 @@ def test_a_killed_program_loses_no_step(room, splat, tmp_path):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["out"]
     assert not [path for path in out.iterdir() if path.name.startswith(".")]
     assert read_listing(out) >= {"completed.ply", "strokes.json"}
+
+
+def test_weights_and_depths_of_ones_own_are_kept_by_their_whole_paths(tmp_path, monkeypatch):
+    """A later run may be elsewhere; a word that is no file stays a word."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "network").mkdir()
+    given = GeneratorOptions(generator_weights="network", generator_depth="network")
+    described = describe_value("synthesis", given)
+    assert (
+        described["generator_weights"] == described["generator_depth"] == str(tmp_path / "network")
+    )
+    named = GeneratorOptions(generator_depth="monocular")
+    assert describe_value("synthesis", named)["generator_depth"] == "monocular"

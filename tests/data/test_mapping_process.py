@@ -7,7 +7,7 @@ pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
 
 import pycolmap
 
-from gscompleter.data.sfm.mapping_process import is_plausible
+from gscompleter.data.sfm.mapping_process import Mapped, MappingJob, is_plausible, write_model
 from gscompleter.data.sfm.matching import is_sequence, pair_all, pair_neighbours, pair_similar
 
 
@@ -23,6 +23,23 @@ def test_lenses_that_no_camera_has_are_implausible():
     assert not is_plausible(camera(22530))
     assert not is_plausible(camera(0))
     assert not is_plausible(camera(344, x=400))
+
+
+def test_the_focal_length_that_is_told_is_that_of_most_photographs(tmp_path):
+    model = pycolmap.Reconstruction()
+    for number, focal in ((1, 500.0), (2, 700.0)):
+        lens = [focal, 320, 240, 0]
+        camera = pycolmap.Camera(
+            camera_id=number, model="SIMPLE_RADIAL", width=640, height=480, params=lens
+        )
+        model.add_camera_with_trivial_rig(camera)
+    for number, camera_id in ((1, 1), (2, 1), (3, 2)):
+        image = pycolmap.Image(name=f"{number}.png", camera_id=camera_id, image_id=number)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d())
+
+    folders = {name: str(tmp_path / name) for name in ("images", "masks", "work", "model")}
+    job = MappingJob(**folders, threads=1, photographs=[], is_panoramic=False)
+    assert write_model(job, Mapped(model, is_focal_fixed=True))["focal"] == 500
 
 
 @pytest.mark.parametrize(

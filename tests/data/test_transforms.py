@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -506,3 +507,11 @@ def test_every_real_scene_loads_completely(shared, every):
         for view in views:
             rotation = view.camera.c2w[:3, :3].double()
             assert (rotation.T @ rotation - torch.eye(3).double()).abs().max() < 1e-5
+
+
+@pytest.mark.skipif(os.name == "nt", reason="names of files have no line breaks there")
+def test_a_sentence_about_a_scene_stays_one_line_whatever_its_folder_is_called(tmp_path):
+    scene = write_scene(tmp_path / "line\nbreak", {"a.png": noise(), "b.png": noise(seed=1)})
+    with pytest.raises(InputError, match="line break") as caught:
+        open_photographs(scene).frame(7)
+    assert "\n" not in str(caught.value)

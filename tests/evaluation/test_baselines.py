@@ -24,10 +24,10 @@ from gscompleter.evaluation.baselines.reggs import (
     compute_mixture_wasserstein,
     compute_pairwise_costs,
     move_into_scene,
+    move_mixture,
     move_scene,
     reduce_mixture,
     register_by_similarity,
-    rotate_mixture,
 )
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.types import Gaussians, View, merge
@@ -104,7 +104,7 @@ def test_a_mixture_moves_as_its_gaussians_do():
     gaussians, camera = random_gaussians(40), camera_at(0.3, yaw=10)
     fit = Similarity(torch.tensor(1.0), SMALL_TURN, torch.tensor([0.2, -0.1, 0.3]))
     moved = cluster_gaussians(move_scene(gaussians, fit), camera, 1000, seed=0)
-    mixture = rotate_mixture(cluster_gaussians(gaussians, camera, 1000, seed=0), fit, camera)
+    mixture = move_mixture(cluster_gaussians(gaussians, camera, 1000, seed=0), fit, camera)
     assert torch.allclose(mixture.means, moved.means, atol=1e-4)
     assert torch.allclose(mixture.covariances, moved.covariances, atol=1e-4)
 

@@ -278,6 +278,16 @@ def test_without_measured_depth_the_scale_is_relative_to_the_model(begun):
     assert ((depth.depth - truth).abs() / truth)[depth.valid].median() < 0.05
 
 
+def test_a_vehicle_in_the_photograph_is_no_surface_that_was_to_be_filled(begun):
+    """A detected vehicle joins the mask of a view, and keeps its measured depth."""
+    below = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    below[-8:] = True
+    target = replace(begun.targets[0], ignore_mask=below)
+    expected = find_expected_depth(target, target, begun.models)
+    assert not expected.valid[below].any()
+    assert torch.equal(expected.valid[~below], (target.depth > 0)[~below])
+
+
 def test_the_drift_is_that_between_the_largest_and_the_smallest_scale():
     assert compute_scale_drift([1.0, 1.1, 0.9]) == pytest.approx(math.log(1.1 / 0.9))
     assert compute_scale_drift([1.0]) is None

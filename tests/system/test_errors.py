@@ -1,5 +1,6 @@
 """Quotes of the input in sentences."""
 
+import ast
 from pathlib import Path
 
 import pytest
@@ -13,6 +14,7 @@ from gscompleter.data.sfm.poses import write_upright
 from gscompleter.models.weights.reading import check_kind
 from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.image import read_pixels
+from paths import ROOT
 
 
 def test_a_short_value_is_quoted_as_it_is():
@@ -30,6 +32,19 @@ def test_a_long_one_keeps_its_two_ends():
 
 def test_a_quote_stays_on_its_line_and_shows_no_control_characters():
     assert quote_value("a\nb\x1b[31m") == "a b [31m"
+
+
+def test_errors_quote_the_paths_that_they_name():
+    """A name of a file may hold line breaks, and be longer than the sentence about it."""
+    bare = []
+    for file in sorted((ROOT / "src").rglob("*.py")):
+        for call in ast.walk(ast.parse(file.read_text())):
+            if isinstance(call, ast.Call) and ast.unparse(call.func) in ("InputError", "require"):
+                shown = [part for part in ast.walk(call) if isinstance(part, ast.FormattedValue)]
+                words = {ast.unparse(part.value) for part in shown}
+                bare += [f"{file}:{call.lineno}"] * bool(words & {"path", "folder", "file", "out"})
+    # This one is quoted where it is assigned.
+    assert [place for place in bare if "evaluation/apart.py" not in place] == []
 
 
 def test_lists_are_quoted_without_walking_all_of_them():

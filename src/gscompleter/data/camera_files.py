@@ -107,9 +107,9 @@ def open_camera_list(path: Path) -> Iterator[Photographs]:
     """
     file = path / INRIA_CAMERAS_FILE if os.path.isdir(path) else path
     frames = locate_images(read_camera_list(file), [file.parent])
-    there, notes = keep_existing(frames, str(file))
+    there, notes = keep_existing(frames, quote_value(file))
     name = file.resolve().parent.name if file.name == INRIA_CAMERAS_FILE else file.stem
-    yield replace(build_photographs(name, str(file), there), notes=notes)
+    yield replace(build_photographs(name, quote_value(file), there), notes=notes)
 
 
 def read_camera_list(path: Path) -> list[Frame]:
@@ -173,7 +173,10 @@ def _parse_supersplat_pose(pose: Any, title: str, resolution: tuple[int, int]) -
 def _build_upright_c2w(
     position: Float[np.ndarray, "3"], target: Float[np.ndarray, "3"]
 ) -> Float[np.ndarray, "4 4"]:
-    """Build camera-to-world of an upright camera that points at a target; NaN along y."""
+    """Build camera-to-world of an upright camera that points at a target.
+
+    NaN if it looks along y, where nothing tells what is upright.
+    """
     # In the splat y points down, as in the camera: x is level, and y completes the axes.
     with np.errstate(all="ignore"):
         z = (target - position) / np.linalg.norm(target - position)

@@ -50,7 +50,7 @@ def parse_camera_path(content: Any, path: Path) -> list[Frame]:
     )
     entries = get_part(content, "camera_path", list)
     require(entries, f"{quote_value(path)} holds no camera; {CAMERA_PATH_ADVICE}.")
-    size = get_size(content, str(path), "render_width", "render_height")
+    size = get_size(content, quote_value(path), "render_width", "render_height")
     to_photographs = find_world(path)
     return [
         _parse_path_camera(entry, f"camera {number} of {quote_value(path)}", size, to_photographs)

@@ -340,7 +340,7 @@ def open_colmap(path: Path) -> Iterator[Photographs]:
     existing, missing_notes = keep_existing(locate_images(frames, roots), str(model))
     existing, depth_notes = attach_depth_maps(existing, roots, model)
     notes += (*missing_notes, *depth_notes, *_describe_orientation(existing[0]))
-    photographs = build_photographs(roots[-1].name, str(model), existing)
+    photographs = build_photographs(roots[-1].name, quote_value(model), existing)
     yield replace(photographs, notes=notes, sparse=_make_model_point_reader(model))
 
 

@@ -51,7 +51,7 @@ def open_llff(path: Path) -> Iterator[Photographs]:
     ]
     near = NEAR_FACTOR * rows[:, 15].min().item()
     far = FAR_FACTOR * rows[:, 16].max().item()
-    scene = build_photographs(file.resolve().parent.name, str(file), frames)
+    scene = build_photographs(file.resolve().parent.name, quote_value(file), frames)
     yield replace(scene, near=near, far=far)
 
 

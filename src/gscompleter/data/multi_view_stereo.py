@@ -79,7 +79,7 @@ def open_mvsnet(path: Path) -> Iterator[Photographs]:
         f"None of the photographs of {quote_value(path / CAMS)} is there; put them into "
         f"`{MVS_FOLDERS[0]}` under the numbers of the cameras.",
     )
-    yield build_photographs(path.resolve().name, str(path), frames)
+    yield build_photographs(path.resolve().name, quote_value(path), frames)
 
 
 def read_cam(path: Path) -> tuple[Float[np.ndarray, "4 4"], Intrinsics]:
@@ -168,7 +168,7 @@ def open_idr(path: Path) -> Iterator[Photographs]:
         mask = find_file([path / "mask"], names, listings)
         frame = Frame(f"{home.name}/{image.name}", title, c2w, lens, image, mask=mask)
         frames.append(frame.with_rigid_pose())
-    yield build_photographs(path.resolve().name, str(path), frames)
+    yield build_photographs(path.resolve().name, quote_value(path), frames)
 
 
 def read_matrices(path: Path) -> dict[str, Float[np.ndarray, "n m"]]:

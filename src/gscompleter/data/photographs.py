@@ -333,7 +333,9 @@ class Photographs:
                 )
             depth = None if depth is None else depth.masked_fill(ignored, 0.0)
 
-        # The detected vehicle joins the mask of the view, but hides no known depth.
+        # The detected vehicle joins the mask of the view alone. Depth under it was measured, so it
+        # tells the unit of the depths (`compare_given_depth`), and which points beside the vehicle
+        # a laser sees past it (`drop_unsure`). What gives or scores depth asks the mask as well.
         vehicle = None if frame.vehicle is None else frame.vehicle()
         if vehicle is not None:
             small = undistort_and_resize(frame, vehicle.astype(np.uint8), size, resolution)

@@ -44,9 +44,11 @@ def read_camera_file(path: Path) -> Photographs:
     image is named after the timestamp and lies in a folder named after the file, or beside it.
     """
     lines = [line for line in read_lines(path) if line.strip()][1:]
-    require(lines, f"{path} lists no frames; below the address, each frame needs a line.")
+    require(
+        lines, f"{quote_value(path)} lists no frames; below the address, each frame needs a line."
+    )
     frames = [_parse_line(line, number, path) for number, line in enumerate(lines)]
-    return build_photographs(path.stem, str(path), frames)
+    return build_photographs(path.stem, quote_value(path), frames)
 
 
 def parse_camera_row(
@@ -67,13 +69,14 @@ def _parse_line(line: str, number: int, path: Path) -> Frame:
         numbers = np.array([float(word) for word in words])
     except ValueError as error:
         raise InputError(
-            f"Frame {number} of {path} is not a line of RealEstate10K, which has 19 numbers: "
-            "timestamp, fx fy cx cy, 0 0, and 3 × 4 of world-to-camera; download it again."
+            f"Frame {number} of {quote_value(path)} is not a line of RealEstate10K, which has 19 "
+            "numbers: timestamp, fx fy cx cy, 0 0, and 3 × 4 of world-to-camera; download it "
+            "again."
         ) from error
     own = path.with_suffix("")
     folder = own if os.path.isdir(own) else path.parent
     intrinsics, c2w = parse_camera_row(numbers)
-    title = f"frame {number} of {path}"
+    title = f"frame {number} of {quote_value(path)}"
     return Frame(timestamp, title, c2w, intrinsics, folder / timestamp)
 
 
@@ -129,7 +132,8 @@ def _open_chunk(path: Path, keys: Collection[str] = ()) -> Iterator[Photographs]
     missing = sorted(set(keys) - {scene.name for scene in scenes})
     require(
         not missing,
-        f"{INDEX} lists {join_names(missing, 3)} in {path}, which lacks it; download it again.",
+        f"{INDEX} lists {join_names(missing, 3)} in {quote_value(path)}, which lacks it; download "
+        "it again.",
     )
     yield from scenes
 
@@ -153,10 +157,11 @@ def _read_chunk(path: Path, _written: int) -> list[Any]:
             defect = "is truncated, no file of torch.save, or too large; download it again"
             if "GLOBAL" in str(error):
                 defect = "holds pickled Python objects, which are refused: they can run any code"
-            raise InputError(f"{path} {defect}.") from error
+            raise InputError(f"{quote_value(path)} {defect}.") from error
     require(
         isinstance(content, list) and content,
-        f"{path} is no chunk: a list of scenes is needed, and it holds {type(content).__name__}.",
+        f"{quote_value(path)} is no chunk: a list of scenes is needed, and it holds "
+        f"{type(content).__name__}.",
     )
     return content
 
@@ -168,8 +173,10 @@ def _parse_scene(example: Any, path: Path, position: int) -> Photographs:
     cameras = entries.get("cameras")
     images = entries.get("images")
     if not isinstance(name, str) or not name:
-        raise InputError(f"Scene {position} of {path} has no `key`; write the chunk again with it.")
-    called = f"scene {quote_value(name)} of {path}"
+        raise InputError(
+            f"Scene {position} of {quote_value(path)} has no `key`; write the chunk again with it."
+        )
+    called = f"scene {quote_value(name)} of {quote_value(path)}"
     if not (_is_dense(cameras, ndim=2) and cameras.is_floating_point() and cameras.shape[1] == 18):
         raise InputError(f"The `cameras` of the {called} are no floats of shape [n, 18].")
 

@@ -72,7 +72,7 @@ def open_scannet(path: Path) -> Iterator[Photographs]:
             lack="it has no pose" if pose is None else None,
         )
         frames.append(frame.with_rigid_pose())
-    yield build_photographs(path.resolve().name, str(path), frames)
+    yield build_photographs(path.resolve().name, quote_value(path), frames)
 
 
 def has_replica(path: Path) -> bool:
@@ -124,4 +124,4 @@ def open_replica(path: Path) -> Iterator[Photographs]:
             None if depth is None else partial(read_depth, depth, unit),
         )
         frames.append(frame.with_rigid_pose())
-    yield build_photographs(path.resolve().name, str(path), frames)
+    yield build_photographs(path.resolve().name, quote_value(path), frames)

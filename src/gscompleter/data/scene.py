@@ -117,7 +117,7 @@ def load_cameras(
     path = require_path(path)
     frames = tuple(read_cameras(path, resolution))
     zero = np.asarray(origin, dtype=np.float64)
-    cameras = Photographs(path.stem, str(path), frames, zero, near, far)
+    cameras = Photographs(path.stem, quote_value(path), frames, zero, near, far)
     return [cameras.camera(number, resolution) for number in range(len(cameras))]
 
 

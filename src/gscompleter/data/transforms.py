@@ -82,7 +82,7 @@ def open_transforms(path: Path) -> Iterator[Photographs]:
     name = (folder.parent if folder.name in TRANSFORMS_HOMES else folder).name
     if len(files) == 1 and files[0].name not in (TRANSFORMS_FILE, *SPLITS):
         name = files[0].stem
-    scene = build_photographs(name, str(files[0] if len(files) == 1 else path), frames)
+    scene = build_photographs(name, quote_value(files[0] if len(files) == 1 else path), frames)
     yield replace(scene, sparse=_make_cloud_reader(files))
 
 
@@ -104,7 +104,7 @@ def _find_files(scene: Path) -> list[Path]:
 def _make_cloud_reader(files: Sequence[Path]) -> partial[Float[np.ndarray, "n 3"]] | None:
     """Return a reader of the points that a file names; None if there are none."""
     for file in files:
-        name = get_text(read_json(file, TRANSFORMS_ADVICE), "ply_file_path", str(file))
+        name = get_text(read_json(file, TRANSFORMS_ADVICE), "ply_file_path", quote_value(file))
         path = None if name is None else locate(file.parent, name, _find_any_case)
         if path is not None and os.path.isfile(path):
             return partial(read_point_cloud, path)
@@ -122,9 +122,13 @@ def read_frames(path: Path) -> list[Frame]:
     if is_marked(content):  # `targets.json`, for example
         refuse_later(content, quote_value(path))
     entries = get_part(content, "frames", list)
-    require(entries, f"{path} lists no frames; its `frames` has to be a list with cameras.")
+    require(
+        entries, f"{quote_value(path)} lists no frames; its `frames` has to be a list with cameras."
+    )
     # Integers in depth maps are millimetres by default, as nerfstudio takes them.
-    units = (get_optional_number(content, key, str(path), *DEPTH_RANGE) for key in DEPTH_UNITS)
+    units = (
+        get_optional_number(content, key, quote_value(path), *DEPTH_RANGE) for key in DEPTH_UNITS
+    )
     unit = next((unit for unit in units if unit is not None), 1e-3)
     listings = FolderListings()
     return [
@@ -141,9 +145,9 @@ def _parse_transforms_frame(
     path: Path,
     listings: FolderListings,
 ) -> Frame:
-    title = f"frame {position} of {path}"
+    title = f"frame {position} of {quote_value(path)}"
     file_path = get_text(entry, "file_path", title)
-    title = title if file_path is None else f"frame {quote_value(file_path)} of {path}"
+    title = title if file_path is None else f"frame {quote_value(file_path)} of {quote_value(path)}"
 
     def locate_file(key: str) -> Path | None:
         name = get_text(entry, key, title)
@@ -186,8 +190,9 @@ def parse_camera_frame(entry: Any, title: str, content: Mapping[str, Any] | None
 
 
 def _parse_intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
-    def read_pair(*keys: str, low: float = -MAX_NUMBER, high: float = MAX_NUMBER) -> NumberPair:
-        x_key, y_key = keys
+    def read_pair(
+        x_key: str, y_key: str, low: float = -MAX_NUMBER, high: float = MAX_NUMBER
+    ) -> NumberPair:
         x = get_optional_number(entry, x_key, title, low, high)
         y = get_optional_number(entry, y_key, title, low, high)
         return x, y
@@ -301,11 +306,11 @@ def read_dataparser_transforms(path: Path) -> Float[np.ndarray, "4 4"]:
     The file holds a rigid 3×4 `transform` and a `scale` that multiplies its result.
     """
     content = read_json(path, "copy it from the folder of the nerfstudio run again")
-    rigid = np.vstack([get_array(content, "transform", str(path), (3, 4)), [0, 0, 0, 1]])
+    rigid = np.vstack([get_array(content, "transform", quote_value(path), (3, 4)), [0, 0, 0, 1]])
     defect = find_pose_defect(rigid)
     require(
         not defect,
         f"The `transform` of {quote_value(path)} cannot be used: {defect}; copy it again.",
     )
-    scale = get_number(content, "scale", str(path), *SCALE_RANGE)
+    scale = get_number(content, "scale", quote_value(path), *SCALE_RANGE)
     return np.diag([scale, scale, scale, 1.0]) @ rigid

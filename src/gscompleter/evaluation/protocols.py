@@ -151,16 +151,16 @@ FRAME_RULES: dict[str, Callable[..., tuple[Split, ...]]] = {
 
 
 def build_index(protocol: EvaluationProtocol, clips: Iterable[Photographs]) -> EvaluationIndex:
-    """Write down the splits of each clip; raise InputError for equal names or a sequence."""
+    """Collect the splits of each clip; raise InputError for equal names or a sequence."""
     scenes: dict[str, tuple[Split, ...]] = {}
     for clip in clips:
         if clip.name in scenes:
-            raise InputError(f"Two clips are called {clip.name}; rename one of them.")
+            raise InputError(f"Two clips are called {quote_value(clip.name)}; rename one of them.")
         scenes[clip.name] = protocol.select_splits(clip)
     if any(split.is_sequence for splits in scenes.values() for split in splits):
         raise InputError(
-            f"{protocol.name} has no index, because its targets depend on each other; give the "
-            "protocol to `evaluate` instead."
+            f"{quote_value(protocol.name)} has no index, because its targets depend on each other; "
+            "give the protocol to `evaluate` instead."
         )
     return EvaluationIndex(protocol.name, scenes)
 
@@ -177,8 +177,9 @@ def read_evaluation_index(path: Path) -> EvaluationIndex:
         defect = error.errors(include_url=False)[0]
         place = quote_value(".".join(str(part) for part in defect["loc"]))
         raise InputError(
-            f"{path} is no evaluation index of version {INDEX_VERSION} ({place}: {defect['msg']}); "
-            "it has to map the name of each scene to its context and target frames, or to null."
+            f"{quote_value(path)} is no evaluation index of version {INDEX_VERSION} ({place}: "
+            f"{defect['msg']}); it has to map the name of each scene to its context and target "
+            "frames, or to null."
         ) from None
     # A scene has one split, several, or null, which leaves it out.
     scenes = {
@@ -267,8 +268,9 @@ def make_tasks(
         for frame in (*split.context, *split.targets):
             if frame >= len(clip):
                 raise InputError(
-                    f"The protocol {protocol.name} needs frame {frame} of {clip.name}, which "
-                    f"has {len(clip)} frames; use the index of this data set."
+                    f"The protocol {quote_value(protocol.name)} needs frame {frame} of "
+                    f"{quote_value(clip.name)}, which has {len(clip)} frames; use the index of "
+                    "this data set."
                 )
         if split.is_sequence:
             task = Task(clip.name, split.context, split.targets, opened, resolution)

@@ -173,7 +173,8 @@ def find_expected_depth(target: View, anchor: View, models: Models) -> DepthMap:
     A scale against an estimate is not absolute, but relative to that of the model.
     """
     if target.depth is not None:
-        return DepthMap(target.depth, target.depth > 0)
+        # A detected vehicle keeps its depth, which is none of the scene.
+        return DepthMap(target.depth, (target.depth > 0) & target.valid_mask)
     return lift_pair(models.reconstructor, target, anchor).reference_depth
 
 

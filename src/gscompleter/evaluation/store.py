@@ -91,20 +91,21 @@ def claim(out: Path, settings: Mapping[str, Any]) -> None:
             old = quote_value(repr(existing.get(key)))
             new = quote_value(repr(wanted.get(key)))
             raise InputError(
-                f"{out} holds a run with {key} {old}, and this run has {new}; name another folder."
+                f"{quote_value(out)} holds a run with {key} {old}, and this run has {new}; name "
+                "another folder."
             )
 
 
 def read_run_settings(out: Path) -> dict[str, Any]:
     """Read the settings of a run; raise InputError if `out` holds none of this version."""
     if not (out / RUN).is_file():
-        raise InputError(f"{out} holds no run; name a folder that `evaluate` wrote.")
+        raise InputError(f"{quote_value(out)} holds no run; name a folder that `evaluate` wrote.")
     settings = read_run_file(out / RUN, "name another folder")
     version = settings.get("version") if isinstance(settings, dict) else None
     if version != RUN_VERSION:
         raise InputError(
-            f"{out} holds a run of version {quote_value(version)}, and version {RUN_VERSION} is "
-            "needed; name another folder and run it again."
+            f"{quote_value(out)} holds a run of version {quote_value(version)}, and version "
+            f"{RUN_VERSION} is needed; name another folder and run it again."
         )
     return dict(settings)
 

@@ -122,7 +122,10 @@ class Painted:
 def load_painted(
     settings: PaintedSettings, seed: int, photographs: Sequence[View], device: str
 ) -> Painted:
-    """Load the generator of images that were painted for the targets."""
+    """Load the generator of images that were painted for the targets.
+
+    As other generators that return given images, it gets these as `photographs`.
+    """
     return Painted(tuple(photographs), settings.painter)
 
 
@@ -192,7 +195,10 @@ def describe_differences(
     scene: Float[Tensor, "h w 3"],
     comparable: Bool[Tensor, "h w"],
 ) -> str:
-    """Write where an image, in the exposure of the scene, differs from it outside of the mask."""
+    """Describe where an image, in the exposure of the scene, differs from it outside of the mask.
+
+    Empty where it hardly does.
+    """
     difference = smooth_masked((image - scene).abs(), comparable, DIFFERENCE_RADIUS).mean(dim=-1)
     differs = comparable & (difference > MAX_DIFFERENCE)
     share = differs.float().mean().item()
@@ -209,7 +215,7 @@ def describe_differences(
 
 
 def describe_open(name: str, is_open: Bool[Tensor, "h w"], hole: Bool[Tensor, "h w"]) -> str:
-    """Write how much of the hole was not painted."""
+    """Describe how much of the hole was not painted; empty for next to nothing."""
     share = int(is_open.sum()) / max(int(hole.sum()), 1)
     if share < MIN_UNPAINTED:
         return ""

@@ -18,7 +18,7 @@ from gscompleter.models.depth_anything.reconstructor import (
     resample_depth_maps,
 )
 from gscompleter.reconstructors.from_depth import FromDepth
-from gscompleter.system.errors import InputError
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.types import DepthMap, View
 
 PUBLISHED = "facebook/map-anything-apache"
@@ -88,7 +88,8 @@ def load_map_anything(weights: Path | None = None, device: str = "cpu") -> FromD
         model = MapAnything.from_pretrained(place)
     except Exception as error:  # the hub, safetensors and the package have errors of their own
         raise InputError(
-            f"MapAnything was not loaded from {place} ({type(error).__name__}); name a folder that "
-            "holds its config.json and model.safetensors."
+            f"MapAnything was not loaded from {quote_value(weights or PUBLISHED)} "
+            f"({type(error).__name__}); name a folder that holds its config.json and "
+            "model.safetensors."
         ) from error
     return FromDepth(model=MapAnythingDepth(model.to(device).eval(), device))

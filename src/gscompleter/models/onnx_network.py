@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from gscompleter.models.weights.published import PublishedWeights
 from gscompleter.models.weights.reading import fetch_checked
-from gscompleter.system.errors import InputError
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.threads import get_thread_count
 
 INSTALL = "pip install 'gscompleter[onnx]'"
@@ -67,8 +67,8 @@ def load_network(
     if not fits or len(session.get_outputs()) != num_outputs:
         listed = ", ".join(f"{x.name} {x.type} {x.shape}" for x in inputs)
         raise InputError(
-            f"{path} is no {weights.model} network: its inputs are {listed}; give {weights.file} "
-            f"from {weights.source}.",
+            f"{quote_value(path)} is no {weights.model} network: its inputs are {listed}; give "
+            f"{weights.file} from {weights.source}.",
             option,
         )
     return network
@@ -92,6 +92,7 @@ def open_session(path: Path, device: str, option: str) -> Any:
         )
     except Exception as error:  # onnxruntime has an error class per status code
         raise InputError(
-            f"{path} cannot be read as an ONNX network: it is damaged or of another format.",
+            f"{quote_value(path)} cannot be read as an ONNX network: it is damaged or of another "
+            "format.",
             option,
         ) from error

@@ -243,7 +243,7 @@ def _load_plane_sweep(weights: Path | None, device: str) -> Reconstructor:
     from gscompleter.reconstructors.plane_sweep import PlaneSweep
 
     if weights is not None:
-        raise InputError(f"plane-sweep takes no weights; leave out {weights}.")
+        raise InputError(f"plane-sweep takes no weights; leave out {quote_value(weights)}.")
     return PlaneSweep()
 
 

@@ -170,7 +170,7 @@ def describe_oddities(path: Path) -> list[str]:
     further = describe_further_properties(list_property_names(path))
     lines = [] if further is None else [further]
     if detect_splat_format(path) == "ply":
-        # As in `list_property_names`.
+        # A fourth band of harmonics is refused, or left out, by those who read it.
         lines = [*describe_values(read_scene(path, leaves_out_band_4=True)), *lines]
     return lines
 
@@ -352,11 +352,12 @@ def save_labels(
     They are removed if nothing was generated.
     """
     place = get_labels_path(path)
+    has_labels = bool((generated > 0).any())
     # What a link names lies elsewhere, and stays.
-    if not (generated > 0).any() or place.is_symlink():
+    if not has_labels or place.is_symlink():
         with contextlib.suppress(FileNotFoundError):
             place.unlink()
-    if not (generated > 0).any():
+    if not has_labels:
         return
     # Run lengths, as labels come in long runs; the digest ties them to this very file.
     runs = [[label, len(list(run))] for label, run in groupby(generated.tolist())]
@@ -381,6 +382,7 @@ def load_labels(path: Path, count: int) -> UInt8[Tensor, "n"]:
         fits = False
     if not fits:
         raise InputError(
-            f"{place} does not hold the labels of {path.name}; remove it to go on without them."
+            f"{quote_value(place)} does not hold the labels of {quote_value(path.name)}; remove it "
+            "to go on without them."
         )
     return torch.from_numpy(np.repeat(runs[:, 0].astype(np.uint8), runs[:, 1]))

@@ -170,8 +170,8 @@ def read_scene(path: Path, leaves_out_band_4: bool = False) -> SceneFile:
     num_rest = count_rest(scene)
     if num_rest not in _NUM_REST or any(f"f_rest_{i}" not in names for i in range(num_rest)):
         raise InputError(
-            f"{path} has {num_rest} properties f_rest_*; spherical harmonics of degree 0 to 3 "
-            "have 0, 9, 24 or 45, numbered from 0."
+            f"{quote_value(path)} has {num_rest} properties f_rest_*; spherical harmonics of "
+            "degree 0 to 3 have 0, 9, 24 or 45, numbered from 0."
         )
     has_linear_scales = find_linear_scales(scene.rows)
     return SceneFile(

@@ -20,7 +20,7 @@ from gscompleter.splats.packing import UnsupportedError
 from gscompleter.types import Gaussians, Origin, merge
 
 MAX_SIMILARITY_ERROR = 1e-3
-"""Largest relative error of a similarity of a file."""
+"""Largest deviation of the rotation of a file from an orthogonal one."""
 HALF_TURN_X = (1.0, -1.0, -1.0)
 """Signs of the axes after half a turn about x."""
 HALF_TURN_Z = (-1.0, -1.0, 1.0)
@@ -38,6 +38,7 @@ def rotate_half_turn(gaussians: Gaussians, signs: tuple[float, float, float]) ->
     return replace(
         gaussians,
         means=gaussians.means * flip,
+        # Conjugated by the half-turn: w and the part along its axis stay.
         quats=gaussians.quats * torch.tensor((1.0, *signs)),
         sh=gaussians.sh * (after / before).round().mT,
         origin=_turn_origin(gaussians.origin, signs),

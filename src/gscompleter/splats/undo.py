@@ -35,6 +35,7 @@ from gscompleter.system.files.writing import EDITS_FILE
 Keys = Int64[ndarray, "_n"]
 """Number of the edit that appended each row, and its place among these in the lower 40 bits."""
 PLACE_BITS = 40
+NO_KEYS = np.empty(0, np.int64)
 
 
 @dataclass(frozen=True)
@@ -63,7 +64,7 @@ class Undone:
 def strip_edits(path: Path, out: Path, numbers: Collection[int] | None = None) -> Undone:
     """Write a splat without some of its edits, which are numbered from 1; None for all of them.
 
-    A splat with a single edit, or without a record, is stripped by its labels.
+    A splat with a single edit, or whose earlier states are not known, is stripped by its labels.
     """
     path = resolve_splat(path)
     edits = read_edits(path)
@@ -93,7 +94,7 @@ def undo_edits(path: Path, edits: Edits, numbers: Collection[int], out: Path) ->
     # What an edit left out comes back with it, unless another edit left it out; no row is left out
     # twice.
     gone = [left_out[index].keys for index in remaining]
-    keys = np.setdiff1d(np.concatenate(appended), np.concatenate(gone) if gone else keys_of_none())
+    keys = np.setdiff1d(np.concatenate(appended), np.concatenate([NO_KEYS, *gone]))
     originals = join_originals(left_out)
 
     had_labels = all_edits[0].had_labels
@@ -134,11 +135,6 @@ def check_undone(path: Path, edits: Edits, numbers: Collection[int], out: Path) 
         )
     if get_written_format(out) is not PLY:
         raise InputError("An earlier state is a .ply; name such a file.", "out")
-
-
-def keys_of_none() -> Keys:
-    """Return no keys."""
-    return np.empty(0, np.int64)
 
 
 def make_keys(number: int, count: int) -> Keys:
@@ -187,7 +183,7 @@ def read_originals(edits: Edits, edit: Edit, before: Keys) -> Originals:
     """Read the rows that an edit left out of a state."""
     none = np.empty((0, 2), np.int64)
     if edit.originals is None:
-        return Originals(keys_of_none(), (), none)
+        return Originals(NO_KEYS, (), none)
     path = edits.find(edit.originals)
     scene = read_scene(path)
     num_kept = len(before) - len(scene.rows)
@@ -214,20 +210,21 @@ def make_remaining_header(
 ) -> tuple[bytes, np.dtype]:
     """Make header and type of rows without the comments of the edits that are taken off.
 
-    Without any edit, the labels are what they were at first.
+    `remaining` are the indices of the other edits. Without any edit, the labels are what they were
+    at first: `had_labels` is the type of their column then, or None if there was none.
     """
     found = LABEL_LINES.search(layout.header)
-    names = layout.rows.dtype.descr
     if found is None:
         return layout.header, layout.rows.dtype
+    columns = layout.rows.dtype.descr
     if not remaining and had_labels is None:
         header = layout.header[: found.start()] + layout.header[found.end() :]
-        return header, np.dtype([column for column in names if column[0] != LABEL_COLUMN])
+        return header, np.dtype([column for column in columns if column[0] != LABEL_COLUMN])
 
+    # Comments of the splat at first, then those of each edit.
     comments = found[1].splitlines(keepends=True)
-    count_at_first = len(comments) - sum(edit.records for edit in edits)
-    kept = comments[:count_at_first]
-    start = count_at_first
+    start = len(comments) - sum(edit.records for edit in edits)
+    kept = comments[:start]
     for index, edit in enumerate(edits):
         if index in remaining:
             kept += comments[start : start + edit.records]
@@ -236,7 +233,7 @@ def make_remaining_header(
     dtype = layout.rows.dtype
     if not remaining and had_labels == "uchar":
         line = line.replace(b" float ", b" uchar ")
-        dtype = np.dtype([(c[0], "u1") if c[0] == LABEL_COLUMN else c for c in names])
+        dtype = np.dtype([(c[0], "u1") if c[0] == LABEL_COLUMN else c for c in columns])
     header = layout.header[: found.start()] + line + b"".join(kept) + layout.header[found.end() :]
     return header, dtype
 

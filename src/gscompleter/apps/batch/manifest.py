@@ -22,6 +22,7 @@ from gscompleter.system.files.names import fold_name, make_valid_name
 from gscompleter.system.files.output_folder import read_command
 from gscompleter.system.files.reading import list_folders, read_bytes
 from gscompleter.system.jobs.jobs import Job
+from gscompleter.system.plugins import is_in_file
 
 FOLDER = "folder"
 """Column of the scene folder."""
@@ -37,7 +38,9 @@ PATH_COLUMNS = (
     "ignore",
     "geometry",
 )
-"""Options that are paths."""
+"""Options that are always a path."""
+PROGRAM_COLUMNS = ("reconstructor", "depth", "generator")
+"""Options that may name a function in a file of Python, as in `my_models.py:predict_depth`."""
 MARKERS = ("batch.json", "run.json")
 """Files that mark the output folders of `batch` and `evaluate`."""
 COMPLETING = ("complete", "clean", "demo")
@@ -54,7 +57,8 @@ OptionValues = dict[str, Any]
 def read_manifest(manifest: Path, common: Mapping[str, Any], out: Path | None = None) -> list[Job]:
     """Read the jobs of a `.csv` or `.jsonl` file or a folder of scenes.
 
-    In a folder of scenes those of `list_results` are left out.
+    `common` are the options of all rows that do not set them. In a folder of scenes those of
+    `list_results` are left out.
     """
     # Options of the command line count from the working folder, those of a row from the manifest,
     # and the row wins.
@@ -78,17 +82,27 @@ def read_manifest(manifest: Path, common: Mapping[str, Any], out: Path | None = 
 
 
 def resolve_paths(row: Mapping[str, Any], base: Path) -> OptionValues:
-    """Make the paths of a row absolute; invalid values stay."""
+    """Make the paths of a row absolute, `base` being their folder; invalid values stay."""
 
     def join(value: Any) -> Any:
         return os.path.join(base, value) if isinstance(value, str) and value else value
 
+    def exists(value: Any) -> bool:
+        return isinstance(value, str) and bool(value) and os.path.exists(join(value))
+
     result = {key: join(value) if key in PATH_COLUMNS else value for key, value in row.items()}
+    for key in PROGRAM_COLUMNS:
+        if is_in_file(result.get(key)):
+            result[key] = join(result[key])
+    # Other weights are names of the hub.
+    for key in ("generator_weights", "generator_depth"):
+        if exists(result.get(key)):
+            result[key] = join(result[key])
     target = result.get("target")
     config = result.get("config")
-    # A text is the path of a file of cameras, or else numbers and names of photographs.
-    is_number = isinstance(target, str) and re.fullmatch(r"[\d\s]*", target)
-    if isinstance(target, str) and not is_number and os.path.exists(join(target)):
+    # A text is the path of a file of cameras, or else numbers and names of photographs. A list
+    # keeps a path with spaces in one piece.
+    if exists(target) and not re.fullmatch(r"[\d\s]*", str(target)):
         result["target"] = [join(target)]
     if isinstance(result.get("mask"), (str, list)):
         masks = result["mask"] if isinstance(result["mask"], list) else [result["mask"]]

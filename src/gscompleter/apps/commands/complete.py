@@ -12,7 +12,6 @@ from gscompleter.apps.commands.shared_decisions import (
     Adapt,
     check_context,
     check_generator,
-    check_photograph_options,
     decide_filling,
     decide_results,
     has_splat_alone,
@@ -121,7 +120,6 @@ def decide_holes(
     `has_marks` and `adapt` are those of `decide_filling`.
     """
     check_context(options.context)
-    check_photograph_options(options, has_marks)
     if options.target and options.auto is not None:
         raise InputError(
             "--target and --auto are both given; use one of them, and complete the result again "
@@ -152,7 +150,10 @@ def decide_holes(
 
 @dataclass(frozen=True)
 class NamedCameras:
-    """Targets and context as they are named; none of them are searched for, or chosen."""
+    """Targets and context as they are named.
+
+    Without targets these are searched for, and without a context it is chosen.
+    """
 
     targets: tuple[str, ...]
     context: Names | None
@@ -217,8 +218,9 @@ def check_painted(options: CompleteOptions) -> None:
 def choose_ending(options: CompleteOptions, filling: FillingRequest) -> Request:
     """Choose what is done with the holes: they are filled, exported, or only planned."""
     if options.export_holes is not None:
-        has_number = options.auto is not None
-        return ExportRequest(filling, options.export_holes, options.path, has_number)
+        return ExportRequest(
+            filling, options.export_holes, options.path, names_number=options.auto is not None
+        )
     return PlanRequest(filling) if options.dry_run else filling
 
 

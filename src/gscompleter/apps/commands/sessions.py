@@ -51,17 +51,18 @@ DEFAULT_OUT = Path("live")
 """Output folder of a session that begins with a scene."""
 DEFAULT_RESOLUTION = (256, 256)
 """Working size of such a session."""
-NAMES_SCENE = ("folder", "scene")
-OF_MACHINE = (
+SCENE_PATHS = ("folder", "scene")
+"""Options that name the scene."""
+OPTIONS_OF_A_RUN = (
     *("out", "overwrite", "quiet", "json", "threads"),
     *("device", "renderer_device", "network_device"),
 )
-"""Options that each run chooses anew."""
+"""Options that each run chooses anew, which a session does not keep."""
 
-Known = TypeVar("Known", bound=CompletingOptions)
+AnyOptions = TypeVar("AnyOptions", bound=CompletingOptions)
 
 
-def decide_session(options: Known, strokes: Path | None) -> SessionRequest:
+def decide_session(options: AnyOptions, strokes: Path | None) -> SessionRequest:
     """Decide on the scene of a session, and on the steps of `strokes` that it goes on from.
 
     Raises InputError if its folder is not free.
@@ -97,7 +98,7 @@ def decide_session(options: Known, strokes: Path | None) -> SessionRequest:
         steps=read_steps(saved.frames, path.parent),
         undone=read_steps(saved.undone, path.parent),
         saved=saved.saved if continues else None,
-        notes=tuple(describe_changes(options, saved, out if continues else None)),
+        notes=tuple(describe_continuation(options, saved, out if continues else None)),
     )
 
 
@@ -127,7 +128,7 @@ def begin_with(options: CompletingOptions) -> SessionRequest:
     return SessionRequest(completion, describe_session(options, completion), options.resolution)
 
 
-def add_saved_options(options: Known, saved: StrokesFile) -> Known:
+def add_saved_options(options: AnyOptions, saved: StrokesFile) -> AnyOptions:
     """Return the options with those of the session where they are not given."""
     given = {name: getattr(options, name) for name in SEPARATE_OPTIONS}
     missing = {name: getattr(saved, name) for name, value in given.items() if value is None}
@@ -144,9 +145,9 @@ def describe_session(options: CompletingOptions, completion: CompletionRequest) 
 
 
 def describe_options(options: CompletingOptions) -> dict[str, Any]:
-    """Describe the options that a session goes on with, without those of a machine."""
+    """Describe the options that a session goes on with, without those of a run."""
     names = [field.name for field in fields(CompletingOptions)]
-    chosen = [name for name in names if name not in (*SEPARATE_OPTIONS, *OF_MACHINE)]
+    chosen = [name for name in names if name not in (*SEPARATE_OPTIONS, *OPTIONS_OF_A_RUN)]
     return {name: describe_value(name, getattr(options, name)) for name in chosen}
 
 
@@ -162,10 +163,12 @@ def describe_value(name: str, value: Any) -> Any:
     return os.path.abspath(value) if is_path else value
 
 
-def find_session(options: Known, strokes: Path | None) -> tuple[Known, Path | None]:
-    """Find the steps to go on with, if any; the options then name a scene only with `strokes`.
+def find_session(options: AnyOptions, strokes: Path | None) -> tuple[AnyOptions, Path | None]:
+    """Find the `strokes.json` to go on with; None to begin anew.
 
-    An output folder without steps stands for the completed scene in it.
+    SCENE may name the session itself: its folder, or the completed scene in it. Then the options
+    that are returned name no scene, which the session knows. An output folder without steps stands
+    for the completed scene in it.
     """
     folder = options.folder
     path = None if strokes is None else find_strokes_file(strokes)
@@ -202,37 +205,42 @@ def is_saved_session(path: Path) -> bool:
     return edits.is_unchanged and bool(edits) and edits.edits[-1].command == "live"
 
 
-def restore_options(options: Known, saved: StrokesFile, path: Path) -> Known:
-    """Return the options that a session began with, and those of this machine as they are given."""
+def restore_options(options: AnyOptions, saved: StrokesFile, path: Path) -> AnyOptions:
+    """Return the options that a session began with, and those of this run as they are given.
+
+    Raises InputError if an option is given that differs from the session's, or if its scene is
+    missing.
+    """
     if saved.session is None:
         raise InputError(
             f"{quote_value(path)} does not tell of which scene it is; name the scene, as in "
             f"`gscompleter live splat.ply --strokes {quote_value(path)}`.",
         )
     kind = type(options)
-    given = {**describe_options(options), "config": describe_config(options)}
     known = {**saved.session, **{name: getattr(saved, name) for name in SEPARATE_OPTIONS}}
-    asked = {
-        **given,
+    given = {
+        **describe_options(options),
         **{name: describe_value(name, getattr(options, name)) for name in SEPARATE_OPTIONS},
+        "config": describe_chosen_config(options),
     }
     for name, value in known.items():
-        refuse_other_value(name, asked.get(name), value, kind)
-        refuse_code(name, asked.get(name), value)
+        refuse_other_value(name, given.get(name), value, kind)
+        refuse_code(name, given.get(name), value)
 
+    # Of this run are its own options, and those of the command that no completion has.
     own = {field.name for field in fields(kind)}
-    own -= {field.name for field in fields(CompletingOptions)} - set(OF_MACHINE)
+    own -= {field.name for field in fields(CompletingOptions)} - set(OPTIONS_OF_A_RUN)
     shown = quote_value(path)
     config = validate_typed(CompleterConfig, known.get("config", {}), shown, STROKES_ADVICE)
-    changed = ChosenConfig(changes=asdict(config))
-    values = {**known, **{name: getattr(options, name) for name in own}, "config": changed}
+    chosen = ChosenConfig(changes=asdict(config))
+    values = {**known, **{name: getattr(options, name) for name in own}, "config": chosen}
     restored = validate_typed(kind, values, shown, STROKES_ADVICE)
-    for name in NAMES_SCENE:
+    for name in SCENE_PATHS:
         scene = getattr(restored, name)
         if scene is not None and not scene.exists():
             raise InputError(
                 f"{quote_value(scene)} is missing, with which the session began; name it where it "
-                f"is now, as in `gscompleter live splat.ply --strokes {quote_value(path)}`.",
+                f"is now, as in `gscompleter live splat.ply --strokes {shown}`.",
             )
     return restored
 
@@ -276,7 +284,8 @@ def list_defaults(name: str, kind: type[CompletingOptions]) -> list[Any]:
     """List the values of an option, as JSON, that mean that it was not given."""
     if name == "config":
         presets = [
-            load_config("default", *kind) for kind in ((False, True), (True, True), (True, False))
+            load_config("default", is_splat, has_photographs)
+            for is_splat, has_photographs in ((False, True), (True, True), (True, False))
         ]
         return [normalize(asdict(preset)) for preset in presets]
     places = (GeneratorOptions, kind)
@@ -291,17 +300,20 @@ def normalize(value: Any) -> Any:
     return [normalize(inner) for inner in value] if isinstance(value, list | tuple) else value
 
 
-def describe_config(options: CompletingOptions) -> dict[str, Any]:
-    """Describe the config that the options of a session name, which goes on with its own."""
+def describe_chosen_config(options: CompletingOptions) -> dict[str, Any]:
+    """Describe the config that options choose, to compare it with that of a session."""
     lacks_photographs = has_splat_alone(options)
     is_splat = options.scene is not None or lacks_photographs
     return asdict(options.config.decide(is_splat, not lacks_photographs))
 
 
-def describe_changes(
+def describe_continuation(
     options: CompletingOptions, saved: StrokesFile, out: Path | None
 ) -> Iterator[str]:
-    """Describe what is another file than it was; `out` is the folder of a session that goes on."""
+    """Say how many steps are done again, and which files are others than they were.
+
+    `out` is the folder of a session that goes on in its place; None for another folder.
+    """
     count = len(saved.frames)
     yield f"Going on after {count} {'step' if count == 1 else 'steps'}, which are done again."
     scene = options.scene or options.folder

@@ -67,8 +67,7 @@ def decide_filling(
 
     `context` and `synthesis` are those of the options, or of the painted images. `has_marks` is
     True if the command is given masks of its own, such as of what goes: `--invert-masks` is then
-    for them. `geometry` is a file with surfaces from elsewhere. `adapt` changes the config for what
-    a command does.
+    for them. `adapt` changes the config for what a command does.
     """
     check_photograph_options(options, has_marks)
     models = decide_models(options, synthesis)
@@ -118,9 +117,9 @@ def decide_scene(
         folder,
         options.format,
         parse_resolution(options.resolution),
-        has_splat and options.resolution is None,
-        options.near,
-        options.far,
+        follows_training=has_splat and options.resolution is None,
+        near=options.near,
+        far=options.far,
         uses_given_depth=not options.no_given_depth,
         refines_poses=not options.no_refine_poses,
         uses_masks=not options.no_masks,
@@ -181,7 +180,7 @@ def has_splat_alone(options: CompletingOptions) -> bool:
 
 
 def names_splat(path: Path) -> bool:
-    """Check whether a path names an existing file of Gaussians, or a folder of nothing else."""
+    """Check whether a path is a file named as one of Gaussians, or a folder of nothing else."""
     if os.path.isdir(path):
         from gscompleter.splats.foreign import holds_splat_alone
 

@@ -25,8 +25,8 @@ Port = Annotated[int, Interval(ge=0, le=65535)]
 NumFrames = Annotated[int, Interval(ge=3, le=1000)]
 OUTPUTS = ("out", "save", "export_holes")
 """Options that name what a command writes."""
-WORDS_OR_PATHS = ("target", "protocol", "generator_weights")
-"""Options whose words may be paths of files that are read."""
+WORDS_OR_PATHS = ("target", "protocol", "generator_weights", "generator_depth")
+"""Options whose words may be paths of files or folders that are read."""
 
 
 @dataclass(frozen=True, kw_only=True)

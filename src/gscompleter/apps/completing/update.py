@@ -50,9 +50,8 @@ MAX_LACKING = 16
 those that show most."""
 MIN_LEFT = 2
 """Fewest photographs that are not kept back."""
-
-
 NO_TARGETS = TargetRequest(max_found=0)
+"""An update looks at photographs alone."""
 
 
 def prepare_update(request: UpdateRequest, console: Console) -> Prepared:
@@ -73,6 +72,7 @@ def prepare_update(request: UpdateRequest, console: Console) -> Prepared:
     num_known = len(opened.photographs)
     if request.photos is not None:
         opened = add_new_photographs(request.photos, request.results, opened, console)
+    # New photographs are numbered after those of the scene.
     new = list(range(num_known, len(opened.photographs)))
     opened = hold_out(opened, request.hold_out, source.context, new)
 
@@ -105,7 +105,10 @@ def add_new_photographs(
 
 
 def hold_out(opened: Opened, count: int, context: Names | None, new: Sequence[int]) -> Opened:
-    """Keep back `count` photographs at even steps, none of them of a context that is named."""
+    """Keep back `count` photographs at even steps, none of them of a context that is named.
+
+    They are chosen among the `new` ones, or among all if there are none.
+    """
     if count == 0:
         return opened
     photographs = opened.photographs
@@ -147,8 +150,9 @@ def choose_evidence(
 
     with show_preparation("reading photographs"):
         read = add_check_views(
-            make_task(opened, sorted(frames), (), task.device.type, True), opened
+            make_task(opened, sorted(frames), (), task.device.type, has_splat=True), opened
         )
+    # The new views go through what `load_models` and those before it did with the first ones.
     transform = compute_view_transform(opened, task)
     task = replace(
         task,

@@ -42,7 +42,7 @@ def write_and_print_tables(
 
 
 def list_row_times(out: Path) -> dict[Path, int]:
-    """Return the files of scores with their modification times."""
+    """List the files of scores with their modification times, in nanoseconds."""
     return {path: path.stat().st_mtime_ns for path in list_row_paths(out)}
 
 

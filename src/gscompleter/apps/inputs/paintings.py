@@ -234,10 +234,12 @@ def read_painting(
     colors, alpha = (still, None) if still is not None else read_colors_and_alpha(path)
     opaque = np.full(colors.shape[:2], True) if alpha is None else alpha >= HALF_OPAQUE
     camera = camera.to("cpu")
-    painting = fit_painting(convert_to_image(colors), torch.from_numpy(opaque), camera, path.name)
+    painting = fit_painting(
+        convert_to_image(colors), torch.from_numpy(opaque), camera, quote_value(path.name)
+    )
     mask = path.with_name(row.hole_mask_path) if row else None
     if mask is None or not mask.is_file():
         return painting
     # `read_mask` marks black pixels, and what was asked for is white.
-    asked = fit_mask(torch.from_numpy(~read_mask(mask)), camera, mask.name)
+    asked = fit_mask(torch.from_numpy(~read_mask(mask)), camera, quote_value(mask.name))
     return replace(painting, asked=asked)

@@ -92,12 +92,14 @@ def move_to_splat(
         transform = from_splat if target.is_in_splat_frame else from_photographs
         targets.append(replace(target, camera=transform_camera(target.camera, transform)))
 
+    # Where the splat fits as it is, its zero is that of the photographs as they were read.
+    is_given = alignment.method == "given"
     return replace(
         task,
         views=[transform_view(view, from_photographs) for view in task.views],
         targets=targets,
         frame=from_photographs @ task.frame,
-        origin=photographs.origin if alignment.method == "given" else origin,
+        origin=photographs.origin if is_given else origin,
         scene=scene,
         splat_file=splat_file,
         method=alignment.method,
@@ -115,6 +117,7 @@ def add_check_views(task: CompletionTask, opened: Opened) -> CompletionTask:
     cameras = collect_usable_cameras(photographs, others, size)
     views = []
     for frame in select_near_and_far(task.goals, cameras, MAX_CHECK_VIEWS):
+        # One that is damaged or hidden by a mask checks nothing, and many others do.
         with suppress(InputError):
             views += photographs.views([frame], size)
     return replace(task, check_views=[view.to(task.device) for view in views])

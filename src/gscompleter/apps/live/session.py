@@ -71,7 +71,7 @@ class Session:
     splat_origin: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     """Origin of the result in the coordinates of the splat's file."""
     undone: tuple[tuple[Completion, SessionStep], ...] = field(default=(), compare=False)
-    """Steps that were undone, the last one to be done again first of all at the end."""
+    """Steps that were undone, with the scene after each; the last of them is done again first."""
 
     @property
     def latest(self) -> Completion:
@@ -100,7 +100,10 @@ class Session:
 
 
 def save_camera(session: Session, camera: Camera) -> Camera:
-    """Move a camera from the frame of the result to that of the photographs, as it is saved."""
+    """Move a camera from the frame of the result to that of the photographs, in which it is saved.
+
+    `place_saved_camera` is the inverse.
+    """
     return transform_camera_exactly(camera, np.linalg.inv(session.transform))
 
 
@@ -129,6 +132,7 @@ def check_step(step: SessionStep) -> None:
 
 def complete_step(session: Session, step: SessionStep, camera: Camera) -> tuple[Completion, str]:
     """Complete all holes that the camera sees."""
+    # The settings that the session began with: a removal leaves others, for its own hole.
     first = session.completions[0].config
     completion = complete_at(session.completer, first, session.latest, camera)
     changed, text = keep_change(session, completion)
@@ -177,24 +181,24 @@ PERFORM: dict[Action, Callable[[Session, SessionStep, Camera], tuple[Completion,
     "remove": remove_step,
     "repair": repair_step,
 }
-"""Function of each action: latest completion to the next one, with a sentence about it."""
+"""Function of each action: the completion after it, and a sentence about what it did."""
 
 
 def keep_change(session: Session, completion: Completion) -> tuple[Completion, str]:
     """Return the completion, or the latest one if its last target changed nothing."""
     result = completion.targets[-1]
-    is_changed = bool(len(result.added)) or result.num_recolored > 0
-    return (completion if is_changed else session.latest), describe_outcome(result)
+    kept = completion if result.has_changed_scene else session.latest
+    return kept, describe_outcome(result)
 
 
 def describe_outcome(result: TargetResult) -> str:
-    """Describe what was added at a camera: one sentence, then one line per note."""
-    if not len(result.added) and not result.num_recolored:
+    """Describe what was added or recoloured at a camera: one sentence, then one line per note."""
+    if not result.has_changed_scene:
         return "\n".join(result.notes or (NOTHING_ADDED,))
-    text = (
-        f"{len(result.added):,} Gaussians are added in a hole of "
-        f"{100 * result.hole_fraction:.1f} % of the image."
-    )
+    changed = f"{len(result.added):,} Gaussians are added"
+    if not len(result.added):
+        changed = f"{result.num_recolored:,} Gaussians are recoloured"
+    text = f"{changed} in a hole of {100 * result.hole_fraction:.1f} % of the image."
     return "\n".join((text, *result.notes))
 
 

@@ -25,6 +25,7 @@ from gscompleter.system.files.writing import (
 from gscompleter.types import Gaussians, merge
 
 GENERATED_FILE = "generated.ply"
+"""Gaussians that were added, without the recoloured ones."""
 
 
 def write_scenes(
@@ -46,24 +47,25 @@ def write_scenes(
     if input_splat is None:
         order = torch.arange(len(completion.context))
         parts = [(part, torch.arange(len(part))) for part in (completion.kept_context, added)]
-        completed = partial(
+        write_completed = partial(
             save_parts, folder / COMPLETED_FILE, parts, provenance=True, made_by=made_by
         )
     else:
         # In the layout and the order of the user's file, so that what was kept is kept bit by bit.
         order = find_file_order(completion.context, input_splat)
-        completed = partial(
+        write_completed = partial(
             save_completed_splat, folder, completion.context, changed, generated, input_splat, run
         )
     # The context has labels if it was completed before.
     has_labels = bool((completion.context.generated > 0).any())
+    # Beside an input splat, `save_completed_splat` writes what went.
     if input_splat is None and completion.source.gone_mask.any():
         rows = completion.source.gone_mask.nonzero()[:, 0].cpu()
         save_removed(
             folder / REMOVED_FILE, completion.context[completion.source.gone_mask].to("cpu"), rows
         )
     writing = [
-        completed,
+        write_completed,
         partial(save_parts, folder / CONTEXT_FILE, [(completion.context, order)], has_labels),
         partial(save_ply, folder / GENERATED_FILE, added, provenance=True, made_by=made_by),
     ]

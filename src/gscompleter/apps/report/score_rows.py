@@ -238,7 +238,6 @@ def make_target_row(
 ) -> TargetRow:
     """Make the row of a target."""
     fit = result.affine
-    added = result.added
     empty = result.unfilled
     return TargetRow(
         target.frame,
@@ -247,10 +246,10 @@ def make_target_row(
         anchor_fallback=result.anchor_fallback,
         hole_fraction=result.hole_fraction,
         affine=AlignmentRow(fit.scale, fit.shift, fit.inliers, fit.method, fit.agreement),
-        added=len(added),
+        added=len(result.added),
         derived_from=target.derived_from,
         recolored=result.num_recolored,
-        target_id=result.target_id if len(added) or result.num_recolored else None,
+        target_id=result.target_id if result.has_changed_scene else None,
         unfilled=UnfilledRow(empty.share, empty.lost_by, empty.regions),
         notes=result.notes,
         warnings=result.warnings,

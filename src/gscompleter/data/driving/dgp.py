@@ -47,7 +47,7 @@ def open_dgp(path: Path) -> Iterator[Photographs]:
     frames.sort(key=lambda frame: frame.name)
     require(frames, f"{quote_value(file)} lists no images; name a scene with cameras.")
     front = min(frame.sensor or "" for frame in frames)
-    yield build_photographs(file.resolve().parent.name, str(file), frames, front=front)
+    yield build_photographs(file.resolve().parent.name, quote_value(file), frames, front=front)
 
 
 def _parse_datum(
@@ -56,7 +56,7 @@ def _parse_datum(
     image = datum["datum"]["image"]
     sensor = get_part(datum, "id", dict).get("name")
     camera = "" if sensor is None else str(sensor)
-    name = get_text(image, "filename", str(file)) or ""
+    name = get_text(image, "filename", quote_value(file)) or ""
     title = f"image {quote_value(name)} of {quote_value(file)}"
     require(name, f"The {title} has no `filename`; {DGP_ADVICE}.")
     require(camera, f"The {title} does not say which camera took it (`id.name`); {DGP_ADVICE}.")
@@ -69,9 +69,11 @@ def _parse_datum(
     # Sparse depth is optional: the point cloud may be missing on disk.
     sweep = sweeps.get(str(datum.get("key")))
     read_points = None
-    points = get_text(sweep, "filename", str(file))
+    points = get_text(sweep, "filename", quote_value(file))
     if points is not None and os.path.isfile(file.parent / points):
-        read_points = partial(_read_sweep_points, file.parent / points, _get_pose(sweep, str(file)))
+        read_points = partial(
+            _read_sweep_points, file.parent / points, _get_pose(sweep, quote_value(file))
+        )
     c2w = _get_pose(image, title)
     place = file.parent / name
     return Frame(name, title, c2w, intrinsics, place, sensor=camera, laser_points=read_points)

@@ -93,7 +93,7 @@ def open_kitti(path: Path) -> Iterator[Photographs]:
         c2w = first @ first_from_camera
         image = folder / images / name
         frames.append(Frame(name, title, c2w, intrinsics, image, laser_points=points))
-    yield build_photographs(folder.resolve().name, str(poses), frames)
+    yield build_photographs(folder.resolve().name, quote_value(poses), frames)
 
 
 def has_kitti_raw(path: Path) -> bool:
@@ -118,11 +118,11 @@ def open_kitti_raw(path: Path) -> Iterator[Photographs]:
     frames = []
     for image, reading in zip(images, readings, strict=True):
         laser = _compute_imu_pose(reading, scale) @ imu_from_laser
-        title = f"photograph {image.stem} of {quote_value(path)}"
+        title = f"photograph {quote_value(image.stem)} of {quote_value(path)}"
         lasers = _find_sweep(path / "velodyne_points" / "data" / f"{image.stem}.bin", laser)
         c2w = laser @ laser_from_first @ first_from_camera
         frames.append(Frame(image.stem, title, c2w, intrinsics, image, laser_points=lasers))
-    yield build_drive(path.resolve().name, str(path), frames)
+    yield build_drive(path.resolve().name, quote_value(path), frames)
 
 
 def _find_sweep(

@@ -117,7 +117,7 @@ def _build_scene(path: Path, shots: list[Shot]) -> Photographs:
     (drive, time, _), *_ = shots
     frames = [frame for _, _, frame in shots]
     frames.sort(key=lambda frame: (frame.sensor != FRONT_CAMERA_KEY, frame.sensor))
-    return build_drive(f"{drive}_{time:.3f}", str(path), frames, front=frames[0].sensor)
+    return build_drive(f"{drive}_{time:.3f}", quote_value(path), frames, front=frames[0].sensor)
 
 
 def _make_infos_frame(

@@ -33,7 +33,7 @@ def open_pandaset(path: Path) -> Iterator[Photographs]:
     cameras = sorted(files, key=lambda file: (file.parent.name != FRONT_CAMERA_FOLDER, file))
     frames = [frame for file in cameras for frame in _read_frames(file)]
     require(frames, f"There are no poses in {quote_value(path)}; {PANDASET_ADVICE}.")
-    yield build_drive(path.resolve().name, str(path), frames, front=FRONT_CAMERA_FOLDER)
+    yield build_drive(path.resolve().name, quote_value(path), frames, front=FRONT_CAMERA_FOLDER)
 
 
 def _read_frames(file: Path) -> Iterator[Frame]:

@@ -109,7 +109,7 @@ def _open_segment(segment: Path) -> Photographs:
     shown = sorted((row for row in rows if row[0] in CAMERA_NAMES), key=lambda row: row[:2])
     require(shown, f"{quote_value(segment)} holds no photographs; {WAYMO_ADVICE}.")
     frames = [_make_waymo_frame(segment, cameras, *row) for row in shown]
-    return build_drive(segment.stem, str(segment), frames, front=CAMERA_NAMES[1])
+    return build_drive(segment.stem, quote_value(segment), frames, front=CAMERA_NAMES[1])
 
 
 def _make_waymo_frame(

@@ -71,7 +71,7 @@ class KeyframeFormat:
         cameras, *files = self.find_frames(path)
         parsed = {}
         for name in sorted(cameras.keys() & files[0]):
-            title = f"frame {name} of {quote_value(path)}"
+            title = f"frame {quote_value(name)} of {quote_value(path)}"
             parsed[name] = self.parse(
                 parse_json(cameras[name](), title, PHONE_EXPORT_ADVICE), title
             )

@@ -106,7 +106,7 @@ def build_recording(
     for name, (c2w, lens) in cameras.items():
         if name not in images:
             continue
-        title = f"frame {name} of {quote_value(path)}"
+        title = f"frame {quote_value(name)} of {quote_value(path)}"
         depth = None
         if name in depths:
             depth = partial(_read_depth, depths[name], confidences.get(name), decoders, title)
@@ -114,7 +114,7 @@ def build_recording(
         frame = Frame(name, title, c2w @ OPENCV_FROM_OPENGL, lens, stored, depth)
         frames.append(frame.with_rigid_pose())
     require(frames, f"No photograph of {quote_value(path)} has a camera; {PHONE_EXPORT_ADVICE}.")
-    return build_photographs(path.resolve().stem, str(path), frames)
+    return build_photographs(path.resolve().stem, quote_value(path), frames)
 
 
 def _read_depth(

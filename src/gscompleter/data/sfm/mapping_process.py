@@ -165,8 +165,8 @@ def join_views(job: MappingJob) -> None:
     """Join the views of each panorama to a rig, with known rotations and one centre."""
     rig = pycolmap.RigConfig()
     for number, view in enumerate(VIEWS):
-        # COLMAP's rig maps from the rig to the camera; `compute_rotation` leads to the panorama's
-        # axes. The first camera is the reference and has no pose of its own.
+        # COLMAP's rig maps from the rig to the camera; `compute_view_rotation` leads from it to the
+        # axes of the panorama. The first camera is the reference and has no pose of its own.
         turn = pycolmap.Rigid3d(pycolmap.Rotation3d(compute_view_rotation(*view).T), np.zeros(3))
         camera = pycolmap.RigConfigCamera(image_prefix=f"view_{number}/", ref_sensor=number == 0)
         camera.cam_from_rig = turn if number else None
@@ -208,7 +208,8 @@ def write_model(job: MappingJob, found: Mapped) -> dict[str, Any]:
     """Write a model and return its quality.
 
     `registered` are the names of the copies, `error` is the mean reprojection error in pixels, and
-    `focal` the focal length in pixels if it was fixed at first, else None.
+    `focal` the focal length in pixels of the camera with most photographs if it was fixed at first,
+    else None.
     """
     quality = {"features": found.features, "contradicted": list(found.contradicted)}
     model = found.model
@@ -217,33 +218,34 @@ def write_model(job: MappingJob, found: Mapped) -> dict[str, Any]:
         return {**quality, **nothing, "focal": None}
     Path(job.model).mkdir(parents=True)
     model.write(job.model)
-    counts = _count_photographs(model)
-    is_fixed = found.is_focal_fixed
+    ((main_camera, _),) = _count_photographs(model).most_common(1)
+    focal = model.cameras[main_camera].mean_focal_length()
     return {
         **quality,
         "registered": [model.images[i].name for i in model.reg_image_ids()],
         "points": model.num_points3D(),
         "error": model.compute_mean_reprojection_error(),
         "is_plausible": has_plausible_lenses(model),
-        "focal": model.cameras[max(counts)].mean_focal_length() if is_fixed else None,
+        "focal": focal if found.is_focal_fixed else None,
     }
 
 
 def select_model(job: MappingJob, check: PlaceCheck | None = None) -> Mapped:
-    """Map with a free focal length, then with plausible fixed ones (True), until it is good.
+    """Map with a free focal length, then with plausible fixed ones, until the model is good.
 
     `check` takes photographs in wrong places out of each model before these are compared. With it
     all focal lengths are tried: a wrong one bends a model that otherwise looks good.
     """
     if job.is_panoramic:  # the focal length of views is known
-        return Mapped(map_largest(job, is_focal_fixed=True), False)
-    best = check_places(map_largest(job), False, check)
+        return Mapped(map_largest(job, is_focal_fixed=True), is_focal_fixed=False)
+    best = check_places(map_largest(job), is_focal_fixed=False, check=check)
     # A plausible model with enough photographs is kept; until then further focal lengths are tried.
-    wanted = math.ceil(WANTED_SHARE * len(job.photographs))
     for fov in FIXED_FOVS:
-        if check is None and best.rating[:2] >= (True, wanted):
+        if check is None and best.rating[:2] >= (True, count_wanted(job)):
             break
-        with_fixed_focals = check_places(map_with_fixed_focals(job, fov), True, check)
+        with_fixed_focals = check_places(
+            map_with_fixed_focals(job, fov), is_focal_fixed=True, check=check
+        )
         if with_fixed_focals.rating > best.rating:
             best = with_fixed_focals
     return best
@@ -252,7 +254,10 @@ def select_model(job: MappingJob, check: PlaceCheck | None = None) -> Mapped:
 def check_places(
     model: pycolmap.Reconstruction | None, is_focal_fixed: bool, check: PlaceCheck | None
 ) -> Mapped:
-    """Take out of a model the photographs that `check` finds in wrong places."""
+    """Take out of a model the photographs that `check` finds in wrong places, in the model itself.
+
+    No model is left if too few photographs are.
+    """
     if model is None or check is None:
         return Mapped(model, is_focal_fixed and model is not None)
     checked = check(model)

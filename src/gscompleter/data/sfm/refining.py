@@ -165,7 +165,8 @@ def move_to_given_frame(refined: Poses, given: Poses) -> Poses:
     """Move refined cameras into the given frame, by the similarity that fits all of them.
 
     The rotation is fitted to their rotations, since the centres of a straight drive determine none
-    about its own line; scale and shift are fitted to the centres. All are least squares.
+    about its own line; scale and shift are fitted to the centres. All are least squares and not the
+    medians of `fit_pose_similarity`, as the poses of one bundle adjustment agree with each other.
     """
     # Orthogonal Procrustes: the rotation R with the largest sum of trace(givenᵀ R refined).
     covariance = np.einsum("nij,nkj->ik", given[:, :3, :3], refined[:, :3, :3])

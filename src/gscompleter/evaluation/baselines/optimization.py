@@ -64,8 +64,8 @@ def optimize(
     counts = torch.zeros_like(scene.opacities)
     # Rounds of density control, evenly over the first 80 % of the iterations.
     last = 0.8 * config.iterations
-    count = config.density_rounds
-    rounds = {math.ceil(last * (i + 1) / count) for i in range(count)}
+    total = config.density_rounds
+    rounds = {math.ceil(last * (i + 1) / total) for i in range(total)}
     order: list[int] = []
     for number in track(range(1, config.iterations + 1), "Optimising"):
         # Each view once in random order, then all again.

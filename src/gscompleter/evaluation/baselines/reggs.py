@@ -23,7 +23,7 @@ from gscompleter.system.progress import track
 from gscompleter.types import Camera, Gaussians, View
 
 EPSILON = 0.1
-"""Entropic regularization, in squared units of length."""
+"""Entropic regularization, in squared scene units as the costs."""
 MAX_ITERATIONS = 100
 """Largest number of updates of both potentials."""
 POTENTIAL_TOLERANCE = 1e-5
@@ -33,9 +33,7 @@ REGGS_RATES = (1e-3, 2e-4, 2e-3)
 DEPTH_WEIGHT = 0.1
 """Weight of the depths in the loss, relative to the colours."""
 PATIENCE = 10
-"""The mixture distance is dropped if it does not fall in this many steps."""
-
-
+"""The mixture distance is dropped once it is no less than all of this many steps before."""
 MAX_BATCH = 2**14
 """Matrices whose eigenvalues are computed at a time."""
 
@@ -78,6 +76,9 @@ def register_by_similarity(
     camera = reference.camera
     own = renderer.render(lifted, camera)
     theirs = renderer.render(scene, camera)
+    # Pixels that the lifted Gaussians hardly cover say nothing about their place, so that colours
+    # count less than in proportion there.
+    coverage = own.alpha.detach()[..., None] ** 3
 
     # The scale begins at the ratio of the depths that both see; the pose is known, so that rotation
     # and translation begin at none.
@@ -103,9 +104,7 @@ def register_by_similarity(
         # The scene is moved to the lifted Gaussians, whose camera stays in place.
         fit = Similarity(scale, quaternion, translation)
         moved = renderer.render(move_scene(scene, fit), camera)
-        alpha = own.alpha.detach()
-        # Pixels that the lifted Gaussians hardly cover say nothing about their place.
-        colour = ((moved.image - reference.image).abs() * alpha[..., None] ** 3).sum()
+        colour = ((moved.image - reference.image).abs() * coverage).sum()
         overlap = own.depth_map().valid & moved.depth_map().valid
         depth = (moved.depth - scale * own.depth.detach())[overlap].abs().sum()
         loss = colour + DEPTH_WEIGHT * depth
@@ -114,7 +113,7 @@ def register_by_similarity(
             means = scale * small_lifted.means
             covariances = scale**2 * small_lifted.covariances
             scaled = Mixture(means, covariances, small_lifted.weights)
-            distance = compute_mixture_wasserstein(scaled, rotate_mixture(small_scene, fit, camera))
+            distance = compute_mixture_wasserstein(scaled, move_mixture(small_scene, fit, camera))
             recent = distances[-PATIENCE:]
             if len(distances) >= PATIENCE and distance.item() >= max(recent):
                 compare_mixtures = False
@@ -122,7 +121,8 @@ def register_by_similarity(
                 loss = loss + config.mixture_weight * distance
             distances.append(distance.item())
 
-        # The best of all steps, since the loss is not monotonous.
+        # The best of all steps, since the loss is not monotonous. Without the distance of mixtures
+        # it is smaller, so that a later step wins once that is dropped.
         if loss.item() < best_loss:
             best_loss = loss.item()
             best = Similarity(*(p.detach().clone() for p in parameters))
@@ -156,7 +156,11 @@ def move_into_scene(lifted: Gaussians, fit: Similarity, camera: Camera) -> Gauss
 
 
 def cluster_gaussians(gaussians: Gaussians, camera: Camera, components: int, seed: int) -> Mixture:
-    """Merge the Gaussians into k-means clusters, in camera axes."""
+    """Merge the Gaussians into k-means clusters, in the frame of the camera.
+
+    Weights are the softmax of the opacities: these lie in [0, 1], so that a faint Gaussian has at
+    least a third of the weight of an opaque one.
+    """
     rotation = camera.c2w[:3, :3]
     axes = rotation.T @ quats_to_rotations(gaussians.quats)
     # Covariance of each Gaussian: R S S R^T, with its axes as columns of R S.
@@ -171,8 +175,8 @@ def cluster_gaussians(gaussians: Gaussians, camera: Camera, components: int, see
     return reduce_mixture(mixture, torch.tensor(labels, device=camera.c2w.device).long())
 
 
-def rotate_mixture(mixture: Mixture, fit: Similarity, camera: Camera) -> Mixture:
-    """Move a mixture in camera axes by the similarity of the scene."""
+def move_mixture(mixture: Mixture, fit: Similarity, camera: Camera) -> Mixture:
+    """Move a mixture in the frame of the camera as `move_scene` moves the scene."""
     c2w = camera.c2w[:3, :3]
     # The similarity acts on world points; both mixtures are in camera axes, about the camera.
     rotation = c2w.T @ fit.rotation @ c2w

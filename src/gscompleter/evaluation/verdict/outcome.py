@@ -170,7 +170,7 @@ def make_clause(sentence: str) -> str:
 
 def count_changed(targets: Sequence[TargetResult]) -> int:
     """Count the targets for which something was added or recoloured."""
-    return sum(len(result.added) > 0 or result.num_recolored > 0 for result in targets)
+    return sum(result.has_changed_scene for result in targets)
 
 
 def describe_work(completion: Completion) -> str:

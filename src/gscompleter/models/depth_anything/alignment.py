@@ -60,7 +60,11 @@ def fit_center_similarity(source: Points, destination: Points) -> Similarity:
 
 
 def fit_robust_similarity(source: Points, destination: Points) -> Similarity:
-    """Fit a similarity, with RANSAC from ten points on."""
+    """Fit a similarity, with RANSAC from ten points on.
+
+    It follows the authors' code to its samples, so that their results are met; the fits of our own
+    (`fit_pose_similarity`, `move_to_given_frame`) also use the rotations of the cameras.
+    """
     every = fit_center_similarity(source, destination)
     if len(source) < MIN_RANSAC_CAMERAS:
         return every

@@ -17,7 +17,6 @@ from gscompleter.models.depth_anything.reconstructor import (
 )
 from gscompleter.models.feed_forward.precision import lower_precision
 from gscompleter.models.weights import PUBLISHED, fetch, load_strictly, read_state_dict
-from gscompleter.models.weights.fitting import get_shapes
 from gscompleter.types import DepthMap, View
 
 
@@ -47,5 +46,5 @@ def load_monocular(name: str, weights: Path | None = None, device: str = "cpu") 
     assert isinstance(config, MetricDepthConfig)
     network = MetricDepthAnything(config)
     state = read_state_dict(path, published)
-    load_strictly(network, state, path, lambda: {name: get_shapes(network.state_dict())})
+    load_strictly(network, state, path)
     return MonocularDepth(network.eval().requires_grad_(False).to(device))

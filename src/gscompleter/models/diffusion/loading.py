@@ -22,7 +22,7 @@ from gscompleter.models.diffusion.published import (
     parse_source,
 )
 from gscompleter.models.diffusion.rotary import HEADS, enable_per_head_positions
-from gscompleter.system.errors import InputError
+from gscompleter.system.errors import InputError, quote_value
 
 PROMPT = "Ensure that the picture does not change in any way"
 """Fixed prompt of the training."""
@@ -76,8 +76,8 @@ def find_sources(path: str | None) -> tuple[Source, Source]:
     if (Path(source.location) / "config.json").is_file():
         return KONTEXT, source
     raise InputError(
-        f"{path} holds neither a model_index.json (a pipeline) nor a config.json (a transformer); "
-        "give a folder that diffusers saved."
+        f"{quote_value(Path(path))} holds neither a model_index.json (a pipeline) nor a "
+        "config.json (a transformer); give a folder that diffusers saved."
     )
 
 

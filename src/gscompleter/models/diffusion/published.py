@@ -115,8 +115,9 @@ def parse_source(path: str, library: str = "diffusers") -> Source:
     name, _, revision = path.partition("@")
     if name.count("/") != 1 or name.startswith((".", "/", "~")) or name.endswith("/"):
         raise InputError(
-            f"There is no folder {path}, and it is no repository of the Hugging Face hub either; "
-            f"give a folder that {library} saved, or USER/NAME or USER/NAME@COMMIT."
+            f"There is no folder {quote_value(Path(path))}, and it is no repository of the Hugging "
+            f"Face hub either; give a folder that {library} saved, or USER/NAME or "
+            "USER/NAME@COMMIT."
         )
     usual = find_usual_licence(name)
     terms = "the licence that its page states" + (f" (usually {usual})" if usual else "")

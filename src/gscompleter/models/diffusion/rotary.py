@@ -1,4 +1,4 @@
-"""Rotary embeddings per attention head, for the FLUX transformer of diffusers.
+"""Rotary embeddings per attention head, which PE-Field adds to diffusers' FLUX transformer.
 
 The heads form four groups, one per quarter of a token. Of six heads in a group, the first uses
 the position of the token, the second that of the quarter, the others those of its own quarters.
@@ -40,7 +40,8 @@ class PerHeadRotary(nn.Module):
         triples = ids.unflatten(-1, (-1, IDS // 3, 3)).transpose(0, 1).double()
         # Of the channels of a head, a part turns with z, one with the row, one with the column.
         angles = torch.cat(
-            [triples[..., axis, None] * self.frequencies(axis, ids) for axis in range(3)], dim=-1
+            [triples[..., axis, None] * self.compute_frequencies(axis, ids) for axis in range(3)],
+            dim=-1,
         )
         # Both channels of a pair turn by the same angle.
         angles = angles.repeat_interleave(2, dim=-1)
@@ -49,7 +50,7 @@ class PerHeadRotary(nn.Module):
         heads = torch.tensor(POSITION_OF_HEAD, device=ids.device)
         return cosines[:, :, heads], sines[:, :, heads]
 
-    def frequencies(self, axis: int, ids: Tensor) -> Float[Tensor, "pairs"]:
+    def compute_frequencies(self, axis: int, ids: Tensor) -> Float[Tensor, "pairs"]:
         """Compute the radians per token for each channel pair of an axis."""
         channels = torch.arange(0, self.axes[axis], 2, dtype=torch.float64, device=ids.device)
         return 1.0 / THETA ** (channels / self.axes[axis])

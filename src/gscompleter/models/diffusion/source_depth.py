@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import torch
@@ -21,7 +22,7 @@ from gscompleter.models.diffusion.published import (
 )
 from gscompleter.numerics.robust import fit_robust_affine
 from gscompleter.reconstructors.depth_predictors import DepthPredictor
-from gscompleter.system.errors import InputError
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.types import Render, View
 
 MONOCULAR_MODEL = "depth-anything/Depth-Anything-V2-Small-hf"
@@ -166,7 +167,7 @@ def load_monocular(path: str = MONOCULAR_MODEL, device: str = "cpu") -> Monocula
     kind = network.config.model_type
     if kind not in PREDICTS_DEPTH:
         raise InputError(
-            f"The depth network of {path} is of the unsupported kind {kind}; choose one of "
-            f"{', '.join(PREDICTS_DEPTH)}."
+            f"The depth network of {quote_value(Path(path))} is of the unsupported kind {kind}; "
+            f"choose one of {', '.join(PREDICTS_DEPTH)}."
         )
     return MonocularDepth(network.eval().to(device), processor, device)

@@ -10,7 +10,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from gscompleter.models.weights.published import PublishedWeights
-from gscompleter.system.errors import InputError
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import get_download_folder
 
 MAX_RETRIES = 2
@@ -39,8 +39,8 @@ def fetch(weights: PublishedWeights, local: Path | None = None, offline: bool = 
         path = local / weights.file if os.path.isdir(local) else local
         if not os.path.isfile(path):
             raise InputError(
-                f"There are no weights at {path}; name the file {weights.file} or its folder, from "
-                f"{weights.source}."
+                f"There are no weights at {quote_value(path)}; name the file {weights.file} or its "
+                f"folder, from {weights.source}."
             )
         return path
     cached = find_cached(weights)

@@ -41,7 +41,7 @@ def load_strictly(
         if fitting:
             advice = f"its tensors are those of {' or '.join(fitting)}"
         raise InputError(
-            f"{origin} does not fit the network {type(model).__name__}: "
+            f"{quote_value(origin)} does not fit the network {type(model).__name__}: "
             f"{describe_differences(needed, given)}; {advice}."
         )
     # Checked before anything is loaded, so that a failure leaves the network as it was.
@@ -54,8 +54,8 @@ def check_finite(state_dict: Mapping[str, Tensor], origin: Path | str) -> None:
     bad = [name for name, tensor in state_dict.items() if not torch.isfinite(tensor).all()]
     if bad:
         raise InputError(
-            f"{origin} holds NaN or infinity in {len(bad)} of {len(state_dict)} tensors (such as "
-            f"{quote_value(bad[0])}); fetch or train it again."
+            f"{quote_value(origin)} holds NaN or infinity in {len(bad)} of {len(state_dict)} "
+            f"tensors (such as {quote_value(bad[0])}); fetch or train it again."
         )
 
 

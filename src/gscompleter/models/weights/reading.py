@@ -55,7 +55,7 @@ def fetch_checked(weights: PublishedWeights, local: Path | None = None) -> Path:
 def check_kind(path: Path, name: str) -> None:
     """Raise InputError if a file is missing, empty, a Git LFS pointer, a web page, or truncated."""
     if not os.path.isfile(path):
-        raise InputError(f"There is no file {path}; put {name} there.")
+        raise InputError(f"There is no file {quote_value(path)}; put {name} there.")
     with open_file(path) as file:
         head = file.read(64)
     refuse_pointer(path)
@@ -78,8 +78,8 @@ def check_sha256(path: Path, expected: str, name: str) -> None:
     for other in PUBLISHED.values():
         if other.sha256 is not None and digest.startswith(other.sha256):
             raise InputError(
-                f"{path} is not the published file {name} but that of {other.name}; choose that "
-                f"model, or fetch {name}."
+                f"{quote_value(path)} is not the published file {name} but that of {other.name}; "
+                f"choose that model, or fetch {name}."
             )
     raise _create_file_error(path, f"is not the published file (SHA-256 {digest[:8]})", name)
 
@@ -128,13 +128,15 @@ def read_safetensors(path: Path, name: str) -> dict[str, Tensor]:
         import safetensors.torch
     except ImportError as error:
         raise InputError(
-            f"To read {path}, safetensors is needed: pip install safetensors; or give {name}."
+            f"To read {quote_value(path)}, safetensors is needed: pip install safetensors; or give "
+            f"{name}."
         ) from error
     try:
         return safetensors.torch.load_file(path)
     except Exception as error:  # damaged files raise many types
         raise InputError(
-            f"{path} is no safetensors file ({quote_value(describe_damage(error))}); give {name}."
+            f"{quote_value(path)} is no safetensors file ({quote_value(describe_damage(error))}); "
+            f"give {name}."
         ) from error
 
 
@@ -144,7 +146,7 @@ def extract_network_tensors(
     """Extract the network's tensors, without the prefix of their names; others are refused."""
 
     def other(held: str) -> InputError:
-        return InputError(f"{path} holds {held}; give {weights.file}.")
+        return InputError(f"{quote_value(path)} holds {held}; give {weights.file}.")
 
     # Some files have the tensors in an entry, beside the state of the training.
     inner = content.get(weights.entry, content) if isinstance(content, Mapping) else None
@@ -180,8 +182,8 @@ def _create_file_error(path: Path, wrong: str, name: str) -> InputError:
     # In the hub's cache the path is a link; deleting its target makes the hub download again.
     file = path.resolve()
     if file == path.absolute():
-        return InputError(f"{path} {wrong}; delete it and fetch {name} again.")
-    return InputError(f"{name} {wrong}; delete {file} and fetch it anew.")
+        return InputError(f"{quote_value(path)} {wrong}; delete it and fetch {name} again.")
+    return InputError(f"{name} {wrong}; delete {quote_value(file)} and fetch it anew.")
 
 
 def _list_some(keys: list[str]) -> str:

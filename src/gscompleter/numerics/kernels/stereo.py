@@ -117,7 +117,7 @@ def _compare(y, own, own_mean, other, other_mean, other_square, cross, line):
 def _match_tiles(
     begin, end, reference, source, transform, inverse_depths, bands, radius, noise, detail, costs
 ):
-    h, w = reference.shape[:2]
+    height, width = reference.shape[:2]
     H, W = source.shape[:2]
     columns = bands.low.shape[1]
     area = np.float32((2 * radius + 1) ** 2)
@@ -127,7 +127,7 @@ def _match_tiles(
         top, left = tile // columns * TILE_ROWS, tile % columns * TILE_COLUMNS
         low = bands.low[tile // columns, tile % columns]
         count = bands.high[tile // columns, tile % columns] - low
-        rows, cols = min(TILE_ROWS, h - top), min(TILE_COLUMNS, w - left)
+        rows, cols = min(TILE_ROWS, height - top), min(TILE_COLUMNS, width - left)
         tall, wide = rows + 2 * radius, cols + 2 * radius
         own = np.empty((3, tall, wide), np.float32)
         other = np.empty((3, tall, wide), np.float32)
@@ -144,8 +144,8 @@ def _match_tiles(
         # `radius` pixels around the tile.
         for y in range(tall):
             for x in range(wide):
-                yy = _clip(top + y - radius, 0, h - 1)
-                xx = _clip(left + x - radius, 0, w - 1)
+                yy = _clip(top + y - radius, 0, height - 1)
+                xx = _clip(left + x - radius, 0, width - 1)
                 total = np.float32(0)
                 for c in range(3):
                     own[c, y, x] = reference[yy, xx, c]
@@ -164,12 +164,12 @@ def _match_tiles(
         first = bands.start[tile]
         for plane in range(count):
             # Warp: A (x, y, 1) + b w, of which the part without x is constant along the row.
-            depth = inverse_depths[low + plane]
+            w = inverse_depths[low + plane]
             for y in range(tall):
                 py = np.float32(top + y - radius) + np.float32(0.5)
-                q0 = transform[0, 1] * py + transform[0, 2] + transform[0, 3] * depth
-                q1 = transform[1, 1] * py + transform[1, 2] + transform[1, 3] * depth
-                q2 = transform[2, 1] * py + transform[2, 2] + transform[2, 3] * depth
+                q0 = transform[0, 1] * py + transform[0, 2] + transform[0, 3] * w
+                q1 = transform[1, 1] * py + transform[1, 2] + transform[1, 3] * w
+                q2 = transform[2, 1] * py + transform[2, 2] + transform[2, 3] * w
                 for x in range(wide):
                     px = np.float32(left + x - radius) + np.float32(0.5)
                     ratio = q2 + transform[2, 0] * px
@@ -229,6 +229,8 @@ def _match_tiles(
                         (max(other_square[y, x], np.float32(0)) + floor)
                         * (max(own_square[y, x], np.float32(0)) + floor)
                     )
+                    # Both terms are 1 for a mismatch: no correlation, or deviations from the means
+                    # that differ by 0.2 or more, summed over three colours in [0, 1].
                     cost = (np.float32(1) - detail) * (np.float32(1) - correlation)
                     cost += detail * min(line[0, x] * np.float32(5), np.float32(1))
                     line[0, x] = min(cost * np.float32(254), np.float32(254))
@@ -267,7 +269,7 @@ def _prefer_given(begin, end, costs, bands, given, weight, step):
 
 
 @njit(fastmath={"contract"}, inline="always")
-def _step(cost, before, lowest, after, total, small, large):
+def _advance_path(cost, before, lowest, after, total, small, large):
     """Advance a path by one pixel and return its lowest cost there."""
     # Hirschmüller's recursion: L(p, d) = C(p, d) + min(L(q, d), L(q, d ± 1) + small,
     # min L(q) + large) - min L(q), with q the pixel before p on the path. Subtracting the lowest
@@ -290,7 +292,7 @@ def _step(cost, before, lowest, after, total, small, large):
 
 @njit(inline="always")
 def _align_bands(before, band_before, band, scratch):
-    """Realign the costs of another tile's band to the planes of this one; others are FAR."""
+    """Realign the costs of another tile's band to the planes of this one; others are INFEASIBLE."""
     if band_before[0] == band[0] and band_before[1] == band[1]:
         return before
     for plane in range(band[0] - 1, band[1] + 1):
@@ -312,10 +314,10 @@ def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, t
     along = np.zeros((2, widest), np.int16)
     nothing = np.zeros(widest, np.int16)
     scratch = np.empty(widest, np.int16)
-    for step in range(h):
-        y = step if down else h - 1 - step
-        now = step % 2
-        then = 1 - step % 2
+    for num_done in range(h):
+        y = num_done if down else h - 1 - num_done
+        now = num_done % 2
+        then = 1 - now
         row, row_before = y // TILE_ROWS, (y - 1 if down else min(y + 1, h - 1)) // TILE_ROWS
         # The row before lies at y - 1 on the way down and at y + 1 on the way up.
         upper = max(y - 1, 0) if down else min(y, h - 2)
@@ -337,7 +339,7 @@ def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, t
                 tile = back // TILE_COLUMNS
                 band = bands.low[row, tile], bands.high[row, tile]
                 before = _align_bands(along[s % 2], band, (low, high), scratch)
-            low_along = _step(
+            low_along = _advance_path(
                 cost, before, low_along, along[1 - s % 2], out, small, large_x[y, edge]
             )
             from_left = of_left[upper, max(x - 1, 0)]
@@ -347,13 +349,13 @@ def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, t
                 before = nothing
                 lowest = np.int16(0)
                 other = x + path - 1
-                if step > 0 and 0 <= other < w:
+                if num_done > 0 and 0 <= other < w:
                     tile = other // TILE_COLUMNS
                     band = bands.low[row_before, tile], bands.high[row_before, tile]
                     lowest = lows[then, path, other]
                     states = rows[then, path, other]
                     before = _align_bands(states, band, (low, high), scratch)
-                lows[now, path, x] = _step(
+                lows[now, path, x] = _advance_path(
                     cost, before, lowest, rows[now, path, x], out, small, larges[path]
                 )
 
@@ -376,18 +378,19 @@ def aggregate_semi_globally(costs, bands, large_x, large_y, large_d, large_u, sm
 
 
 def select_planes(totals, bands, h, w):
-    """Select the best plane of every pixel, with fraction, and its margin over the second best.
+    """Select the best plane [h, w] of every pixel, with fraction, and its margin over another one.
 
-    The second best is not adjacent to the best. Margins are in units of a cost, per path.
+    Margins are the difference to the best total more than two planes away, per path and so in units
+    of a matching cost.
     """
     index = np.empty((h, w), np.float32)
     margin = np.empty((h, w), np.float32)
-    share(_choose, h, totals, bands, index, margin)
+    share(_select_planes, h, totals, bands, index, margin)
     return index, margin
 
 
 @njit(nogil=True, fastmath={"contract"})
-def _choose(begin, end, totals, bands, index, margin):
+def _select_planes(begin, end, totals, bands, index, margin):
     w = index.shape[1]
     for y in range(begin, end):
         for x in range(w):
@@ -416,27 +419,28 @@ def _choose(begin, end, totals, bands, index, margin):
             index[y, x] = at
 
 
-def reproject(depth, other, b_from_a, a_from_b):
-    """Project every pixel of view a to view b and back, by their inverse depths.
+def reproject(inverse, other, b_from_a, a_from_b):
+    """Project every pixel of view a to view b and back, by inverse depths.
 
+    inverse, other [h, w]: inverse depths of a and b. b_from_a, a_from_b [3, 4]: the transforms.
     Returns the distance between each pixel and its image, in pixels, or -1 if it falls outside b,
-    and its z-depth in b relative to b's own.
+    and its z-depth in b relative to b's own; both [h, w].
     """
-    error = np.full(depth.shape, np.float32(-1), np.float32)
-    ratio = np.ones(depth.shape, np.float32)
-    share(_carry, len(depth), depth, other, b_from_a, a_from_b, error, ratio)
+    error = np.full(inverse.shape, np.float32(-1), np.float32)
+    ratio = np.ones(inverse.shape, np.float32)
+    share(_reproject, len(inverse), inverse, other, b_from_a, a_from_b, error, ratio)
     return error, ratio
 
 
 @njit(nogil=True, fastmath={"contract"})
-def _carry(begin, end, depth, other, b_from_a, a_from_b, error, ratio):
-    w = depth.shape[1]
+def _reproject(begin, end, inverse, other, b_from_a, a_from_b, error, ratio):
+    w = inverse.shape[1]
     H, W = other.shape
     for y in range(begin, end):
         for x in range(w):
             px = np.float32(x + 0.5)
             py = np.float32(y + 0.5)
-            own = depth[y, x]
+            own = inverse[y, x]
             # Into b: the homogeneous pixel and, as its third entry, the ratio of z-depths.
             q2 = b_from_a[2, 0] * px + b_from_a[2, 1] * py + b_from_a[2, 2] + b_from_a[2, 3] * own
             if q2 <= np.float32(1e-3):
@@ -447,7 +451,7 @@ def _carry(begin, end, depth, other, b_from_a, a_from_b, error, ratio):
             sy /= q2
             if not (sx >= 0 and sx < W and sy >= 0 and sy < H):
                 continue
-            # The corners may lie on two surfaces; the one that agrees best counts.
+            # The four pixels around may lie on two surfaces; the one that agrees best counts.
             best = np.float32(1e9)
             expected = own / q2
             value = other[int(sy), int(sx)]
@@ -476,12 +480,12 @@ def fill_background(values, known):
     Low inverse depths are far away, and one ray may miss a thin object in front.
     """
     filled = values.copy()
-    share(_fill_unknown, len(values), values, known, filled)
+    share(_fill_background, len(values), values, known, filled)
     return filled
 
 
 @njit(nogil=True)
-def _fill_unknown(begin, end, values, known, filled):
+def _fill_background(begin, end, values, known, filled):
     h, w = values.shape
     for y in range(begin, end):
         for x in range(w):

@@ -82,7 +82,9 @@ def has_baseline(poses: Sequence[Matrix]) -> bool:
 def fit_pose_similarity(before: Sequence[Matrix], after: Sequence[Matrix]) -> Matrix:
     """Fit the similarity between two sets of poses of the same cameras, robust to outliers.
 
-    The rotation is the one closest to most, scale and shift are medians; both `has_baseline`.
+    The rotation is the one closest to most, scale and shift are medians; both `has_baseline`. Least
+    squares (`fit_center_similarity`, `move_to_given_frame`) would follow the poses that were found
+    in a wrong place of a splat.
     """
     turns = np.stack([b[:3, :3] @ a[:3, :3].T for a, b in zip(before, after, strict=True)])
     # trace(R_iᵀ R_j) grows as the angle between two rotations falls; each pair of poses gives one

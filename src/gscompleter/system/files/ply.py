@@ -67,16 +67,21 @@ def read_header(file: BinaryIO, path: Path) -> tuple[bytes, list[Element]]:
     refuse_pointer(path)
     lines = [file.readline(512)]
     if lines[0].strip() != b"ply":
-        raise InputError(f"{path} is empty or not a PLY file (it does not begin with 'ply').")
+        raise InputError(
+            f"{quote_value(path)} is empty or not a PLY file (it does not begin with 'ply')."
+        )
     while lines[-1].split() != [b"end_header"]:
         lines.append(file.readline(4096))
         if not lines[-1].endswith(b"\n"):
-            raise InputError(f"{path} is truncated: its header has no end; fetch the file again.")
+            raise InputError(
+                f"{quote_value(path)} is truncated: its header has no end; fetch the file again."
+            )
     try:
         return b"".join(lines), _parse_elements(lines[1:-1])
     except DamagedError as error:
         raise InputError(
-            f"{path} has a broken header ({quote_value(describe_damage(error))}); export it again."
+            f"{quote_value(path)} has a broken header ({quote_value(describe_damage(error))}); "
+            "export it again."
         ) from error
 
 
@@ -128,11 +133,11 @@ def read_ply_file(
         if vertex is None or missing or vertex.dtype.hasobject:
             content = describe_content(elements, missing) if describe_content else None
             if content is not None:
-                raise InputError(f"{path} is no {kind} but {content}.")
+                raise InputError(f"{quote_value(path)} is no {kind} but {content}.")
             properties = ", ".join(missing or names)
             raise InputError(
-                f"{path} is no {kind}: it does not begin with vertices that have {properties} and "
-                "no lists."
+                f"{quote_value(path)} is no {kind}: it does not begin with vertices that have "
+                f"{properties} and no lists."
             )
         is_ascii = re.search(rb"^format\s+ascii", header, re.M) is not None
         if is_ascii:
@@ -141,7 +146,7 @@ def read_ply_file(
             rows = _map_rows(file, vertex.dtype, len(header), vertex.count)
         if len(rows) < vertex.count:
             raise InputError(
-                f"{path} is truncated: it ends after {len(rows):,} of "
+                f"{quote_value(path)} is truncated: it ends after {len(rows):,} of "
                 f"{quote_value(f'{vertex.count:,}')} {unit}; fetch or write the file again."
             )
         trailer = _map_rows(file, np.dtype(np.uint8), len(header) + rows.nbytes)
@@ -183,7 +188,7 @@ def _read_ascii_rows(file: BinaryIO, vertex: Element, path: Path) -> np.ndarray:
         table = np.array(list(islice(lines, vertex.count)), np.float64).reshape(-1, width)
     except ValueError as error:
         raise InputError(
-            f"{path} holds rows that are not {width} numbers each; write it anew."
+            f"{quote_value(path)} holds rows that are not {width} numbers each; write it anew."
         ) from error
     # Digits that a float cannot hold are kept, such as those of map coordinates.
     columns: Mapping[str, Any] = vertex.dtype.fields or {}
