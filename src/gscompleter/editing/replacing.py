@@ -85,7 +85,7 @@ def find_contested(
     The masks mark those of the context that Φ invented, and that Ψ lifted from photographs. Returns
     None if none are contested, as in the paper.
     """
-    if not state.config.add_observed:
+    if not state.config.add_observed or (invented is None and lifted is None):
         return None
     is_invented = mark_rendered(state.source, invented)
     is_lifted = mark_rendered(state.source, lifted) & ~is_invented
