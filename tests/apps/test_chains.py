@@ -156,7 +156,7 @@ def measure_emptiness(splat: Path) -> float:
     return -10 * error.square().mean().log10().item()
 
 
-@pytest.mark.parametrize("name", ["complete", "update"])
+@pytest.mark.parametrize("name", [pytest.param("complete", marks=pytest.mark.slow), "update"])
 def test_what_was_removed_stays_out(name, room, camera, without_crate, tmp_path):
     targets = ("--target", camera) if name == "complete" else ()
     again = run_on(room, name, without_crate, tmp_path / "again", *targets)

@@ -209,6 +209,13 @@ def test_a_held_key_shows_before_as_long_as_it_is_held(bare):
     assert np.abs(bare.picture() - after).max() < 0.02
 
 
+def test_keys_choose_what_is_shown(bare):
+    bare.page.keyboard.press("3")
+    assert bare.page.evaluate("gsc.stats()")["mode"] == "before"
+    bare.page.evaluate("gsc.setMode('side')")
+
+
+@pytest.mark.slow
 def test_keys_and_drags_do_what_the_page_says(bare):
     bare.do("gsc.goTo('camera-1')")
     for key, mode in (("1", "side"), ("2", "slider"), ("3", "before"), ("4", "after")):
@@ -273,7 +280,10 @@ def test_a_link_opens_at_its_camera(browser, saved):
     tab.context.close()
 
 
-@pytest.mark.parametrize(("width", "height"), [(4 * SIDE, SIDE), (SIDE, 3 * SIDE)])
+@pytest.mark.parametrize(
+    ("width", "height"),
+    [(4 * SIDE, SIDE), pytest.param(SIDE, 3 * SIDE, marks=pytest.mark.slow)],
+)
 def test_nothing_is_shown_beyond_the_frame_of_a_camera_until_it_is_moved(
     browser, saved, width, height
 ):
