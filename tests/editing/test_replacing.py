@@ -9,10 +9,11 @@ import torch
 
 from gscompleter import GSCompleter, load_renderer
 from gscompleter.config import CompleterConfig
-from gscompleter.editing.replacing import find_contested
+from gscompleter.editing.replacing import fade_before_returned, find_contested
 from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.parts import OBSERVED
+from gscompleter.parts import OBSERVED, PartOrigin, make_part
 from gscompleter.render.cache import SceneRenderer
+from gscompleter.stages.superfluous import limit_errors
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
 from gscompleter.types import Gaussians, Reconstruction, View, make_observed, merge, sh_from_rgb
@@ -140,6 +141,21 @@ def test_what_was_lifted_to_a_wrong_place_gives_way():
 def test_what_was_lifted_stays_where_photographs_agree():
     everything = torch.ones(len(WHOLE), dtype=torch.bool)
     assert not begin_lifted(WHOLE, everything).source.replaced_mask.any()
+
+
+def test_additions_before_what_returned_fade():
+    begun = begin_lifted(WHOLE, None)
+    board = make_part(PartOrigin("photographs"), make_observed_again(make_board(1.6)))
+    views = [photo.view for photo in begun.photos]
+    images = [RENDERER.render(WHOLE, view.camera).image for view in views]
+    limits = limit_errors(images, views, 0.01)
+    covered = replace(begun, added_parts=(board,))
+    assert score(covered.scene)[2] < score(WHOLE)[2] - 3
+    faded = fade_before_returned(covered, views, limits, SCENES)
+    renders = [RENDERER.render(faded.scene, view.camera).image for view in views]
+    # Renders are exact, so that no error at all is allowed.
+    for error, limit in zip(limit_errors(renders, views, 0.0), limits, strict=True):
+        assert error <= limit + 1e-7
 
 
 def test_what_photographs_confirm_is_still_there():

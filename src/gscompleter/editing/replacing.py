@@ -19,6 +19,7 @@ from torch import Tensor
 
 from gscompleter.config import CleaningConfig
 from gscompleter.numerics.image_ops import average_box
+from gscompleter.parts import PartOrigin, make_part
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.protocols import FrozenScene, Renderer
 from gscompleter.render.view_map import get_view_map
@@ -28,6 +29,7 @@ from gscompleter.stages.add_observed import (
     find_usable,
     keep_large_regions,
 )
+from gscompleter.stages.error_budgets import meet_error_budgets
 from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.stages.superfluous import (
     FADED_OPACITY,
@@ -37,7 +39,7 @@ from gscompleter.stages.superfluous import (
 )
 from gscompleter.state import Completion
 from gscompleter.trust.photometric import sum_weights
-from gscompleter.types import ContextScene, Gaussians, Render, View, merge
+from gscompleter.types import ContextScene, ErrorBudget, Gaussians, Render, View, merge
 
 MAX_ROUNDS = 8
 """Layers of Gaussians that step aside behind each other."""
@@ -214,7 +216,27 @@ def return_needed(
     dropped = exclude_needed_additions(
         lambda: plans, candidates.opacities, is_dropped, views, limits
     )
-    return drop_rows(state, given, contested.rows.masked_scatter(contested.rows, dropped))
+    gone = contested.rows.masked_scatter(contested.rows, dropped)
+    return fade_before_returned(drop_rows(state, given, gone), views, limits, scenes)
+
+
+def fade_before_returned(
+    state: Completion, views: Sequence[View], limits: Sequence[float], scenes: SceneRenderer
+) -> Completion:
+    """Fade what photographs added until each photograph is within a mean squared error.
+
+    Some of it stands before Gaussians that returned, by which the photographs that these were
+    lifted from lose: 0.3 dB of 36 at a fountain.
+    """
+    if not state.added_parts:
+        return state
+    added = merge([part.gaussians for part in state.added_parts])
+    frozen = scenes.freeze_at((state.rendered_context,), [view.camera for view in views])
+    budgets = [[ErrorBudget(view, "mse", limit)] for view, limit in zip(views, limits, strict=True)]
+    plans = [scene.vary_opacities(added) for scene in frozen]
+    kept = meet_error_budgets(added, frozen, budgets, plans, state.config.psnr_guard)
+    parts = (make_part(PartOrigin("photographs"), kept),) if len(kept) else ()
+    return replace(state, added_parts=parts)
 
 
 def find_unneeded_candidates(
