@@ -13,7 +13,7 @@ from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile
 from gscompleter.parts import NOT_INVENTED, OBSERVED
 from gscompleter.splats.edits import Edits
 from gscompleter.splats.formats import detect_splat_format
-from gscompleter.splats.row_kinds import GIVEN, find_rows_of_kinds, has_recolored, tells_kinds
+from gscompleter.splats.row_kinds import find_rows_of_kinds, has_recolored, tells_kinds
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.writing import EDITS_FILE
 from gscompleter.types import Gaussians
@@ -22,16 +22,14 @@ from gscompleter.types import Gaussians
 def mark_earlier_work(task: CompletionTask) -> tuple[CompletionTask, tuple[str, ...]]:
     """Mark what earlier commands made of the splat of a task; lines tell about it.
 
-    Φ invented a part, and Ψ lifted a part from photographs. The rest is that of a user.
+    Φ invented a part, and Ψ lifted a part from further photographs. The rest stays.
     """
     assert task.scene is not None
     assert task.splat_file is not None
     edits = task.splat_file.edits
     invented = read_rows(task.splat_file, task.scene, ("target", "gap"))
-    # The first command had no file before it if Ψ made the scene.
-    is_scene_lifted = bool(edits) and edits.edits[0].given is None
-    lifted_kinds = ("photographs", GIVEN) if is_scene_lifted else ("photographs",)
-    lifted = read_rows(task.splat_file, task.scene, lifted_kinds)
+    # What a first command lifted stays: its own photographs would lose (decision 113).
+    lifted = read_rows(task.splat_file, task.scene, ("photographs",))
 
     # Of a file whose rows are not known, labels tell as much if nothing was ever recoloured: those
     # of a user that were recoloured for a target have its number, too.
