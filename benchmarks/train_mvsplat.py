@@ -255,7 +255,7 @@ class Training:
 
     def __init__(self, seed: int, size: int, pairs: int, device: str) -> None:
         self.drawn = {"seed": seed, "size": size, "pairs": pairs}
-        """What each step is drawn by; steps of other values do not go on from these."""
+        """Values that the steps are drawn by; a training with others does not go on from these."""
         self.device = device
         torch.manual_seed(seed)
         self.network = MVSplat()

@@ -10,7 +10,7 @@ import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from gscompleter.data.formats import SCENE_FORMATS, open_photographs
+from gscompleter.data.formats import find_format, open_photographs
 from gscompleter.data.limits import require
 from gscompleter.data.mask_checks import read_masks_as_asked, refuse_nothing_to_invert
 from gscompleter.data.mask_reading import MaskReading
@@ -34,11 +34,6 @@ class RefinedCameras:
     kept: str
     """Sentence on what else lies in the folder; empty if there is nothing."""
 
-    @property
-    def is_refined(self) -> bool:
-        """True if the poses are not the given ones."""
-        return self.refinement.is_accepted
-
     def describe(self, out: Path) -> str:
         """Describe the result in a sentence for the user."""
         errors = (
@@ -46,15 +41,13 @@ class RefinedCameras:
             f"refined ones by {self.refinement.refined_error:.2f}"
         )
         count = len(self.photographs.posed)
-        if self.is_refined:
-            return f"The cameras of {count} photographs are refined: {errors}: {out}"
-        return f"The cameras of {count} photographs stay as they are: {errors}: {out}"
+        done = "are refined" if self.refinement.is_accepted else "stay as they are"
+        return f"The cameras of {count} photographs {done}: {errors}: {out}"
 
 
 def has_cameras(path: Path) -> bool:
     """Return True if a path holds photographs with cameras, by names and first bytes."""
-    formats = (row for name, row in SCENE_FORMATS.items() if name != "photograph")
-    return any(bool(row.detect(path)) for row in formats)
+    return find_format(path) not in (None, "photograph")
 
 
 def refine_given_poses(

@@ -75,11 +75,10 @@ def rate_by_photographs(
     config: CleaningConfig,
 ) -> ErrorChanges:
     """Rate each Gaussian of a scene by how photographs change without it."""
-    # One after the other, since what is frozen of a large scene takes memory.
-    frozen = (
-        renderer.freeze(scene[:0], view.camera) for view in track(views, "Comparing photographs")
-    )
-    return sum_error_changes(scene, faded, views, frozen, config)
+    nothing = [renderer.freeze(scene[:0], view.camera) for view in views]
+    # One after the other, since the plan of a large scene takes memory.
+    plans = (empty.vary_opacities(scene) for empty in track(nothing, "Comparing photographs"))
+    return sum_error_changes(scene.opacities, faded, views, nothing, plans, config)
 
 
 def halve_view(view: View) -> View:

@@ -21,7 +21,7 @@ from gscompleter.config import CleaningConfig
 from gscompleter.numerics.image_ops import average_box
 from gscompleter.parts import PartOrigin, make_part
 from gscompleter.render.cache import SceneRenderer
-from gscompleter.render.protocols import FrozenScene, Renderer
+from gscompleter.render.protocols import FrozenScene, OpacityRender, Renderer
 from gscompleter.render.view_map import get_view_map
 from gscompleter.stages.add_observed import (
     MIN_ADDED_SHARE,
@@ -206,13 +206,13 @@ def return_needed(
     candidates = given.source.rendered[contested.rows]
     views = [photo.view for photo in state.photos]
     frozen = scenes.freeze_at(state.parts, [view.camera for view in views])
-    is_dropped = find_unneeded_candidates(candidates, views, frozen, scenes.renderer, config)
+    plans = [scene.vary_opacities(candidates) for scene in frozen]
+    is_dropped = find_unneeded_candidates(candidates, views, frozen, plans, scenes.renderer, config)
 
     # No photograph may be worse than it was with all of them.
     whole = merge(given.parts)
     images = (scenes.renderer.render(whole, view.camera).image for view in views)
     limits = limit_errors(images, views, config.tolerance)
-    plans = [scene.vary_opacities(candidates) for scene in frozen]
     dropped = exclude_needed_additions(
         lambda: plans, candidates.opacities, is_dropped, views, limits
     )
@@ -243,16 +243,17 @@ def find_unneeded_candidates(
     candidates: Gaussians,
     views: Sequence[View],
     frozen: Sequence[FrozenScene],
+    plans: Sequence[OpacityRender],
     renderer: Renderer,
     config: CleaningConfig,
 ) -> Bool[Tensor, "c"]:
     """Find candidates by which photographs lose, or that stand needlessly before what they show.
 
-    `frozen` is the scene without them. All of them are faint in the comparison: otherwise those
-    that are behind others look needless.
+    `frozen` is the scene without them, and `plans` render it with them at other opacities. All of
+    them are faint in the comparison: otherwise those that are behind others look needless.
     """
     are_faint = torch.ones_like(candidates.opacities, dtype=torch.bool)
-    changes = sum_error_changes(candidates, are_faint, views, frozen, config)
+    changes = sum_error_changes(candidates.opacities, are_faint, views, frozen, plans, config)
 
     # What photographs do not show, since something is before it, contradicts none of them.
     faint = replace(candidates, opacities=candidates.opacities.clamp_max(FADED_OPACITY))

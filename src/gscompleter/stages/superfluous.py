@@ -60,23 +60,24 @@ class ErrorChanges:
 
 
 def sum_error_changes(
-    added: Gaussians,
+    opacities: Float[Tensor, "n"],
     faded: Bool[Tensor, "n"],
     views: Sequence[View],
-    frozen: Iterable[FrozenScene],
+    frozen: Sequence[FrozenScene],
+    plans: Iterable[OpacityRender],
     config: CleaningConfig,
 ) -> ErrorChanges:
     """Sum the error changes of Gaussians that are added to a scene, which is frozen at the views.
 
+    A plan for each view renders the scene with them, at other opacities than their own ones [n].
     Those in `faded` are faint meanwhile.
     """
     generator = torch.Generator().manual_seed(0)
-    gained = torch.zeros_like(added.opacities)
-    lost = torch.zeros_like(added.opacities)
+    gained = torch.zeros_like(opacities)
+    lost = torch.zeros_like(opacities)
     equal_share = 0.0
-    for view, scene in zip(views, frozen, strict=True):
-        plan = scene.vary_opacities(added)
-        change = predict_error_change(plan, added.opacities, faded, view, config.probes, generator)
+    for view, scene, plan in zip(views, frozen, plans, strict=True):
+        change = predict_error_change(plan, opacities, faded, view, config.probes, generator)
         gained += (-change).clamp_min(0)
         lost += change.clamp_min(0)
         num_shown = int((change != 0).sum()) + int((sum_weights(scene) > 0).sum())

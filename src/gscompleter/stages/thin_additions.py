@@ -41,11 +41,11 @@ def drop_doubled(
 
     `frozen` is the scene at the photographs without them.
     """
+    plans = [scene.vary_opacities(added) for scene in frozen]
     none = torch.zeros_like(added.opacities, dtype=torch.bool)
-    changes = sum_error_changes(added, none, views, frozen, THINNING)
+    changes = sum_error_changes(added.opacities, none, views, frozen, plans, THINNING)
     doubled = find_doubled(added, changes.find_removable(THINNING), changes.lost)
 
-    plans = [scene.vary_opacities(added) for scene in frozen]
     images = (plan(added.opacities).image for plan in plans)
     limits = limit_errors(images, views, THINNING.tolerance)
     gone = exclude_needed_additions(lambda: plans, added.opacities, doubled, views, limits)

@@ -39,7 +39,7 @@ class BatchOptions(EngineOptions):
     retries: Annotated[int, Interval(ge=0, le=100)] = 2
     """Further attempts for a job that was killed or that failed unexpectedly."""
     rerun: Literal["nothing", "failures"] = "nothing"
-    """What is done again of an earlier run in OUT. Nothing, or the jobs that failed."""
+    """Repeat this part of an earlier run in OUT. Nothing, or the jobs that failed."""
     each: tuple[str, ...] = ()
     """Options of `complete` for every row that does not set them, as in --each resolution=256."""
 

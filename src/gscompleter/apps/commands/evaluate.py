@@ -174,7 +174,7 @@ class EvaluateOptions(SynthesisOptions, EngineOptions, MaskOptions):
     far: float | None = None
     """Largest depth in the scene, in the unit of its cameras. By default as for near."""
     rerun: Literal["nothing", "failures", "scores"] = "nothing"
-    """What is done again of an earlier run in OUT. Nothing, the cases that failed, or the scores of
+    """Repeat this part of an earlier run in OUT. Nothing, the cases that failed, or the scores of
     all saved predictions."""
     engine: EngineName | None = None
     """Engine that runs jobs or cases: processes of this machine, Ray, or SLURM. This process if not

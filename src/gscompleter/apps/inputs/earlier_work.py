@@ -1,4 +1,4 @@
-"""What earlier commands made of a splat, as the record beside its file says."""
+"""The rows of a splat that earlier commands made, as the record beside its file says."""
 
 from __future__ import annotations
 

@@ -26,7 +26,7 @@ from gscompleter.system.files.writing import COMPLETED_FILES, SUMMARY_FILE
 
 RECORD_FILE = "report.json"
 SUMMARY_ADVICE = "complete the scene again"
-"""What to do about a damaged file."""
+"""Advice about a damaged file, for errors."""
 MAX_FRAME_NUMBER = 1e12
 """Largest absolute number of the transform and the origin of a `ResultFrame`: the determinant and
 what is computed in float32 stay finite."""
@@ -102,9 +102,9 @@ class FittedRow:
     """
 
     psnr: float
-    """Of the whole image."""
+    """PSNR of the whole image."""
     observed_psnr: float
-    """Outside of holes."""
+    """PSNR outside of holes."""
     moved: float
     """Length of the fitted rotation and shift, in pixels of an image whose longer side is at most
     320."""
@@ -283,8 +283,8 @@ class CompletionSummary:
     removal: RemovalRow | None = None
     """None if nothing was removed that a photograph shows."""
     kept: KeptRow | None = None
-    """What cameras that decided nothing still see of a splat without photographs; None for any
-    other scene, or if they see nothing opaque."""
+    """Scores of a splat without photographs at cameras that decided nothing; None for any other
+    scene, or if these see nothing opaque."""
     new_photographs: int | None = None
     """Number of photographs that an input splat does not reproduce, as it was not trained on them;
     None under full trust, as of a reconstructed scene."""

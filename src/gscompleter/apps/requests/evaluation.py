@@ -56,7 +56,7 @@ class EvaluationRequest:
     out: Path
     """Folder of the scores; those of an earlier run are kept."""
     rerun: Literal["nothing", "failures", "scores"] = "nothing"
-    """What is done again of an earlier run: the cases that failed, or the scores of all."""
+    """Part of an earlier run that is repeated: none, failed cases, or the scores of all."""
     engine: EngineRequest = EngineRequest()
     answer: AnswerRequest = AnswerRequest()
 

@@ -73,9 +73,9 @@ class FittedQuality:
     """Scores in dB after one pose and one gain of the target camera were fitted."""
 
     psnr: float
-    """Of the whole image."""
+    """PSNR of the whole image."""
     observed_psnr: float
-    """Outside of holes."""
+    """PSNR outside of holes."""
     moved: float
     """Length of the rotation and shift, in pixels of an image of at most `FIT_SIDE`."""
     gain: float
