@@ -328,8 +328,10 @@ class Server:
 
 @pytest.fixture(scope="module")
 def comfyui():
-    """Return a function that runs a workflow in ComfyUI itself; it returns the nodes that did not
-    run again."""
+    """Return a function that runs a workflow in ComfyUI itself.
+
+    It returns the nodes that did not run again.
+    """
     cli_args = pytest.importorskip("comfy.cli_args", reason="needs ComfyUI on the path")
     cli_args.args.cpu = True
     import execution
