@@ -36,6 +36,8 @@ TARGETS = "targets.json"
 """File with the cameras of a result, beside completed.ply."""
 MASK = "gscompleter mask"
 """Name of the image that is painted on."""
+SHOWN = "rgb"
+"""Attribute with the colour of points; from one named `color`, Cycles renders points black."""
 INVENTED = (1.0, 0.0, 1.0)
 """Colour of what was invented, in the attribute `origin`."""
 TYPES = {
@@ -220,7 +222,7 @@ def add_points(
     mesh.vertices.foreach_set("co", points["position"].astype(np.float32).ravel())
     is_invented = points["generated"] > 0
     origin = np.where(is_invented[:, None], np.array(INVENTED, np.float32), points["color"])
-    for key, color in (("color", points["color"]), ("origin", origin)):
+    for key, color in ((SHOWN, points["color"]), ("origin", origin)):
         attribute = mesh.attributes.new(key, "FLOAT_COLOR", "POINT")
         linear = np.ones((count, 4), np.float32)
         linear[:, :3] = decode_srgb(color)
@@ -250,7 +252,7 @@ def draw_as_points(thing: bpy.types.Object, position: np.ndarray) -> None:
     nodes, links = material.node_tree.nodes, material.node_tree.links
     nodes.clear()
     color = nodes.new("ShaderNodeAttribute")
-    color.attribute_name = "color"
+    color.attribute_name = SHOWN
     light = nodes.new("ShaderNodeEmission")
     output = nodes.new("ShaderNodeOutputMaterial")
     links.new(color.outputs["Color"], light.inputs["Color"])
@@ -350,48 +352,59 @@ def find_splat(context: bpy.types.Context) -> bpy.types.Object:
     return chosen
 
 
-def get_mask(size: tuple[int, int]) -> bpy.types.Image:
-    """Return the image of the mask, black at first; another size begins anew."""
+def find_folder(context: bpy.types.Context) -> Path:
+    """Return the folder to write to."""
+    folder = context.scene.gscompleter_folder
+    if folder.startswith("//") and not bpy.data.filepath:
+        raise GscompleterError("The scene has no file yet; save it, or choose another folder.")
+    return Path(bpy.path.abspath(folder))
+
+
+def read_mask(size: tuple[int, int]) -> np.ndarray:
+    """Return what is marked [h, w], the first row on top; nothing if the size is another one."""
+    width, height = size
     image = bpy.data.images.get(MASK)
-    if image is not None and tuple(image.size) != size:
-        bpy.data.images.remove(image)
-        image = None
-    if image is None:
-        image = bpy.data.images.new(MASK, *size, alpha=False)
-        image.use_fake_user = True
-    return image
-
-
-def read_mask(image: bpy.types.Image) -> np.ndarray:
-    """Return a mask [h, w], the first row on top."""
-    width, height = image.size
+    if image is None or tuple(image.size) != size:
+        return np.zeros((height, width), bool)
     pixels = np.empty(width * height * 4, np.float32)
     image.pixels.foreach_get(pixels)
     # Rows of Blender's images begin below.
     return pixels.reshape(height, width, 4)[::-1, :, 0] > 0.5
 
 
-def add_to_mask(image: bpy.types.Image, marked: np.ndarray) -> None:
-    """Paint pixels [h, w] of a mask white, the first row on top."""
-    mask = read_mask(image) | marked
-    pixels = np.ones((*mask.shape, 4), np.float32)
+def add_to_mask(marked: np.ndarray) -> None:
+    """Mark pixels [h, w] besides what is marked, the first row on top."""
+    height, width = marked.shape
+    mask = marked | read_mask((width, height))
+    # Undo gives back images that were there before, but not the pixels that one had before; so each
+    # mask is an image of its own, packed, which the file of the scene keeps, too.
+    image = bpy.data.images.new(MASK, width, height, alpha=False)
+    pixels = np.ones((height, width, 4), np.float32)
     pixels[..., :3] = mask[::-1, :, None]
     image.pixels.foreach_set(pixels.ravel())
-    image.update()
+    image.pack()
+    image.use_fake_user = True
+    earlier = bpy.data.images.get(MASK)
+    if earlier not in (None, image):
+        earlier.user_remap(image)
+        bpy.data.images.remove(earlier)
+        image.name = MASK
 
 
-def write_repair(context: bpy.types.Context, folder: Path) -> str:
+def write_repair(context: bpy.types.Context) -> str:
     """Write the camera and the mask; returns the command that repairs."""
     splat = find_splat(context)
     frame = describe_camera(context.scene, splat)
-    image = bpy.data.images.get(MASK)
-    if image is None or not read_mask(image).any():
-        raise GscompleterError("Nothing is marked; draw around what is wrong first.")
-    if tuple(image.size) != get_size(context.scene):
+    image, size = bpy.data.images.get(MASK), get_size(context.scene)
+    if image is not None and tuple(image.size) != size:
         raise GscompleterError("The size of the output changed since it was marked; mark it again.")
+    mask = read_mask(size)
+    if not mask.any():
+        raise GscompleterError("Nothing is marked; draw around what is wrong first.")
+    folder = find_folder(context)
     folder.mkdir(parents=True, exist_ok=True)
     write_camera(folder / "camera.json", frame)
-    write_mask(folder / "mask.png", read_mask(image))
+    write_mask(folder / "mask.png", mask)
     source = splat.get("splat") or "splat.ply"
     words = ["gscompleter", "repair", str(source), "--target", str(folder / "camera.json")]
     words += ["--mask", str(folder / "mask.png"), "--out", str(folder / "repaired")]
@@ -490,7 +503,7 @@ class GSC_OT_mark(bpy.types.Operator):  # noqa: N801
     def _mark(self, context):
         size = get_size(context.scene)
         corners = find_frame(context)
-        add_to_mask(get_mask(size), fill_polygon(move_to_image(self._path, corners, size), size))
+        add_to_mask(fill_polygon(move_to_image(self._path, corners, size), size))
 
 
 def find_frame(context: bpy.types.Context) -> np.ndarray:
@@ -537,9 +550,8 @@ class GSC_OT_write(bpy.types.Operator):  # noqa: N801
 
     def execute(self, context):
         """Write them, and leave the command in the clipboard."""
-        folder = Path(bpy.path.abspath(context.scene.gscompleter_folder))
         try:
-            command = write_repair(context, folder)
+            command = write_repair(context)
         except (GscompleterError, OSError) as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}

@@ -42,6 +42,11 @@ PAINTER = "ComfyUI"
 """Name of the painter unless the user names another."""
 NAME = "The painted image"
 """Name of the image in sentences."""
+NOTHING_ADDED = "Nothing of the painting was added."
+FULL_ALREADY = (
+    "The scene is opaque wherever the mask is white, only not confirmed by photographs, and what "
+    "was painted there fits it no better; mark what is wrong, with Repair."
+)
 GEOMETRY = {"default": "", "tooltip": "Scan or mesh that gives depth in holes"}
 OUT = {"default": "output/gscompleter", "tooltip": "Folder for a new folder per result"}
 SIDE = {"default": 512, "min": 64, "max": 4096, "step": 8}
@@ -91,7 +96,27 @@ def make_place(out: str) -> Path:
     return next(place for n in count(1) if not (place := Path(out) / f"{n:05}").exists())
 
 
-class ShowSplat:
+class ReadsFiles:
+    """A node that runs again once a file that its inputs name was written anew."""
+
+    @classmethod
+    def IS_CHANGED(cls, out: str = "", **inputs: object) -> str:
+        """Describe the files of the inputs; ComfyUI keeps results while it stays the same.
+
+        Results in `out` are no inputs.
+        """
+        named = [Path(value.strip()) for value in inputs.values() if isinstance(value, str)]
+        files = [
+            file
+            for path in named
+            if path.name and path.exists()
+            for file in (sorted(path.rglob("*")) if path.is_dir() else [path])
+        ]
+        stamps = [(str(file), file.stat().st_mtime_ns, file.stat().st_size) for file in files]
+        return str(stamps)
+
+
+class ShowSplat(ReadsFiles):
     """Render a splat at a camera, to be painted on."""
 
     RETURN_TYPES: ClassVar = ("IMAGE",)
@@ -133,7 +158,7 @@ def choose_camera(cameras: list[gsc.Camera], number: int, target: str) -> gsc.Ca
     return cameras[number]
 
 
-class FindHoles:
+class FindHoles(ReadsFiles):
     """Render a scene at a target camera, and mark what is empty or not confirmed."""
 
     RETURN_TYPES: ClassVar = ("IMAGE", "MASK", HANDLE, "IMAGE", "IMAGE", "IMAGE")
@@ -258,8 +283,8 @@ class RegisterPainting:
             completion = completer.advance(holes.state, holes.target)
             result = completion.targets[-1]
             if not len(result.added) and not result.num_recolored:
-                reasons = filter(None, (result.refusal, *result.notes))
-                raise gsc.InputError(" ".join(["Nothing of the painting was added.", *reasons]))
+                reasons = [*filter(None, (result.refusal, *result.notes))]
+                raise gsc.InputError(" ".join([NOTHING_ADDED, *(reasons or [FULL_ALREADY])]))
             models = replace(ready.work.models, generator="painted")
             run = describe_maker(models, ready.task, completion)
             place = make_place(out)
@@ -281,7 +306,7 @@ class RegisterPainting:
             return (str(place / COMPLETED_FILE),)
 
 
-class Repair:
+class Repair(ReadsFiles):
     """Take what a mask marks out of a splat, and fill its place."""
 
     RETURN_TYPES: ClassVar = ("STRING", "IMAGE")

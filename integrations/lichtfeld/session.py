@@ -166,6 +166,10 @@ def copy_record(splat: Path, folder: Path) -> None:
 
 
 def find_photographs() -> str:
-    """Return the folder of the data set that is loaded; empty for none."""
+    """Return the folder of the data set that is loaded; empty for none, or if it was centred.
+
+    Its splat is then not in the frame of the files. Older versions never centre one.
+    """
     params = lf.dataset_params()
-    return params.data_path if params.has_params() else ""
+    is_centred = getattr(params, "centralize_dataset", "off") != "off"
+    return params.data_path if params.has_params() and not is_centred else ""

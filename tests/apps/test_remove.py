@@ -13,6 +13,7 @@ import torch
 from command import run
 from gscompleter import load_ply, save_ply
 from gscompleter.apps.inputs.removal import (
+    find_by_position,
     find_in_boxes,
     find_in_masks,
     find_in_region,
@@ -29,6 +30,7 @@ from gscompleter.render.loading import load_renderer
 from gscompleter.system.files.image import read_image, write_image
 from gscompleter.types import find_equal_positions, merge
 from scenes import Room, camera_at, cast, gaussians_of, photographed, random_gaussians, view_of
+from splat_files import write_supersplat
 
 SIZE = 48
 CAMERAS = [
@@ -240,6 +242,19 @@ def test_a_selection_is_found_by_position():
     assert torch.nonzero(found)[:, 0].tolist() == [3, 7, 20]
     moved = random_gaussians(50, seed=1)
     assert not find_equal_positions(splat.means, moved.means).any()
+
+
+def test_a_selection_of_supersplat_is_found(tmp_path):
+    """In another order, at positions of any size, and without the labels."""
+    splat = replace(
+        random_gaussians(500, sh_degree=1), generated=torch.zeros(500, dtype=torch.uint8)
+    )
+    splat.means[:100] *= 1e4
+    splat.means[100:200] *= 1e-6
+    chosen = torch.randperm(500)[:200]
+    file = write_supersplat(tmp_path / "selection.ply", splat[chosen])
+    found = find_by_position(Selection(file=file), splat, np.zeros(3))
+    assert torch.nonzero(found)[:, 0].tolist() == sorted(chosen.tolist())
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ import torch
 from PIL import Image
 
 from gscompleter import InputError, load_cameras
+from gscompleter.data.camera_files import is_in_splat_frame
 from gscompleter.data.formats import SCENE_FORMATS, open_photographs
 from gscompleter.data.points import MIN_RANGE_POINTS, add_depth_range, compute_depth_range
 from gscompleter.data.scene import write_cameras
@@ -99,12 +101,18 @@ def supersplat_pose(camera: Camera) -> dict:
     }
 
 
-@pytest.mark.parametrize("project", [False, True])
-def test_poses_of_supersplat_show_the_room_upright(tmp_path, project):
+@pytest.mark.parametrize("name", ["poses.json", "document.json", "scene.ssproj"])
+def test_poses_of_supersplat_show_the_room_upright(tmp_path, name):
     poses = [supersplat_pose(camera) for camera in CAMERAS]
-    content = {"poseSets": [{"name": "set0", "poses": poses}]} if project else poses
-    path = tmp_path / "document.json"
-    path.write_text(json.dumps(content))
+    document = {"version": 0, "poseSets": [{"name": "set0", "poses": poses}], "splats": [{}]}
+    content = json.dumps(poses if name == "poses.json" else document)
+    path = tmp_path / name
+    path.write_text(content)
+    if name == "scene.ssproj":
+        with zipfile.ZipFile(path, "w") as project:
+            project.writestr("document.json", content)
+            project.writestr("splat_0.ply", b"ply\n")
+    assert is_in_splat_frame(path)
     for camera, view in zip(load_cameras(path, (SIZE, SIZE)), VIEWS, strict=True):
         check(camera, view.camera)
         assert (view_of(Room(), camera).image - view.image).abs().mean() < 0.003
@@ -113,6 +121,17 @@ def test_poses_of_supersplat_show_the_room_upright(tmp_path, project):
     assert wide.K[0, 0] == pytest.approx(0.9 * 2 * SIZE, rel=1e-4)
     with pytest.raises(InputError, match="have no image size; give a resolution"):
         load_cameras(path)
+
+
+def test_a_project_that_cannot_be_read_is_a_sentence(tmp_path):
+    path = tmp_path / "scene.ssproj"
+    path.write_text("{}")
+    with pytest.raises(InputError, match=r"scene\.ssproj is no project of SuperSplat"):
+        load_cameras(path, (SIZE, SIZE))
+    with zipfile.ZipFile(path, "w") as project:
+        project.writestr("splat_0.ply", b"ply\n")
+    with pytest.raises(InputError, match=r"scene\.ssproj is no project of SuperSplat"):
+        load_cameras(path, (SIZE, SIZE))
 
 
 @pytest.mark.parametrize(

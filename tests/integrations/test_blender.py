@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import shlex
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -149,7 +152,7 @@ def blender():
 
 
 def test_blender_shows_the_points_where_its_cameras_see_them(blender, result):
-    bpy, _ = blender
+    bpy, add_on = blender
     path = str(result / "completed.ply")
     assert bpy.ops.gscompleter.import_result(filepath=path) == {"FINISHED"}
     scene = bpy.context.scene
@@ -180,11 +183,28 @@ def test_blender_shows_the_points_where_its_cameras_see_them(blender, result):
         assert (1 - y) * SIZE == pytest.approx(pixels[row, 1].item(), abs=0.01)
 
     # What is drawn is a cloud of points with their colours.
-    depsgraph = bpy.context.evaluated_depsgraph_get()
-    geometry = points.evaluated_get(depsgraph).evaluated_geometry()
-    drawn = geometry.pointcloud
+    drawn_things = bpy.context.evaluated_depsgraph_get().object_instances
+    (drawn,) = [one.object.data for one in drawn_things if one.object.type == "POINTCLOUD"]
     assert len(drawn.points) == len(given)
-    assert drawn.attributes["color"].domain == "POINT"
+    assert drawn.attributes[add_on.SHOWN].domain == "POINT"
+
+
+def test_blender_renders_the_points_in_their_colours(blender, result, tmp_path):
+    bpy, _ = blender
+    bpy.ops.gscompleter.import_result(filepath=str(result / "completed.ply"))
+    scene = bpy.context.scene
+    scene.render.engine = "CYCLES"
+    scene.cycles.samples, scene.cycles.use_denoising = 16, False
+    scene.view_settings.view_transform = "Standard"
+    scene.render.filepath = str(tmp_path / "rendered.png")
+    assert bpy.ops.render.render(write_still=True) == {"FINISHED"}
+    with Image.open(tmp_path / "rendered.png") as image:
+        rendered = torch.from_numpy(np.array(image.convert("RGB"), np.float32)) / 255
+    expected = gsc.load_renderer("cpu").render(gsc.load_ply(result / "completed.ply"), CAMERA)
+    # Points leave gaps between them, which are black, and darken pixels in part.
+    shown = rendered.amax(dim=-1) > 0.8 * expected.image.amax(dim=-1)
+    assert shown.float().mean() > 0.2
+    assert (rendered - expected.image).abs()[shown].median() < 0.1 * expected.image.max()
 
 
 def test_what_is_marked_in_blender_is_repaired(blender, result, tmp_path, monkeypatch):
@@ -196,8 +216,9 @@ def test_what_is_marked_in_blender_is_repaired(blender, result, tmp_path, monkey
     scene.gscompleter_splat.location = (1.0, 2.0, 3.0)
     bpy.context.view_layer.update()
     square = add_on.fill_polygon(np.array([[30, 26], [44, 26], [44, 38], [30, 38]]), (SIZE, SIZE))
-    add_on.add_to_mask(add_on.get_mask((SIZE, SIZE)), square)
-    words = shlex.split(add_on.write_repair(bpy.context, tmp_path / "marked"))
+    add_on.add_to_mask(square)
+    scene.gscompleter_folder = str(tmp_path / "marked")
+    words = shlex.split(add_on.write_repair(bpy.context))
     (camera,) = load_cameras(tmp_path / "marked" / "camera.json")
     assert (camera.c2w - CAMERA.c2w).abs().max() < 1e-5
     assert (camera.K - CAMERA.K).abs().max() < 1e-3 * CAMERA.K.max()
@@ -222,6 +243,97 @@ def test_blender_refuses_with_a_sentence(blender, result, tmp_path):
     (tmp_path / "other.ply").write_bytes(b"ply\n")
     with pytest.raises(RuntimeError, match="no plain"):
         bpy.ops.gscompleter.import_result(filepath=str(tmp_path / "other.ply"))
-    add_on.get_mask((8, 8))
+    bpy.context.scene.camera.data.type = "PERSP"
+    add_on.add_to_mask(np.ones((8, 8), bool))
+    with pytest.raises(RuntimeError, match="size of the output changed"):
+        bpy.ops.gscompleter.write()
     bpy.ops.gscompleter.clear()
     assert bpy.data.images.get(add_on.MASK) is None
+    add_on.add_to_mask(np.ones((SIZE, SIZE), bool))
+    with pytest.raises(RuntimeError, match="The scene has no file yet"):
+        bpy.ops.gscompleter.write()
+
+
+def mark_square(add_on, first) -> int:
+    """Mark ten by ten pixels; returns how many are marked then."""
+    marked = np.zeros((SIZE, SIZE), bool)
+    marked[first : first + 10, 10:20] = True
+    add_on.add_to_mask(marked)
+    return int(add_on.read_mask((SIZE, SIZE)).sum())
+
+
+def test_undo_takes_back_one_mark_after_the_other(blender, result):
+    bpy, add_on = blender
+
+    def step(operator):
+        assert operator() == {"FINISHED"}
+        return int(add_on.read_mask((SIZE, SIZE)).sum())
+
+    bpy.ops.ed.undo_push(message="empty")
+    bpy.ops.gscompleter.import_result(filepath=str(result / "completed.ply"))
+    bpy.ops.ed.undo_push(message="imported")
+    for first, count in ((0, 100), (20, 200)):
+        assert mark_square(add_on, first) == count
+        bpy.ops.ed.undo_push(message="marked")
+    undo, redo = bpy.ops.ed.undo, bpy.ops.ed.redo
+    assert [step(undo) for _ in range(3)] == [100, 0, 0]
+    assert (len(bpy.data.objects), bpy.context.scene.gscompleter_splat) == (0, None)
+    assert [step(redo) for _ in range(3)] == [0, 100, 200]
+    assert bpy.context.scene.gscompleter_splat.type == "EMPTY"
+
+
+def test_the_file_of_the_scene_keeps_splat_mask_and_folder(blender, result, tmp_path):
+    bpy, add_on = blender
+    bpy.ops.gscompleter.import_result(filepath=str(result / "completed.ply"))
+    mark_square(add_on, 20)
+    file = str(tmp_path / "scene.blend")
+    bpy.ops.wm.save_as_mainfile(filepath=file)
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    bpy.ops.wm.open_mainfile(filepath=file)
+    assert bpy.ops.gscompleter.write() == {"FINISHED"}
+    (camera,) = load_cameras(tmp_path / "gscompleter" / "camera.json")
+    assert (camera.c2w - CAMERA.c2w).abs().max() < 1e-5
+    with Image.open(tmp_path / "gscompleter" / "mask.png") as image:
+        assert np.array(image)[20:30, 10:20].min() == 255
+        assert np.count_nonzero(image) == 100
+
+
+def test_a_path_is_drawn_where_the_camera_shows_it(blender, result):
+    """The window stands in: without a screen there is none, but its maths is Blender's own."""
+    bpy, add_on = blender
+    bpy.ops.gscompleter.import_result(filepath=str(result / "completed.ply"))
+    scene = bpy.context.scene
+    camera = scene.camera
+    camera.data.shift_x, camera.data.shift_y = 0.1, -0.05
+    scene.gscompleter_splat.scale = (2.0, 2.0, 2.0)
+    bpy.context.view_layer.update()
+    view = camera.matrix_world.normalized().inverted()
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    projection = camera.calc_matrix_camera(depsgraph, x=200, y=200)
+    context = SimpleNamespace(
+        scene=scene,
+        region=SimpleNamespace(width=200, height=200),
+        region_data=SimpleNamespace(perspective_matrix=projection @ view),
+    )
+    assert add_on.find_frame(context) == pytest.approx(np.array([[0, 0], [200, 200]]), abs=0.01)
+
+
+def test_the_file_installs_as_an_add_on(result, tmp_path):
+    """Blender copies it among its add-ons, and switches it on and off more than once."""
+    pytest.importorskip("bpy", reason="needs the package bpy, which is Blender itself")
+    # In a process of its own, since Blender asks where its add-ons lie when it is imported.
+    code = f"""
+import bpy
+bpy.ops.preferences.addon_install(filepath={str(ADD_ON)!r})
+for _ in range(2):
+    bpy.ops.preferences.addon_enable(module={ADD_ON.stem!r})
+    bpy.ops.gscompleter.import_result(filepath={str(result / "completed.ply")!r})
+    bpy.ops.preferences.addon_disable(module={ADD_ON.stem!r})
+    assert not hasattr(bpy.types.Scene, "gscompleter_splat")
+"""
+    environment = {**os.environ, "BLENDER_USER_RESOURCES": str(tmp_path)}
+    done = subprocess.run(
+        [sys.executable, "-c", code], env=environment, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert len(list(tmp_path.rglob(ADD_ON.name))) == 1

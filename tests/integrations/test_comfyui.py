@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import importlib.util
 import inspect
 import json
@@ -294,3 +295,103 @@ def test_the_registry_finds_its_fields():
     assert fields["project"]["version"] == gsc.__version__
     assert "gscompleter" in fields["project"]["dependencies"]
     assert fields["tool"]["comfy"]["DisplayName"]
+
+
+def test_a_node_runs_again_when_a_file_was_written_anew(tmp_path):
+    node = NODES.NODE_CLASS_MAPPINGS["GSCompleterRepair"]
+    file, out = tmp_path / "camera.json", tmp_path / "out"
+    file.write_text("{}")
+    out.mkdir()
+    inputs = {"splat": "", "target": f" {file} ", "out": str(out), "large_masks": False}
+    first = node.IS_CHANGED(**inputs)
+    (out / "00001").mkdir()
+    assert node.IS_CHANGED(**inputs) == first
+    file.write_text("{ }")
+    assert node.IS_CHANGED(**inputs) != first
+    folder = {"scene": str(tmp_path)}
+    before = node.IS_CHANGED(**folder)
+    (tmp_path / "new.jpg").touch()
+    assert node.IS_CHANGED(**folder) != before
+
+
+class Server:
+    """The page of ComfyUI, as far as its executor speaks to it."""
+
+    client_id = last_node_id = None
+
+    def __init__(self):
+        self.sockets_metadata = {}
+
+    def send_sync(self, event, data, client=None):
+        pass
+
+
+@pytest.fixture(scope="module")
+def comfyui():
+    """Return a function that runs a workflow in ComfyUI itself.
+
+    It returns the nodes that did not run again.
+    """
+    cli_args = pytest.importorskip("comfy.cli_args", reason="needs ComfyUI on the path")
+    cli_args.args.cpu = True
+    import execution
+    import nodes
+
+    masks = Path(nodes.__file__).with_name("comfy_extras") / "nodes_mask.py"
+    for module in (masks, PACKAGE):
+        assert asyncio.run(nodes.load_custom_node(str(module)))
+    executor = execution.PromptExecutor(Server(), execution.CacheType.CLASSIC, 0)
+
+    def run_workflow(workflow):
+        # The page sends it anew each time, and ComfyUI writes into what it got.
+        workflow = json.loads(json.dumps(workflow))
+        is_valid, error, outputs, _ = asyncio.run(execution.validate_prompt("1", workflow, None))
+        assert is_valid, error
+        executor.execute(workflow, "1", {}, outputs)
+        events = dict(executor.status_messages)
+        assert executor.success, events["execution_error"]["exception_message"]
+        return events["execution_cached"]["nodes"]
+
+    return run_workflow
+
+
+@pytest.mark.slow
+def test_comfyui_itself_fills_and_repairs(comfyui, scene, tmp_path):
+    """Its own nodes paint between ours, and pass on images and masks."""
+    target = {"target": str(scene / "target.json"), "height": SIZE, "width": SIZE}
+    find = {"scene": str(scene), "context": "0, 2", "camera": 1, **target}
+    write_cameras(scene / "one.json", [TARGET])
+    wrong = {"target": str(scene / "one.json"), "large_masks": True}
+    repaired = tmp_path / "repaired"
+    composite = {"destination": ["1", 0], "source": ["1", 3], "x": 0, "y": 0}
+    workflow = {
+        "1": {"class_type": "GSCompleterFindHoles", "inputs": find},
+        "2": {
+            "class_type": "ImageCompositeMasked",
+            "inputs": {**composite, "resize_source": False, "mask": ["1", 1]},
+        },
+        "3": {
+            "class_type": "GSCompleterRegisterPainting",
+            "inputs": {"holes": ["1", 2], "image": ["2", 0], "out": str(tmp_path)},
+        },
+        "4": {
+            "class_type": "GSCompleterRepair",
+            "inputs": {**wrong, "splat": ["3", 0], "mask": ["1", 1], "out": str(repaired)},
+        },
+        "5": {"class_type": "PreviewImage", "inputs": {"images": ["4", 1]}},
+        "6": {
+            "class_type": "GSCompleterShowSplat",
+            "inputs": {"splat": ["4", 0], "camera": 1, **target},
+        },
+        "7": {"class_type": "PreviewImage", "inputs": {"images": ["6", 0]}},
+    }
+    assert comfyui(workflow) == []
+    for folder in (tmp_path, repaired):
+        result = gsc.load_splat(folder / "00001" / "completed.ply")
+        assert int((result.generated > 0).sum()) > 100
+    # Nothing changed, and nothing runs; then a file of cameras is written anew.
+    assert len(comfyui(workflow)) == len(workflow)
+    assert not (tmp_path / "00002").exists()
+    write_cameras(scene / "target.json", [CAMERAS[1], TARGET])
+    assert comfyui(workflow) == []
+    assert (tmp_path / "00002").exists()

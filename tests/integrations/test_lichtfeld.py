@@ -226,6 +226,14 @@ def test_what_is_missing_is_a_sentence(lf, plugin, splat, tmp_path, spoil, sente
         session.Session(tmp_path).send(session.Request("repair"))
 
 
+def test_a_data_set_that_was_centred_is_not_where_its_files_say(lf, plugin, tmp_path):
+    session = part(plugin, "session")
+    lf.params.data_path = str(tmp_path)
+    assert session.find_photographs() == str(tmp_path)
+    lf.params.centralize_dataset = "by_cameras"
+    assert session.find_photographs() == ""
+
+
 def test_the_photographs_of_the_data_set_are_evidence(lf, plugin, splat, tmp_path):
     scene = photographed(tmp_path / "scene", [replace(CAMERA, near=None, far=None)])
     lf.params.data_path = str(scene)

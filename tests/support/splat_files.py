@@ -202,6 +202,36 @@ def write_sog(path: Path, files: dict[str, bytes]) -> Path:
     return path
 
 
+def write_supersplat(path: Path, gaussians: Gaussians) -> Path:
+    """Write Gaussians as SuperSplat 2.32 exports a .ply, by its source.
+
+    It turns a splat by 180° about z when it reads it, and back when it writes it, with matrices of
+    float32. It writes these properties alone, and not those that it does not know.
+    """
+    turns = []
+    for angle in (-np.pi, np.pi):
+        turn = np.eye(3)
+        turn[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+        turns.append(turn.astype(np.float32).astype(np.float64))
+    both = (turns[0] @ turns[1]).astype(np.float32).astype(np.float64)
+    rest = gaussians.sh[:, 1:].transpose(1, 2).reshape(len(gaussians), -1)
+    columns = {
+        **dict(zip("xyz", (gaussians.means.double().numpy() @ both.T).T, strict=True)),
+        **{f"rot_{n}": column for n, column in enumerate(gaussians.quats.T)},
+        **{f"scale_{n}": column for n, column in enumerate(gaussians.scales.log().T)},
+        "opacity": gaussians.opacities.logit(),
+        **{f"f_dc_{n}": column for n, column in enumerate(gaussians.sh[:, 0].T)},
+        **{f"f_rest_{n}": column for n, column in enumerate(rest.T)},
+    }
+    table = np.zeros(len(gaussians), [(name, "<f4") for name in columns])
+    for name, column in columns.items():
+        table[name] = column
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {len(table)}"]
+    head += [f"property float {name}" for name in columns]
+    path.write_bytes("\n".join([*head, "end_header\n"]).encode() + table.tobytes())
+    return path
+
+
 def glb_table(gaussians: Gaussians) -> tuple[dict, bytes]:
     """Make description and binary part of a .glb with the Gaussians in its axes."""
     prefix = "KHR_gaussian_splatting:"

@@ -1,8 +1,9 @@
 """A stand-in of LichtFeld Studio's Python interface, written from its documentation.
 
 The program is in no package registry. The documentation is `docs/plugins/api-reference.md`,
-`docs/plugins/getting-started.md` and the type stubs of plug-in interface 1.0 (2026). What the
-plug-in uses of it is here, on NumPy arrays; whatever else it asked for would be an AttributeError.
+`docs/plugins/getting-started.md` and the type stubs of plug-in interface 1.0 (2026; commits
+0273ce2, 0af90d2 for scenes, 4197bf1 for undo). What the plug-in uses of it is here, on NumPy
+arrays; whatever else it asked for would be an AttributeError.
 """
 
 from __future__ import annotations
@@ -302,6 +303,7 @@ class DatasetParams:
     """Where the photographs of the data set lie."""
 
     data_path: str = ""
+    centralize_dataset: str = "off"
 
     def has_params(self) -> bool:
         return bool(self.data_path)

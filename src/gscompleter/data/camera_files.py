@@ -15,6 +15,8 @@ from __future__ import annotations
 
 import math
 import os
+import zipfile
+import zlib
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
@@ -39,11 +41,21 @@ from gscompleter.data.json_fields import (
 from gscompleter.data.limits import require
 from gscompleter.data.photographs import Photographs, Resolution, build_photographs
 from gscompleter.data.transforms import TRANSFORMS_FILE, read_frames
+from gscompleter.system.damage import describe_damage
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.reading import is_json_list, read_head, read_json
+from gscompleter.system.files.reading import (
+    MAX_JSON,
+    is_json_list,
+    parse_json,
+    read_head,
+    read_json,
+    read_zip_entry,
+)
 
 INRIA_CAMERAS_FILE = "cameras.json"
 CAMERAS_ADVICE = "export the cameras again"
+PROJECT_ENDING = ".ssproj"
+PROJECT_CAMERAS = "document.json"
 DEFAULT_FOV = 60.0
 """SuperSplat's default field of view, in degrees."""
 SPLAT_FROM_WORLD = np.array([-1.0, -1.0, 1.0])
@@ -72,7 +84,7 @@ def read_cameras(path: Path, resolution: Resolution = None) -> list[Frame]:
         is_colmap = not os.path.isfile(path / TRANSFORMS_FILE) and has_colmap(path)
         return read_scene_cameras(path) if is_colmap else read_frames(path / TRANSFORMS_FILE)
     refuse_other_exports(path)
-    content = read_json(path, "name a file of cameras")
+    content = read_document(path)
 
     # A JSON file does not name its program; the keys tell it.
     if _is_supersplat(content):
@@ -82,14 +94,30 @@ def read_cameras(path: Path, resolution: Resolution = None) -> list[Frame]:
     return read_camera_list(path) if isinstance(content, list) else read_frames(path)
 
 
+def read_document(path: Path) -> Any:
+    """Read a file of cameras in JSON, or that of a project of SuperSplat."""
+    if path.suffix.lower() != PROJECT_ENDING:
+        return read_json(path, "name a file of cameras")
+    # Splats lie beside it in the project, so that it is not read as a whole.
+    try:
+        with zipfile.ZipFile(path) as project:
+            data = read_zip_entry(project, PROJECT_CAMERAS, MAX_JSON)
+    except (OSError, KeyError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+        raise InputError(
+            f"{quote_value(path)} is no project of SuperSplat "
+            f"({quote_value(describe_damage(error))}); save it again."
+        ) from error
+    return parse_json(data, path, CAMERAS_ADVICE)
+
+
 def is_in_splat_frame(path: Path) -> bool:
     """Check whether the cameras of a file are in the frame of a splat, not of photographs.
 
     So are poses of SuperSplat, and paths of nerfstudio without the transform of their run.
     """
-    if path.suffix.lower() != ".json" or not os.path.isfile(path):
+    if path.suffix.lower() not in (".json", PROJECT_ENDING) or not os.path.isfile(path):
         return False
-    content = read_json(path, "name a file of cameras")
+    content = read_document(path)
     return _is_supersplat(content) or (is_camera_path(content) and find_world(path) is None)
 
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
 import tyro
 
 from gscompleter.apps.commands.complete import CompleteOptions, choose_ending, decide_holes
+from gscompleter.apps.commands.shared_decisions import has_splat_alone
 from gscompleter.apps.requests.completion import RemovalRequest, Request
 from gscompleter.apps.requests.splat import Selection
 from gscompleter.config import CompleterConfig
 from gscompleter.data.mask_reading import MaskReading
+from gscompleter.system.errors import InputError
 from gscompleter.system.process import import_without_collection
 
 
@@ -27,10 +29,8 @@ class RemoveOptions(CompleteOptions):
     """
 
     folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = None
-    """Folder of the photographs of the splat, in any layout that `complete` reads; leave it out if
-    there are none."""
-    scene: Path = field()  # without the default of `complete`
-    """File of Gaussians (a splat) to work on."""
+    """The splat; or the folder of its photographs, in any layout that `complete` reads, if
+    `--scene` names the splat."""
     box: tuple[float, ...] = ()
     """Remove Gaussians inside of boxes: smallest x, y and z of each, then largest."""
     box_rotation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
@@ -46,6 +46,10 @@ class RemoveOptions(CompleteOptions):
 
 def decide_removal(options: RemoveOptions) -> Request:
     """Decide what is removed, and how its hole is filled."""
+    if options.scene is None and not has_splat_alone(options):
+        raise InputError(
+            "Without a splat there is nothing that could be removed; name it with --scene.", "scene"
+        )
     reading = MaskReading(options.invert_masks, options.large_masks)
     # With masks of what goes, `--invert-masks` is for them instead of for masks of photographs.
     has_marks = options.mask is not None
