@@ -117,9 +117,9 @@ def test_groups_name_options_that_there_are_and_each_once():
 
 
 def test_the_scene_is_explained_for_the_command():
-    for command in ("repair", "live"):
+    for command in ("repair", "live", "remove"):
         assert rows_of(help_of(command))["SCENE"].split("SCENE ")[1].strip().startswith("The splat")
-    for command in ("update", "remove", "clean"):
+    for command in ("update", "clean"):
         text = " ".join(rows_of(help_of(command))["SCENE"].split())
         assert "photographs of the splat" in text, command
     assert "leave SCENE out" not in help_of("remove")

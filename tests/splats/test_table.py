@@ -49,6 +49,8 @@ def get_promise(name: str) -> Promise:
 
 
 def test_every_format_has_a_promise():
+    missing = sorted(set(SPLAT_FORMATS) - set(PROMISES))
+    assert not missing, f"add to PROMISES a file and the largest errors of {missing}"
     assert set(PROMISES) == set(SPLAT_FORMATS)
 
 
@@ -107,7 +109,8 @@ def test_a_row_says_what_its_files_hold(tmp_path, name):
 
 @pytest.mark.parametrize("name", [name for name in SPLAT_FORMATS if name not in WRITTEN])
 def test_a_format_that_is_only_read_is_written_by_the_tests(name):
-    assert PROMISES[name].file in BY_HAND
+    is_written = PROMISES[name].file in BY_HAND
+    assert is_written, f"add a writer of {PROMISES[name].file} to BY_HAND (splat_files.py)"
 
 
 def read_endings(page: str, title: str) -> set[str]:
@@ -119,7 +122,9 @@ def read_endings(page: str, title: str) -> set[str]:
 
 @pytest.mark.parametrize("row", SPLAT_FORMATS.values(), ids=list(SPLAT_FORMATS))
 def test_a_format_has_a_line_in_the_reference_page(row: SplatFormat):
-    assert row.endings[0] in read_endings("formats.md", "Splats")
+    ending = row.endings[0]
+    is_there = ending in read_endings("formats.md", "Splats")
+    assert is_there, f"add a line for {ending} to the table under Splats of docs/formats.md"
     if row.write is not None and row.read_record is not None:
         assert row.endings[0] in read_endings("provenance.md", "Where it is")
 

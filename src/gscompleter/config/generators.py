@@ -41,6 +41,8 @@ class GeneratorEntry:
     settings: type[GeneratorSettings] = GeneratorSettings
     help: Mapping[str, str] = field(default_factory=dict)
     """Sentence about each setting that is the option `--generator-NAME`, by its name."""
+    is_own: bool = True
+    """True if the image is made here, and not a photograph or somebody's painting."""
 
 
 GENERATORS = {
@@ -51,12 +53,14 @@ GENERATORS = {
     "oracle": GeneratorEntry(
         "the real photograph",
         "gscompleter.generators.oracle:load_oracle",
+        is_own=False,
     ),
     "painted": GeneratorEntry(
         # The painter is an option of its own, beside that of the images.
         "by `complete --images`",
         "gscompleter.generators.painted:load_painted",
         PaintedSettings,
+        is_own=False,
     ),
 }
 """Built-in generators by name."""

@@ -104,7 +104,12 @@ def build_gaussians(
 ) -> Gaussians:
     """Build observed Gaussians (`generated` is 0) from arrays, as float32."""
     arrays = (means, quats, scales, opacities, sh)
-    if len({len(array) for array in arrays}) > 1 or sh.shape[1] - 1 not in NUM_SH_REST:
+    dimensions = tuple(array.ndim for array in arrays)
+    if (
+        dimensions != (2, 2, 2, 1, 3)
+        or len({len(array) for array in arrays}) > 1
+        or sh.shape[1] - 1 not in NUM_SH_REST
+    ):
         raise DamagedError("its Gaussians do not all have the same properties")
     return make_observed(
         *[torch.from_numpy(np.require(array, np.float32, ["C", "W"])) for array in arrays]

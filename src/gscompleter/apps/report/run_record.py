@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from gscompleter import __version__
+from gscompleter.config.generators import GENERATORS
 from gscompleter.parts import NOT_INVENTED
 from gscompleter.splats.edits import hash_given
 from gscompleter.splats.provenance import ModelRecord, RunRecord, shorten
@@ -13,7 +14,7 @@ from gscompleter.state import Completion
 TOOL = "gscompleter"
 LICENCE = "Apache-2.0"
 """Licence of gscompleter, whose own models have no weights."""
-OWN_MODELS = ("plane-sweep", "warp-inpaint")
+OWN_MODELS = ("plane-sweep", *(name for name, entry in GENERATORS.items() if entry.is_own))
 
 
 def make_run_record(
