@@ -7,8 +7,8 @@ from jaxtyping import Float
 
 TURN_PER_TWO_STEPS = 15.0
 """Angle in degrees between viewing directions that counts as much as two steps between cameras."""
-SAME_PLACE = 1e-6
-"""Distance of cameras in one place at most, as a share of the largest: rounding moves centres."""
+MAX_CENTER_ROUNDING = 1e-6
+"""Largest distance of cameras in one place, which rounding sets apart, as a share of the largest."""
 ERROR_SIDE = 256
 """Shorter side, in pixels, of the image that distances of matches from epipolar lines are given in:
 of photographs of any size they can then be compared."""
@@ -30,7 +30,7 @@ def find_near_pairs(
     distance = np.linalg.norm(centers[:, None] - centers[None], axis=-1)
     turned = np.degrees(np.arccos((forward @ forward.T).clip(-1, 1)))
     # Cameras in one place, each with itself among them, form no pair: there is no parallax.
-    distance[distance <= SAME_PLACE * distance.max()] = np.inf
+    distance[distance <= MAX_CENTER_ROUNDING * distance.max()] = np.inf
     # The usual distance between neighbouring cameras is the unit of the dissimilarity.
     step = np.median(distance.min(axis=1))
     if np.isinf(step):
