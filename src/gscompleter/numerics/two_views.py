@@ -8,7 +8,7 @@ from jaxtyping import Float
 TURN_PER_TWO_STEPS = 15.0
 """Angle in degrees between viewing directions that counts as much as two steps between cameras."""
 MAX_CENTER_ROUNDING = 1e-6
-"""Largest distance of cameras in one place, which rounding sets apart, as a share of the largest."""
+"""Distance of cameras in one place at most, as a share of the largest: rounding moves centres."""
 ERROR_SIDE = 256
 """Shorter side, in pixels, of the image that distances of matches from epipolar lines are given in:
 of photographs of any size they can then be compared."""
