@@ -83,7 +83,7 @@ def check_frame_numbers(folder: Path, words: PhotographNames, num_video_frames: 
 def check_target_files(words: Sequence[str], resolution: Resolution) -> None:
     """Refuse targets that are neither photographs nor files of cameras, and files that are damaged.
 
-    For photographs whose cameras are not yet known: only then is one of a name searched for.
+    It is called before cameras of photographs are searched for, when names are not yet compared.
     """
     for word in words:
         if names_photograph(word):
@@ -106,7 +106,7 @@ def read_targets(
     """
     targets: list[Target] = []
     for word in words:
-        # What is called as a photograph of the scene in the working folder is not meant.
+        # Numbers and photographs are those of the scene, whatever the working folder holds.
         if os.path.exists(word) and not names_photograph(word):
             cameras = load_cameras(word, resolution, origin=photographs.origin.tolist())
             is_of_splat = has_splat and is_in_splat_frame(Path(word))

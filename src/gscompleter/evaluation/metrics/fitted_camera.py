@@ -8,10 +8,10 @@ that bring R(p) nearest to I over O by least squares, the pose that is searched 
 
     p = argmin  sum over O of  rho(blur(g(p) R(p)) - blur(I)),
 
-where rho is quadratic up to `ROBUST` and grows linearly beyond it. Such a step is taken only where
-it lowers the mean square as well, since the score is a PSNR: that of g(p) R(p).
-Steps are those of Lucas and Kanade: how an image changes with the pose follows from its gradient
-and its depth, so that a step needs one render and not seven.
+where rho is quadratic up to `ROBUST` and grows linearly beyond it. Steps are those of Lucas and
+Kanade: how an image changes with the pose follows from its gradient and its depth, so that a step
+needs one render and not seven. It is taken only where it lowers the mean square, too, since the
+score is a PSNR: that of g(p) R(p).
 """
 
 from __future__ import annotations
