@@ -8,9 +8,12 @@ import pytest
 from command import run
 from exact_room import make_cameras, write_photographs, write_transforms
 from gscompleter.apps.commands.shared_decisions import names_splat
+from gscompleter.apps.inputs.named_photographs import check_target_files, read_targets
 from gscompleter.apps.inputs.opening import describe_cameras_above
+from gscompleter.data.formats import open_photographs
 from gscompleter.data.sfm.poses import has_photographs, list_all_photographs
 from gscompleter.splats.formats import save_splat
+from gscompleter.system.errors import InputError
 from pose_files import write_camera_list
 from scenes import random_gaussians
 
@@ -41,6 +44,31 @@ def test_photographs_that_are_not_there_are_refused(tmp_path, monkeypatch, capsy
     assert run(monkeypatch, "complete", scene, *words, "--out", tmp_path / "out") == 2
     assert said in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_a_number_is_a_photograph_whatever_the_working_folder_holds(tmp_path, monkeypatch):
+    photographs = open_photographs(write_transforms(tmp_path / "scene", CAMERAS))
+    (tmp_path / "1").mkdir()
+    monkeypatch.chdir(tmp_path)
+    (target,) = read_targets(photographs, ["1"], None, has_splat=False)
+    assert target.frame == 1
+
+
+def test_a_target_that_several_photographs_are_called_is_not_unknown(tmp_path):
+    names = [f"images/{side}/{number}.png" for side in ("left", "right") for number in "01"]
+    photographs = open_photographs(write_transforms(tmp_path / "scene", CAMERAS, names))
+    with pytest.raises(InputError, match="2 photographs of .* are called 0.png: .*left/0.png"):
+        read_targets(photographs, ["0.png"], None, has_splat=False)
+    (target,) = read_targets(photographs, ["right/0.png"], None, has_splat=False)
+    assert target.frame == 2
+
+
+def test_photographs_without_cameras_may_be_targets_by_their_files(tmp_path):
+    write_photographs(tmp_path, CAMERAS)
+    image = next(tmp_path.glob("*.png"))
+    check_target_files([image.name, str(image), "2"], None)
+    with pytest.raises(InputError, match="is no target: name a photograph with its ending"):
+        check_target_files(["nowhere.json"], None)
 
 
 def test_photographs_are_named_by_file_in_options_lines_and_results(tmp_path, monkeypatch, capsys):

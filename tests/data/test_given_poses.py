@@ -65,6 +65,15 @@ def test_photographs_that_cannot_be_refined_are_refused(scene, tmp_path, monkeyp
     assert not (tmp_path / "out").exists()
 
 
+def test_photographs_that_colmap_left_out_are_not_called_refined(room):
+    some = given_poses.RefinedCameras(room, replace(DONE, photographs=1), "")
+    assert "cameras of 1 of 2 photographs are refined" in some.describe(Path("out"))
+    every = given_poses.RefinedCameras(room, replace(DONE, photographs=2), "")
+    assert "cameras of 2 photographs are refined" in every.describe(Path("out"))
+    kept = given_poses.RefinedCameras(room, KEPT, "")
+    assert "cameras of 2 photographs stay" in kept.describe(Path("out"))
+
+
 @pytest.mark.slow
 def test_colmap_refines_given_cameras(scene, tmp_path, monkeypatch):
     pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")

@@ -10,7 +10,7 @@ from gscompleter.evaluation.metrics.fitted_camera import (
     MAX_MOVE,
     blur,
     clamp_image,
-    compute_slopes,
+    compute_move_jacobian,
     fit_gains,
     measure_fitted,
     move_camera_by,
@@ -52,7 +52,7 @@ def test_a_camera_that_was_shifted_on_purpose_costs_nothing(scene, target, move)
     assert fitted.gain == pytest.approx(1, abs=0.02)
 
 
-def test_slopes_are_how_colours_change_with_the_camera(scene, target):
+def test_derivatives_are_how_colours_change_with_the_camera(scene, target):
     renderer, camera = load_renderer("cpu"), target.camera
     median, focal = 3.5, float(camera.K[0, 0])
     render = renderer.render(scene, camera)
@@ -60,13 +60,13 @@ def test_slopes_are_how_colours_change_with_the_camera(scene, target):
     depth = render.depth.where(render.alpha > 0.5, median)
     points = (rays * depth[..., None]).double().numpy()
     image = blur(clamp_image(render), 1.5)
-    slopes = compute_slopes(image, points, median, focal)
+    jacobian = compute_move_jacobian(image, points, median, focal)
     for number in range(6):
         move = 0.1 * np.eye(6)[number]
         moved = renderer.render(scene, move_camera_by(camera, move, median / focal))
         change = (blur(clamp_image(moved), 1.5) - image) / 0.1
         # Not at the border, where the blur sees no further.
-        ours, truth = (x[8:-8, 8:-8].ravel() for x in (slopes[..., number], change))
+        ours, truth = (x[8:-8, 8:-8].ravel() for x in (jacobian[..., number], change))
         assert np.corrcoef(ours, truth)[0, 1] > 0.9
         assert (ours @ truth) / (truth @ truth) == pytest.approx(1, abs=0.25)
 
@@ -104,6 +104,17 @@ def test_pixels_in_holes_decide_nothing(scene, target):
     assert fitted.observed_psnr > 60
     assert fitted.psnr < 30
     assert measure_fitted(scene, target, ~NO_HOLES, load_renderer("cpu")) is None
+
+
+@pytest.mark.filterwarnings("error")
+def test_no_pose_is_fitted_where_shrinking_leaves_no_pixel(scene, target):
+    # A strip of 2,400 pixels, of which a smaller image has no whole row outside of the margin.
+    size = 400
+    camera = camera_at(0.1, size=size)
+    photograph = View(torch.full((size, size, 3), 0.5), camera)
+    holes = torch.ones(size, size, dtype=torch.bool)
+    holes[100:106] = False
+    assert measure_fitted(scene, photograph, holes, load_renderer("cpu")) is None
 
 
 def test_a_camera_far_from_its_photograph_is_not_searched_for(scene, target):

@@ -29,24 +29,29 @@ class RefinedCameras:
     """Photographs that had cameras, after a refinement."""
 
     photographs: Photographs
-    """With the refined poses, or the given ones if matches agree no better with others."""
+    """With the refined poses; all as given if kept-back matches agree no better with these."""
     refinement: PoseRefinement
     kept: str
-    """Sentence on what else lies in the folder; empty if there is nothing."""
+    """Sentence on what else lies in the output folder; empty if there is nothing."""
 
     def describe(self, out: Path) -> str:
-        """Describe the result in a sentence for the user."""
+        """Describe the result in a sentence for the user; `out` is the output folder."""
         errors = (
             f"given poses miss matches by {self.refinement.given_error:.2f} px (of {ERROR_SIDE}), "
             f"refined ones by {self.refinement.refined_error:.2f}"
         )
         count = len(self.photographs.posed)
-        done = "are refined" if self.refinement.is_accepted else "stay as they are"
-        return f"The cameras of {count} photographs {done}: {errors}: {out}"
+        # Photographs that COLMAP could not refine keep their cameras, in the same file.
+        number = self.refinement.photographs
+        refined = f"{number}" if number == count else f"{number} of {count}"
+        done = f"{count} photographs stay as they are"
+        if self.refinement.is_accepted:
+            done = f"{refined} photographs are refined"
+        return f"The cameras of {done}: {errors}: {out}"
 
 
 def has_cameras(path: Path) -> bool:
-    """Return True if a path holds photographs with cameras, by names and first bytes."""
+    """Return True if a path holds photographs with cameras, by names and first bytes of files."""
     return find_format(path) not in (None, "photograph")
 
 
@@ -55,21 +60,23 @@ def refine_given_poses(
 ) -> RefinedCameras:
     """Refine the cameras of photographs that have some, and write them for other programs.
 
-    Raises InputError if they cannot be refined, or if the file cannot hold their lenses.
+    They are written as given if matches agree no better with the refined ones. Raises InputError if
+    they cannot be refined, or if the file cannot hold their lenses.
     """
     given = open_photographs(path)
     refuse_nothing_to_invert(given.list_masks(), reading)
     given = read_masks_as_asked(given, reading)
-    patterns = (TRANSFORMS_FILE, SUMMARY_FILE)
+    written = (TRANSFORMS_FILE, SUMMARY_FILE)
     with (
-        reserve_output(out, overwrite, POSES_COMMAND, patterns) as output,
+        reserve_output(out, overwrite, POSES_COMMAND, written) as output,
         output.write() as folder,
     ):
         photographs, refinement = refine_poses(given)
         require(
             refinement is not None,
             f"The cameras of {quote_value(path)} cannot be refined: COLMAP used fewer than "
-            f"{MIN_REFINED} photographs, or all were taken at one place.",
+            f"{MIN_REFINED} photographs, or most share their place with another; use them as "
+            "they are.",
         )
         assert refinement is not None
         write_transforms(folder / TRANSFORMS_FILE, photographs, out)

@@ -259,7 +259,7 @@ class Photographs:
         if not isinstance(word, str):
             self.frame(word)
             return int(word)
-        numbers = self._match_names(word)
+        numbers = self.match_names(word)
         names = [self.frame(number).file_name for number in numbers]
         if len(numbers) > 1:
             raise InputError(
@@ -275,7 +275,7 @@ class Photographs:
             )
         return numbers[0]
 
-    def _match_names(self, word: str) -> list[int]:
+    def match_names(self, word: str) -> list[int]:
         """List the frames whose photograph a word names, those that it names exactly if any."""
         path_of_word = fold_name(word.replace("\\", "/"))
         wanted = PurePosixPath(path_of_word).parts

@@ -1,4 +1,4 @@
-"""Pairs of photographs: which ones show the same, and how far matches lie from epipolar lines."""
+"""Pairs of cameras: those that may see the same, and distances of matches from epipolar lines."""
 
 from __future__ import annotations
 
@@ -6,9 +6,12 @@ import numpy as np
 from jaxtyping import Float
 
 TURN_PER_TWO_STEPS = 15.0
-"""Rotation in degrees that counts as much as two steps between cameras."""
+"""Angle in degrees between viewing directions that counts as much as two steps between cameras."""
+MAX_CENTER_ROUNDING = 1e-6
+"""Distance of cameras in one place at most, as a share of the largest: rounding moves centres."""
 ERROR_SIDE = 256
-"""Shorter side in pixels of the image in whose pixels distances of matches are told."""
+"""Shorter side, in pixels, of the image that distances of matches from epipolar lines are given in:
+of photographs of any size they can then be compared."""
 
 Rays = Float[np.ndarray, "m 3"]
 """Directions in camera axes at z = 1."""
@@ -19,16 +22,19 @@ Focals = Float[np.ndarray, "2"]
 def find_near_pairs(
     centers: Float[np.ndarray, "n 3"], forward: Float[np.ndarray, "n 3"], count: int
 ) -> list[tuple[int, int]]:
-    """Find pairs i < j with a baseline, of each camera with `count` of similar place and direction.
+    """Pair each camera with the `count` most similar in place and direction; i < j, sorted.
 
-    `forward` are unit vectors along which cameras look.
+    `centers` are in any unit, and `forward` are unit vectors along which cameras look. Rotations
+    about these do not count, since features are matched in spite of them.
     """
     distance = np.linalg.norm(centers[:, None] - centers[None], axis=-1)
     turned = np.degrees(np.arccos((forward @ forward.T).clip(-1, 1)))
-    # Cameras in one place, the same one among them, form no pair: there is no parallax.
-    distance[distance == 0] = np.inf
+    # Cameras in one place, each with itself among them, form no pair: there is no parallax.
+    distance[distance <= MAX_CENTER_ROUNDING * distance.max()] = np.inf
     # The usual distance between neighbouring cameras is the unit of the dissimilarity.
     step = np.median(distance.min(axis=1))
+    if np.isinf(step):
+        return []
     unlike = distance / step + 2 * turned / TURN_PER_TWO_STEPS
     nearest = unlike.argsort(axis=1, kind="stable")[:, :count]
     pairs = {(i, int(j)) for i, row in enumerate(nearest) for j in row if np.isfinite(unlike[i, j])}
@@ -41,11 +47,12 @@ def compute_sampson_distances(
     rays: tuple[Rays, Rays],
     focals: tuple[Focals, Focals],
 ) -> Float[np.ndarray, "m"]:
-    """Compute Sampson's distances of matches from their epipolar lines in pixels, with a sign.
+    """Compute signed Sampson distances of matches from their epipolar lines, in pixels.
 
-    To first order, it is how far both features of a match together have to move to meet. `rotation`
-    and `shift` lead points from the first camera to the second; the length of the shift does not
-    matter.
+    To first order, it is how far both features of a match together have to move until their rays
+    meet. `rays` and `focals` are those of the first and the second camera. `rotation` and `shift`
+    map points of the first camera to the second, in camera axes; the length of the shift does not
+    matter, but without any all distances are 0.
     """
     x, y, z = shift
     # E = [t]x R, and b' E a = 0 for the rays a and b of one point.
@@ -53,7 +60,7 @@ def compute_sampson_distances(
     a, b = rays
     line_in_b = a @ essential.T
     line_in_a = b @ essential
-    # Slopes of the residual per pixel, not per unit of the image plane.
-    slopes = np.concatenate([line_in_b[:, :2] / focals[1], line_in_a[:, :2] / focals[0]], axis=1)
+    # Gradient of the residual by the pixels of both features: a ray moves by 1 / focal per pixel.
+    gradients = np.concatenate([line_in_b[:, :2] / focals[1], line_in_a[:, :2] / focals[0]], axis=1)
     residuals: Float[np.ndarray, "m"] = (b * line_in_b).sum(axis=1)
-    return residuals / np.maximum(np.linalg.norm(slopes, axis=1), 1e-30)
+    return residuals / np.maximum(np.linalg.norm(gradients, axis=1), 1e-30)

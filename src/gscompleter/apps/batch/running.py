@@ -38,12 +38,12 @@ from gscompleter.system.jobs.jobs import (
 from gscompleter.system.progress import show_preparation, show_progress, track
 
 DecideRow = Callable[[Mapping[str, Any], Path], FillingRequest]
-"""Makes the request of a row of a manifest, for an output folder."""
+"""Makes the request of the options of a row of a manifest, for an output folder."""
 
 OUTCOMES = {"nothing-gained": "nothing gained"}
 """Words for the outcomes of jobs that did not fail; any other is "completed"."""
 MAX_NAMED_FAILURES = 5
-"""Most failures that the terminal names."""
+"""Most failures that the terminal names, and most folders of earlier results."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,10 @@ def complete_batch(request: BatchRequest, decide_row: DecideRow) -> int:
 
 
 def prepare_batch(request: BatchRequest) -> PreparedBatch:
-    """Read the manifest, claim the output folder, and find the jobs that are left."""
+    """Read the manifest, claim the output folder, and find the jobs that are left.
+
+    The rows of failures that are to be repeated are removed.
+    """
     share_number, num_shares = request.engine.share
     jobs = read_manifest(request.manifest, request.common, request.out)
     refuse_overlap(request.out, list_input_paths(jobs))
@@ -110,7 +113,10 @@ def prepare_batch(request: BatchRequest) -> PreparedBatch:
 def run_left_jobs(
     batch: PreparedBatch, retries: int, decide_row: DecideRow, console: Console
 ) -> None:
-    """Run the jobs that are left, and print a line as each of them ends."""
+    """Run the jobs that are left, and print a line as each of them ends.
+
+    A job is tried `retries` times more if its process was killed or it failed unexpectedly.
+    """
     out = batch.out
     perform = partial(perform_job, out=out, retries=retries, decide_row=decide_row)
     ended = run_jobs(batch.left, perform, partial(has_row, out=out), batch.engine, retries)
@@ -129,7 +135,7 @@ def list_input_paths(jobs: Sequence[Job]) -> list[Path]:
 
 
 def describe_state(row: Mapping[str, Any] | None) -> str:
-    """Describe in a word or two how a job ended."""
+    """Describe in a word or two how the job of a row ended; None is no row."""
     if row is None:
         return "not known"
     if row["state"] == "failed":
@@ -163,7 +169,7 @@ def summarize_share(failed: set[str], share: Sequence[Job], left: Sequence[Job])
 
 
 def write_batch_results(out: Path, jobs: Sequence[Job]) -> None:
-    """Write the table and the page, repeatedly while other shards add rows."""
+    """Write the table and the page, again until no other shard has added a row meanwhile."""
     from gscompleter.apps.report.page import write_overview
 
     # A shard that ends while this one writes may be overwritten by an older table. Whoever writes
@@ -177,12 +183,16 @@ def write_batch_results(out: Path, jobs: Sequence[Job]) -> None:
 
 
 def perform_job(job: Job, out: Path, retries: int, decide_row: DecideRow) -> None:
-    """Complete the scene of a job in any process, and write its row."""
+    """Complete the scene of a job and write its row, in this process or in a worker."""
     run_job(job, out, lambda: complete_job(job, out / JOBS, decide_row), retries)
 
 
 def complete_job(job: Job, jobs: Path, decide_row: DecideRow) -> dict[str, Any]:
-    """Complete the scene of a job in a folder of `jobs`, and return its part of a row."""
+    """Complete the scene of a job in its folder below `jobs`, and return its part of a row.
+
+    That has the outcome, the scores and what it cost: seconds of wall time, seconds of CPU time of
+    this process (without that of COLMAP, which has its own), bytes of files, and bytes of memory.
+    """
     import warnings
 
     from gscompleter.apps.completing.complete import complete_folder

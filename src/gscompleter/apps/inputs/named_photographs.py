@@ -18,13 +18,15 @@ from gscompleter.data.video import is_video
 from gscompleter.system.errors import InputError, quote_value
 
 FRAME_NUMBER = re.compile("-?[0-9]{1,9}")
+"""Words that are numbers of photographs. Longer ones are names, such as times in nanoseconds; one
+below 0 is refused as a number, not searched for as a name."""
 
 PhotographNames = Sequence[int | str]
-"""Photographs by number or by name."""
+"""Photographs by number, from 0, or by name."""
 
 
 def find_context(photographs: Photographs, context: PhotographNames | None) -> tuple[int, ...]:
-    """Find the context frames that are named; none if there are none."""
+    """Find the frames of `--context`; empty if it is not given."""
     frames = tuple(find_frame(photographs, word, "context") for word in context or ())
     # Words differ by now, but a name and a number can mean one photograph.
     if len(set(frames)) < len(frames):
@@ -35,12 +37,14 @@ def find_context(photographs: Photographs, context: PhotographNames | None) -> t
 
 
 def find_frame(photographs: Photographs, word: int | str, option: str) -> int:
-    """Find the frame of a word of an option: a number, or the name of a photograph."""
+    """Find the frame of a word of `--option`: a number, or the name of a photograph."""
     number = int(word) if FRAME_NUMBER.fullmatch(str(word)) else word
     try:
         return photographs.find_frame(number)
     except InputError as error:
-        if option == "target" and isinstance(number, str):
+        # Of a name that several photographs have, the sentence lists these.
+        is_unknown = isinstance(number, str) and not photographs.match_names(number)
+        if option == "target" and is_unknown:
             example = quote_value(photographs.frame(0).file_name)
             raise InputError(
                 f"'{quote_value(word, 60)}' is no target: name a photograph or its number from 0 "
@@ -52,11 +56,12 @@ def find_frame(photographs: Photographs, word: int | str, option: str) -> int:
 
 
 def check_frame_numbers(folder: Path, words: PhotographNames, num_video_frames: int) -> None:
-    """Refuse frames beyond the photographs whose cameras have to be found.
+    """Refuse numbers beyond the photographs of `folder`, before the search for their cameras.
 
-    Panoramas are split into several photographs each, and a video into as many as it is sharp.
+    Of a video, `num_video_frames` serve as photographs at most. Each panorama is split into several
+    photographs, so that any number is possible.
     """
-    # Numbers only; a name may still be that of a photograph.
+    # Names are left for later: photographs have them once their cameras are known.
     frames = [int(word) for word in map(str, words) if FRAME_NUMBER.fullmatch(word)]
     if is_video(folder):
         count = num_video_frames
@@ -76,14 +81,17 @@ def check_frame_numbers(folder: Path, words: PhotographNames, num_video_frames: 
 
 
 def check_target_files(words: Sequence[str], resolution: Resolution) -> None:
-    """Read the cameras of `--target`, and refuse words that are neither frames nor files."""
+    """Refuse targets that are neither photographs nor files of cameras, and files that are damaged.
+
+    It is called before cameras of photographs are searched for, when names are not yet compared.
+    """
     for word in words:
-        if FRAME_NUMBER.fullmatch(word):
+        if names_photograph(word):
             continue
         if not os.path.exists(word):
             raise InputError(
-                f"'{quote_value(word, 60)}' is no target: name the number of a frame, or an "
-                "existing file of cameras, such as a transforms.json.",
+                f"'{quote_value(word, 60)}' is no target: name a photograph with its ending, "
+                "or its number, or an existing file of cameras, such as a transforms.json.",
                 "target",
             )
         load_cameras(word, resolution)
@@ -92,23 +100,30 @@ def check_target_files(words: Sequence[str], resolution: Resolution) -> None:
 def read_targets(
     photographs: Photographs, words: Sequence[str], resolution: Resolution, has_splat: bool
 ) -> list[Target]:
-    """Read the target cameras in the order of the command line."""
+    """Read the target cameras in the order of the command line.
+
+    `has_splat` is True if an input splat is completed, whose frame files of cameras may be in.
+    """
     targets: list[Target] = []
     for word in words:
-        if os.path.exists(word) and not is_image(word):
+        # Numbers and photographs are those of the scene, whatever the working folder holds.
+        if os.path.exists(word) and not names_photograph(word):
             cameras = load_cameras(word, resolution, origin=photographs.origin.tolist())
             is_of_splat = has_splat and is_in_splat_frame(Path(word))
             targets += [Target(camera, is_in_splat_frame=is_of_splat) for camera in cameras]
-        # A photograph in the working folder can be called as one of the scene, which is meant.
         else:
             frame = find_frame(photographs, word, "target")
             targets.append(Target(photographs.camera(frame, resolution), frame))
     return targets
 
 
-def is_image(path: str) -> bool:
-    """Return True if a path names a photograph, not a file of cameras."""
-    return path.lower().endswith(PHOTOGRAPH_ENDINGS)
+def names_photograph(word: str) -> bool:
+    """Return True if a word is the number or the file of a photograph, not a file of cameras.
+
+    A name without its ending may be either.
+    """
+    is_number = FRAME_NUMBER.fullmatch(word) is not None
+    return is_number or word.lower().endswith(PHOTOGRAPH_ENDINGS)
 
 
 def add_photograph(target: Target, photographs: Photographs, resolution: Resolution) -> Target:

@@ -32,7 +32,11 @@ from gscompleter.apps.inputs.hole_kinds import (
     pair_masks,
     read_marks,
 )
-from gscompleter.apps.inputs.named_photographs import find_context, read_targets
+from gscompleter.apps.inputs.named_photographs import (
+    find_context,
+    names_photograph,
+    read_targets,
+)
 from gscompleter.apps.inputs.reading import check_sizes
 from gscompleter.apps.inputs.removal import select_without_masks
 from gscompleter.apps.inputs.selection import choose_context
@@ -275,7 +279,7 @@ def check_words(request: RenderRequest, path: Path | None) -> None:
             "context",
         )
     for word in request.targets:
-        if not os.path.exists(word):
+        if names_photograph(word) or not os.path.exists(word):
             raise InputError(
                 f"'{quote_value(word, 60)}' is no target: there are no photographs to name, so "
                 "name an existing file of cameras, such as a transforms.json.",

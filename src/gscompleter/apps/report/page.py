@@ -50,9 +50,10 @@ from gscompleter.system.files.output_folder import refuse_foreign_file
 from gscompleter.system.files.writing import encode_text, replace_file
 from gscompleter.system.jobs.jobs import JOBS, Job, read_row
 
-# Files of a completion and of a batch.
+# Files of a completion: its page, and the viewer with its scene inside, which is optional.
 REPORT_FILE = "report.html"
 VIEWER_FILE = "view.html"
+# Files of a batch: its page, and the table of all jobs.
 INDEX_FILE = "index.html"
 TABLE_FILE = "table.csv"
 
@@ -60,6 +61,7 @@ MAX_LISTED = 2000
 """Most jobs, and most failures, on the page of a batch, which a browser opens at once; the table
 has all."""
 TARGET_COLUMNS = ("hole_fraction", "psnr_before", "psnr_after")
+"""Columns of the table that are means over the targets of a job."""
 TABLE_COLUMNS = (
     *("job", "state", "reason", "attempts", "outcome", "headline"),
     *("unused_before", "unused_after"),
@@ -67,14 +69,16 @@ TABLE_COLUMNS = (
     *("coverage_before", "coverage_after", "added"),
     *("seconds", "cpu_seconds", "result_bytes", "peak_bytes"),
 )
+"""Columns of the table: entries of the rows of jobs, by their names."""
 SETTINGS = ("version", "device", "seed", "depth_range", "settings")
+"""Entries of `summary.json` that the page lists as settings."""
 MAX_PAGE_PIXELS = 12_000_000
-"""Largest sum of image pixels in a page (about 5 MB); more are scaled down."""
+"""Largest sum of the pixels of all images in a page (about 5 MB); larger ones are scaled down."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """An embedded image."""
+    """An embedded image: its text for those who do not see it, its size in pixels, and its data."""
 
     alt: str
     width: int
@@ -84,7 +88,7 @@ class Picture:
 
 @dataclass(frozen=True)
 class Gallery:
-    """Images of a folder, embedded at one scale."""
+    """PNG images of a folder, embedded at one scale; names are those of files without ending."""
 
     folder: Path
     scale: float = 1.0
@@ -113,7 +117,7 @@ def open_gallery(folder: Path) -> Gallery:
 
 
 def render_template(template: str, values: Mapping[str, object]) -> str:
-    """Render a template with style and script."""
+    """Render a template with `values`, style and script."""
     environment = create_environment()
     script = environment.get_template("script.js").render()
     # The content security policy names the hash of the only script that may run.
@@ -152,7 +156,7 @@ def write_completion_page(folder: Path) -> None:
 def render_completion_page(folder: Path) -> str:
     """Render the page of the completion in `folder`."""
     summary = read_summary(folder)
-    # Warnings that only one target has; those of several stand above.
+    # Warnings of several targets are in `list_warnings`, once for all; a target has the others.
     groups = group_target_warnings(summary.targets)
     own_warnings = [
         row.warnings if len(groups.get(row.warnings, ())) == 1 else () for row in summary.targets
@@ -187,7 +191,7 @@ def render_completion_page(folder: Path) -> str:
 def list_photographs(summary: CompletionSummary) -> list[tuple[str, ScoreRow, str]]:
     """List images, row and use of each photograph of a page without targets.
 
-    The images are numbered in the order in which they were written.
+    The images are numbered in the order in which `write_what_is_drawn` was given the photographs.
     """
     if summary.targets:
         return []
@@ -201,18 +205,25 @@ def list_photographs(summary: CompletionSummary) -> list[tuple[str, ScoreRow, st
 
 
 def find_length_unit(summary: CompletionSummary) -> str:
-    """Return metres if the format defines them and the splat has no frame of its own."""
-    format = SCENE_FORMATS.get(summary.scene.format)
-    if format is None or format.unit is None or summary.frame.method != "given":
+    """Return the unit of lengths: that of the format, such as metres, or else "scene units".
+
+    A splat with a frame of its own, which the photographs were aligned to, has its own unit.
+    """
+    scene_format = SCENE_FORMATS.get(summary.scene.format)
+    has_own_unit = summary.frame.method != "given"
+    if scene_format is None or scene_format.unit is None or has_own_unit:
         return "scene units"
-    return str(format.unit)
+    return str(scene_format.unit)
 
 
 def average_scores(summary: Mapping[str, Any]) -> dict[str, Any]:
-    """Average the scores of a completion over its targets."""
-    # Three columns are averages; the others are of the whole completion.
+    """Average the scores of a completion, as columns of the table of a batch.
+
+    They are means over photographs that were not used and over targets, None without any; coverage
+    and the number of added Gaussians are of the whole completion.
+    """
     targets = summary["targets"]
-    # Photographs that were not used test the result, where the scene covers them.
+    # A photograph has scores where the completed scene covers it.
     unused = [row for row in summary["held_out"] if row["psnr_after"] is not None]
     return {
         "unused_before": average(row["psnr_before"] for row in unused),
@@ -226,7 +237,7 @@ def average_scores(summary: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def write_overview(out: Path, jobs: Sequence[Job]) -> None:
-    """Write the table and the page of `jobs`."""
+    """Write the table and the page of those of `jobs` that have a row, into `out`."""
     found_rows = [read_row(job, out) for job in jobs]
     rows = [row for row in found_rows if row is not None]
     texts = {TABLE_FILE: format_csv(rows), INDEX_FILE: render_batch_page(out, rows)}
@@ -236,7 +247,7 @@ def write_overview(out: Path, jobs: Sequence[Job]) -> None:
 
 
 def format_csv(rows: Iterable[Mapping[str, Any]]) -> str:
-    """Format rows as CSV."""
+    """Format rows as CSV, with the columns `TABLE_COLUMNS`; what a row lacks is empty."""
     text = io.StringIO(newline="")
     writer = csv.DictWriter(text, TABLE_COLUMNS, extrasaction="ignore", lineterminator="\n")
     writer.writeheader()
@@ -245,7 +256,7 @@ def format_csv(rows: Iterable[Mapping[str, Any]]) -> str:
 
 
 def render_batch_page(out: Path, rows: Sequence[Mapping[str, Any]]) -> str:
-    """Render the page of the batch in `out`."""
+    """Render the page of the batch in `out`; `rows` are those of its jobs, done or failed."""
     good = [row for row in rows if row["state"] == "done"]
     bad = [row for row in rows if row["state"] == "failed"]
     empty = [row for row in good if row.get("outcome") == "nothing-gained"]
@@ -261,6 +272,7 @@ def render_batch_page(out: Path, rows: Sequence[Mapping[str, Any]]) -> str:
             "jobs": [{**dict.fromkeys(TABLE_COLUMNS), **row} for row in good[:MAX_LISTED]],
             "done": len(good),
             "failures": bad[:MAX_LISTED],
+            # Failures with a page to look at: scenes that were completed and did not reconstruct.
             "reported": {
                 row["job"]
                 for row in bad[:MAX_LISTED]
@@ -280,7 +292,10 @@ def render_batch_page(out: Path, rows: Sequence[Mapping[str, Any]]) -> str:
 
 
 def find_median_gain(rows: Sequence[Mapping[str, Any]], score: str) -> float | None:
-    """Return the median gain of a score in dB over the jobs that have it, or None."""
+    """Return the median gain in dB over the jobs with a score, or None.
+
+    `score` names its columns without the endings `_before` and `_after`.
+    """
     gains = []
     for row in rows:
         before, after = row.get(f"{score}_before"), row.get(f"{score}_after")

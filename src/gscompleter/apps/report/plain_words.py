@@ -16,7 +16,7 @@ from gscompleter.apps.report.schema import (
     UnfilledRow,
 )
 from gscompleter.data.depth_beside_colmap import DEPTH_KINDS
-from gscompleter.evaluation.verdict.kept import KeptRow
+from gscompleter.evaluation.verdict.kept import INVISIBLE_PSNR, KeptRow
 from gscompleter.evaluation.verdict.numbers import format_number, format_percent
 from gscompleter.system.errors import quote_value
 
@@ -129,7 +129,7 @@ def list_notes(summary: CompletionSummary) -> Iterator[Note]:
         yield Note("coordinates", ORIGIN_NOTE, is_warning=True)
     if scene.renders_from is not None:
         yield Note("check", BARE_NOTE)
-        is_seen = summary.kept is not None and not summary.kept.is_unseen
+        is_seen = summary.kept is not None and not summary.kept.is_visibly_unchanged
         yield Note("other cameras", describe_kept(summary.kept), is_seen)
     else:
         yield from list_photograph_notes(summary)
@@ -156,11 +156,12 @@ def describe_kept(kept: KeptRow | None) -> str:
         )
     seen = f"Seen from {kept.cameras} cameras that decided nothing"
     worst = f"{format_number(kept.worst_psnr, 1)} dB at worst"
-    if kept.is_unseen:
-        return f"{seen}, what the splat showed stays as it was: {worst}, and 45 dB is not seen."
+    unseen = f"{INVISIBLE_PSNR:.0f} dB is not seen"
+    if kept.is_visibly_unchanged:
+        return f"{seen}, what the splat showed stays as it was: {worst}, and {unseen}."
     return (
-        f"{seen}, additions hide a part of what the splat showed: {worst}, where 45 dB is not "
-        "seen. Look at it from aside (`gscompleter view`); strip takes the additions away."
+        f"{seen}, additions hide a part of what the splat showed: {worst}, where {unseen}. Look at "
+        "it from aside (`gscompleter view`); strip takes the additions away."
     )
 
 

@@ -95,7 +95,7 @@ def refine_poses(photographs: Photographs) -> tuple[Photographs, PoseRefinement 
     """Refine the poses of photographs together; keep all as given if matches agree no better.
 
     Returns the photographs in the given frame and scale, and what was done: None if fewer than
-    `MIN_REFINED` photographs can be refined, or if all cameras stand in one place.
+    `MIN_REFINED` photographs can be refined, or if most cameras share their place with another.
     """
     require_pycolmap()
     with tempfile.TemporaryDirectory() as work:

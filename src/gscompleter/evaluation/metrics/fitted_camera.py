@@ -3,13 +3,15 @@
 A pose that is off by a quarter of a pixel, or another exposure, costs a picture decibels that no
 method can gain. So one pose (six numbers) and one gain for each channel of the target camera are
 fitted to its photograph, outside of holes. Nothing of the scene changes. With the render R(p) at
-the pose p, the photograph I and the pixels O that are counted outside of holes,
+the pose p, the photograph I, the pixels O that are counted outside of holes, and the gains g(p)
+that bring R(p) nearest to I over O by least squares, the pose that is searched for is
 
-    p, g = argmin  sum over O of  rho(blur(g R(p)) - blur(I)),
+    p = argmin  sum over O of  rho(blur(g(p) R(p)) - blur(I)),
 
-where rho is quadratic up to `ROBUST` and grows linearly beyond it. The score is the PSNR of g R(p).
-Steps are those of Lucas and Kanade: how an image changes with the pose follows from its gradient
-and its depth, so that a step needs one render and not seven.
+where rho is quadratic up to `ROBUST` and grows linearly beyond it. Steps are those of Lucas and
+Kanade: how an image changes with the pose follows from its gradient and its depth, so that a step
+needs one render and not seven. It is taken only where it lowers the mean square, too, since the
+score is a PSNR: that of g(p) R(p).
 """
 
 from __future__ import annotations
@@ -32,26 +34,30 @@ from gscompleter.types import Camera, Gaussians, Render, View
 FIT_SIDE = 320
 """Longer side of the image that the pose is fitted in, at most; scores are of the whole one."""
 MAX_MOVE = 4.0
-"""Largest rotation and shift along each axis, in pixels: poses are not searched for, but mended."""
+"""Largest of the six numbers of a move, in pixels: poses are not searched for, but mended."""
 MIN_STEP = 0.05
-"""Largest change in pixels at which the fit has converged."""
+"""Change of each number of a move, in pixels, below which the fit has converged."""
 MAX_NEWTON_STEPS = 10
-"""Most steps of Gauss and Newton for each blur."""
+"""Most Gauss-Newton steps for each blur."""
 BLURS = (6.0, 1.5)
 """Standard deviations of the blur in pixels, one after the other, so that edges that lie beside
 their place pull."""
 SHARES = (1.0, 0.5, 0.25)
-"""Shares of a step that are tried until one helps."""
+"""Shares of a step that are tried until one lowers the mean square."""
 ROBUST = 0.03
-"""Error of a colour from which on it pulls no more than linearly."""
+"""Error of a colour in [0, 1] from which on its loss grows linearly, as in that of Huber."""
 HOLE_MARGIN = 2
 """Pixels around holes that do not count, since holes move with the camera."""
 MIN_POSE_PIXELS = 500
-"""Fewest pixels that determine a pose."""
+"""Fewest pixels, of the image that a pose is fitted in, that determine it."""
 
 PixelValues = Float[np.ndarray, "h w 3"]
 Move = Float[np.ndarray, "6"]
-"""Rotation about x, y, z and shift along them, in camera axes and pixels."""
+"""Rotation about x, y, z and shift along them, in camera axes.
+
+In pixels: a rotation by one is 1 / focal length in radians, and a shift by one is what moves a
+point at the median depth of the scene by a pixel. Moves are small, so that their numbers add.
+"""
 
 
 @dataclass(frozen=True)
@@ -77,9 +83,9 @@ class FittedQuality:
     observed_psnr: float
     """PSNR outside of holes."""
     moved: float
-    """Length of the rotation and shift, in pixels of an image of at most `FIT_SIDE`."""
+    """Length of the six numbers of the move, in pixels of an image of at most `FIT_SIDE`."""
     gain: float
-    """Mean of the gains of the channels."""
+    """Mean of the factors by which the channels of the render were multiplied."""
 
 
 def measure_fitted(
@@ -88,34 +94,34 @@ def measure_fitted(
     """Fit the camera and the exposure of a target to its photograph, and score the scene there.
 
     `holes` is where the scene was empty before it was completed. None if fewer than
-    `MIN_POSE_PIXELS` lie outside.
+    `MIN_POSE_PIXELS` of the image that the pose is fitted in lie outside.
     """
     observed = ~dilate(holes, HOLE_MARGIN) & target.valid_mask
-    if observed.sum() < MIN_POSE_PIXELS:
-        return None
-    # In a small image, for the time of a dozen renders; what counts there is what holes, masks
-    # and their margin leave of the photograph.
+    # The pose is fitted in a small image, since each step renders one; what counts there is what
+    # holes, their margin and masks leave of the photograph.
     small = shrink_view(replace(target, ignore_mask=~observed), FIT_SIDE)
     counted = small.valid_mask.cpu().numpy()
+    if counted.sum() < MIN_POSE_PIXELS:
+        return None
     start = renderer.render(scene, small.camera)
-    median = measure_depth(start, small.valid_mask)
+    median_depth = measure_depth(start, small.valid_mask)
     focal = float(small.camera.K[0, 0])
-    # In camera axes, where moves are made.
+    # From world axes to those of the camera, in which moves are made.
     rays = small.camera.z_rays().double().cpu().numpy()
     rays = rays @ small.camera.c2w[:3, :3].double().cpu().numpy()
 
     def read_picture(render: Render) -> MovedPicture:
         shown = render.depth_map()
-        depth = shown.depth.where(shown.valid, median).double().cpu().numpy()
+        depth = shown.depth.where(shown.valid, median_depth).double().cpu().numpy()
         return MovedPicture(clamp_image(render), rays * depth[..., None])
 
     def draw(move: Move) -> MovedPicture:
-        camera = move_camera_by(small.camera, move, median / focal)
+        camera = move_camera_by(small.camera, move, median_depth / focal)
         return read_picture(renderer.render(scene, camera))
 
     first = read_picture(start)
-    move = fit_move(draw, first, small.image.cpu().numpy(), counted, median, focal)
-    pose = move_camera_by(small.camera, move, median / focal).c2w
+    move = fit_move(draw, first, small.image.cpu().numpy(), counted, median_depth, focal)
+    pose = move_camera_by(small.camera, move, median_depth / focal).c2w
     image = clamp_image(renderer.render(scene, replace(target.camera, c2w=pose)))
     gains = fit_gains(image, target.image.cpu().numpy(), observed.cpu().numpy())
     fitted = torch.from_numpy(np.clip(image * gains, 0, 1)).to(target.image)
@@ -136,14 +142,14 @@ def clamp_image(render: Render) -> PixelValues:
 
 
 def measure_depth(render: Render, where: Bool[Tensor, "h w"]) -> float:
-    """Measure the median depth of a render over the pixels of `where`, in scene units."""
+    """Measure the median z-depth over `where` in scene units; 1 if the scene covers none of it."""
     depths = render.depth_map()
     seen = where & depths.valid
     return float(depths.depth[seen].median()) if seen.any() else 1.0
 
 
 def move_camera_by(camera: Camera, move: Move, unit: float) -> Camera:
-    """Rotate and shift a camera; `unit` is the shift that is a pixel at the median depth."""
+    """Move a camera; `unit` is the shift, in scene units, that is a pixel at the median depth."""
     pose = camera.c2w.double().cpu().numpy().copy()
     pose[:3, 3] += pose[:3, :3] @ (move[3:] * unit)
     pose[:3, :3] = pose[:3, :3] @ cv2.Rodrigues(move[:3] / float(camera.K[0, 0]))[0]
@@ -155,23 +161,24 @@ def fit_move(
     first: MovedPicture,
     truth: PixelValues,
     counted: Bool[np.ndarray, "h w"],
-    median: float,
+    median_depth: float,
     focal: float,
 ) -> Move:
     """Fit the move, from wide to narrow blur; zero if the picture is no nearer to the truth.
 
-    `first` is the picture before any move. `median` is the median depth in scene units, and `focal`
-    the focal length in pixels.
+    `first` is the picture before any move. `median_depth` is in scene units, and `focal` the focal
+    length along x in pixels. It is taken for that along y, too: if pixels are not square, steps are
+    less exact, but each is tested.
     """
-    still = np.zeros(6)
-    move = still
+    no_move = np.zeros(6)
+    move = no_move
     picture = first
     for sigma in BLURS:
         move, picture = fit_blurred(
-            draw, move, picture, truth, counted, sigma, median=median, focal=focal
+            draw, move, picture, truth, counted, sigma, median_depth=median_depth, focal=focal
         )
     before, after = (measure_loss(each.image, truth, counted) for each in (first, picture))
-    return move if after < before else still
+    return move if after < before else no_move
 
 
 def fit_blurred(
@@ -182,12 +189,13 @@ def fit_blurred(
     counted: Bool[np.ndarray, "h w"],
     sigma: float,
     *,
-    median: float,
+    median_depth: float,
     focal: float,
 ) -> tuple[Move, MovedPicture]:
-    """Fit the move to blurred images, by steps of Gauss and Newton with robust weights.
+    """Fit the move to images blurred by `sigma` pixels, by Gauss-Newton steps with robust weights.
 
-    `picture` is the scene after `move`, from which it begins; returns both at the end.
+    It begins at `move`, after which the scene is `picture`, and returns both as they are at the
+    end. The gains are fitted anew before each step, to sharp images, and constant within it.
     """
     wanted = blur(truth, sigma)
 
@@ -199,11 +207,14 @@ def fit_blurred(
     for _ in range(MAX_NEWTON_STEPS):
         gains = fit_gains(picture.image, truth, counted)
         residuals = compute_residuals(picture.image, gains)
-        slopes = compute_slopes(blur(picture.image, sigma), picture.points, median, focal)
-        slopes = (slopes * gains[:, None])[counted].reshape(-1, 6)
-        weighted = slopes / np.maximum(np.abs(residuals), ROBUST)[:, None]
+        jacobian = compute_move_jacobian(
+            blur(picture.image, sigma), picture.points, median_depth, focal
+        )
+        jacobian = (jacobian * gains[:, None])[counted].reshape(-1, 6)
+        # Weights of the loss of Huber: errors beyond `ROBUST` pull no harder than one of its size.
+        weighted = jacobian / np.maximum(np.abs(residuals), ROBUST)[:, None]
         # A little damping, where two of the numbers act alike, as a turn and a shift do.
-        normal = weighted.T @ slopes
+        normal = weighted.T @ jacobian
         normal += (1e-4 * np.trace(normal) + 1e-12) * np.eye(6)
         change = -np.linalg.solve(normal, weighted.T @ residuals)
 
@@ -224,26 +235,29 @@ def fit_blurred(
     return move, picture
 
 
-def compute_slopes(
-    image: PixelValues, points: Float[np.ndarray, "h w 3"], median: float, focal: float
+def compute_move_jacobian(
+    image: PixelValues, points: Float[np.ndarray, "h w 3"], median_depth: float, focal: float
 ) -> Float[np.ndarray, "h w 3 6"]:
-    """Compute how each colour changes with each number of a move.
+    """Compute the derivatives of each colour by the six numbers of a move.
 
-    A point X in camera axes goes to X - r x X - s as the camera turns by r and shifts by s, and so
-    its pixel by du, in pixels; the colour at a fixed pixel changes by -gradient · du.
+    `points` are what the pixels show, in camera axes. As the camera turns by r and shifts by s, a
+    point X goes to X - r x X - s there, and its pixel by du; the colour at a fixed pixel changes by
+    -gradient · du.
     """
     x, y, z = np.moveaxis(points, -1, 0)
+    # r x X + s for each number: -1 times the motion of X.
     across = np.stack(
         [
-            # r x X for unit turns about x, y and z, a pixel each at the focal length
+            # Rotations about x, y and z, by 1 / focal radians each.
             np.stack([np.zeros_like(z), -z, y], axis=-1) / focal,
             np.stack([z, np.zeros_like(z), -x], axis=-1) / focal,
             np.stack([-y, x, np.zeros_like(z)], axis=-1) / focal,
-            *(np.broadcast_to(axis * median / focal, points.shape) for axis in np.eye(3)),
+            # Shifts along them, by the unit of `move_camera_by`.
+            *(np.broadcast_to(axis * median_depth / focal, points.shape) for axis in np.eye(3)),
         ],
         axis=-1,
     )
-    # The pixel is focal * (x, y) / z: by the quotient rule, with -across for the motion.
+    # The pixel is focal * (x, y) / z up to a constant: du by the quotient rule.
     moved_x = -focal * (across[..., 0, :] - (x / z)[..., None] * across[..., 2, :]) / z[..., None]
     moved_y = -focal * (across[..., 1, :] - (y / z)[..., None] * across[..., 2, :]) / z[..., None]
     down, right = np.gradient(image, axis=(0, 1))
@@ -251,7 +265,7 @@ def compute_slopes(
 
 
 def measure_loss(image: PixelValues, truth: PixelValues, counted: Bool[np.ndarray, "h w"]) -> float:
-    """Measure the squared error outside of holes after the best gains."""
+    """Measure the mean squared error over counted pixels, after the best gains."""
     gains = fit_gains(image, truth, counted)
     return float(np.square(image * gains - truth)[counted].mean())
 
@@ -259,7 +273,7 @@ def measure_loss(image: PixelValues, truth: PixelValues, counted: Bool[np.ndarra
 def fit_gains(
     image: PixelValues, truth: PixelValues, counted: Bool[np.ndarray, "h w"]
 ) -> Float[np.ndarray, "3"]:
-    """Fit the gain of each channel by least squares; 1 for a black one."""
+    """Fit the factor of each channel of `image` by least squares; 1 where it is black."""
     seen = image[counted]
     energy = (seen * seen).sum(axis=0)
     products = (seen * truth[counted]).sum(axis=0)
@@ -267,5 +281,5 @@ def fit_gains(
 
 
 def blur(image: PixelValues, sigma: float) -> PixelValues:
-    """Blur an image."""
+    """Blur an image by a Gaussian of `sigma` pixels."""
     return np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.float64)

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from gscompleter.numerics.geometry import is_inside, project, project_mask, sample
+from gscompleter.numerics.geometry import project, project_mask, sample
 from gscompleter.render.protocols import Renderer
 from gscompleter.stages.filter_holes import select_in_mask
 from gscompleter.types import Camera, DepthMap, Gaussians
@@ -34,9 +34,12 @@ class SurfaceAgreement:
     pixels: int
     """Number of the target's pixels in the overlap."""
     abs_rel: float | None = None
+    """Mean of |z - D| / D, with z-depths z and those D that they are compared with."""
     chamfer: float | None = None
-    """Chamfer distance as a share of the median depth of the context, for averages over scenes."""
+    """Mean distance to the nearest point of the other cloud, averaged over both directions, as a
+    share of the median depth of the context at the target, for averages over scenes."""
     f_score: float | None = None
+    """Harmonic mean of precision and recall at `MATCH_DISTANCE`, in [0, 1]."""
 
 
 def compare_depths(
@@ -44,6 +47,7 @@ def compare_depths(
 ) -> SurfaceAgreement:
     """Compute mean(|depth - truth| / truth) over pixels of `where` with known truth; 0 is best.
 
+    z-depths in scene units; the truth is 0 where it is unknown, and `depth` is known in `where`.
     No scale is fitted, because registration has to remove scale errors.
     """
     known = where & (truth > 0)
@@ -59,7 +63,8 @@ def compute_f_score(
 ) -> float:
     """Compute 2 P R / (P + R) of two point sets; 1 is best, and 0 if P = R = 0.
 
-    Precision P is the share of A within `threshold` (scene units) of B, recall R that of B near A.
+    `a_to_b` are distances of points of A to the nearest one of B, `b_to_a` the reverse, in scene
+    units as `threshold`. Precision P is the share of A within it, recall R that of B.
     """
     precision = float((a_to_b <= threshold).mean())
     recall = float((b_to_a <= threshold).mean())
@@ -103,23 +108,25 @@ def measure_alignment(
 def measure_primitive_alignment(
     registered: Gaussians, context: Gaussians, target: Camera, renderer: Renderer
 ) -> SurfaceAgreement:
-    """Measure the same for all registered Gaussians, without filtering and rendering them.
+    """Measure as `measure_alignment`, but all registered Gaussians, before stage 4 filters them.
 
-    A Gaussian counts if its mean projects to a pixel that the context covers; these pixels are the
-    overlap. AbsRel is the mean of |z - D| / D with the z-depth z of the mean and the rendered
-    context depth D. Renders would favour scattered Gaussians, which cover fewer and easier pixels.
+    They are not rendered: renders would favour scattered Gaussians, which cover fewer and easier
+    pixels. A Gaussian counts if its mean projects to a pixel that the context covers; these pixels
+    are the overlap. AbsRel is the mean of |z - D| / D with the z-depth z of the mean and the
+    rendered context depth D.
     """
     registered = drop_transparent(registered)
     context = drop_transparent(context)
     reference = renderer.render(context, target).depth_map()
 
-    # The depths of the means themselves, each against that of the context at its pixel.
+    # All means here are inside the image, so that their pixels can be looked up.
     points = registered[project_mask(reference.valid, registered, target)].means
     pixels, z = project(points, target)
     x, y = pixels.long().unbind(-1)
     overlap = torch.zeros_like(reference.valid)
     overlap[y, x] = True
     expected = reference.depth[y, x].double()
+    # Without a Gaussian there is no mean, and no overlap either.
     error = ((z - expected).abs() / expected).mean().item() if len(points) else None
     return compare_clouds(registered, context, target, reference, overlap, error)
 
@@ -132,7 +139,10 @@ def compare_clouds(
     overlap: Bool[Tensor, "h w"],
     error: float | None,
 ) -> SurfaceAgreement:
-    """Add Chamfer distance and F-score over `overlap` to the AbsRel `error`."""
+    """Add Chamfer distance and F-score over `overlap` to the AbsRel `error`.
+
+    `reference` is the depth of the context at the target, known in all of `overlap`.
+    """
     count = int(overlap.sum())
     if count == 0:
         return SurfaceAgreement(0)
@@ -144,7 +154,7 @@ def compare_clouds(
     surface = select_in_mask(context, None, overlap, target).means
     pixels, z = project(surface, target)
     at_pixel = sample(reference.depth[..., None], pixels, "nearest")[..., 0]
-    surface = surface[is_inside(pixels, z, target) & ((z - at_pixel).abs() <= threshold)]
+    surface = surface[(z - at_pixel).abs() <= threshold]
     if len(points) == 0 or len(surface) == 0:
         return SurfaceAgreement(count, error)
     there = compute_nearest_distances(points, context.means)
@@ -155,5 +165,5 @@ def compare_clouds(
 
 
 def drop_transparent(gaussians: Gaussians) -> Gaussians:
-    """Drop Gaussians that no renderer shows."""
+    """Drop Gaussians that no renderer shows, since even their centres are too transparent."""
     return gaussians[gaussians.opacities >= MIN_SCORED_OPACITY]

@@ -1,4 +1,7 @@
-"""Measure of what a completion keeps of a given splat, seen from cameras that decided nothing."""
+"""Measure of how a splat without photographs looks after its completion.
+
+It is seen from further cameras around it, which took no part in the completion.
+"""
 
 from __future__ import annotations
 
@@ -13,32 +16,37 @@ from gscompleter.state import Completion
 from gscompleter.types import Camera
 from gscompleter.virtual_capture.render_views import MIN_OPAQUE
 
-INVISIBLE = 45.0
-"""PSNR in dB from which on a change cannot be seen, as in `psnr_guard.invisible_psnr`."""
+INVISIBLE_PSNR = 45.0
+"""PSNR in dB from which on a change cannot be seen: the default of `psnr_guard.invisible_psnr`."""
 
 
 @dataclass(frozen=True)
 class KeptRow:
-    """Renders of the completed scene against those of the splat, where the splat was opaque."""
+    """Renders of the completed scene against those of the splat, where the splat was opaque.
+
+    Elsewhere it has a hole or a rim of one, which the completion was to change.
+    """
 
     cameras: int
     """Number of cameras that see something opaque of the splat."""
     worst_psnr: float
     """Smallest PSNR over these cameras, in dB."""
     mean_psnr: float
+    """Mean PSNR over them, in dB."""
 
     @property
-    def is_unseen(self) -> bool:
-        """True if none of the cameras sees a change."""
-        return self.worst_psnr >= INVISIBLE
+    def is_visibly_unchanged(self) -> bool:
+        """True if no change can be seen from any of the cameras."""
+        return self.worst_psnr >= INVISIBLE_PSNR
 
 
 def measure_kept(
     completion: Completion, cameras: Sequence[Camera], renderer: Renderer
 ) -> KeptRow | None:
-    """Measure what is kept; None if no camera sees anything opaque of the splat.
+    """Measure how much the splat changed; None if no camera sees anything opaque of it.
 
-    Pixels that showed what was removed do not count: they were to change.
+    Additions before it count, and so do new colours. Pixels that showed what was removed do not:
+    they were to change.
     """
     scores = []
     for camera in cameras:

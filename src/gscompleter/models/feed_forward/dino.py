@@ -1,4 +1,7 @@
-"""The DINOv2 vision transformer, the source of DepthSplat's monocular features."""
+"""The DINOv2 vision transformer (Oquab et al. 2023), whose features DepthSplat and VolSplat use.
+
+Names of parameters and modules are the keys of the published weights.
+"""
 
 from __future__ import annotations
 
@@ -38,8 +41,8 @@ class Attention(nn.Module):
 
     def forward(self, x: Float[Tensor, "n t c"]) -> Float[Tensor, "n t c"]:
         """Apply self-attention."""
-        # One matrix for queries, keys and values: [n, t, 3 c] to three times [n, heads, t, c /
-        # heads].
+        # One matrix for queries, keys and values, from [n, t, 3 * c] to three of the shape
+        # [n, heads, t, c / heads].
         q, k, v = self.qkv(x).unflatten(2, (3, self.heads, -1)).permute(2, 0, 3, 1, 4)
         return self.proj(F.scaled_dot_product_attention(q, k, v).transpose(1, 2).flatten(2))
 
@@ -58,7 +61,7 @@ class Mlp(nn.Module):
 
 
 class LayerScale(nn.Module):
-    """A learned factor per channel."""
+    """A learned factor per channel, by which a residual branch is damped."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -70,7 +73,7 @@ class LayerScale(nn.Module):
 
 
 class Block(nn.Module):
-    """A layer of the transformer."""
+    """A layer of the transformer: attention and MLP, each with a norm before and a residual."""
 
     def __init__(self, channels: int, heads: int) -> None:
         super().__init__()
@@ -88,7 +91,7 @@ class Block(nn.Module):
 
 
 class DinoV2(nn.Module):
-    """A vision transformer with patches of 14 x 14 pixels."""
+    """A vision transformer with patches of 14 x 14 pixels and one class token."""
 
     def __init__(self, channels: int, num_blocks: int, heads: int) -> None:
         super().__init__()
@@ -101,11 +104,15 @@ class DinoV2(nn.Module):
     def forward(
         self, images: Float[Tensor, "n 3 h w"], blocks: Sequence[int]
     ) -> list[Float[Tensor, "n c p q"]]:
-        """Compute feature maps after `blocks`, for normalised images with sides divisible by 14."""
+        """Compute a feature map after each of `blocks`, indices from 0 in ascending order.
+
+        Maps have a value per patch (p = h / 14, q = w / 14), after the last norm. `images` have the
+        mean and deviation of ImageNet taken out (`normalize_images`) and sides divisible by 14.
+        """
         size = (images.shape[2] // PATCH, images.shape[3] // PATCH)
         class_token = self.cls_token.expand(len(images), -1, -1)
         tokens = torch.cat([class_token, self.patch_embed(images)], 1)
-        tokens = tokens + self.get_position_embeddings(*size)
+        tokens = tokens + resize_position_embeddings(self.pos_embed, *size)
         maps = []
         for i, block in enumerate(self.blocks):
             tokens = block(tokens)
@@ -114,18 +121,19 @@ class DinoV2(nn.Module):
                 maps.append(self.norm(tokens)[:, 1:].transpose(1, 2).unflatten(2, size))
         return maps
 
-    def get_position_embeddings(self, rows: int, columns: int) -> Float[Tensor, "1 t c"]:
-        """Return position embeddings for `rows` x `columns` patches."""
-        return resize_position_embeddings(self.pos_embed, rows, columns)
-
 
 def resize_position_embeddings(
     stored: Float[Tensor, "1 s c"], rows: int, columns: int
 ) -> Float[Tensor, "1 t c"]:
-    """Resize position embeddings to `rows` x `columns`, with the original's 0.1 size offset."""
+    """Resize position embeddings of `GRID` x `GRID` patches to `rows` x `columns`.
+
+    The first one is that of the class token. Scale factors are those of the published code, which
+    adds 0.1 to the numbers of patches, so that rounding never loses one; without it the map would
+    be sampled at other places, and features would differ.
+    """
     if rows == columns == GRID:
         return stored
-    # From tokens to a map, as it is resized like an image; the class token keeps its embedding.
+    # From tokens to a map, which is resized like an image; the class token keeps its embedding.
     grid = stored[:, 1:].transpose(1, 2).unflatten(2, (GRID, GRID))
     factors = ((rows + 0.1) / GRID, (columns + 0.1) / GRID)
     resized = F.interpolate(grid, scale_factor=factors, mode="bicubic")
