@@ -14,7 +14,7 @@ from gscompleter.render.spherical_harmonics import evaluate_sh_basis
 from gscompleter.stages.recolor import fit_image_colors
 from gscompleter.trust import HeldViews
 from gscompleter.trust.photometric import load_trust, sum_weights
-from gscompleter.types import ContextScene, View
+from gscompleter.types import ContextScene, Gaussians, View
 from scenes import Room, camera_at, gaussians_of, view_of
 from target_views import begin_with
 
@@ -181,6 +181,26 @@ def test_photographs_are_held_by_their_summed_weights():
     for view, sums in zip(PHOTOS, held.sums, strict=True):
         expected = sum_weights(RENDERER.freeze(scene, view.camera))
         assert torch.allclose(sums, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_what_stays_is_drawn_and_not_copied(monkeypatch):
+    """A scene without the Gaussians that change was as large as the scene itself."""
+    scene = splat()
+    held = hold(scene)
+    copied = []
+    choose = Gaussians.__getitem__
+
+    def spy(gaussians, index):
+        chosen = choose(gaussians, index)
+        if chosen.sh.untyped_storage().data_ptr() != gaussians.sh.untyped_storage().data_ptr():
+            copied.append(len(chosen))
+        return chosen
+
+    monkeypatch.setattr(Gaussians, "__getitem__", spy)
+    rows, _ = recolored(scene, held=held)
+    # What may change alone; here that is less than a half.
+    assert len(rows) > 0
+    assert 0 < sum(copied) < 0.5 * len(scene)
 
 
 def test_the_number_of_threads_does_not_matter():

@@ -30,7 +30,7 @@ from gscompleter.render.viewpoint import (
 from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, Gaussians, Render
 
-FROZEN_BLOCK = 1_000_000
+FROZEN_BLOCK = 4_000_000
 """Gaussians that are frozen at a time."""
 MAX_TILED_SIDE = TILE * np.iinfo(np.int16).max
 """Largest side of an image in pixels, since kernels number tiles in 16 bits."""
