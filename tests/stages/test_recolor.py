@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize, pad
 
+from copies import watch_copies
 from gscompleter.config import CompleterConfig, RecolorConfig
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.cpu import CpuRenderer
@@ -14,7 +15,7 @@ from gscompleter.render.spherical_harmonics import evaluate_sh_basis
 from gscompleter.stages.recolor import fit_image_colors
 from gscompleter.trust import HeldViews
 from gscompleter.trust.photometric import load_trust, sum_weights
-from gscompleter.types import ContextScene, Gaussians, View
+from gscompleter.types import ContextScene, View
 from scenes import Room, camera_at, gaussians_of, view_of
 from target_views import begin_with
 
@@ -187,16 +188,7 @@ def test_what_stays_is_drawn_and_not_copied(monkeypatch):
     """A scene without the Gaussians that change was as large as the scene itself."""
     scene = splat()
     held = hold(scene)
-    copied = []
-    choose = Gaussians.__getitem__
-
-    def spy(gaussians, index):
-        chosen = choose(gaussians, index)
-        if chosen.sh.untyped_storage().data_ptr() != gaussians.sh.untyped_storage().data_ptr():
-            copied.append(len(chosen))
-        return chosen
-
-    monkeypatch.setattr(Gaussians, "__getitem__", spy)
+    copied = watch_copies(monkeypatch)
     rows, _ = recolored(scene, held=held)
     # What may change alone; here that is less than a half.
     assert len(rows) > 0
