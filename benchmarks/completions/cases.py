@@ -47,6 +47,8 @@ class BenchCase:
     far: float | None = None
     gaussians: Whole | None = None
     """Number of Gaussians of the input splat, or None if the context is reconstructed."""
+    splat: Path | None = None
+    """A trained splat, a .ply, of which the input splat is a copy; None for the reconstruction."""
 
     @property
     def pixels(self) -> int:
@@ -127,9 +129,13 @@ def read_manifest(path: Path) -> Manifest:
             "cases",
         ) from error
 
-    # Scenes of the project's own cases lie in the folder that GSCOMPLETER_DATA names.
+    def find(name: Path) -> Path:
+        # Scenes of the project's own cases lie in the folder that GSCOMPLETER_DATA names.
+        return path.parent / os.path.expandvars(name)
+
     cases = [
-        replace(case, scene=path.parent / os.path.expandvars(case.scene)) for case in manifest.cases
+        replace(case, scene=find(case.scene), splat=case.splat and find(case.splat))
+        for case in manifest.cases
     ]
     return replace(manifest, cases=tuple(cases))
 
@@ -149,8 +155,8 @@ def write_input_splat(case: BenchCase, folder: Path, models: Models, device: str
     # Equal cases share a file within this process, whose hashes the name is made of.
     path = folder / f"{abs(hash(case)):x}.ply"
     if not path.exists():
-        context = case.begin(models, device).context
-        save_ply(path, multiply_gaussians(context, case.gaussians, models.seed))
+        scene = case.begin(models, device).context if case.splat is None else load_ply(case.splat)
+        save_ply(path, multiply_gaussians(scene, case.gaussians, models.seed))
     return path
 
 

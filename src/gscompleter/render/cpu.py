@@ -88,8 +88,12 @@ class CpuFrozenScene:
 
     def _extend(self, new: Gaussians) -> CpuFrozenScene:
         """Freeze context and `new` together: composite once, and keep what the image showed."""
-        splats = self.viewpoint.project(to_arrays(new), new.is_antialiased)
-        added, order = order_by_use(self.viewpoint.fill_lists(splats, self.depth_limits))
+        # No variable holds the splats, of which most are in no list.
+        added, order = order_by_use(
+            self.viewpoint.fill_lists(
+                self.viewpoint.project(to_arrays(new), new.is_antialiased), self.depth_limits
+            )
+        )
         count = self.count + len(new)
         if len(added.entries) == 0:
             return replace(self, count=count)
