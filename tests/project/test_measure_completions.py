@@ -12,6 +12,7 @@ from completions.cases import (
     BenchCase,
     GrowthValues,
     Manifest,
+    copy_photographs,
     multiply_gaussians,
     read_manifest,
     write_input_splat,
@@ -231,6 +232,18 @@ def test_the_cases_of_the_documentation_can_be_read():
     given = read_manifest(PERFORMANCE.with_name("given_splats.json"))
     assert [*given.make_series(AXES)["gaussians"]] == [100_000, 1_000_000, 4_000_000]
     assert given.cases[0].splat == given.cases[0].scene / "splat.ply"
+
+
+def test_photographs_of_a_case_are_copied_without_the_others(scene, tmp_path):
+    case = BenchCase("room", scene, (2,), (0,), (SIZE, SIZE), splat=Path("splat.ply"))
+    copied = copy_photographs(case, tmp_path)
+    photographs = copied.open()
+    assert len(photographs) == 2
+    for frame, before in zip((*copied.context, *copied.targets), (2, 0), strict=True):
+        (view,) = photographs.views([frame], (SIZE, SIZE))
+        (known,) = case.open().views([before], (SIZE, SIZE))
+        assert torch.equal(view.image, known.image)
+        assert torch.allclose(view.camera.c2w, known.camera.c2w, atol=1e-6)
 
 
 def test_copies_of_a_trained_splat_are_what_is_completed(tmp_path):
