@@ -28,6 +28,7 @@ from completions.cases import (
     Manifest,
     Series,
     check_frames,
+    copy_photographs,
     read_manifest,
     write_input_splat,
 )
@@ -128,8 +129,15 @@ class Bench:
 
     def complete(self, case: BenchCase) -> Sample:
         """Complete a case, in a process of its own unless all share this one."""
-        out = self.folder / "completion"
         scene = write_input_splat(case, self.folder, self.models, self.device)
+        if case.splat is not None:
+            with TemporaryDirectory(dir=self.folder) as own:
+                return self.run(copy_photographs(case, Path(own)), scene)
+        return self.run(case, scene)
+
+    def run(self, case: BenchCase, scene: Path | None) -> Sample:
+        """Complete the photographs of a case, or the splat in the file `scene`."""
+        out = self.folder / "completion"
         if self.options.in_process:
             call = partial(case.complete, self.models, self.device, scene)
             return measure_call(call, self.device, self.yardstick)

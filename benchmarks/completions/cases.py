@@ -16,10 +16,12 @@ from pydantic import ConfigDict, TypeAdapter
 
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
+from gscompleter.data.scene import write_cameras
 from gscompleter.evaluation.methods import Models
 from gscompleter.splats.ply import load_ply, save_ply
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.image import write_image
 from gscompleter.system.files.reading import read_json
 from gscompleter.types import Gaussians
 
@@ -47,6 +49,8 @@ class BenchCase:
     far: float | None = None
     gaussians: Whole | None = None
     """Number of Gaussians of the input splat, or None if the context is reconstructed."""
+    splat: Path | None = None
+    """A trained splat, a .ply, of which the input splat is a copy; None for the reconstruction."""
 
     @property
     def pixels(self) -> int:
@@ -127,9 +131,13 @@ def read_manifest(path: Path) -> Manifest:
             "cases",
         ) from error
 
-    # Scenes of the project's own cases lie in the folder that GSCOMPLETER_DATA names.
+    def find(name: Path) -> Path:
+        # Scenes of the project's own cases lie in the folder that GSCOMPLETER_DATA names.
+        return path.parent / os.path.expandvars(name)
+
     cases = [
-        replace(case, scene=path.parent / os.path.expandvars(case.scene)) for case in manifest.cases
+        replace(case, scene=find(case.scene), splat=case.splat and find(case.splat))
+        for case in manifest.cases
     ]
     return replace(manifest, cases=tuple(cases))
 
@@ -149,9 +157,32 @@ def write_input_splat(case: BenchCase, folder: Path, models: Models, device: str
     # Equal cases share a file within this process, whose hashes the name is made of.
     path = folder / f"{abs(hash(case)):x}.ply"
     if not path.exists():
-        context = case.begin(models, device).context
-        save_ply(path, multiply_gaussians(context, case.gaussians, models.seed))
+        scene = case.begin(models, device).context if case.splat is None else load_ply(case.splat)
+        save_ply(path, multiply_gaussians(scene, case.gaussians, models.seed))
     return path
+
+
+def copy_photographs(case: BenchCase, folder: Path) -> BenchCase:
+    """Copy the photographs of a case to `folder`, as those of an owner who has no others.
+
+    Others of its scene would check the splat, whatever the number of those that are named.
+    """
+    photographs = case.open()
+    frames = sorted({*case.context, *case.targets})
+    scene = folder / "photographs"
+    scene.mkdir(parents=True, exist_ok=True)
+    views = [photographs.views([frame], None)[0] for frame in frames]
+    names = [f"{frame}.png" for frame in frames]
+    for name, view in zip(names, views, strict=True):
+        write_image(scene / name, view.image)
+    write_cameras(scene / "transforms.json", [view.camera for view in views], names)
+    numbers = {frame: number for number, frame in enumerate(frames)}
+    return replace(
+        case,
+        scene=scene,
+        context=tuple(numbers[frame] for frame in case.context),
+        targets=tuple(numbers[frame] for frame in case.targets),
+    )
 
 
 def multiply_gaussians(scene: Gaussians, count: int, seed: int = 0) -> Gaussians:

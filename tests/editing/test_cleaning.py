@@ -10,13 +10,14 @@ import pytest
 import torch
 
 from command import run
+from copies import watch_copies
 from gscompleter.config import CleaningConfig
 from gscompleter.editing.cleaning import find_removable, find_superfluous
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.render.loading import load_renderer
 from gscompleter.splats.ply import load_ply
 from gscompleter.stages.error_budgets import compute_squared_error
-from gscompleter.stages.superfluous import predict_error_change
+from gscompleter.stages.superfluous import exclude_needed, predict_error_change
 from gscompleter.types import View, merge, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, labelled, photographed, view_of
 
@@ -56,6 +57,13 @@ def losses(scene, taken, views=VIEWS):
         - psnr(RENDERER.render(scene[~taken], v.camera).image, v.image)
         for v in views
     ]
+
+
+def test_what_stays_is_not_copied_to_be_drawn_without_the_rest(monkeypatch):
+    copied = watch_copies(monkeypatch)
+    removed = exclude_needed(SCENE, FLOAT, VIEWS, [1.0] * len(VIEWS), RENDERER)
+    assert torch.equal(removed, FLOAT)
+    assert sum(copied) <= len(FLOATERS)
 
 
 def find_all(*arguments) -> torch.Tensor:

@@ -102,6 +102,22 @@ def test_neighbours_are_searched_for_again_only_around_what_went(monkeypatch):
     assert max(searches[1:]) < 0.05 * len(scene)
 
 
+def test_few_that_lost_a_neighbour_ask_the_tree_that_is_there(monkeypatch):
+    means = torch.rand(2000, 3, generator=torch.Generator().manual_seed(0))
+    nearest = NearestGaussians(means, means, 5, "searching")
+    left = torch.ones(2000, dtype=torch.bool)
+    left[[7, 100, 1500]] = False
+    asked = []
+    monkeypatch.setattr(NearestGaussians, "_search", lambda _, points, among: asked.append(points))
+    lost = nearest.take_away(~left, left, left)
+    assert len(lost) > 3
+    assert [len(points) for points in asked] == [0]
+    monkeypatch.undo()
+    anew = NearestGaussians(means, means[left], 5, "searching")
+    numbers = left.nonzero()[:, 0].numpy()
+    assert (nearest.rows[left.numpy()] == numbers[anew.rows[left.numpy()]]).all()
+
+
 def test_a_strength_of_two_takes_more_and_of_a_half_less():
     scene = merge([ROOM, *(blobs(MIDDLE, size, opacity=0.9) for size in (3.0, 5.0, 8.0))])
     counts = [taken(scene, FloaterConfig().strengthen(s)).sum().item() for s in (0.5, 1.0, 2.0)]

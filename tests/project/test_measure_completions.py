@@ -12,8 +12,10 @@ from completions.cases import (
     BenchCase,
     GrowthValues,
     Manifest,
+    copy_photographs,
     multiply_gaussians,
     read_manifest,
+    write_input_splat,
 )
 from completions.measure import (
     PROCESS,
@@ -30,7 +32,11 @@ from completions.report import (
     fit_exponent,
     format_report,
 )
+from gscompleter.evaluation.methods import Models
+from gscompleter.generators import load_generator
+from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.render.loading import load_renderer
+from gscompleter.splats.ply import load_ply, save_ply
 from gscompleter.system.errors import InputError
 from paths import ROOT
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
@@ -223,6 +229,32 @@ def test_the_cases_of_the_documentation_can_be_read():
     for axis in AXES:
         assert max(series[axis]) == 16 * min(series[axis])
     assert len(series["views"][32].context) == 32
+    given = read_manifest(PERFORMANCE.with_name("given_splats.json"))
+    assert [*given.make_series(AXES)["gaussians"]] == [100_000, 1_000_000, 4_000_000]
+    assert given.cases[0].splat == given.cases[0].scene / "splat.ply"
+
+
+def test_photographs_of_a_case_are_copied_without_the_others(scene, tmp_path):
+    case = BenchCase("room", scene, (2,), (0,), (SIZE, SIZE), splat=Path("splat.ply"))
+    copied = copy_photographs(case, tmp_path)
+    photographs = copied.open()
+    assert len(photographs) == 2
+    for frame, before in zip((*copied.context, *copied.targets), (2, 0), strict=True):
+        (view,) = photographs.views([frame], (SIZE, SIZE))
+        (known,) = case.open().views([before], (SIZE, SIZE))
+        assert torch.equal(view.image, known.image)
+        assert torch.allclose(view.camera.c2w, known.camera.c2w, atol=1e-6)
+
+
+def test_copies_of_a_trained_splat_are_what_is_completed(tmp_path):
+    trained = replace(gaussians_of(view_of(Room(), CAMERAS[0])), encoded=None)
+    save_ply(tmp_path / "splat.ply", trained)
+    case = replace(CASE, gaussians=3 * len(trained), splat=tmp_path / "splat.ply")
+    models = Models(PlaneSweep(), load_generator("warp-inpaint"), load_renderer("cpu"))
+    copies = load_ply(write_input_splat(case, tmp_path, models, "cpu"))
+    assert len(copies) == 3 * len(trained)
+    nearest = torch.cdist(copies.means, trained.means).amin(dim=1)
+    assert (nearest < trained.scales.max()).all()
 
 
 @pytest.mark.slow

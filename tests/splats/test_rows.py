@@ -94,10 +94,10 @@ def test_every_permutation_is_one_of_cycles():
     rng = np.random.default_rng(0)
     for count in (1, 2, 3, 50):
         order = rng.permutation(count)
-        values = rng.random((count, 3)).astype(np.float32)
-        expected = values[order]
-        permute_rows(order, values, np.zeros(count, np.bool_))
-        assert np.array_equal(values, expected)
+        tables = [rng.random((count, width)).astype(np.float32) for width in (3, 4, 3, 1, 12, 0)]
+        expected = [table[order] for table in tables]
+        permute_rows(order, *tables, np.zeros(count, np.bool_))
+        assert all(np.array_equal(*pair) for pair in zip(tables, expected, strict=True))
 
 
 def test_parts_are_written_as_if_they_were_merged(tmp_path, monkeypatch):

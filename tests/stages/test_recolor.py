@@ -6,6 +6,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize, pad
 
+from copies import watch_copies
 from gscompleter.config import CompleterConfig, RecolorConfig
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.cpu import CpuRenderer
@@ -181,6 +182,17 @@ def test_photographs_are_held_by_their_summed_weights():
     for view, sums in zip(PHOTOS, held.sums, strict=True):
         expected = sum_weights(RENDERER.freeze(scene, view.camera))
         assert torch.allclose(sums, expected, rtol=1e-4, atol=1e-4)
+
+
+def test_what_stays_is_drawn_and_not_copied(monkeypatch):
+    """A scene without the Gaussians that change was as large as the scene itself."""
+    scene = splat()
+    held = hold(scene)
+    copied = watch_copies(monkeypatch)
+    rows, _ = recolored(scene, held=held)
+    # What may change alone; here that is less than a half.
+    assert len(rows) > 0
+    assert 0 < sum(copied) < 0.5 * len(scene)
 
 
 def test_the_number_of_threads_does_not_matter():

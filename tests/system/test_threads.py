@@ -67,6 +67,36 @@ def test_all_threads_allocate_from_one_arena():
     assert life.stdout.count("<heap nr=") == 1
 
 
+LARGE_ARRAYS = """
+import sys
+import numpy as np
+from gscompleter.system.process import give_large_arrays_own_pages
+
+def measure():
+    with open("/proc/self/statm") as file:
+        return int(file.read().split()[1]) * 4096
+
+if sys.argv[1] == "own":
+    give_large_arrays_own_pages()
+np.ones(3 * 2**20)  # 24 MB, after which glibc lets smaller arrays share its heap
+arrays = [np.ones(2**20) for _ in range(16)]
+before = measure()
+del arrays[:-1]  # the last one ends the heap
+print(before - measure())
+"""
+
+
+@pytest.mark.linux
+def test_large_arrays_go_back_to_the_system_when_they_are_freed():
+    returned = []
+    for pages in ("own", "shared"):
+        command = [sys.executable, "-c", LARGE_ARRAYS, pages]
+        life = subprocess.run(command, capture_output=True, text=True, check=True)
+        returned.append(int(life.stdout))
+    own, shared = returned
+    assert own > 15 * 8 * 2**20 * 0.9 > shared
+
+
 @pytest.mark.slow
 def test_what_the_environment_says_gives_way_to_what_is_told_and_to_nothing_else():
     cores = cpu_threads.count_available_cores()

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -254,7 +254,8 @@ def score_cleaning(
     `taken` are the Gaussians that go; `files` has the file of each photograph by frame. Also
     returns what each photograph sees of them.
     """
-    kept = given[~taken]
+    # What is transparent is not drawn, and the rest is not copied to be drawn without it.
+    kept = replace(given, opacities=given.opacities.masked_fill(taken, 0))
     rows = []
     seen = []
     for view in track(views, "scores"):

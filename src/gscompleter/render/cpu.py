@@ -30,7 +30,7 @@ from gscompleter.render.viewpoint import (
 from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, Gaussians, Render
 
-FROZEN_BLOCK = 1_000_000
+FROZEN_BLOCK = 4_000_000
 """Gaussians that are frozen at a time."""
 MAX_TILED_SIDE = TILE * np.iinfo(np.int16).max
 """Largest side of an image in pixels, since kernels number tiles in 16 bits."""
@@ -88,8 +88,12 @@ class CpuFrozenScene:
 
     def _extend(self, new: Gaussians) -> CpuFrozenScene:
         """Freeze context and `new` together: composite once, and keep what the image showed."""
-        splats = self.viewpoint.project(to_arrays(new), new.is_antialiased)
-        added, order = order_by_use(self.viewpoint.fill_lists(splats, self.depth_limits))
+        # No variable holds the splats, of which most are in no list.
+        added, order = order_by_use(
+            self.viewpoint.fill_lists(
+                self.viewpoint.project(to_arrays(new), new.is_antialiased), self.depth_limits
+            )
+        )
         count = self.count + len(new)
         if len(added.entries) == 0:
             return replace(self, count=count)

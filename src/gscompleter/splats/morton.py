@@ -29,10 +29,12 @@ def sort_nearby(gaussians: Gaussians) -> Int64[Tensor, "n"]:
     For what was just read and that nobody else holds: a sorted copy would take as much again.
     """
     order = argsort_nearby(gaussians)
-    for values in vars(gaussians).values():
-        if isinstance(values, Tensor):
-            rows = values.numpy().reshape(len(order), -1)
-            permute_rows(order.numpy(), rows, np.zeros(len(order), np.bool_))
+    count = len(order)
+    encoded = torch.empty(count, 0) if gaussians.encoded is None else gaussians.encoded
+    values = (gaussians.means, gaussians.quats, gaussians.scales, gaussians.opacities, gaussians.sh)
+    rows = [value.numpy().reshape(count, -1) for value in values]
+    permute_rows(order.numpy(), *rows, encoded.numpy(), np.zeros(count, np.bool_))
+    gaussians.generated.copy_(gaussians.generated[order])
     return order
 
 

@@ -218,6 +218,8 @@ def measure_depth_range(
 
     Half the nearest and twice the farthest percentile leave space for what the scene lacks.
     """
+    # Depths do not depend on colours, whose harmonics are most of what a renderer reads.
+    scene = replace(scene, sh=scene.sh[:, :1].contiguous())
     depths = []
     for camera in cameras:
         if not (compute_z_depths(scene.means, camera) > 0).any():

@@ -66,6 +66,7 @@ from gscompleter.splats.morton import sort_nearby
 from gscompleter.stages.context import prepare_single
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.process import give_large_arrays_own_pages
 from gscompleter.system.progress import show_preparation, stage
 from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.types import Camera, Gaussians, View
@@ -444,7 +445,10 @@ def check_completion_inputs(
 
 def read_splat(splat: SplatRequest) -> Gaussians:
     """Read the Gaussians of a splat."""
-    return load_splat(splat.path, splat.drop_nonfinite, splat.ignore_properties)
+    gaussians = load_splat(splat.path, splat.drop_nonfinite, splat.ignore_properties)
+    if len(gaussians) >= MIN_PROXY_GAUSSIANS:
+        give_large_arrays_own_pages()
+    return gaussians
 
 
 def add_splat(

@@ -99,8 +99,10 @@ def find_file_order(context: Gaussians, input_splat: InputSplatFile) -> Int64[Te
     """Find the Gaussians of the context in the order of the input file."""
     if input_splat.file_order is None:
         return torch.arange(len(context))
-    # `file_order[i]` is the place in the file of Gaussian i; sorting by it inverts that.
-    return input_splat.file_order.argsort()
+    # `file_order[i]` is the place in the file of Gaussian i; this inverts it.
+    order = torch.empty_like(input_splat.file_order)
+    order[input_splat.file_order] = torch.arange(len(order))
+    return order
 
 
 def save_completed_splat(

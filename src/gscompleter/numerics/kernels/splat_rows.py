@@ -129,21 +129,34 @@ def _encode_value(i, scales, opacities, encoded, written, row):
 
 
 @njit(nogil=True)
-def permute_rows(order, values, seen):
-    """Bring the row order[i] of `values` [n, c] to row i, in place; `seen` [n] begins as False."""
-    held = np.empty((1, values.shape[1]), values.dtype)
+def permute_rows(order, means, quats, scales, opacities, sh, encoded, seen):
+    """Bring the Gaussian order[i] to row i, in place; `seen` [n] begins as False.
+
+    All arrays are [n, c]. They are permuted together, since each step waits for the memory that
+    says where the next row is.
+    """
     for start in range(len(order)):
-        if seen[start]:
-            continue
-        # A permutation is a set of cycles: the first row of each is held until its end.
-        copy_row(values, start, held, 0)
+        # A permutation is a set of cycles. The first row of each goes along to its end.
         place = start
-        while order[place] != start:
-            copy_row(values, order[place], values, place)
+        while not seen[place]:
             seen[place] = True
-            place = order[place]
-        copy_row(held, 0, values, place)
-        seen[place] = True
+            source = order[place]
+            if source != start:
+                _swap_rows(means, place, source)
+                _swap_rows(quats, place, source)
+                _swap_rows(scales, place, source)
+                _swap_rows(opacities, place, source)
+                _swap_rows(sh, place, source)
+                _swap_rows(encoded, place, source)
+                place = source
+
+
+@njit(inline="always")
+def _swap_rows(values, row, other):
+    for column in range(values.shape[1]):
+        held = values[row, column]
+        values[row, column] = values[other, column]
+        values[other, column] = held
 
 
 @njit(inline="always")
