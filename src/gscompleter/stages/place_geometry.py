@@ -199,9 +199,9 @@ def search_place(
         and is_determined(geometry, places[best], scene, surface, seen)
     ):
         raise InputError(
-            f"{geometry.name} fits the scene in several places alike, as symmetric rooms do, and "
-            f"anything where photographs show one wall or one corner; nothing tells which is "
-            f"right; {ADVICE}, or photographs that show more, as opposite walls and furniture.",
+            f"{geometry.name} fits the scene in several places alike, as in a symmetric room, "
+            f"along a single wall or in a corner; {ADVICE}, or photographs that show opposite "
+            f"walls and furniture.",
             "geometry",
         )
     return move_to(geometry, places[best], compared[best])
@@ -216,7 +216,7 @@ def is_determined(
 ) -> bool:
     """Return True if geometry fits worse when the move that is least determined goes on.
 
-    One wall does not tell where along it the geometry is, and neither a wall nor a corner how large.
+    One wall does not tell where along it the geometry is, and no single corner how large.
     """
     move = LONG_MOVE * find_least_determined_move(place, surface, seen)
     fit, *others = (
