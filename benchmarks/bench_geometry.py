@@ -2,9 +2,10 @@
 
     python benchmarks/bench_geometry.py [--only NAME]
 
-The scan is the points that the depth sensor measured in other photographs. The neighbour is
-the next photograph to the target on the side of the context, neither given nor scanned. The splat is what plane-sweep makes
-of both photographs with the depth of the sensor, completed as a splat of unknown photographs.
+The scan is the points that the depth sensor measured in other photographs. The neighbour is the
+next photograph to the target on the side of the context, neither given nor scanned. The splat is
+what plane-sweep makes of both photographs with the depth of the sensor, completed as a splat of
+unknown photographs.
 """
 
 from __future__ import annotations
