@@ -81,7 +81,6 @@ def make_seen_grid(shape: str):
 
 @pytest.mark.parametrize("shape", ["plane", "cylinder"])
 def test_the_least_determined_move_goes_along_the_surface_however_long(shape):
-    """With straight moves in place of the exponential map, a turn leaves the cylinder."""
     seen = make_seen_grid(shape)
     move = find_least_determined_move(np.eye(4), seen, seen)
     assert np.linalg.norm(move) == pytest.approx(1)

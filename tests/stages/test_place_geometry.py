@@ -112,7 +112,7 @@ def test_a_room_that_is_symmetric_as_far_as_it_is_seen_is_refused():
         place(move_elsewhere(mesh), Room((BOX,)))
 
 
-@pytest.mark.parametrize("shown", ["wall", "corner"])
+@pytest.mark.parametrize("shown", [pytest.param("wall", marks=pytest.mark.slow), "corner"])
 def test_geometry_that_slides_along_all_that_is_seen_is_refused(shown):
     """At any scale, about the corner too, it counts as in the same place: it has no other walls."""
     mesh = make_mesh(Room((BOX,)))
