@@ -8,7 +8,10 @@ from scipy.spatial.transform import Rotation
 from gscompleter.numerics.given_geometry import GivenGeometry, make_geometry, move_points
 from gscompleter.numerics.surface_alignment import (
     align_surface,
+    find_least_determined_move,
     fit_closest_points,
+    make_gap_equations,
+    make_move,
     make_seen_points,
     sample_surface,
 )
@@ -63,6 +66,45 @@ def test_a_small_error_is_fitted_away():
     similarity, share = fit_closest_points(np.eye(4), surface, see_room())
     assert measure_error(similarity, moved) < 0.002
     assert share > 0.95
+
+
+def make_seen_grid(shape: str):
+    """Make the points of a plane or of a half cylinder, in a frame that is turned."""
+    u, v = (part.ravel() for part in np.meshgrid(np.linspace(-1, 1, 30), np.linspace(-1, 1, 30)))
+    angles = np.pi / 2 * u
+    flat = np.stack([u, v, 0 * u], axis=1)
+    points = flat if shape == "plane" else np.stack([np.sin(angles), v, np.cos(angles)], axis=1)
+    return make_seen_points(
+        move_points(make_similarity_of(1, 50, (0, 0, 4)), points), np.full(900, 4.0)
+    )
+
+
+@pytest.mark.parametrize("shape", ["plane", "cylinder"])
+def test_the_least_determined_move_goes_along_the_surface_however_long(shape):
+    seen = make_seen_grid(shape)
+    move = find_least_determined_move(np.eye(4), seen, seen)
+    assert np.linalg.norm(move) == pytest.approx(1)
+    # Shorter than the surface, beyond whose borders nothing is close.
+    place = make_move(0.4 * move, seen)
+    inside = np.linalg.norm(seen.points - seen.middle, axis=1) < 0.5
+    moved = move_points(place, seen.points[inside])
+    gaps, rows = seen.tree.query(moved)
+    along_normals = np.abs(np.einsum("ni,ni->n", moved - seen.points[rows], seen.normals[rows]))
+    assert np.linalg.norm(moved - seen.points[inside], axis=1).max() > 0.1
+    assert along_normals.max() < 0.01
+    assert gaps.max() < 0.1
+
+
+def test_a_room_is_determined_in_each_direction():
+    rng = np.random.default_rng(0)
+    seen = see_room()
+    surface = sample_surface(MESH, rng)
+    move = find_least_determined_move(np.eye(4), surface, seen)
+    gaps = [
+        make_gap_equations(make_move(step * move, seen), surface, seen, 0.3).gaps
+        for step in (0, 0.4)
+    ]
+    assert np.abs(gaps[1]).mean() > 10 * np.abs(gaps[0]).mean()
 
 
 def test_points_of_a_surface_lie_on_it_in_proportion_to_areas():

@@ -1,5 +1,6 @@
 """Places of geometry from elsewhere: in the frame of a scene, beside it, or in another one."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -9,12 +10,16 @@ import torch
 from gscompleter import GSCompleter, InputError
 from gscompleter.numerics.given_geometry import GivenGeometry, make_geometry
 from gscompleter.stages.place_geometry import place_geometry
-from gscompleter.types import Render
+from gscompleter.types import Camera, Render
 from room_mesh import OTHER_ROOM, mesh_of, points_of, triangles_of
 from scenes import Room, camera_at, cast, gaussians_of, merge, view_of
 
 CAMERAS = [camera_at(x, size=64) for x in (-0.3, 0.1)]
 BOX = Room().boxes[0]
+ONE_WALL = [camera_at(x, y=-0.6, z=2.6, size=64, focal=1.5) for x in (-1.3, -1.0)]
+"""Cameras that see nothing but the wall at the end of the room."""
+CORNER = [camera_at(x, y=0.6, z=1.5, yaw=35, size=64, focal=0.6) for x in (-0.3, 0.1)]
+"""Cameras that see two walls and the floor, and hardly anything else."""
 BESIDE_CAMERAS = ((0.5, -0.5, -0.95), (2.9, 1.5, 0.3))
 
 
@@ -33,9 +38,11 @@ def move_elsewhere(geometry: GivenGeometry) -> GivenGeometry:
     return geometry.transform(similarity)
 
 
-def place(geometry: GivenGeometry, room: Room = Room()) -> GivenGeometry:
+def place(
+    geometry: GivenGeometry, room: Room = Room(), cameras: Sequence[Camera] = CAMERAS
+) -> GivenGeometry:
     """Place geometry by the true depth of what two cameras see of a room."""
-    views = [view_of(room, camera, frame) for frame, camera in enumerate(CAMERAS)]
+    views = [view_of(room, camera, frame) for frame, camera in enumerate(cameras)]
     renders = [
         Render(view.image, cast(room, view.camera)[1], torch.ones_like(view.image[..., 0]))
         for view in views
@@ -103,6 +110,27 @@ def test_a_room_that_is_symmetric_as_far_as_it_is_seen_is_refused():
     mesh = make_mesh(Room((BOX, BESIDE_CAMERAS)))
     with pytest.raises(InputError, match="fits the scene in several places alike"):
         place(move_elsewhere(mesh), Room((BOX,)))
+
+
+@pytest.mark.parametrize("shown", [pytest.param("wall", marks=pytest.mark.slow), "corner"])
+def test_geometry_that_slides_along_all_that_is_seen_is_refused(shown):
+    """At any scale, about the corner too, it counts as in the same place: it has no other walls."""
+    mesh = make_mesh(Room((BOX,)))
+    middles = mesh.vertices[mesh.faces].mean(axis=1)
+    is_shown = middles[:, 2] > 4.9
+    if shown == "corner":
+        is_shown |= (middles[:, 0] > 2.9) | (middles[:, 1] > 1.4)
+    walls = replace(mesh, faces=mesh.faces[is_shown])
+    cameras = ONE_WALL if shown == "wall" else CORNER
+    with pytest.raises(InputError, match="several places alike.* opposite walls and furniture"):
+        place(move_elsewhere(walls), Room((BOX,)), cameras)
+
+
+def test_what_stands_before_a_single_wall_stays_as_it_is():
+    mesh = make_mesh()
+    off = mesh.move(np.array([0.05, 0.05, 0.05]))
+    assert place(mesh, cameras=ONE_WALL) is mesh
+    assert place(off, cameras=ONE_WALL) is off
 
 
 @pytest.mark.slow

@@ -346,33 +346,73 @@ def fit_closest_points(
     Distances count along the normals of the surface, relative to the depth of each seen point. Also
     returns the share of seen points on the surface.
     """
-    # The unknowns are a turn, a shift and a growth about the middle of what is seen, whose size is
-    # the unit of lengths.
     if len(surface.points) == 0 or len(seen.points) == 0:
         return similarity, 0.0
-    weights = seen.size / seen.depths
     for gate in GATES:
-        closest, distances = find_closest(similarity, surface, seen)
-        near = np.flatnonzero(distances <= gate)
-        if len(near) < MIN_SEEN:
+        equations = make_gap_equations(similarity, surface, seen, gate)
+        if len(equations.gaps) < MIN_SEEN:
             break
-        points = move_points(similarity, surface.points[closest[near]])
-        normals = surface.normals[closest[near]] @ np.linalg.inv(similarity[:3, :3])
-        normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-        arms = (points - seen.middle) / seen.size
-        growth = np.einsum("ni,ni->n", arms, normals)
-        rows = weights[near, None] * np.column_stack([np.cross(arms, normals), normals, growth])
-        gaps = (seen.points[near] - points) / seen.size
-        gaps = weights[near] * np.einsum("ni,ni->n", gaps, normals)
-        # Depth errs to one side at the edges of surfaces, so that large gaps count for nothing
-        # (Geman and McClure's loss); at first all do, or the nearest wall would hold the rest.
-        spread = max(2 * float(np.median(np.abs(gaps))), MIN_SPREAD * gate)
-        trusted = 1 / (1 + (gaps / spread) ** 2) ** 2
-        values, axes = np.linalg.eigh(rows.T @ (trusted[:, None] * rows))
-        step = axes @ (axes.T @ (rows.T @ (trusted * gaps)) / (values + DAMPING * values[-1]))
-        similarity = make_step(step, seen) @ similarity
+        similarity = make_move(equations.solve(), seen) @ similarity
     distances = find_closest(similarity, surface, seen)[1]
     return similarity, float((distances <= GATES[-1]).mean())
+
+
+@dataclass(frozen=True)
+class GapEquations:
+    """How moves change the gaps from a surface to seen points, as a weighted linear system.
+
+    The unknowns are a turn, a shift and a growth about the middle of what is seen, whose size is
+    the unit of lengths.
+    """
+
+    rows: Float[ndarray, "n 7"]
+    gaps: Float[ndarray, "n"]
+    """Along the normals of the surface, relative to the depth of each seen point."""
+    weights: Float[ndarray, "n"]
+
+    def decompose(self) -> tuple[Float[ndarray, "7"], Float[ndarray, "7 7"]]:
+        """Find seven moves, as columns, and the sum of squares by which each changes the gaps.
+
+        The move that changes them least is the first.
+        """
+        values, moves = np.linalg.eigh(self.rows.T @ (self.weights[:, None] * self.rows))
+        return values, moves
+
+    def solve(self) -> Float[ndarray, "7"]:
+        """Find the move that closes the gaps."""
+        values, moves = self.decompose()
+        sums = self.rows.T @ (self.weights * self.gaps)
+        return moves @ (moves.T @ sums / (values + DAMPING * values[-1]))
+
+
+def make_gap_equations(
+    similarity: SurfaceSimilarity, surface: SurfacePoints, seen: SeenPoints, gate: float
+) -> GapEquations:
+    """Make the equations of the seen points whose distance over the depth is at most `gate`."""
+    closest, distances = find_closest(similarity, surface, seen)
+    near = np.flatnonzero(distances <= gate)
+    points = move_points(similarity, surface.points[closest[near]])
+    normals = surface.normals[closest[near]] @ np.linalg.inv(similarity[:3, :3])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    arms = (points - seen.middle) / seen.size
+    growth = np.einsum("ni,ni->n", arms, normals)
+    scale = seen.size / seen.depths[near]
+    rows = scale[:, None] * np.column_stack([np.cross(arms, normals), normals, growth])
+    gaps = scale * np.einsum("ni,ni->n", (seen.points[near] - points) / seen.size, normals)
+    # Depth errs to one side at the edges of surfaces, so that large gaps count for nothing
+    # (Geman and McClure's loss); at first all do, or the nearest wall would hold the rest.
+    spread = max(2 * float(np.median(np.abs(gaps))), MIN_SPREAD * gate) if len(gaps) else 1.0
+    return GapEquations(rows, gaps, 1 / (1 + (gaps / spread) ** 2) ** 2)
+
+
+def find_least_determined_move(
+    similarity: SurfaceSimilarity, surface: SurfacePoints, seen: SeenPoints
+) -> Float[ndarray, "7"]:
+    """Find the move, of length 1, that changes the gaps from a surface to seen points least.
+
+    Along one plane it changes none.
+    """
+    return make_gap_equations(similarity, surface, seen, GATES[-1]).decompose()[1][:, 0]
 
 
 def find_closest(
@@ -388,11 +428,16 @@ def get_similarity_scale(similarity: SurfaceSimilarity) -> float:
     return float(np.cbrt(np.linalg.det(similarity[:3, :3])))
 
 
-def make_step(step: Float[ndarray, "7"], seen: SeenPoints) -> SurfaceSimilarity:
-    """Make the similarity of a turn, a shift and a growth about the middle of what is seen."""
-    from scipy.spatial.transform import Rotation
+def make_move(move: Float[ndarray, "7"], seen: SeenPoints) -> SurfaceSimilarity:
+    """Make the similarity of a turn, a shift and a growth about the middle of what is seen.
 
-    matrix = np.eye(4)
-    matrix[:3, :3] = np.exp(step[6]) * Rotation.from_rotvec(step[:3]).as_matrix()
-    matrix[:3, 3] = seen.middle + seen.size * step[3:6] - matrix[:3, :3] @ seen.middle
-    return matrix
+    All three go on together as they begin (the exponential map), so that a long move along a plane,
+    an edge or a cylinder stays on it.
+    """
+    from scipy.linalg import expm
+
+    x, y, z = move[:3]
+    generator = np.zeros((4, 4))
+    generator[:3, :3] = [[move[6], -z, y], [z, move[6], -x], [-y, x, move[6]]]
+    generator[:3, 3] = seen.size * move[3:6] - generator[:3, :3] @ seen.middle
+    return expm(generator)

@@ -27,8 +27,10 @@ from gscompleter.numerics.surface_alignment import (
     SurfacePoints,
     SurfaceSimilarity,
     align_surface,
+    find_least_determined_move,
     fit_closest_points,
     get_similarity_scale,
+    make_move,
     make_seen_points,
     sample_surface,
 )
@@ -59,6 +61,9 @@ MAX_SAME = 0.1
 """Largest distance of two places that count as one, relative to the size of what is seen."""
 MAX_ELSEWHERE = 0.05
 """Largest share of a surface that is farther away in two places that count as one."""
+LONG_MOVE = 0.4
+"""How far a place is moved on to test whether anything determines it, relative to the size of what
+is seen. Places that are right then agree by a tenth less, those along a wall as before."""
 
 
 @dataclass(frozen=True)
@@ -84,10 +89,14 @@ class SurfaceComparison:
         return agrees.float().mean().item() if len(agrees) else 0.0
 
     @property
+    def is_compared(self) -> bool:
+        """True if enough of what is seen is compared to judge a place that was found."""
+        return len(self.deviations) >= MIN_SEEN_SHARE * self.num_seen
+
+    @property
     def is_placed(self) -> bool:
-        """True if a place that was found is believed."""
-        is_enough = len(self.deviations) >= MIN_SEEN_SHARE * self.num_seen
-        return is_enough and self.agreement >= MIN_PLACED
+        """True if a place that was found is believed, provided that what is seen determines it."""
+        return self.is_compared and self.agreement >= MIN_PLACED
 
 
 @dataclass(frozen=True)
@@ -157,7 +166,9 @@ def place_geometry(
     similarity, _ = fit_closest_points(np.eye(4), surface, seen)
     after = scene.compare(geometry.transform(similarity))
     is_better = after.is_placed and MIN_GAIN * after.deviation <= before.deviation
-    return move_to(geometry, similarity, after) if is_better else geometry
+    if is_better and is_determined(geometry, similarity, scene, surface, seen):
+        return move_to(geometry, similarity, after)
+    return geometry
 
 
 def search_place(
@@ -183,13 +194,38 @@ def search_place(
     most = max(compared[number].agreement for number in found)
     alike = [number for number in found if compared[number].agreement > most - MIN_LEAD]
     best = min(alike, key=lambda number: compared[number].deviation)
-    if not all(are_same_place(places[best], places[i], surface, seen) for i in alike):
+    if not (
+        all(are_same_place(places[best], places[i], surface, seen) for i in alike)
+        and is_determined(geometry, places[best], scene, surface, seen)
+    ):
         raise InputError(
-            f"{geometry.name} fits the scene in several places alike, as symmetric rooms do, and "
-            f"nothing tells which is right; {ADVICE}.",
+            f"{geometry.name} fits the scene in several places alike, as in a symmetric room, "
+            f"along a single wall or in a corner; {ADVICE}, or photographs that show opposite "
+            f"walls and furniture.",
             "geometry",
         )
     return move_to(geometry, places[best], compared[best])
+
+
+def is_determined(
+    geometry: GivenGeometry,
+    place: SurfaceSimilarity,
+    scene: SeenScene,
+    surface: SurfacePoints,
+    seen: SeenPoints,
+) -> bool:
+    """Return True if geometry fits worse when the move that is least determined goes on.
+
+    One wall does not tell where along it the geometry is, and no single corner how large.
+    """
+    move = LONG_MOVE * find_least_determined_move(place, surface, seen)
+    fit, *others = (
+        scene.compare(geometry.transform(similarity))
+        for similarity in (place, make_move(move, seen) @ place, make_move(-move, seen) @ place)
+    )
+    return not any(
+        other.is_compared and other.agreement > fit.agreement - MIN_LEAD for other in others
+    )
 
 
 def are_same_place(
