@@ -1,11 +1,11 @@
 """Write the figures of docs/reproduce.md and docs/results.md from the outputs of evaluations.
 
-    python benchmarks/write_results.py [--reproduced OUT] [--held-out OUT] [--check]
+    python benchmarks/write_results.py [--reproduced OUT] [--development OUT] [--held-out OUT] [--check]
     python benchmarks/write_results.py --tables NAME OUT
     python benchmarks/write_results.py --measured NAME COMMIT
 
-`make reproduce` and `make held-out` make the two outputs. Tables and scores are copied to
-docs/results with the commit that computed them. What stands between `<!-- ours: ... -->` and
+`make reproduce`, `make development` and `make held-out` make the three outputs. Tables and scores are
+copied to docs/results with the commit that computed them. What stands between `<!-- ours: ... -->` and
 `<!-- end -->` in the pages is written from there, beside the numbers of the paper
 (paper_values.yaml). Nobody types a figure. With --check nothing is written; the exit code is 1 if a
 page differs from the stored outputs.
@@ -65,8 +65,6 @@ ALTERNATIVES = {
     "licence": "licence",
 }
 """Columns of the table of alternatives."""
-DEVELOPMENT = "plane-sweep-cases-warp-inpaint"
-"""Start of the name of the run with the table of all development cases."""
 REGION = re.compile(r"(<!-- ours: (?P<words>[^>]*?) -->\n)(?P<body>.*?)(<!-- end -->)", re.DOTALL)
 NOT_MEASURED = "Not measured yet.\n"
 
@@ -75,6 +73,7 @@ def main() -> None:
     """Copy outputs and write the pages, as the command line asks."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--reproduced", type=Path, help="output of make reproduce")
+    parser.add_argument("--development", type=Path, help="output of make development")
     parser.add_argument("--held-out", type=Path, help="output of make held-out")
     parser.add_argument("--check", action="store_true", help="only compare the pages")
     parser.add_argument("--tables", nargs=2, metavar=("NAME", "OUT"))
@@ -86,9 +85,10 @@ def main() -> None:
         copy_tables(*options.tables)
     if options.reproduced is not None:
         copy_reproduction(options.reproduced)
+    if options.development is not None:
+        copy_scores("development", options.development)
     if options.held_out is not None:
-        shutil.copyfile(options.held_out / "tables.json", STORED / "held_out.json")
-        note_measured("held_out", find_one_commit([STORED / "held_out.json"]))
+        copy_scores("held_out", options.held_out)
     stale = []
     for name in PAGES:
         page = DOCS / name
@@ -103,18 +103,22 @@ def main() -> None:
     sys.exit(1 if stale and options.check else 0)
 
 
+def copy_scores(name: str, out: Path) -> None:
+    """Copy the scores of an evaluation, whose pages name them by `name`."""
+    scores = STORED / f"{name}.json"
+    shutil.copyfile(out / "tables.json", scores)
+    note_measured(name, find_one_commit([scores]))
+
+
 def copy_reproduction(out: Path) -> None:
-    """Copy tables and results of a reproduction, and the scores of all cases."""
+    """Copy tables and results of a reproduction."""
     for path in sorted((out / "tables").glob("*.json")):
         shutil.copyfile(path, STORED / "tables" / path.name)
     # Figures show photographs, which may not be redistributed.
     text = (out / "results.md").read_text("utf-8")
     without_figures = re.sub(r"## [^\n]*\n+!\[[^\n]*\n*", "", text)
     (STORED / "results.md").write_text(without_figures.rstrip() + "\n", "utf-8")
-    (scores,) = (out / "runs").glob(f"{DEVELOPMENT}/tables.json")
-    shutil.copyfile(scores, STORED / "development.json")
-    stored = [STORED / "development.json", *(STORED / "tables").glob("*.json")]
-    note_measured("reproduced", find_one_commit(stored))
+    note_measured("reproduced", find_one_commit((STORED / "tables").glob("*.json")))
 
 
 def copy_tables(name: str, out: str) -> None:
