@@ -1,14 +1,15 @@
 """Write the figures of docs/reproduce.md and docs/results.md from the outputs of evaluations.
 
-    python benchmarks/write_results.py [--reproduced OUT] [--development OUT] [--held-out OUT] [--check]
+    python benchmarks/write_results.py [--reproduced OUT] [--development OUT] [--held-out OUT]
+    python benchmarks/write_results.py --check
     python benchmarks/write_results.py --tables NAME OUT
     python benchmarks/write_results.py --measured NAME COMMIT
 
-`make reproduce`, `make development` and `make held-out` make the three outputs. Tables and scores are
-copied to docs/results with the commit that computed them. What stands between `<!-- ours: ... -->` and
-`<!-- end -->` in the pages is written from there, beside the numbers of the paper
-(paper_values.yaml). Nobody types a figure. With --check nothing is written; the exit code is 1 if a
-page differs from the stored outputs.
+`make reproduce`, `make development` and `make held-out` make the three outputs. Tables and scores
+are copied to docs/results with the commit that computed them. What stands between
+`<!-- ours: ... -->` and `<!-- end -->` in the pages is written from there, beside the numbers of
+the paper (paper_values.yaml). Nobody types a figure. With --check nothing is written; the exit code
+is 1 if a page differs from the stored outputs.
 
 A figure is true of the code that it was measured with. docs/results/measured.json has that commit
 for each set of figures, with the digests of its method and of its golden scenes, and the sentence
