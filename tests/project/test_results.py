@@ -117,10 +117,10 @@ def test_a_figure_says_what_happened_to_its_method(monkeypatch, tmp_path):
 def test_a_page_is_stale_once_the_method_changed(monkeypatch):
     """The check fails until the page says so: once for each measurement."""
     filled = write_results.fill_page("<!-- ours: measured held_out -->\n<!-- end -->")
-    assert "Measured at commit `a18a163d`" in filled
+    measured = json.loads(write_results.MEASURED.read_text())["held_out"]
+    assert f"Measured at commit `{measured['commit']}`" in filled
     assert write_results.fill_page(filled) == filled
-    method = json.loads(write_results.MEASURED.read_text())["held_out"]["method"]
-    monkeypatch.setattr(write_results, "compute_current_digest", lambda: method)
+    monkeypatch.setattr(write_results, "compute_current_digest", lambda: measured["method"])
     assert write_results.fill_page(filled) != filled
 
 
