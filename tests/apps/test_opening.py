@@ -46,6 +46,17 @@ def test_photographs_that_are_not_there_are_refused(tmp_path, monkeypatch, capsy
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("option", ["--context", "--target"])
+def test_a_name_that_no_file_has_is_refused_before_cameras_are_searched_for(
+    tmp_path, monkeypatch, capsys, option
+):
+    write_photographs(tmp_path / "plain", CAMERAS)
+    words = (option, "photo_009.png", "photo_001.png")
+    assert run(monkeypatch, "complete", tmp_path / "plain", *words, "--out", tmp_path / "out") == 2
+    said = f"There is no photograph 'photo_009.png' among the {len(CAMERAS)} of"
+    assert said in capsys.readouterr().err
+
+
 def test_a_number_is_a_photograph_whatever_the_working_folder_holds(tmp_path, monkeypatch):
     photographs = open_photographs(write_transforms(tmp_path / "scene", CAMERAS))
     (tmp_path / "1").mkdir()

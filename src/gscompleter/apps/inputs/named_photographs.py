@@ -16,6 +16,7 @@ from gscompleter.data.scene import load_cameras
 from gscompleter.data.sfm.poses import PHOTOGRAPH_ENDINGS, list_photograph_files
 from gscompleter.data.video import is_video
 from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.names import fold_name
 
 FRAME_NUMBER = re.compile("-?[0-9]{1,9}")
 """Words that are numbers of photographs. Longer ones are names, such as times in nanoseconds; one
@@ -56,21 +57,31 @@ def find_frame(photographs: Photographs, word: int | str, option: str) -> int:
 
 
 def check_frame_numbers(folder: Path, words: PhotographNames, num_video_frames: int) -> None:
-    """Refuse numbers beyond the photographs of `folder`, before the search for their cameras.
+    """Refuse photographs that `folder` does not have, before the search for their cameras.
 
     Of a video, `num_video_frames` serve as photographs at most. Each panorama is split into several
     photographs, so that any number is possible.
     """
-    # Names are left for later: photographs have them once their cameras are known.
-    frames = [int(word) for word in map(str, words) if FRAME_NUMBER.fullmatch(word)]
+    named = [word for word in map(str, words) if names_photograph(word)]
+    frames = [int(word) for word in named if FRAME_NUMBER.fullmatch(word)]
     if is_video(folder):
         count = num_video_frames
     else:
         files = list_photograph_files(folder)
         count = len(files)
-        # Telling panoramas apart opens each photograph, so it is done only if a number needs it.
-        if frames and has_panoramas([folder / name for name in files]):
+        # Telling panoramas apart opens each photograph, so it is done only if a word needs it.
+        if named and has_panoramas([folder / name for name in files]):
             return
+        # Folders and endings of the names are compared once cameras are known.
+        stems = {fold_name(Path(name).stem) for name in files}
+        for word in named:
+            is_number = FRAME_NUMBER.fullmatch(word) is not None
+            if not is_number and fold_name(Path(word).stem) not in stems:
+                raise InputError(
+                    f"There is no photograph '{quote_value(word, 60)}' among the {count} of "
+                    f"{quote_value(folder)}; name one of them, such as "
+                    f"'{quote_value(Path(files[0]).name)}', or its number from 0 to {count - 1}."
+                )
 
     for frame in frames:
         if not 0 <= frame < count:
