@@ -119,6 +119,8 @@ def test_the_painted_image_ends_in_the_splat(found, tmp_path):
     ]
 
 
+# `test_the_painted_image_ends_in_the_splat` and the next test register one painting each.
+@pytest.mark.slow
 def test_each_painting_gets_its_folder_and_may_be_larger(found, tmp_path):
     image, mask, holes, *_ = found
     large = paint(image, mask).repeat_interleave(2, dim=1).repeat_interleave(2, dim=2)
