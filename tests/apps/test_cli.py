@@ -167,6 +167,8 @@ def test_the_same_command_gives_the_same_bytes(scene, completed, tmp_path, monke
         assert (tmp_path / "out" / name).read_bytes() == (completed / name).read_bytes(), name
 
 
+# `test_photometric.py` strips a result to the byte, and `test_completer.py` compares the context.
+@pytest.mark.slow
 def test_a_given_ply_is_kept_bit_for_bit(scene, completed, tmp_path, monkeypatch):
     given = completed / "context.ply"
     out = tmp_path / "out"
