@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from command import run
 from gscompleter import load_ply, save_ply
@@ -158,8 +159,9 @@ def test_a_cleaning_compares_at_refined_poses_and_the_next_command_takes_them(
     pose = np.array(row["transform_matrix"]) @ OPENCV_FROM_OPENGL
     assert np.array_equal(pose, CAMERAS[SHAKEN].c2w.double().numpy())
 
-    # COLMAP is not asked again beside a splat: its poses lie there.
-    monkeypatch.setattr(refined_poses, "refine_poses", None)
-    words = ("--scene", out / "completed.ply", "--context", *CONTEXT, "--resolution", 48, 48)
-    assert run(monkeypatch, "clean", scene, *words, "--out", tmp_path / "again") == 0
-    assert "are used" in capsys.readouterr().err
+    # The next command takes them, as they lie beside its splat.
+    photographs = open_photographs(scene)
+    opened = Opened(SceneRequest(scene), photographs, "nerfstudio", len(photographs))
+    opened = refined_poses.take_over_poses(opened, out / "completed.ply", Console(quiet=True))
+    assert opened.refinement is not None
+    assert np.array_equal(opened.photographs.frames[SHAKEN].c2w, pose)
