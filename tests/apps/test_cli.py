@@ -204,7 +204,7 @@ def told_by_the_oracle(scene, tmp_path_factory) -> Path:
     out = tmp_path_factory.mktemp("oracle") / "out"
     more = ("--generator", "oracle", "--config", "no-da", "--config.registration.iterations", 3)
     with pytest.MonkeyPatch.context() as monkeypatch:
-        assert run(monkeypatch, *complete(scene, out, *more, "--quiet")) == 0
+        assert run(monkeypatch, *complete(scene, out, *more, *SMALL)) == 0
     return out
 
 

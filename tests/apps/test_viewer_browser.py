@@ -331,7 +331,8 @@ def test_nothing_is_shown_beyond_the_frame_after_the_window_is_resized(
     tab.context.close()
 
 
-# `test_viewer.py` has such a page, and `test_keys_and_drags_do_what_the_page_says` leaves a frame.
+# `test_viewer.py` has such a page, and
+# `test_nothing_is_shown_beyond_the_frame_of_a_camera_until_it_is_moved` leaves a frame.
 @pytest.mark.slow
 def test_a_page_without_cameras_fills_the_window(browser, exhibit, libraries, tmp_path):
     (tmp_path / "page.html").write_bytes(make_page(replace(exhibit, cameras=()), libraries)[0])
