@@ -35,26 +35,20 @@ install_import_hook(CHECKED, "checked_calls.check_first_calls")
 
 
 LONGEST = (
-    "apps/test_viewer_browser.py",
     "apps/test_cli.py",
+    "apps/test_viewer_browser.py",
+    "apps/test_live.py",
     "test_completer.py",
     "project/test_snippets.py",
-    "apps/test_live.py",
     "models/test_feed_forward.py",
     "apps/test_doors.py",
-    "evaluation/test_runs.py",
-    "apps/test_live_browser.py",
     "apps/test_painters.py",
-    "apps/test_splat_alone.py",
-    "apps/test_remove.py",
-    "data/test_colmap.py",
     "models/test_diffusion.py",
-    "splats/alignment/test_estimate.py",
-    "data/test_limits.py",
-    "evaluation/test_steps.py",
-    "models/test_published_models.py",
-    "apps/test_rehearsal.py",
+    "evaluation/test_runs.py",
     "test_commands_on_a_device.py",
+    "apps/test_remove.py",
+    "integrations/test_comfyui.py",
+    "stages/test_add_observed.py",
 )
 """Files that take longest, in the order in which processes of pytest-xdist begin them: one that
 began a long file last would be waited for."""

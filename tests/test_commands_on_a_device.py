@@ -192,7 +192,9 @@ def test_photographs_update_a_splat_and_others_are_kept_back(room, tmp_path, mon
     assert_bounded(device, "update")
 
 
-@pytest.mark.parametrize("source", ["photographs", "splat alone"])
+@pytest.mark.parametrize(
+    "source", ["photographs", pytest.param("splat alone", marks=pytest.mark.slow)]
+)
 def test_a_splat_that_does_not_fit_on_the_gpu_is_refused_before_anything_is_computed(
     room, tmp_path, monkeypatch, capsys, source
 ):

@@ -251,9 +251,8 @@ def test_auto_chooses_a_gpu_that_draws(device):
     assert choose_devices("auto") == Devices("cuda", "cuda")
 
 
-# With gaps, the same stages are bounded as well.
 @pytest.mark.parametrize(
-    "name", ["with gaps", *(pytest.param(n, marks=pytest.mark.slow) for n in ("default", "paper"))]
+    "name", ["default", *(pytest.param(n, marks=pytest.mark.slow) for n in ("with gaps", "paper"))]
 )
 def test_a_completion_stays_on_the_device_and_waits_no_more_than_it_has_to(device, name):
     views = make_views()

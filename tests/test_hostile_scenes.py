@@ -199,7 +199,13 @@ SWEEPS: dict[str, bytes | Callable[[], bytes]] = {
 }
 
 
-@pytest.mark.parametrize("name", SWEEPS)
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name == "zeros by the gigabyte"))
+        for name in SWEEPS
+    ],
+)
 def test_a_sweep_that_is_none_is_refused(tmp_path, name):
     folder = write_swept_dgp(tmp_path)
     read(folder)

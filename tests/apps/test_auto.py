@@ -17,7 +17,7 @@ from scenes import camera_at, photographed
 PLACES = ((-0.4, -4), (-0.2, 0), (0.0, 0), (0.3, 4), (0.5, 8))
 QUICK = (
     "--resolution",
-    48,
+    32,
     "--near",
     0.5,
     "--far",
@@ -71,12 +71,12 @@ def test_the_scene_covers_more_from_around_the_photographs(completed):
 
 def test_the_cameras_stand_beside_the_photographs_they_were_derived_from(scene, completed):
     photographs = open_photographs(scene)
-    found = load_cameras(completed / "targets.json", 48)
+    found = load_cameras(completed / "targets.json", 32)
     rows = summary_of(completed)["targets"]
     assert len(found) == len(rows)
     for camera, row in zip(found, rows, strict=True):
-        assert (camera.width, camera.height) == (48, 48)
-        assert measure_baseline(camera, photographs.camera(row["derived_from"], 48)) < 0.5
+        assert (camera.width, camera.height) == (32, 32)
+        assert measure_baseline(camera, photographs.camera(row["derived_from"], 32)) < 0.5
 
 
 @pytest.mark.slow
@@ -155,8 +155,8 @@ def test_a_dry_run_shows_what_named_targets_would_cost(scene, tmp_path, monkeypa
     out = tmp_path / "out"
     words = ("complete", scene, "--out", out, "--target", 4, "--dry-run", *QUICK)
     assert run(monkeypatch, *words) == 0
-    (camera,) = load_cameras(out / "targets.json", 48)
-    assert torch.allclose(camera.c2w, open_photographs(scene).camera(4, 48).c2w, atol=1e-6)
+    (camera,) = load_cameras(out / "targets.json", 32)
+    assert torch.allclose(camera.c2w, open_photographs(scene).camera(4, 32).c2w, atol=1e-6)
 
 
 def test_a_number_may_follow_auto_or_not():

@@ -24,28 +24,33 @@ def browser() -> Iterator[Any]:
         yield browser
 
 
-@pytest.fixture
-def batch(tmp_path) -> Path:
+@pytest.fixture(scope="module")
+def batch(tmp_path_factory) -> Path:
     """Write the folder of a batch with a scene that is done and one that failed."""
+    folder = tmp_path_factory.mktemp("batch")
     done = {"state": "done", "targets": 1, "added": 3, "seconds": 2.0, **dict.fromkeys(SCORES, 0.5)}
     failed = {"state": "failed", "reason": "There is no <photograph>."}
     shards = {"state": "failed", "reason": "The scene did not reconstruct."}
-    (tmp_path / "rows").mkdir()
+    (folder / "rows").mkdir()
     for name, row in (("room & hall", done), ("cellar", failed), ("attic", shards)):
         content = {"job": name, "options": {}, "attempts": 1, **row}
-        (tmp_path / "rows" / f"{name}.json").write_text(json.dumps(content))
-    images = tmp_path / "jobs" / "room & hall" / "images"
+        (folder / "rows" / f"{name}.json").write_text(json.dumps(content))
+    images = folder / "jobs" / "room & hall" / "images"
     images.mkdir(parents=True)
     for number, when in enumerate(("before", "after")):
         write_image(images / f"target1_{when}.png", torch.full((24, 32, 3), 0.5 + 0.2 * number))
-    (tmp_path / "jobs" / "attic").mkdir()
-    (tmp_path / "jobs" / "attic" / "report.html").write_text("<title>Attic</title>")
-    write_overview(tmp_path, [Job("room & hall"), Job("cellar"), Job("attic")])
-    return tmp_path
+    (folder / "jobs" / "attic").mkdir()
+    (folder / "jobs" / "attic" / "report.html").write_text("<title>Attic</title>")
+    write_overview(folder, [Job("room & hall"), Job("cellar"), Job("attic")])
+    return folder
 
 
-def test_the_pictures_of_the_jobs_are_shown(browser, batch):
-    tab = Tab(browser, batch / "index.html", 1000, 800)
+@pytest.fixture(scope="module")
+def tab(browser, batch) -> Tab:
+    return Tab(browser, batch / "index.html", 1000, 800)
+
+
+def test_the_pictures_of_the_jobs_are_shown(tab, batch):
     tab.page.evaluate("Promise.all([...document.images].map((image) => image.decode()))")
     sizes = tab.page.evaluate("[...document.images].map((image) => image.naturalWidth)")
     assert sizes == [32, 32]
@@ -55,8 +60,7 @@ def test_the_pictures_of_the_jobs_are_shown(browser, batch):
     assert tab.page.locator("#failures").inner_text().count("There is no <photograph>.") == 1
 
 
-def test_a_failed_job_that_left_a_report_links_to_it(browser, batch):
-    tab = Tab(browser, batch / "index.html", 1000, 800)
+def test_a_failed_job_that_left_a_report_links_to_it(tab):
     (link,) = tab.page.locator("#failures a").all()
     assert link.inner_text() == "attic"
     link.click()

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from command import run
 from gscompleter import load_ply, save_ply
@@ -26,14 +27,6 @@ def scene(tmp_path) -> Path:
     return write_shaken(tmp_path / "scene")
 
 
-QUICK = [
-    word
-    for name in ("registration.iterations", "refine.iterations", "refine.color-rounds")
-    for word in (f"--config.{name}", 2)
-]
-"""Few steps of the stages, where the result does not matter."""
-
-
 def complete(monkeypatch, scene: Path, out: Path, *more: object) -> dict:
     """Complete at a photograph, and return the summary."""
     words = ("--context", *CONTEXT, "--target", 6, "--resolution", 96, 96, "--out", out)
@@ -41,24 +34,7 @@ def complete(monkeypatch, scene: Path, out: Path, *more: object) -> dict:
     return json.loads((out / "summary.json").read_text())
 
 
-def test_refined_poses_are_told_and_kept(scene, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(refined_poses, "refine_poses", correct)
-    out = tmp_path / "out"
-    assert complete(monkeypatch, scene, out, *QUICK)["scene"]["refined_poses"] == vars(DONE)
-    assert DONE.describe() in capsys.readouterr().err.replace("\n", " ")
-    (row,) = json.loads((out / "refined_poses.json").read_text())["frames"]
-    pose = np.array(row["transform_matrix"]) @ OPENCV_FROM_OPENGL
-    assert np.array_equal(pose, CAMERAS[SHAKEN].c2w.double().numpy())
-
-    # COLMAP is not asked again beside a splat: its poses lie there.
-    monkeypatch.setattr(refined_poses, "refine_poses", None)
-    capsys.readouterr()
-    splat = ("--scene", out / "completed.ply", "--dry-run")
-    complete(monkeypatch, scene, tmp_path / "again", *QUICK, *splat)
-    assert "are used" in capsys.readouterr().err
-
-
-# `test_refined_poses_are_told_and_kept` begins so.
+# `test_a_cleaning_compares_at_refined_poses_and_the_next_command_takes_them` is shorter.
 @pytest.mark.slow
 def test_contradicted_poses_are_refined_and_the_next_command_takes_them(
     scene, tmp_path, monkeypatch, capsys
@@ -169,10 +145,23 @@ def test_poses_that_a_given_splat_contradicts_are_kept(scene, splat, monkeypatch
     assert refined_poses.ask_splat(photographs, refined, task, DONE).is_accepted
 
 
-def test_a_cleaning_compares_at_refined_poses(scene, splat, tmp_path, monkeypatch):
+def test_a_cleaning_compares_at_refined_poses_and_the_next_command_takes_them(
+    scene, splat, tmp_path, monkeypatch, capsys
+):
     monkeypatch.setattr(refined_poses, "refine_poses", correct)
+    out = tmp_path / "out"
     words = ("--scene", splat, "--context", *CONTEXT, "--resolution", 96, 96)
-    assert run(monkeypatch, "clean", scene, *words, "--out", tmp_path / "out") == 0
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert run(monkeypatch, "clean", scene, *words, "--out", out) == 0
+    assert "refined ones by 0.10 px (of 256); the splat agrees" in capsys.readouterr().err
+    summary = json.loads((out / "summary.json").read_text())
     assert summary["scene"]["refined_poses"]["refined_error"] == DONE.refined_error
-    assert (tmp_path / "out" / "refined_poses.json").is_file()
+    (row,) = json.loads((out / "refined_poses.json").read_text())["frames"]
+    pose = np.array(row["transform_matrix"]) @ OPENCV_FROM_OPENGL
+    assert np.array_equal(pose, CAMERAS[SHAKEN].c2w.double().numpy())
+
+    # The next command takes them, as they lie beside its splat.
+    photographs = open_photographs(scene)
+    opened = Opened(SceneRequest(scene), photographs, "nerfstudio", len(photographs))
+    opened = refined_poses.take_over_poses(opened, out / "completed.ply", Console(quiet=True))
+    assert opened.refinement is not None
+    assert np.array_equal(opened.photographs.frames[SHAKEN].c2w, pose)

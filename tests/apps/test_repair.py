@@ -158,6 +158,8 @@ def test_a_selection_is_repaired_as_what_a_mask_marks(folder, selected, tmp_path
     assert back.read_bytes() == splat.read_bytes()
 
 
+# Tests above repair a selection in a splat alone, and a mask with photographs.
+@pytest.mark.slow
 def test_a_selection_is_repaired_with_photographs(folder, selected, tmp_path, monkeypatch):
     out = tmp_path / "out"
     words = ("repair", folder / "photographs", "--scene", folder / "splat.ply", "--quiet")

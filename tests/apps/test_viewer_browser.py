@@ -139,7 +139,10 @@ def observed_of(exhibit: ViewerContent) -> Gaussians:
     return exhibit.after[exhibit.after.generated == 0]
 
 
-@pytest.mark.parametrize(("name", "camera"), [("target-1", TARGET), ("camera-1", LEFT)])
+@pytest.mark.parametrize(
+    ("name", "camera"),
+    [("target-1", TARGET), pytest.param("camera-1", LEFT, marks=pytest.mark.slow)],
+)
 def test_both_pictures_are_those_of_our_renderer(bare, exhibit, name, camera):
     bare.do("gsc.setMode('side')")
     assert bare.do(f"gsc.goTo('{name}')")
@@ -207,6 +210,23 @@ def test_a_held_key_shows_before_as_long_as_it_is_held(bare):
     bare.page.keyboard.up("b")
     bare.do("gsc.settled()")
     assert np.abs(bare.picture() - after).max() < 0.02
+
+
+def test_nothing_is_shown_beyond_the_frame_of_a_camera_until_it_is_moved(bare):
+    bare.do("gsc.setMode('after')")
+    bare.do("gsc.goTo('target-1')")
+    around = np.ones((SIDE, 2 * SIDE), dtype=bool)
+    around[:, SIDE // 2 : -SIDE // 2] = False
+    shown = bare.picture()
+    # One colour, which is not the black of holes.
+    assert np.ptp(shown[around], axis=0).max() == 0
+    assert shown[around].min() > 0.2
+
+    bare.key("w")
+    assert not bare.do("gsc.stats().framed")
+    assert np.ptp(bare.picture()[around], axis=0).max() > 0.3
+    bare.key("r")
+    assert np.abs(bare.picture() - shown).max() < 0.02
 
 
 def test_keys_choose_what_is_shown(bare):
@@ -280,14 +300,12 @@ def test_a_link_opens_at_its_camera(browser, saved):
     tab.context.close()
 
 
-@pytest.mark.parametrize(
-    ("width", "height"),
-    [(4 * SIDE, SIDE), pytest.param(SIDE, 3 * SIDE, marks=pytest.mark.slow)],
-)
-def test_nothing_is_shown_beyond_the_frame_of_a_camera_until_it_is_moved(
+# `test_nothing_is_shown_beyond_the_frame_of_a_camera_until_it_is_moved` is the short one.
+@pytest.mark.slow
+@pytest.mark.parametrize(("width", "height"), [(4 * SIDE, SIDE), (SIDE, 3 * SIDE)])
+def test_nothing_is_shown_beyond_the_frame_after_the_window_is_resized(
     browser, saved, width, height
 ):
-    """Neither after the page is opened nor after the window is resized."""
     tab = Window(browser, saved, SIDE, SIDE, "#camera=target-1&mode=after")
     tab.page.add_style_tag(content=BARE)
     tab.do("gsc.settled()")
@@ -313,6 +331,9 @@ def test_nothing_is_shown_beyond_the_frame_of_a_camera_until_it_is_moved(
     tab.context.close()
 
 
+# `test_viewer.py` has such a page, and
+# `test_nothing_is_shown_beyond_the_frame_of_a_camera_until_it_is_moved` leaves a frame.
+@pytest.mark.slow
 def test_a_page_without_cameras_fills_the_window(browser, exhibit, libraries, tmp_path):
     (tmp_path / "page.html").write_bytes(make_page(replace(exhibit, cameras=()), libraries)[0])
     tab = Window(browser, tmp_path / "page.html", 320, 240)

@@ -171,6 +171,8 @@ def test_coordinates_that_float32_can_hold_are_left_alone(room, tmp_path):
     assert load_camera(aside, 0).center.tolist() == pytest.approx([299.7, -200.0, 0.0])
 
 
+# The next test completes around a local origin, and `test_map_coordinates.py` in a map.
+@pytest.mark.slow
 def test_a_remote_scene_is_completed_around_a_local_origin(room, tmp_path, monkeypatch):
     far, out = moved(room, tmp_path / "far", UTM), tmp_path / "out"
     origin = np.array([UTM[0] - 0.3, *UTM[1:]])

@@ -78,7 +78,13 @@ def score(scene: Gaussians) -> list[float]:
     return [psnr(RENDERER.render(scene, v.camera).image.clamp(0, 1), v.image) for v in PHOTOS]
 
 
-@pytest.mark.parametrize("z", [1.6, 2.6], ids=["before the box", "within it"])
+@pytest.mark.parametrize(
+    "z",
+    [
+        pytest.param(1.6, id="before the box", marks=pytest.mark.slow),
+        pytest.param(2.6, id="within it"),
+    ],
+)
 def test_what_stands_before_a_photographed_surface_gives_way(z):
     scene = merge([CUT, make_board(z)])
     kept, replaced = begin(scene, marks=False), begin(scene)

@@ -16,7 +16,7 @@ from solids import chair, cover, stone
 
 RENDERER = load_renderer("cpu")
 UP = torch.tensor([0.0, -1.0, 0.0])
-SIZE = 96
+SIZE = 64
 
 
 def look_at_chair() -> Camera:
@@ -49,11 +49,11 @@ def test_a_hole_that_was_cut_through_a_surface_lies_in_the_hull():
 
 
 def test_what_is_added_for_an_object_lies_in_its_hull():
-    seat = chair(0.015)
+    seat = chair()
     target = look_at_chair()
     contexts = choose_cameras_around(seat, target, RENDERER)
     views = gsc.render_views(seat, contexts)
-    hull = look_from_outside(seat, RENDERER, 192)
+    hull = look_from_outside(seat, RENDERER, 96)
     outside = {}
     for name in ("without", "with"):
         config = CompleterConfig.bare()

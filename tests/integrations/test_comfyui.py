@@ -28,6 +28,9 @@ SIZE = 64
 CAMERAS = [camera_at(x, size=SIZE) for x in (-0.3, 0.0, 0.3)]
 TARGET = camera_at(x=0.8, z=0.5, yaw=25, size=SIZE)
 MAGENTA = torch.tensor([1.0, 0.0, 1.0])
+MARK = torch.zeros(1, SIZE, SIZE)
+MARK[:, 26:38, 30:44] = 1.0
+"""A mask in the middle of the splat alone."""
 
 
 def load_nodes():
@@ -119,6 +122,8 @@ def test_the_painted_image_ends_in_the_splat(found, tmp_path):
     ]
 
 
+# `test_the_painted_image_ends_in_the_splat` and the next test register one painting each.
+@pytest.mark.slow
 def test_each_painting_gets_its_folder_and_may_be_larger(found, tmp_path):
     image, mask, holes, *_ = found
     large = paint(image, mask).repeat_interleave(2, dim=1).repeat_interleave(2, dim=2)
@@ -196,19 +201,26 @@ def test_targets_are_searched_for_and_photographs_chosen(scene):
     assert mask.sum() > 0
 
 
-def test_a_painted_mask_is_repaired_and_the_record_goes_on(alone, tmp_path, monkeypatch):
-    mask = torch.zeros(1, SIZE, SIZE)
-    mask[:, 26:38, 30:44] = 1.0
-    inputs = {"target": str(alone / "camera.json"), "out": str(tmp_path), "mask": mask}
-    first, after = call("GSCompleterRepair", splat=str(alone / "splat.ply"), **inputs)
+def repair(alone: Path, out: Path) -> tuple[str, torch.Tensor]:
+    """Repair what a mask marks in a splat, and return the result and its image."""
+    inputs = {"target": str(alone / "camera.json"), "out": str(out), "mask": MARK}
+    return call("GSCompleterRepair", splat=str(alone / "splat.ply"), **inputs)
+
+
+def test_a_painted_mask_is_repaired(alone, tmp_path):
+    first, after = repair(alone, tmp_path)
     assert after.shape == (1, SIZE, SIZE, 3)
     given = {"splat": str(alone / "splat.ply"), "target": str(alone / "camera.json")}
     (before,) = call("GSCompleterShowSplat", **given, height=SIZE, width=SIZE)
-    assert (after - before).abs()[mask == 0].mean() < 0.02
-    assert (after - before).abs()[mask == 1].max() > 0.1
+    assert (after - before).abs()[MARK == 0].mean() < 0.02
+    assert (after - before).abs()[MARK == 1].max() > 0.1
     assert gsc.load_splat(first).generated.any()
 
-    # A painting on top of it is a second edit, and both come off one by one.
+
+# The tests before repair, and register a painting; `test_undo.py` takes edits off one by one.
+@pytest.mark.slow
+def test_a_painting_on_top_of_a_repair_is_a_second_edit(alone, tmp_path, monkeypatch):
+    first, _ = repair(alone, tmp_path)
     image, asked, holes, *_ = find_alone(first, alone / "away.json")
     painted = {"holes": holes, "image": paint(image, asked), "out": str(tmp_path)}
     (second,) = call("GSCompleterRegisterPainting", **painted)

@@ -66,7 +66,7 @@ NETWORKS = {
 @pytest.mark.parametrize(
     "name",
     [
-        pytest.param(name, marks=[pytest.mark.slow] * (name in ("depthsplat", "volsplat")))
+        pytest.param(name, marks=[pytest.mark.slow] * (name != "depth-anything"))
         for name in NETWORKS
     ],
 )

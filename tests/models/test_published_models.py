@@ -80,6 +80,8 @@ def test_without_a_file_it_is_said_where_to_get_it(monkeypatch, tmp_path):
         load_reconstructor("mvsplat-acid")
 
 
+# `test_feed_forward.py` completes with this network, and a test below has its range.
+@pytest.mark.slow
 def test_a_completion_with_random_weights_runs_end_to_end(mvsplat_file, tmp_path, monkeypatch):
     """Random weights: this only checks frames, shapes and stages."""
     cameras = [camera_at(x, size=SIZE) for x in (-0.3, 0.1, 0.6)]

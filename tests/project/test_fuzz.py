@@ -34,7 +34,7 @@ def test_mutated_inputs_end_in_a_sentence_or_a_result():
 @pytest.mark.linux
 def test_odd_values_and_damaged_files_end_in_a_sentence_or_a_result():
     """Calls of the Python interface and its readers, in a process of its own with its limits."""
-    calls, files = os.environ.get("FUZZ_CALLS", "10"), os.environ.get("FUZZ_FILES", "40")
+    calls, files = os.environ.get("FUZZ_CALLS", "5"), os.environ.get("FUZZ_FILES", "40")
     words = ["--calls", calls, "--files", files, "--seed", "2"]
     command = [sys.executable, str(SUPPORT / "fuzz_python.py"), *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -131,9 +131,10 @@ def test_the_rest_of_a_process_is_what_its_completion_does_not_count(quick):
     assert seconds[REST] > 0
 
 
-def test_the_tables_have_a_row_for_each_case(quick):
-    text = (quick / "tables.md").read_text()
-    assert text.count("| room |") == 1
+def test_the_tables_have_a_row_for_each_case(scene, tmp_path):
+    words = ("--cases", write_cases(scene, near=0.5, far=20), "--quick", "--in-process", "--quiet")
+    assert measure(*words, "--out", tmp_path / "out") == 0
+    assert (tmp_path / "out" / "tables.md").read_text().count("| room |") == 1
 
 
 def test_a_crowd_of_copies_looks_like_the_scene():
@@ -308,8 +309,8 @@ def test_what_cannot_be_measured_is_refused(scene, capsys, case, words, sentence
     assert sentence in assert_a_sentence(capsys)
 
 
-def test_results_are_not_replaced_unasked(quick, scene, capsys):
-    assert measure("--cases", write_cases(scene), "--out", quick) == 2
+def test_results_are_not_replaced_unasked(scene, capsys):
+    assert measure("--cases", write_cases(scene), "--out", scene) == 2
     assert "not empty" in assert_a_sentence(capsys)
 
 

@@ -75,8 +75,8 @@ def test_blocks_of_depth_halve_the_error_between_them():
 
 
 def test_given_depth_that_stereo_contradicts_is_left_out_and_a_line_says_so():
-    views = [view_of(Room(), camera_at(x, size=96), number) for number, x in enumerate((-0.2, 0.2))]
-    rows, columns = torch.linspace(0, 12, 96)[:, None], torch.linspace(0, 18, 96)
+    views = [view_of(Room(), camera_at(x, size=64), number) for number, x in enumerate((-0.2, 0.2))]
+    rows, columns = torch.linspace(0, 12, 64)[:, None], torch.linspace(0, 18, 64)
     waves = 2.5 + rows.sin() * columns.cos()
     plain = PlaneSweep()([replace(view, depth=None) for view in views])
     wrong = [replace(view, depth=None, given_depth=waves) for view in views]

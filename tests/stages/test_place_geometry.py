@@ -69,7 +69,7 @@ def test_a_scan_that_is_2_cm_off_is_corrected():
     np.testing.assert_allclose(placed.placement.shift, [-0.02, 0, 0.02], atol=0.005)
 
 
-@pytest.mark.parametrize("kind", ["mesh", "points"])
+@pytest.mark.parametrize("kind", ["mesh", pytest.param("points", marks=pytest.mark.slow)])
 def test_geometry_in_a_frame_of_its_own_comes_to_its_place(kind):
     scan = make_geometry(points_of(), np.empty((0, 3), np.int64), "scan.ply")
     geometry = make_mesh() if kind == "mesh" else scan
@@ -83,7 +83,13 @@ def test_geometry_in_a_frame_of_its_own_comes_to_its_place(kind):
     assert placement.describe().startswith(f"{geometry.name} was moved to where the scene shows")
 
 
-@pytest.mark.parametrize("geometry", [make_mesh(OTHER_ROOM), move_elsewhere(make_mesh(OTHER_ROOM))])
+@pytest.mark.parametrize(
+    "geometry",
+    [
+        pytest.param(make_mesh(OTHER_ROOM), marks=pytest.mark.slow),
+        move_elsewhere(make_mesh(OTHER_ROOM)),
+    ],
+)
 def test_a_mesh_of_another_room_is_refused(geometry):
     with pytest.raises(InputError, match="room.ply is not what the scene shows, neither"):
         place(geometry)
