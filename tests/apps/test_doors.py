@@ -190,7 +190,7 @@ def test_a_name_that_is_too_long_is_a_sentence(
         ("--depth", "nothing"),
         ("--scene", "missing.ply"),
         ("--target", "missing.json"),
-        ("--target", "photographs/0.png"),
+        ("--target", "photographs/9.png"),
         ("--target", 4),
         ("--context", 0, 4),
         ("--context", 0, 0),

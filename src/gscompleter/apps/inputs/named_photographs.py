@@ -38,7 +38,7 @@ def find_context(photographs: Photographs, context: PhotographNames | None) -> t
 
 
 def find_frame(photographs: Photographs, word: int | str, option: str) -> int:
-    """Find the frame of a word of `--option`: a number, or the name of a photograph."""
+    """Find the frame of a word of an option: a number, or the name of a photograph."""
     number = int(word) if FRAME_NUMBER.fullmatch(str(word)) else word
     try:
         return photographs.find_frame(number)
