@@ -73,17 +73,18 @@ def make_splat(views: Sequence[View]) -> Gaussians:
 
 @dataclass(frozen=True)
 class Score:
-    """A completion against the photographs and the sensor; shares and errors in percent."""
+    """Scores of a completion by the photographs and the sensor; shares and errors in percent."""
 
     hole: float
+    """Share of the image."""
     given: float
-    """Of the hole, by the scan."""
+    """Share of the hole whose depth the scan tells."""
     error: float
     """Mean relative error of depth in the hole, where the sensor has one."""
     target: float
-    """PSNR in dB."""
+    """PSNR at the target, in dB."""
     neighbour: float
-    """PSNR in dB."""
+    """PSNR at the neighbour, in dB."""
 
 
 def complete(

@@ -510,6 +510,13 @@ class Gaussians(Displayed, TensorDataclass):
             rows = {name: value.index_select(0, chosen) for name, value in values.items()}
         return replace(self, **rows)
 
+    def hide(self, hidden: Bool[Tensor, "n"]) -> Gaussians:
+        """Make Gaussians transparent, so that renderers draw only the others.
+
+        All but the opacities is shared: a selection of the others would copy their harmonics.
+        """
+        return replace(self, opacities=self.opacities.masked_fill(hidden, 0.0), encoded=None)
+
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""

@@ -212,21 +212,26 @@ def test_a_held_key_shows_before_as_long_as_it_is_held(bare):
     assert np.abs(bare.picture() - after).max() < 0.02
 
 
+def check_frame(tab: Window, shown: Picture, around: np.ndarray) -> None:
+    """Check that nothing is `shown` in `around`, the pixels beyond the frame, until one moves."""
+    # One colour, which is not the black of holes.
+    assert np.ptp(shown[around], axis=0).max() == 0
+    assert shown[around].min() > 0.2
+
+    tab.key("w")
+    assert not tab.do("gsc.stats().framed")
+    assert np.ptp(tab.picture()[around], axis=0).max() > 0.3
+    tab.key("r")
+    assert np.abs(tab.picture() - shown).max() < 0.02
+
+
 def test_nothing_is_shown_beyond_the_frame_of_a_camera_until_it_is_moved(bare):
     bare.do("gsc.setMode('after')")
     bare.do("gsc.goTo('target-1')")
     around = np.ones((SIDE, 2 * SIDE), dtype=bool)
     around[:, SIDE // 2 : -SIDE // 2] = False
     shown = bare.picture()
-    # One colour, which is not the black of holes.
-    assert np.ptp(shown[around], axis=0).max() == 0
-    assert shown[around].min() > 0.2
-
-    bare.key("w")
-    assert not bare.do("gsc.stats().framed")
-    assert np.ptp(bare.picture()[around], axis=0).max() > 0.3
-    bare.key("r")
-    assert np.abs(bare.picture() - shown).max() < 0.02
+    check_frame(bare, shown, around)
 
 
 def test_keys_choose_what_is_shown(bare):
@@ -319,15 +324,7 @@ def test_nothing_is_shown_beyond_the_frame_after_the_window_is_resized(
     around[inside] = False
     shown = tab.picture()
     assert np.abs(shown[inside] - frame).mean() < 0.01
-    # One colour, which is not the black of holes.
-    assert np.ptp(shown[around], axis=0).max() == 0
-    assert shown[around].min() > 0.2
-
-    tab.key("w")
-    assert not tab.do("gsc.stats().framed")
-    assert np.ptp(tab.picture()[around], axis=0).max() > 0.3
-    tab.key("r")
-    assert np.abs(tab.picture() - shown).max() < 0.02
+    check_frame(tab, shown, around)
     tab.context.close()
 
 

@@ -1,4 +1,4 @@
-"""What is copied of scenes, whose harmonics are most of the memory of a command."""
+"""Watch copies of scenes, whose harmonics are most of the memory of a command."""
 
 import pytest
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from typing import Any
 
@@ -254,8 +254,7 @@ def score_cleaning(
     `taken` are the Gaussians that go; `files` has the file of each photograph by frame. Also
     returns what each photograph sees of them.
     """
-    # What is transparent is not drawn, and the rest is not copied to be drawn without it.
-    kept = replace(given, opacities=given.opacities.masked_fill(taken, 0))
+    kept = given.hide(taken)
     rows = []
     seen = []
     for view in track(views, "scores"):

@@ -244,7 +244,7 @@ def find_revealed(
     # One set of rows for all that may go: the context, in which the unused Gaussians are invisible,
     # then their pieces. Of these, the inner ones go in any case.
     first = state.rendered_context
-    others = replace(first, opacities=first.opacities.masked_fill(unused, 0.0), encoded=None)
+    others = first.hide(unused)
     state = replace(state, rendered_context=merge([others, inner, outer]))
     gone = torch.cat([unused, unused.new_ones(len(inner)), unused.new_zeros(len(outer))])
 

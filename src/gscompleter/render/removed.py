@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import torch
 from jaxtyping import Bool
 from torch import Tensor
@@ -44,8 +42,7 @@ def draw_removed(source: ContextScene, camera: Camera, renderer: Renderer) -> Bo
     # What is chosen for removal is among `removed`, too, and must not be drawn twice. What gave way
     # to photographs hides nothing.
     hidden = source.chosen_mask | source.replaced_mask
-    others = replace(scene, opacities=scene.opacities.masked_fill(hidden, 0.0))
-    return mark_shown(source.removed, others, camera, renderer)
+    return mark_shown(source.removed, scene.hide(hidden), camera, renderer)
 
 
 def mark_shown(

@@ -62,7 +62,7 @@ MAX_SAME = 0.1
 MAX_ELSEWHERE = 0.05
 """Largest share of a surface that is farther away in two places that count as one."""
 LONG_MOVE = 0.4
-"""How far a place is moved on to test whether anything determines it, relative to the size of what
+"""Length of the move that tests whether anything determines a place, relative to the size of what
 is seen. Places that are right then agree by a tenth less, those along a wall as before."""
 
 

@@ -133,9 +133,7 @@ def fit_image_colors(
     gains = (basis * change).sum(dim=1, keepdim=True)  # γ = bᵀ A⁻¹ b
 
     wanted = torch.lerp(frozen.render.image, reference.image, weight[..., None])
-    # What is transparent is not drawn, and the others are not copied to be drawn without it.
-    others = replace(scene, opacities=scene.opacities.masked_fill(is_open, 0))
-    errors = renderer.freeze(others, reference.camera).vary_colors(scene[rows])
+    errors = renderer.freeze(scene.hide(is_open), reference.camera).vary_colors(scene[rows])
     steps = fit_steps(errors, wanted, colors, gains, config.iterations)
 
     # Changes that nobody sees would only mark Gaussians as generated. Leaving them out changes a

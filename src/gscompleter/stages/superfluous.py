@@ -7,7 +7,7 @@ predicts the error without each.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -157,8 +157,7 @@ def exclude_needed(
     memory. Additions to a scene that is frozen already have `exclude_needed_additions`.
     """
     candidates = scene[removable]
-    # What is transparent is not drawn, and the rest is not copied to be drawn without it.
-    rest = replace(scene, opacities=scene.opacities.masked_fill(removable, 0))
+    rest = scene.hide(removable)
 
     def iterate_plans() -> Iterator[OpacityRender]:
         for view in views:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Literal
@@ -107,7 +107,7 @@ def mark_selected(
 
     Raises an InputError if no target shows any.
     """
-    others = replace(scene, opacities=scene.opacities.masked_fill(chosen, 0.0), encoded=None)
+    others = scene.hide(chosen)
     marks = [mark_shown(scene[chosen], others, camera, renderer) for camera in targets]
     if not any(mark.any() for mark in marks):
         raise InputError(

@@ -63,7 +63,8 @@ def check_frame_numbers(folder: Path, words: PhotographNames, num_video_frames: 
     photographs, so that any number is possible.
     """
     named = [word for word in map(str, words) if names_photograph(word)]
-    frames = [int(word) for word in named if FRAME_NUMBER.fullmatch(word)]
+    names = [word for word in named if not FRAME_NUMBER.fullmatch(word)]
+    frames = [int(word) for word in named if word not in names]
     if is_video(folder):
         count = num_video_frames
     else:
@@ -74,9 +75,8 @@ def check_frame_numbers(folder: Path, words: PhotographNames, num_video_frames: 
             return
         # Folders and endings of the names are compared once cameras are known.
         stems = {fold_name(Path(name).stem) for name in files}
-        for word in named:
-            is_number = FRAME_NUMBER.fullmatch(word) is not None
-            if not is_number and fold_name(Path(word).stem) not in stems:
+        for word in names:
+            if fold_name(Path(word).stem) not in stems:
                 raise InputError(
                     f"There is no photograph '{quote_value(word, 60)}' among the {count} of "
                     f"{quote_value(folder)}; name one of them, such as "
