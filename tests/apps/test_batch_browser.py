@@ -26,22 +26,29 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture(scope="module")
 def batch(tmp_path_factory) -> Path:
-    """Write the folder of a batch with a scene that is done and one that failed."""
+    """Write the folder of a batch: a scene that is done, and three failures.
+
+    Of two there is a page: that of its own failure, and that of an earlier run.
+    """
     folder = tmp_path_factory.mktemp("batch")
     done = {"state": "done", "targets": 1, "added": 3, "seconds": 2.0, **dict.fromkeys(SCORES, 0.5)}
     failed = {"state": "failed", "reason": "There is no <photograph>."}
     shards = {"state": "failed", "reason": "The scene did not reconstruct."}
     (folder / "rows").mkdir()
-    for name, row in (("room & hall", done), ("cellar", failed), ("attic", shards)):
+    rows = {"room & hall": done, "cellar": failed, "attic": shards, "loft": failed}
+    for name, row in rows.items():
         content = {"job": name, "options": {}, "attempts": 1, **row}
         (folder / "rows" / f"{name}.json").write_text(json.dumps(content))
     images = folder / "jobs" / "room & hall" / "images"
     images.mkdir(parents=True)
     for number, when in enumerate(("before", "after")):
         write_image(images / f"target1_{when}.png", torch.full((24, 32, 3), 0.5 + 0.2 * number))
-    (folder / "jobs" / "attic").mkdir()
-    (folder / "jobs" / "attic" / "report.html").write_text("<title>Attic</title>")
-    write_overview(folder, [Job("room & hall"), Job("cellar"), Job("attic")])
+    summary = {"outcome": {"headline": shards["reason"]}}
+    for name in ("attic", "loft"):
+        (folder / "jobs" / name).mkdir()
+        (folder / "jobs" / name / "report.html").write_text("<title>A page</title>")
+        (folder / "jobs" / name / "summary.json").write_text(json.dumps(summary))
+    write_overview(folder, [Job(name) for name in rows])
     return folder
 
 
@@ -57,14 +64,14 @@ def test_the_pictures_of_the_jobs_are_shown(tab, batch):
     assert tab.errors == []
     below = batch.as_uri()
     assert all(url.startswith(below) for url in tab.requests)
-    assert tab.page.locator("#failures").inner_text().count("There is no <photograph>.") == 1
+    assert tab.page.locator("#failures").inner_text().count("There is no <photograph>.") == 2
 
 
 def test_a_failed_job_that_left_a_report_links_to_it(tab):
     (link,) = tab.page.locator("#failures a").all()
     assert link.inner_text() == "attic"
     link.click()
-    assert tab.page.title() == "Attic"
+    assert tab.page.title() == "A page"
 
 
 # `test_report.py` finds no address in a page.

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -146,6 +147,46 @@ def test_a_box_beside_a_map_is_told_where_the_map_is(folders, tmp_path, monkeypa
     words = ("--box", -1, -1, -1, 1, 1, 1, "--resolution", SIZE, SIZE)
     assert run(monkeypatch, "remove", folders[1] / "room", *scene, *words) == 2
     assert "reaches from 499" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def local_splat(folders, tmp_path_factory) -> Path:
+    """Write the splat relative to the origin of the photographs in the map, as results are."""
+    place = open_photographs(folders[1] / "room").origin
+    splat = load_splat(folders[0] / "splat.ply")
+    means = splat.means + torch.from_numpy(MAP - place).float()
+    path = tmp_path_factory.mktemp("local") / "splat.ply"
+    save_ply(path, replace(splat, means=means))
+    return path
+
+
+def test_a_box_beside_a_splat_near_zero_is_told_where_that_is(
+    folders, local_splat, tmp_path, monkeypatch, capsys
+):
+    scene = ("--scene", local_splat, "--out", tmp_path / "OUT")
+    low = MAP.astype(int).tolist()
+    words = ("--box", *low, *(number + 1 for number in low), "--resolution", SIZE, SIZE)
+    assert run(monkeypatch, "remove", folders[1] / "room", *scene, *words) == 2
+    said = capsys.readouterr().err
+    assert "reaches from" in said
+    assert "reaches from 499" not in said
+
+
+@pytest.mark.slow
+def test_boxes_are_in_the_coordinates_of_a_splat_near_zero(
+    folders, local_splat, tmp_path, monkeypatch
+):
+    counts = []
+    moved = MAP - open_photographs(folders[1] / "room").origin
+    splats = (folders[0] / "splat.ply", local_splat)
+    for name, folder, splat, by in zip("ab", folders, splats, (np.zeros(3), moved), strict=True):
+        low, high = np.array([-0.5, -0.5, 3]) + by, np.array([0.5, 0.5, 6]) + by
+        words = ("--box", *low.tolist(), *high.tolist(), "--out", tmp_path / name)
+        scene = (folder / "room", "--scene", splat)
+        assert run(monkeypatch, "remove", *scene, *words, "--resolution", SIZE, SIZE) == 0
+        counts.append(summary_of(tmp_path / name)["gaussians"]["removed"])
+    assert counts[0] == counts[1]
+    assert counts[0] > 50
 
 
 # `test_remove.py` removes a selection, and `tests/splats/test_origin.py` reads origins.

@@ -8,7 +8,11 @@ import pytest
 from command import run
 from exact_room import make_cameras, write_photographs, write_transforms
 from gscompleter.apps.commands.shared_decisions import names_splat
-from gscompleter.apps.inputs.named_photographs import check_target_files, read_targets
+from gscompleter.apps.inputs.named_photographs import (
+    check_target_files,
+    read_targets,
+    refuse_missing_photographs,
+)
 from gscompleter.apps.inputs.opening import describe_cameras_above
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.sfm.poses import has_photographs, list_all_photographs
@@ -55,6 +59,16 @@ def test_a_name_that_no_file_has_is_refused_before_cameras_are_searched_for(
     assert run(monkeypatch, "complete", tmp_path / "plain", *words, "--out", tmp_path / "out") == 2
     said = f"There is no photograph 'photo_009.png' among the {len(CAMERAS)} of"
     assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("word", ["photo 1 #a.png", "photo_1__a.png", "photos\\photo 1 #a.PNG"])
+def test_a_photograph_whose_copy_has_another_name_is_found_by_both(tmp_path, word):
+    write_photographs(tmp_path / "plain", CAMERAS, ["photo 1 #a.png", "b.png", "c.png", "d.png"])
+    refuse_missing_photographs(tmp_path / "plain", [word], 0)
+    # As `poses` names the copies for COLMAP.
+    names = ["photo_1__a.png", "b.png", "c.png", "d.png"]
+    copies = open_photographs(write_transforms(tmp_path / "copies", CAMERAS, names))
+    assert copies.frame(copies.find_frame(word.split("\\")[-1])).name == names[0]
 
 
 def test_a_number_is_a_photograph_whatever_the_working_folder_holds(tmp_path, monkeypatch):

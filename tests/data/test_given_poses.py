@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from command import run
 from gscompleter.data import given_poses
@@ -63,6 +64,33 @@ def test_photographs_that_cannot_be_refined_are_refused(scene, tmp_path, monkeyp
     assert run(monkeypatch, "poses", scene, "--out", tmp_path / "out") == 2
     assert "cannot be refined" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
+
+
+def test_what_the_file_cannot_hold_is_refused_before_a_refinement(
+    scene, tmp_path, monkeypatch, capsys
+):
+    def fail(photographs: Photographs) -> None:
+        raise AssertionError("minutes of COLMAP")
+
+    monkeypatch.setattr(given_poses, "refine_poses", fail)
+    (scene / "masks").mkdir()
+    for frame in open_photographs(scene).frames:
+        mask = Image.new("L", frame.size(), 255)
+        mask.paste(0, (0, 0, 4, 4))
+        mask.save(scene / "masks" / f"{Path(frame.name).stem}.png")
+    words = ("poses", scene, "--invert-masks", "--out", tmp_path / "out")
+    assert run(monkeypatch, *words) == 2
+    assert "the other way round" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_photograph_that_is_gone_is_left_out(scene, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(given_poses, "refine_poses", lambda photographs: (photographs, KEPT))
+    open_photographs(scene).frames[0].file.path.unlink()
+    assert run(monkeypatch, "poses", scene, "--out", tmp_path / "out") == 0
+    assert f"{len(CAMERAS) - 1} photographs stay" in capsys.readouterr().out.replace("\n", " ")
+    content = json.loads((tmp_path / "out" / "transforms.json").read_text())
+    assert len(content["frames"]) == len(CAMERAS) - 1
 
 
 def test_photographs_that_colmap_left_out_are_not_called_refined(room):
@@ -124,6 +152,17 @@ def test_fisheye_lenses_beside_others_are_refused(room, tmp_path):
     mixed = replace(room, frames=(fisheye, *room.frames[1:]))
     with pytest.raises(InputError, match="fisheye and other lenses"):
         write_transforms(tmp_path / "transforms.json", mixed, tmp_path)
+
+
+@pytest.mark.linux
+def test_paths_lead_to_the_photographs_through_a_link(room, tmp_path):
+    (tmp_path / "far" / "away").mkdir(parents=True)
+    home = tmp_path / "link"
+    home.symlink_to(tmp_path / "far" / "away")
+    write_transforms(home / "transforms.json", room, home)
+    for before, after in zip(room.frames, open_photographs(home).frames, strict=True):
+        assert after.file is not None
+        assert after.file.path.samefile(before.file.path)
 
 
 def test_masks_are_named_unless_they_are_the_other_way_round(room, tmp_path):

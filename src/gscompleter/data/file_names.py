@@ -12,7 +12,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-from gscompleter.system.files.names import fold_name
+from gscompleter.system.files.names import fold_name, make_colmap_name
 
 
 class FolderListings:
@@ -26,7 +26,11 @@ class FolderListings:
         self._names: dict[Path, dict[str, str]] = {}
 
     def find(self, folder: Path, relative: str) -> Path | None:
-        """Find `relative` below `folder`, as written or else in any case; None without it."""
+        """Find `relative` below `folder`, as written or else in any case; None without it.
+
+        Copies for COLMAP, and what is named as they are, also stand for a file whose name has
+        blanks or # instead of _.
+        """
         if os.path.isabs(relative):
             return Path(relative) if _exists(Path(relative)) else None
         path = folder
@@ -44,7 +48,7 @@ class FolderListings:
         return path
 
     def _list(self, folder: Path) -> dict[str, str]:
-        """Map each name to itself, and folded names to the first that folds so."""
+        """Map each name to itself, and other spellings to the first name that has them."""
         if folder not in self._names:
             names: list[str] = []
             with suppress(OSError):
@@ -52,7 +56,8 @@ class FolderListings:
                 # and stays.
                 names = sorted(os.listdir(folder), reverse=True)
             folded = {fold_name(name): name for name in names}
-            self._names[folder] = {**folded, **{name: name for name in names}}
+            copies = {make_colmap_name(spelling): name for spelling, name in folded.items()}
+            self._names[folder] = {**copies, **folded, **{name: name for name in names}}
         return self._names[folder]
 
 

@@ -17,7 +17,7 @@ from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.sfm.poses import POSES_COMMAND
 from gscompleter.data.sfm.refining import MIN_REFINED, PoseRefinement, refine_poses
-from gscompleter.data.transforms import TRANSFORMS_FILE, write_transforms
+from gscompleter.data.transforms import TRANSFORMS_FILE, describe_transforms, write_transforms
 from gscompleter.numerics.two_views import ERROR_SIDE
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.output_folder import reserve_output
@@ -29,7 +29,7 @@ class RefinedCameras:
     """Photographs that had cameras, after a refinement."""
 
     photographs: Photographs
-    """With the refined poses; all as given if kept-back matches agree no better with these."""
+    """With the refined poses; all as given unless kept-back matches agree clearly better."""
     refinement: PoseRefinement
     kept: str
     """Sentence on what else lies in the output folder; empty if there is nothing."""
@@ -40,8 +40,9 @@ class RefinedCameras:
             f"given poses miss matches by {self.refinement.given_error:.2f} px (of {ERROR_SIDE}), "
             f"refined ones by {self.refinement.refined_error:.2f}"
         )
-        count = len(self.photographs.posed)
-        # Photographs that COLMAP could not refine keep their cameras, in the same file.
+        count = len(self.photographs.present)
+        # Others keep their cameras, in the same file: those that COLMAP could not refine, that a
+        # mask hides, or that are too many (`choose_known`).
         number = self.refinement.photographs
         refined = f"{number}" if number == count else f"{number} of {count}"
         done = f"{count} photographs stay as they are"
@@ -60,12 +61,15 @@ def refine_given_poses(
 ) -> RefinedCameras:
     """Refine the cameras of photographs that have some, and write them for other programs.
 
-    They are written as given if matches agree no better with the refined ones. Raises InputError if
-    they cannot be refined, or if the file cannot hold their lenses.
+    They are written as given unless matches agree clearly better with the refined ones
+    (`PoseRefinement.is_accepted`). Raises InputError if they cannot be refined, or if the file
+    cannot describe them (`describe_transforms`).
     """
     given = open_photographs(path)
     refuse_nothing_to_invert(given.list_masks(), reading)
     given = read_masks_as_asked(given, reading)
+    # Refuses what cannot be written before minutes of COLMAP.
+    describe_transforms(given, out)
     written = (TRANSFORMS_FILE, SUMMARY_FILE)
     with (
         reserve_output(out, overwrite, POSES_COMMAND, written) as output,

@@ -30,7 +30,7 @@ from gscompleter.data.moving_boxes import mask_moving
 from gscompleter.numerics.geometry import compute_sparse_depth
 from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.image import composite_over_black, convert_to_image
-from gscompleter.system.files.names import fold_name
+from gscompleter.system.files.names import fold_name, make_colmap_name
 from gscompleter.types import MAX_IMAGE_SIDE, Camera, View
 
 
@@ -119,6 +119,11 @@ class Photographs:
     def posed(self) -> list[int]:
         """Numbers of the frames whose camera is known; the others keep their numbers unused."""
         return [number for number, frame in enumerate(self.frames) if frame.has_camera]
+
+    @property
+    def present(self) -> list[int]:
+        """Numbers of the frames whose camera is known and whose photograph exists."""
+        return [number for number in self.posed if self.frame(number).has_photograph()]
 
     def load_predicted_depth(self, view: View) -> Float[Tensor, "h w"] | None:
         """Load the predicted depth beside a photograph at the size of its view; None without one.
@@ -276,7 +281,14 @@ class Photographs:
         return numbers[0]
 
     def match_names(self, word: str) -> list[int]:
-        """List the frames whose photograph a word names, those that it names exactly if any."""
+        """List the frames whose photograph a word names, those that it names exactly if any.
+
+        Where cameras were searched for, frames have the names of the copies for COLMAP, and a word
+        may be the name of the file itself.
+        """
+        return self._match_spelling(word) or self._match_spelling(make_colmap_name(word))
+
+    def _match_spelling(self, word: str) -> list[int]:
         path_of_word = fold_name(word.replace("\\", "/"))
         wanted = PurePosixPath(path_of_word).parts
         wanted_stem = PurePosixPath(os.path.splitext(path_of_word)[0]).parts

@@ -232,26 +232,34 @@ def _parse_distortion(entry: Mapping[str, Any], title: str) -> Distortion:
 
 
 def write_transforms(path: Path, photographs: Photographs, home: Path) -> None:
-    """Write the cameras of photographs as nerfstudio reads them, in the frame of their files.
+    """Write the cameras of photographs as nerfstudio reads them; see `describe_transforms`."""
+    content = describe_transforms(photographs, home)
+    with replace_file(path) as file:
+        file.write((json.dumps(content, indent=1) + "\n").encode())
 
-    Paths of photographs and masks are relative to `home`, the folder that the file is for. Depth
-    and points are not named. Raises InputError for photographs inside a container, masks whose
-    white hides, and lenses that the format does not have.
+
+def describe_transforms(photographs: Photographs, home: Path) -> dict[str, Any]:
+    """Describe the cameras of the photographs that exist for nerfstudio, in their files' frame.
+
+    Paths of photographs and masks are relative to `home`, the folder that the file is for, or
+    absolute on another drive. Depth and points are not named. Raises InputError for photographs
+    inside a container, masks whose white hides, lenses that the format does not have, and fisheye
+    beside other lenses.
     """
-    frames = [describe_frame(photographs.frame(number), home) for number in photographs.posed]
+    # A path with .. that passes a link leads to another place than its words say.
+    home = Path(os.path.realpath(home))
+    frames = [describe_frame(photographs.frame(number), home) for number in photographs.present]
     models = {frame["camera_model"] for frame in frames}
     require(
         len(models) == 1,
         f"The photographs of {photographs.title} have fisheye and other lenses, which programs do "
         "not read in one transforms.json; undistort the images first.",
     )
-    content = {"camera_model": models.pop(), "frames": frames}
-    with replace_file(path) as file:
-        file.write((json.dumps(content, indent=1) + "\n").encode())
+    return {"camera_model": models.pop(), "frames": frames}
 
 
 def describe_frame(frame: Frame, home: Path) -> dict[str, Any]:
-    """Describe a photograph and its camera, as `write_transforms` does."""
+    """Describe a photograph and its camera, as `describe_transforms` does."""
     if frame.file is None or frame.file.path is None:
         raise InputError(
             f"The photograph of {frame.title} is no file of its own, which transforms.json cannot "
@@ -260,7 +268,7 @@ def describe_frame(frame: Frame, home: Path) -> dict[str, Any]:
     width, height = frame.size()
     pinhole = frame.intrinsics.compute_pinhole(width, height)
     content = {
-        "file_path": os.path.relpath(frame.file.path, home),
+        "file_path": find_path_from(home, frame.file.path),
         # The change of axes is its own inverse.
         "transform_matrix": (frame.c2w @ OPENCV_FROM_OPENGL).tolist(),
         "w": width,
@@ -277,8 +285,20 @@ def describe_frame(frame: Frame, home: Path) -> dict[str, Any]:
             "The masks hide what is white, and other programs read them the other way round; "
             "invert the images, or leave out --invert-masks.",
         )
-        content["mask_path"] = os.path.relpath(frame.mask, home)
+        content["mask_path"] = find_path_from(home, frame.mask)
     return content
+
+
+def find_path_from(home: Path, path: Path) -> str:
+    """Find the path of a file from the folder `home`, whose own path has no links.
+
+    It is absolute where no relative one exists, on another drive of Windows.
+    """
+    # A photograph may be a link itself, whose own name is the one that the user knows.
+    real = Path(os.path.realpath(path.parent), path.name)
+    if real.drive != home.drive:
+        return real.as_posix()
+    return Path(os.path.relpath(real, home)).as_posix()
 
 
 def describe_distortion(frame: Frame) -> dict[str, Any]:

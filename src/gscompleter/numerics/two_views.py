@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 from jaxtyping import Float
 
-TURN_PER_TWO_STEPS = 15.0
-"""Angle in degrees between viewing directions that counts as much as two steps between cameras."""
+TURN_PER_STEP = 7.5
+"""Angle in degrees between viewing directions that counts as much as a step between cameras. It is
+chosen, not measured: it decides only which pairs are matched."""
 MAX_CENTER_ROUNDING = 1e-6
-"""Distance of cameras in one place at most, as a share of the largest: rounding moves centres."""
+"""Distance of cameras in one place at most, as a share of the largest distance between two cameras:
+rounding moves centres."""
 ERROR_SIDE = 256
 """Shorter side, in pixels, of the image that distances of matches from epipolar lines are given in:
 of photographs of any size they can then be compared."""
@@ -35,7 +37,7 @@ def find_near_pairs(
     step = np.median(distance.min(axis=1))
     if np.isinf(step):
         return []
-    unlike = distance / step + 2 * turned / TURN_PER_TWO_STEPS
+    unlike = distance / step + turned / TURN_PER_STEP
     nearest = unlike.argsort(axis=1, kind="stable")[:, :count]
     pairs = {(i, int(j)) for i, row in enumerate(nearest) for j in row if np.isfinite(unlike[i, j])}
     return sorted({(min(pair), max(pair)) for pair in pairs})

@@ -127,7 +127,7 @@ def run_left_jobs(
 
 
 def list_input_paths(jobs: Sequence[Job]) -> list[Path]:
-    """List the files and folders that the rows of a manifest read, each once."""
+    """List the paths of `PATH_COLUMNS` in the rows of a manifest, each once."""
     cells = [job.options.get(name) for job in jobs for name in PATH_COLUMNS]
     # A row whose path is no text, as JSON allows, fails by itself.
     paths = dict.fromkeys(cell for cell in cells if isinstance(cell, str) and cell)
@@ -191,7 +191,8 @@ def complete_job(job: Job, jobs: Path, decide_row: DecideRow) -> dict[str, Any]:
     """Complete the scene of a job in its folder below `jobs`, and return its part of a row.
 
     That has the outcome, the scores and what it cost: seconds of wall time, seconds of CPU time of
-    this process (without that of COLMAP, which has its own), bytes of files, and bytes of memory.
+    this process (without that of COLMAP, which has its own), bytes of files, and the peak
+    of the resident memory of this process, None where the system does not tell it.
     """
     import warnings
 

@@ -26,13 +26,15 @@ def prepare_removal(request: RemovalRequest, console: Console) -> Prepared:
     selection = request.selection
     check_selection(selection)
     ready = prepare_completion(request.completion, console, place=selection)
-    # Of photographs they were checked as soon as these were opened.
+    # Masks of photographs were checked when these were opened. Cameras of renders have names only
+    # now.
     if selection.masks is not None and ready.opened.renders_from is not None:
         names = [frame.name for frame in ready.opened.photographs.frames]
         check_removal_masks(selection.masks, names, selection.mask_reading)
 
+    # The request of a removal names a splat.
     assert ready.task.scene is not None
-    widened = widen_regions(selection, ready.task.scene, ready.task.origin)
+    widened = widen_regions(selection, ready.task.scene, ready.task.splat_origin)
     return replace(
         ready,
         command=request.command,
@@ -50,7 +52,7 @@ def choose_selected(selection: Selection, ready: Prepared) -> Gone:
     )
     # Gaussians that reach out of a box or the sphere are cut at its border. Those that a mask or a
     # file selects go as a whole.
-    return Gone(chosen, partial(contain_points, selection, ready.task.origin))
+    return Gone(chosen, partial(contain_points, selection, ready.task.splat_origin))
 
 
 def describe_selection(selection: Selection) -> dict[str, Any]:
@@ -58,7 +60,7 @@ def describe_selection(selection: Selection) -> dict[str, Any]:
     # JSON has no paths.
     return {
         "box": selection.boxes,
-        "box_rotation": selection.box_rotation,
+        "box_rotation": selection.box_rotation if selection.boxes else None,
         "sphere": selection.sphere,
         "mask": selection.masks and str(selection.masks),
         "select": selection.file and str(selection.file),

@@ -6,7 +6,7 @@ import os
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from gscompleter.apps.inputs.task import Target
 from gscompleter.data.camera_files import is_in_splat_frame
@@ -16,7 +16,7 @@ from gscompleter.data.scene import load_cameras
 from gscompleter.data.sfm.poses import PHOTOGRAPH_ENDINGS, list_photograph_files
 from gscompleter.data.video import is_video
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.names import fold_name
+from gscompleter.system.files.names import fold_name, make_colmap_name
 
 FRAME_NUMBER = re.compile("-?[0-9]{1,9}")
 """Words that are numbers of photographs. Longer ones are names, such as times in nanoseconds; one
@@ -29,7 +29,7 @@ PhotographNames = Sequence[int | str]
 def find_context(photographs: Photographs, context: PhotographNames | None) -> tuple[int, ...]:
     """Find the frames of `--context`; empty if it is not given."""
     frames = tuple(find_frame(photographs, word, "context") for word in context or ())
-    # Words differ by now, but a name and a number can mean one photograph.
+    # Equal words were refused before, but a name and a number can mean one photograph.
     if len(set(frames)) < len(frames):
         twice = next(frame for frame in frames if frames.count(frame) > 1)
         name = quote_value(photographs.frame(twice).file_name)
@@ -48,7 +48,7 @@ def find_frame(photographs: Photographs, word: int | str, option: str) -> int:
         if option == "target" and is_unknown:
             example = quote_value(photographs.frame(0).file_name)
             raise InputError(
-                f"'{quote_value(word, 60)}' is no target: name a photograph or its number from 0 "
+                f"'{quote_value(word)}' is no target: name a photograph or its number from 0 "
                 f"to {len(photographs) - 1}, such as {example}, or an existing "
                 "file of cameras, such as a transforms.json.",
                 option,
@@ -56,11 +56,12 @@ def find_frame(photographs: Photographs, word: int | str, option: str) -> int:
         raise InputError(str(error), option) from error
 
 
-def check_frame_numbers(folder: Path, words: PhotographNames, num_video_frames: int) -> None:
+def refuse_missing_photographs(folder: Path, words: PhotographNames, num_video_frames: int) -> None:
     """Refuse photographs that `folder` does not have, before the search for their cameras.
 
-    Of a video, `num_video_frames` serve as photographs at most. Each panorama is split into several
-    photographs, so that any number is possible.
+    Of a video, `num_video_frames` serve as photographs at most, and they have no names yet. Each
+    panorama is split into several photographs, so that any number is possible. Words without an
+    ending, which may be files of cameras, are not judged.
     """
     named = [word for word in map(str, words) if names_photograph(word)]
     names = [word for word in named if not FRAME_NUMBER.fullmatch(word)]
@@ -73,12 +74,14 @@ def check_frame_numbers(folder: Path, words: PhotographNames, num_video_frames: 
         # Telling panoramas apart opens each photograph, so it is done only if a word needs it.
         if named and has_panoramas([folder / name for name in files]):
             return
-        # Folders and endings of the names are compared once cameras are known.
-        stems = {fold_name(Path(name).stem) for name in files}
+        # Folders and endings of the names are compared once cameras are known. Then photographs
+        # have the names of their copies for COLMAP, which are understood as well.
+        stems = {fold_stem(name) for name in files}
+        stems |= {fold_stem(make_colmap_name(name)) for name in files}
         for word in names:
-            if fold_name(Path(word).stem) not in stems:
+            if fold_stem(word) not in stems:
                 raise InputError(
-                    f"There is no photograph '{quote_value(word, 60)}' among the {count} of "
+                    f"There is no photograph '{quote_value(word)}' among the {count} of "
                     f"{quote_value(folder)}; name one of them, such as "
                     f"'{quote_value(Path(files[0]).name)}', or its number from 0 to {count - 1}."
                 )
@@ -101,7 +104,7 @@ def check_target_files(words: Sequence[str], resolution: Resolution) -> None:
             continue
         if not os.path.exists(word):
             raise InputError(
-                f"'{quote_value(word, 60)}' is no target: name a photograph with its ending, "
+                f"'{quote_value(word)}' is no target: name a photograph with its ending, "
                 "or its number, or an existing file of cameras, such as a transforms.json.",
                 "target",
             )
@@ -126,6 +129,11 @@ def read_targets(
             frame = find_frame(photographs, word, "target")
             targets.append(Target(photographs.camera(frame, resolution), frame))
     return targets
+
+
+def fold_stem(name: str) -> str:
+    """Fold the name of a photograph without its folders, of any system, and without its ending."""
+    return fold_name(PurePosixPath(name.replace("\\", "/")).stem)
 
 
 def names_photograph(word: str) -> bool:

@@ -10,7 +10,7 @@ from pathlib import Path
 from rich.console import Console
 
 from gscompleter.apps.inputs.describing import print_lines
-from gscompleter.apps.inputs.named_photographs import check_frame_numbers
+from gscompleter.apps.inputs.named_photographs import refuse_missing_photographs
 from gscompleter.apps.inputs.removal import check_removal_masks
 from gscompleter.apps.inputs.selection import collect_usable_cameras
 from gscompleter.apps.inputs.task import Opened
@@ -86,7 +86,7 @@ def open_scene(
         refuse_other_exports(folder)
         refuse_scenes_below(folder)
         print_lines(console, *describe_cameras_above(folder))
-        check_frame_numbers(folder, search.named, search.num_frames)
+        refuse_missing_photographs(folder, search.named, search.num_frames)
         if request.removal_masks is not None and not is_video(folder):
             names = list_all_photographs(folder)
             check_removal_masks(request.removal_masks, names, request.removal_reading)

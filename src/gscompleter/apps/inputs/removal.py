@@ -76,7 +76,7 @@ def select_with_masks(
     """
     scene = task.scene
     assert scene is not None
-    chosen = find_by_position(selection, scene, task.origin)
+    chosen = find_by_position(selection, scene, task.splat_origin)
     if selection.masks:
         photographs = opened.photographs
         masks = find_masks(selection.masks, [frame.name for frame in photographs.frames])
@@ -93,7 +93,7 @@ def select_with_masks(
         # Masks that are the other way round select most of the splat.
         check_selected_share(is_in_masks.float().mean().item(), selection.mask_reading)
         chosen |= is_in_masks
-    return require_chosen(chosen, scene, task.origin)
+    return require_chosen(chosen, scene, task.splat_origin)
 
 
 def select_without_masks(

@@ -160,6 +160,15 @@ class CompletionTask:
         return self.views[0].image.device
 
     @property
+    def splat_origin(self) -> Float[np.ndarray, "3"]:
+        """Origin of the scene in the coordinates of its file: what is named in them is moved by it.
+
+        A splat near zero may be that of photographs in a map, so it is not `origin`. It is zero
+        without an input splat, since a reconstructed scene is written as it is.
+        """
+        return np.zeros(3) if self.splat_file is None else self.splat_file.origin
+
+    @property
     def cameras(self) -> list[Camera]:
         """Cameras of the context and of the targets."""
         return [*(view.camera for view in self.views), *(t.camera for t in self.targets)]

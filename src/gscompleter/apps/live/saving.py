@@ -61,7 +61,7 @@ def begin_session(prepared: PreparedSession) -> Session:
         ready.task.frame,
         ready.opened.photographs.origin,
         ready.opened.request.resolution,
-        splat_origin=ready.task.origin,
+        splat_origin=ready.task.splat_origin,
     )
 
 

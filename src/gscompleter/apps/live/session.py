@@ -69,7 +69,7 @@ class Session:
     steps: tuple[SessionStep, ...] = ()
     """The steps, one for each completion but the first."""
     splat_origin: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
-    """Origin of the result in the coordinates of the splat's file."""
+    """Origin of the result in the coordinates of the splat's file; zero without one."""
     undone: tuple[tuple[Completion, SessionStep], ...] = field(default=(), compare=False)
     """Steps that were undone, with the scene after each; the last of them is done again first."""
 

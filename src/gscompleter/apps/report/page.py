@@ -47,7 +47,7 @@ from gscompleter.system.files.image import (
     read_pixels,
 )
 from gscompleter.system.files.output_folder import refuse_foreign_file
-from gscompleter.system.files.writing import encode_text, replace_file
+from gscompleter.system.files.writing import SUMMARY_FILE, encode_text, replace_file
 from gscompleter.system.jobs.jobs import JOBS, Job, read_row
 
 # Files of a completion: its page, and the viewer with its scene inside, which is optional.
@@ -189,7 +189,7 @@ def render_completion_page(folder: Path) -> str:
 
 
 def list_photographs(summary: CompletionSummary) -> list[tuple[str, ScoreRow, str]]:
-    """List images, row and use of each photograph of a page without targets.
+    """List the photographs of a page without targets: how names of its images begin, row and use.
 
     The images are numbered in the order in which `write_what_is_drawn` was given the photographs.
     """
@@ -259,24 +259,23 @@ def render_batch_page(out: Path, rows: Sequence[Mapping[str, Any]]) -> str:
     """Render the page of the batch in `out`; `rows` are those of its jobs, done or failed."""
     good = [row for row in rows if row["state"] == "done"]
     bad = [row for row in rows if row["state"] == "failed"]
-    empty = [row for row in good if row.get("outcome") == "nothing-gained"]
+    without_gain = [row for row in good if row.get("outcome") == "nothing-gained"]
     seconds = [row["seconds"] for row in good]
     return render_template(
         "batch.html",
         {
             "counts": {
-                "completed": len(good) - len(empty),
-                "nothing gained": len(empty),
+                "completed": len(good) - len(without_gain),
+                "nothing gained": len(without_gain),
                 "failed": len(bad),
             },
             "jobs": [{**dict.fromkeys(TABLE_COLUMNS), **row} for row in good[:MAX_LISTED]],
             "done": len(good),
             "failures": bad[:MAX_LISTED],
-            # Failures with a page to look at: scenes that were completed and did not reconstruct.
             "reported": {
                 row["job"]
                 for row in bad[:MAX_LISTED]
-                if os.path.isfile(out / JOBS / row["job"] / REPORT_FILE)
+                if reports_failure(out / JOBS / row["job"], row["reason"])
             },
             "gains": {
                 "at unused photographs": find_median_gain(good, "unused"),
@@ -289,6 +288,20 @@ def render_batch_page(out: Path, rows: Sequence[Mapping[str, Any]]) -> str:
             "table": TABLE_FILE,
         },
     )
+
+
+def reports_failure(folder: Path, reason: str) -> bool:
+    """Return True if a failed job left a page to look at: its scene did not reconstruct.
+
+    The folder of another failure may hold the page of an earlier run, with other options.
+    """
+    if not os.path.isfile(folder / REPORT_FILE):
+        return False
+    try:
+        summary = json.loads((folder / SUMMARY_FILE).read_bytes())
+        return bool(summary["outcome"]["headline"] == reason)
+    except (OSError, ValueError, KeyError, TypeError):
+        return False
 
 
 def find_median_gain(rows: Sequence[Mapping[str, Any]], score: str) -> float | None:

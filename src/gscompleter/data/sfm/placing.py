@@ -12,7 +12,6 @@ import hashlib
 import json
 import math
 import os
-import re
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -35,7 +34,6 @@ from gscompleter.data.sfm.poses import (
     MAX_COPY_SIDE,
     POSES_COMMAND,
     POSES_FILES,
-    SEPARATORS,
     identify_files,
     list_all_photographs,
     read_earlier,
@@ -45,6 +43,7 @@ from gscompleter.data.sfm.poses import (
 from gscompleter.numerics.geometry import select_spread_cameras
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import convert_to_pixels
+from gscompleter.system.files.names import make_colmap_name
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.files.writing import SUMMARY_FILE
 from gscompleter.system.progress import track
@@ -288,11 +287,7 @@ def write_known_copies(
 
 def choose_known(photographs: Photographs) -> list[int]:
     """Choose photographs to compare with: those that exist, of very many some far apart."""
-    frames = [
-        number
-        for number in photographs.posed
-        if photographs.frame(number).has_photograph() and not photographs.is_hidden(number)
-    ]
+    frames = [number for number in photographs.present if not photographs.is_hidden(number)]
     if len(frames) <= MAX_KNOWN:
         return frames
     cameras = [photographs.camera(number, MAX_COPY_SIDE) for number in frames]
@@ -369,7 +364,7 @@ def write_new_copy(
     (view,) = build_photographs(given.name, title, [frame]).views([0], MAX_COPY_SIDE)
 
     # Two photographs may differ in their endings alone; then the second copy has both endings.
-    plain = re.sub(SEPARATORS, "_", given.name)
+    plain = make_colmap_name(given.name)
     copy = f"{NEW_FOLDER}/{Path(plain).with_suffix('.png').as_posix()}"
     if (home / COPIES_FOLDER / copy).exists():
         copy = f"{NEW_FOLDER}/{plain}.png"

@@ -56,6 +56,7 @@ from gscompleter.system.files.image import (
     open_image,
     turn_upright,
 )
+from gscompleter.system.files.names import make_colmap_name
 from gscompleter.system.files.output_folder import refuse_later_results, reserve_output
 from gscompleter.system.files.reading import read_json
 from gscompleter.system.files.writing import SUMMARY_FILE
@@ -73,9 +74,6 @@ PACKED_INDEX = "meta.json"
 """File beside the images of an unpacked .sog, which says what they hold."""
 MAX_INDEX = 1 << 26
 """Largest such file that is looked into, in bytes."""
-SEPARATORS = r"[\s#]"
-"""Characters that names of copies do not have: in COLMAP's lists a space ends a name, and # begins
-a comment."""
 COPIES_FOLDER = "images"
 """Folder of the copies."""
 MAX_FOLDERS = 10_000
@@ -459,7 +457,7 @@ def write_copies(
     hidden = read_hidden(given.path, given.mask, reading.ignores_white)
     for number, (pixels, shade) in enumerate(split_panorama(given.path, hidden)):
         kind = f"view_{number}"
-        name = Path(re.sub(SEPARATORS, "_", given.name)).with_suffix(".jpg")
+        name = Path(make_colmap_name(given.name)).with_suffix(".jpg")
         target = _prepare_target(folder / COPIES_FOLDER / kind / name, given.path)
         Image.fromarray(pixels).save(target, quality=COPY_JPEG_QUALITY, subsampling=0)
         side = len(pixels)
@@ -497,7 +495,7 @@ def write_upright(
         lens = read_lens(exif)
 
     copy.thumbnail((MAX_COPY_SIDE, MAX_COPY_SIDE), Image.Resampling.LANCZOS)
-    name = re.sub(SEPARATORS, "_", source) + ("" if is_known else ".png")
+    name = make_colmap_name(source) + ("" if is_known else ".png")
     target = _prepare_target(folder / COPIES_FOLDER / name, path)
     if is_ready:
         shutil.copyfile(path, target)

@@ -92,7 +92,7 @@ class PoseRefinement:
 
 
 def refine_poses(photographs: Photographs) -> tuple[Photographs, PoseRefinement | None]:
-    """Refine the poses of photographs together; keep all as given if matches agree no better.
+    """Refine the poses of photographs together; keep all unless matches agree clearly better.
 
     Returns the photographs in the given frame and scale, and what was done: None if fewer than
     `MIN_REFINED` photographs can be refined, or if most cameras share their place with another.

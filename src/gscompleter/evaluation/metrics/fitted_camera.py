@@ -25,12 +25,13 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.evaluation.metrics.image import MAX_PSNR, compute_masked_psnr
+from gscompleter.evaluation.metrics.image import compute_masked_psnr
 from gscompleter.evaluation.metrics.unused_photographs import shrink_view
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.render.protocols import Renderer
 from gscompleter.types import Camera, Gaussians, Render, View
 
+# Pixels of what follows are those of the image that the pose is fitted in, but for `HOLE_MARGIN`.
 FIT_SIDE = 320
 """Longer side of the image that the pose is fitted in, at most; scores are of the whole one."""
 MAX_MOVE = 4.0
@@ -47,7 +48,9 @@ SHARES = (1.0, 0.5, 0.25)
 ROBUST = 0.03
 """Error of a colour in [0, 1] from which on its loss grows linearly, as in that of Huber."""
 HOLE_MARGIN = 2
-"""Pixels around holes that do not count, since holes move with the camera."""
+"""Pixels of the whole photograph around holes that do not count, where invented and photographed
+colours mix. A move of `MAX_MOVE`, and the blur, carry invented colours farther. That is allowed:
+each step has to lower the error of all pixels that count, most of which lie far from any hole."""
 MIN_POSE_PIXELS = 500
 """Fewest pixels, of the image that a pose is fitted in, that determine it."""
 
@@ -127,9 +130,11 @@ def measure_fitted(
     fitted = torch.from_numpy(np.clip(image * gains, 0, 1)).to(target.image)
     whole = compute_masked_psnr(fitted, target.image, target.valid_mask)
     outside = compute_masked_psnr(fitted, target.image, ~holes & target.valid_mask)
+    # At least `MIN_POSE_PIXELS` count.
+    assert whole is not None
     assert outside is not None
     return FittedQuality(
-        MAX_PSNR if whole is None else whole,
+        whole,
         outside,
         float(np.linalg.norm(move)),
         float(gains.mean()),
@@ -213,7 +218,8 @@ def fit_blurred(
         jacobian = (jacobian * gains[:, None])[counted].reshape(-1, 6)
         # Weights of the loss of Huber: errors beyond `ROBUST` pull no harder than one of its size.
         weighted = jacobian / np.maximum(np.abs(residuals), ROBUST)[:, None]
-        # A little damping, where two of the numbers act alike, as a turn and a shift do.
+        # A little damping, where two of the numbers act alike, as a turn and a shift do. It only
+        # shortens steps, each of which is tested.
         normal = weighted.T @ jacobian
         normal += (1e-4 * np.trace(normal) + 1e-12) * np.eye(6)
         change = -np.linalg.solve(normal, weighted.T @ residuals)

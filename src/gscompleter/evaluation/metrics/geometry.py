@@ -24,12 +24,16 @@ MIN_SCORED_OPACITY = 1 / 255
 """Opacity below which renderers drop a Gaussian."""
 
 MATCH_DISTANCE = 0.05
-"""Largest distance of a match, as a share of the median context depth at the target."""
+"""Largest distance of a match, and of a Gaussian of the context from the surface that the target
+sees, as a share of the median context depth there. Ours: the paper names none."""
 
 
 @dataclass(frozen=True)
 class SurfaceAgreement:
-    """Agreement of depths, and of Gaussians with the context, where both overlap; None for none."""
+    """Agreement of depths, and of Gaussians with the context, where both overlap.
+
+    A figure is None where there is no overlap, or no Gaussian in it.
+    """
 
     pixels: int
     """Number of the target's pixels in the overlap."""
@@ -79,7 +83,9 @@ def compute_nearest_distances(
     queries = points.detach().cpu().double().numpy()
     targets = others.detach().cpu().double().numpy()
     # Without balancing the tree stays fast if many points coincide.
-    return cKDTree(targets, balanced_tree=False).query(queries, workers=-1)[0]
+    tree = cKDTree(targets, balanced_tree=False)
+    # Cores beyond those of `--threads` belong to other processes.
+    return tree.query(queries, workers=torch.get_num_threads())[0]
 
 
 @torch.no_grad()
@@ -141,7 +147,8 @@ def compare_clouds(
 ) -> SurfaceAgreement:
     """Add Chamfer distance and F-score over `overlap` to the AbsRel `error`.
 
-    `reference` is the depth of the context at the target, known in all of `overlap`.
+    `reference` is the depth of the context at the target, known in all of `overlap`. Only without
+    an overlap is `error` None.
     """
     count = int(overlap.sum())
     if count == 0:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from gscompleter.config import PsnrGuardConfig
 from gscompleter.evaluation.metrics.image import compute_masked_psnr
 from gscompleter.evaluation.verdict.held_out import render_before_after
 from gscompleter.render.protocols import Renderer
@@ -16,8 +17,9 @@ from gscompleter.state import Completion
 from gscompleter.types import Camera
 from gscompleter.virtual_capture.render_views import MIN_OPAQUE
 
-INVISIBLE_PSNR = 45.0
-"""PSNR in dB from which on a change cannot be seen: the default of `psnr_guard.invisible_psnr`."""
+INVISIBLE_PSNR = PsnrGuardConfig().invisible_psnr
+"""PSNR in dB from which on a change cannot be seen. It is that of the guard by default: what a user
+sees does not depend on the guard of a run."""
 
 
 @dataclass(frozen=True)
@@ -45,8 +47,8 @@ def measure_kept(
 ) -> KeptRow | None:
     """Measure how much the splat changed; None if no camera sees anything opaque of it.
 
-    Additions before it count, and so do new colours. Pixels that showed what was removed do not:
-    they were to change.
+    What additions in front of the splat hide counts, and so do new colours. Pixels that showed what
+    was removed do not: they were to change. A camera counts from one opaque pixel on.
     """
     scores = []
     for camera in cameras:

@@ -49,6 +49,7 @@ class PixelFeatures(nn.Module):
         """
         known = self.depth_predictor(images, cameras)
         features = self.feature_upsampler(known.vit_maps, known.maps)
+        # The nearest value, as the authors' code does, and the order that their weights expect.
         certainty = F.interpolate(known.certainty, size=images.shape[-2:])
         flat = images.flatten(0, 1)
         regressed = self.gaussian_regressor(torch.cat([flat, known.depth, certainty, features], 1))

@@ -18,6 +18,11 @@ def make_valid_name(text: str) -> str:
     return f"_{name}" if DEVICES.fullmatch(name) else name
 
 
+def make_colmap_name(name: str) -> str:
+    """Replace blanks and # in a name: in COLMAP's lists they end it and begin a comment."""
+    return re.sub(r"[\s#]", "_", name)
+
+
 def fold_name(name: str) -> str:
     """Fold a name to what all of its spellings share.
 
