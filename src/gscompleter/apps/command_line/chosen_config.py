@@ -46,19 +46,26 @@ class ChosenConfig(Settings):
         return apply_changes(config, self.changes, where, where) if self.changes else config
 
 
-def make_parsing_rule() -> Callable[[StructTypeInfo], StructConstructorSpec | None]:
-    """Return a rule by which tyro parses `--config NAME` and the settings that are typed alone."""
-    settings = make_changes_type(CompleterConfig)
+def make_parsing_rule(
+    has_settings: bool,
+) -> Callable[[StructTypeInfo], StructConstructorSpec | None]:
+    """Return a rule by which tyro parses `--config NAME`, and settings that are typed alone.
+
+    Without `has_settings` it knows none of these: to prepare them takes tyro a tenth of a second.
+    """
     named = Annotated[str, tyro.conf.arg(name=CONFIG_OPTION, prefix_name=False)]
 
     def rule(info: StructTypeInfo) -> StructConstructorSpec | None:
         if info.type is not ChosenConfig:
             return None
+        name = StructFieldSpec("name", named, ChosenConfig.name, "")
+        if not has_settings:
+            return StructConstructorSpec(collect_changes, (name,))
+        settings = make_changes_type(CompleterConfig)
         spec = ConstructorRegistry.get_struct_spec(
             StructTypeInfo.make(settings, tyro.MISSING, False)
         )
         assert isinstance(spec, StructConstructorSpec)
-        name = StructFieldSpec("name", named, ChosenConfig.name, "")
         return StructConstructorSpec(collect_changes, (name, *spec.fields))
 
     return rule
