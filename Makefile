@@ -13,7 +13,7 @@ GPU := $(and $(NVIDIA),$(NVCC))
 # --index-url, not --extra-index-url: where that index is out of reach, pip would take the build for CUDA
 # from the other one without a word.
 TORCH_INDEX := $(if $(GPU),,--index-url $(TORCH_CPU_INDEX))
-PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check $(PIP_FLAGS)
 
 # Not installed, as most tests are about machines without them: tests of the code for GPUs read the
 # wheels.

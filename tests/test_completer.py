@@ -258,7 +258,9 @@ def test_with_the_embedded_models_the_same_seed_gives_the_same_bytes():
         assert torch.equal(tensor, tensors(b.scene)[name]), name
 
 
-@pytest.mark.parametrize("unit", [pytest.param(0.001, marks=pytest.mark.slow), 1000.0])
+# `tests/reconstructors/test_plane_sweep.py` scales the unit.
+@pytest.mark.slow
+@pytest.mark.parametrize("unit", [0.001, 1000.0])
 def test_with_the_embedded_models_the_unit_scales_the_result_and_changes_no_image(unit):
     ours, theirs = completed_by_embedded_models(1.0), completed_by_embedded_models(unit)
     (a,), (b,) = ours.targets, theirs.targets
@@ -354,6 +356,7 @@ def test_photographs_are_frozen_once_however_many_targets_there_are():
         assert sum(torch.equal(c.c2w, view.camera.c2w) for c in renderer.frozen) == 1
 
 
+@pytest.mark.slow
 def test_a_completer_that_kept_views_of_another_state_gives_the_same_bytes():
     views, (_, target) = photographs(), cameras()
     other = camera_at(-0.9, yaw=-12, size=SIZE)
@@ -499,7 +502,9 @@ def test_what_was_made_for_classic_rendering_covers_as_much_antialiased():
         assert adapt_to_mode(marked[:0], marked, view.camera) is marked
 
 
-@pytest.mark.parametrize("doubted", [False, pytest.param(True, marks=pytest.mark.slow)])
+# `test_what_was_made_for_classic_rendering_covers_as_much_antialiased` has such a scene.
+@pytest.mark.slow
+@pytest.mark.parametrize("doubted", [False, True])
 def test_an_antialiased_scene_is_completed_as_one(tmp_path, doubted):
     """It scores like the classic one of the same room, up to its wider low-pass filter."""
     views, target = photographs(), cameras()[1]

@@ -177,6 +177,7 @@ def test_a_given_scene_tells_its_depth_range_anywhere(views):
     assert 0 < near < far
 
 
+@pytest.mark.slow
 def test_baselines_fit_on_any_device(views):
     scene = gaussians_of(VIEWS[0]).to(DEVICE)
     steps = OptimizationConfig(iterations=3, density_rounds=1, gradient_threshold=0.0)

@@ -45,6 +45,7 @@ def is_same(one: Completion, other: Completion) -> bool:
     return all(torch.equal(getattr(one.scene, n), getattr(other.scene, n)) for n in names)
 
 
+@pytest.mark.slow
 def test_inference_mode_changes_nothing(completion):
     with torch.inference_mode():
         done = complete()
@@ -55,6 +56,7 @@ def test_inference_mode_changes_nothing(completion):
     assert further.targets[1].added is not None
 
 
+@pytest.mark.slow
 def test_float64_as_the_default_type_changes_nothing(completion):
     views = [view_of(Room(), camera) for camera in CAMERAS]
     torch.set_default_dtype(torch.float64)

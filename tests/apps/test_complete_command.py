@@ -298,6 +298,8 @@ def test_a_splat_is_doubted_by_photographs_that_are_near_and_by_some_from_everyw
     assert select_near_and_far([camera_at(0.45)], {}, 16) == []
 
 
+# `test_map_coordinates.py` and `test_kept_files.py` keep results.
+@pytest.mark.slow
 def test_a_result_is_kept_small_with_its_labels_and_without_a_copy_of_the_input(
     scene, chosen, tmp_path, monkeypatch
 ):

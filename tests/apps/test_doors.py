@@ -281,6 +281,7 @@ def test_a_limit_of_memory_is_a_sentence(splat, tmp_path, megabytes):
     assert (tmp_path / "a.splat").exists() == (done.returncode == 0)
 
 
+@pytest.mark.slow
 @pytest.mark.linux
 def test_names_that_are_no_utf_8_lose_no_run(splat, tmp_path, monkeypatch, capsys):
     folder = Path(os.fsdecode(os.fsencode(tmp_path) + b"/B\xe4r"))

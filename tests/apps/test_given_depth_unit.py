@@ -136,6 +136,7 @@ def test_false_matches_on_one_side_do_not_move_the_factor():
     assert fit.factor == pytest.approx(0.4, rel=0.01)
 
 
+@pytest.mark.slow
 def test_the_command_prints_the_factor(tmp_path, monkeypatch, capsys):
     scene = make_scene(tmp_path / "room", "png", lambda z, _: 2.5 * z)
     words = ["complete", scene, "--context", 0, 1, "--target", 2, "--out", tmp_path / "out"]

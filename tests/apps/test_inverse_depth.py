@@ -47,6 +47,7 @@ def test_inverse_depth_that_deviates_from_points_only_supports_stereo(scene):
     assert "only where stereo measures nothing" in read.notes[1]
 
 
+@pytest.mark.slow
 def test_the_command_says_what_it_thinks_of_the_maps(scene, tmp_path, monkeypatch, capsys):
     words = ["complete", scene, "--context", 1, 2, "--target", 3, "--resolution", 36, 48]
     assert run(monkeypatch, *words, "--dry-run", "--out", tmp_path / "out") == 0

@@ -105,6 +105,7 @@ def test_what_is_installed_and_known_answers(answer):
     assert answer("warmup")["folder"]
 
 
+@pytest.mark.slow
 def test_a_batch_answers_with_its_rows(room, tmp_path, answer, monkeypatch):
     monkeypatch.setattr(engine, "open_local", open_here)
     manifest = tmp_path / "scenes.csv"

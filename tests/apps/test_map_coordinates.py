@@ -247,6 +247,8 @@ def test_small_results_say_how_far_they_round(folders, tmp_path, monkeypatch):
     assert any("the largest rounding of a position is" in note for note in notes)
 
 
+# `test_the_map_changes_nothing_of_a_completion` does it by the command.
+@pytest.mark.slow
 def test_python_takes_photographs_at_the_origin_of_a_splat(folders, tmp_path):
     scene = load_splat(folders[1] / "splat.ply")
     room = folders[1] / "room"

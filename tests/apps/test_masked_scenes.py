@@ -197,6 +197,7 @@ def test_evaluate_of_boxes_names_the_option_of_masks(scenes, tmp_path, monkeypat
     assert "Masks are always read (--no-masks leaves them out)" in said
 
 
+@pytest.mark.slow
 def test_cases_read_masks(scenes, tmp_path, monkeypatch, capsys):
     case = {"scene": str(scenes["alpha"]), "context": [1, 3], "target": 5, "neighbours": [4]}
     content = {"resolution": [HEIGHT, WIDTH], "cases": [case]}

@@ -166,6 +166,7 @@ def test_without_unused_photographs_shared_features_decide(scene, tmp_path, monk
         assert json.loads((out / "summary.json").read_text())["held_out"] == []
 
 
+@pytest.mark.slow
 def test_the_reason_for_no_gain_is_the_first_line_and_is_said_once(
     scene, tmp_path, monkeypatch, capsys
 ):

@@ -109,6 +109,7 @@ def test_weights_of_a_file_are_its_own(words, room, tmp_path, monkeypatch, capsy
     assert "opens its own weights" in line
 
 
+@pytest.mark.slow
 def test_depths_are_compared_in_one_table(room, tmp_path, monkeypatch, capsys):
     case = {"scene": str(room), "context": [0, 1], "target": 2, "near": 0.5, "far": 20}
     cases = tmp_path / "cases.json"
@@ -193,6 +194,7 @@ def depth(view):
 """Source of a depth that has nothing to do with the scene."""
 
 
+@pytest.mark.slow
 def test_evaluate_says_what_the_reconstructor_says_of_photographs(tmp_path, monkeypatch, capsys):
     cameras = [camera_at(x, size=64) for x in (-0.3, 0.1, 0.5)]
     scene = photographed(tmp_path / "room", cameras)

@@ -300,6 +300,7 @@ def test_options_that_exclude_each_other_are_refused(
     assert not (tmp_path / "NEW").exists()
 
 
+@pytest.mark.slow
 def test_what_was_painted_is_not_exported_over(scene, holes, tmp_path, monkeypatch, capsys):
     named = ("--target", TARGETS[0], "--export-holes", holes)
     command = words(scene, tmp_path / "out", *named, "--overwrite")
@@ -360,6 +361,7 @@ def filmed(scene, tmp_path_factory) -> Path:
     return home / "holes"
 
 
+@pytest.mark.slow
 def test_a_video_passes_the_targets(filmed):
     content = json.loads((filmed / "holes.json").read_text())
     path = content["path"]

@@ -131,6 +131,8 @@ def test_photographs_come_to_a_given_splat(scene, splat, tmp_path, monkeypatch, 
     assert summary["context"][1]["psnr_before"] > kept["context"][1]["psnr_before"] + 0.5
 
 
+# `tests/evaluation/test_scene_poses.py` and `tests/data/test_refining.py` refine.
+@pytest.mark.slow
 def test_poses_that_a_given_splat_contradicts_are_kept(scene, splat, monkeypatch):
     photographs = open_photographs(scene)
     refined, _ = correct(photographs)

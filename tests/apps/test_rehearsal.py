@@ -114,7 +114,9 @@ def test_the_doctor_says_why_kernels_are_kept_elsewhere(monkeypatch, capsys):
     assert (found.there, found.told) == (False, note)
 
 
-@pytest.mark.parametrize("is_short", [True, pytest.param(False, marks=pytest.mark.slow)])
+# `make kernels` rehearses before all tests.
+@pytest.mark.slow
+@pytest.mark.parametrize("is_short", [True, False])
 def test_a_rehearsal_meets_every_kernel_of_a_completion(is_short):
     """It runs in a process of its own, because kernels may have run here before."""
     said = """

@@ -200,6 +200,7 @@ def test_targets_are_photographs_and_what_shows_the_crate_is_not_scored(
     assert (ignored == torch.tensor([1.0, 0.0, 1.0])).all(-1)[shown].float().mean() > 0.95
 
 
+@pytest.mark.slow
 def test_a_plan_names_a_photograph_and_the_hole_that_is_left(scene, tmp_path, monkeypatch, capsys):
     splat = load_ply(scene / "splat.ply")
     save_ply(tmp_path / "selected.ply", splat[find_in_boxes(splat.means, CRATE, UPRIGHT)])

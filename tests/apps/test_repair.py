@@ -128,6 +128,7 @@ def selected(folder) -> Path:
     return folder / "selected.ply"
 
 
+@pytest.mark.slow
 def test_a_selection_is_repaired_as_what_a_mask_marks(folder, selected, tmp_path, monkeypatch):
     splat, out = folder / "splat.ply", tmp_path / "out"
     words = ("--target", folder / "one.json", "--select", selected, "--quiet")

@@ -255,6 +255,7 @@ def test_with_nothing_named_the_camera_of_a_pixel_aligned_splat_is_found(
     assert first.forward[2] > 0.98
 
 
+@pytest.mark.slow
 def test_whether_a_splat_is_trained_is_decided_once(folder, tmp_path, monkeypatch):
     searches = []
 

@@ -92,6 +92,7 @@ def test_a_truncated_track_is_refused(tmp_path):
         give_depths(open_photographs(tmp_path), [0])
 
 
+@pytest.mark.slow
 def test_the_command_says_that_depth_was_given(tmp_path, monkeypatch):
     cameras = [camera_at(x, size=48) for x in (-0.2, 0.2, 0.5)]
     scene = with_depth(tmp_path / "room", cameras)

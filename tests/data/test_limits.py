@@ -193,6 +193,8 @@ def test_a_remote_scene_is_completed_around_a_local_origin(room, tmp_path, monke
     assert np.allclose(camera.center, load_camera(far, 2).center)
 
 
+# `tests/apps/test_map_coordinates.py` moves one.
+@pytest.mark.slow
 def test_a_splat_in_large_coordinates_is_moved_or_refused(room, tmp_path, monkeypatch, capsys):
     from gscompleter import load_ply, save_ply
     from gscompleter.types import merge

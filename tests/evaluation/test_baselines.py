@@ -141,7 +141,8 @@ def psnr_of(scene: Gaussians, view: View) -> float:
     return psnr(load_renderer("cpu").render(scene, view.camera).image, view.image)
 
 
-@pytest.mark.parametrize("rounds", [pytest.param(0, marks=pytest.mark.slow), 4])
+@pytest.mark.slow
+@pytest.mark.parametrize("rounds", [0, 4])
 def test_optimisation_fits_the_repaired_view(rounds):
     views, scene, target = repaired_room()
     config = OptimizationConfig(iterations=90, density_rounds=rounds)

@@ -297,6 +297,7 @@ def test_what_cannot_be_made_is_a_sentence(more, sentence, rooms, tmp_path, monk
     assert "Traceback" not in error
 
 
+@pytest.mark.slow
 def test_the_steps_need_the_model_of_the_paper(rooms, tmp_path, monkeypatch, capsys):
     for package in ("diffusers", "transformers", "accelerate"):
         pytest.importorskip(package, reason="needs gscompleter[diffusion]")

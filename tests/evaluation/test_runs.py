@@ -550,6 +550,7 @@ def test_one_case_per_scene_is_the_first(scenes, tmp_path, monkeypatch, capsys):
     assert "one_per_scene" in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_full_is_what_the_completer_does_by_itself(tasks):
     task = tasks[0]
     views, (target,) = task.load(task.context), task.load(task.targets)

@@ -184,6 +184,8 @@ def test_a_sequence_of_nothing_or_too_much_is_refused(text):
 # Steps
 
 
+# `test_a_step_that_fails_is_the_last` takes steps as well.
+@pytest.mark.slow
 def test_ours_improves_every_view_of_a_sequence_and_stays_metric(begun, ours):
     assert [step.frame for step in ours.steps] == [2, 3]
     assert ours.error is None
@@ -332,6 +334,7 @@ def test_a_stopped_sequence_goes_on_after_its_last_whole_step(finished, tmp_path
     assert evaluate([SHORT], METHOD_NAMES, out, CONFIG) == RowCounts(0, 0, 3)
 
 
+@pytest.mark.slow
 def test_rows_that_are_lost_are_made_again_from_what_is_saved(finished, tmp_path, monkeypatch):
     out = tmp_path / "out"
     shutil.copytree(finished, out)

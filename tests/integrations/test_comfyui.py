@@ -136,6 +136,8 @@ def test_each_painting_gets_its_folder_and_may_be_larger(found, tmp_path):
     assert (small.sh[-1] - scaled.sh[-1]).abs().max() < 0.2 * small.sh[-1].abs().max()
 
 
+# `test_the_painted_image_ends_in_the_splat` paints as well.
+@pytest.mark.slow
 def test_a_layer_with_the_filling_alone_is_enough(found, tmp_path):
     """Its fourth channel is alpha, and what it does not cover is the scene."""
     image, mask, holes, *_ = found
@@ -194,6 +196,7 @@ def test_a_splat_alone_is_shown_and_its_holes_are_found(alone):
     assert away[2].ready.opened.renders_from == "targets"
 
 
+@pytest.mark.slow
 def test_targets_are_searched_for_and_photographs_chosen(scene):
     _, mask, holes, *_ = find(scene, context="", target="", camera=0)
     assert len(holes.ready.task.targets) == 1

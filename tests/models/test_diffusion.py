@@ -69,6 +69,7 @@ def inpaint_folder(tmp_path_factory):
     return tiny_diffusion.saved(tiny_diffusion.stable_diffusion(), folder)
 
 
+@pytest.mark.slow
 def test_the_sizes_are_those_of_diffusers_and_the_nearest_aspect_wins():
     from diffusers.pipelines.flux.pipeline_flux_kontext import PREFERRED_KONTEXT_RESOLUTIONS
 
@@ -385,9 +386,8 @@ def completed(tmp_path, monkeypatch, *model) -> dict:
     return json.loads((out / "summary.json").read_text())
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param("pe-field", marks=pytest.mark.slow), "diffusers-inpaint"]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["pe-field", "diffusers-inpaint"])
 def test_a_smoke_test_of_a_whole_completion_with_random_weights(
     name, kontext_folder, inpaint_folder, tmp_path, monkeypatch
 ):

@@ -309,6 +309,7 @@ def test_undecided_mvsplat_takes_the_middle_of_each_views_inverse_range():
     assert torch.allclose(disparity, middle[..., None, None].expand_as(disparity), rtol=1e-5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["small-s1-u4-l4", "base-s2-u2-l4"])
 def test_undecided_depthsplat_takes_the_middle_of_each_views_inverse_range(name):
     """At a second scale, 32 candidates reach from 16 intervals below to 15 above the first."""
@@ -386,7 +387,8 @@ def test_gaussians_move_with_the_cameras(name):
 
 
 # A CPU takes minutes for some convolutions of bfloat16.
-@pytest.mark.parametrize("name", [pytest.param("mvsplat", marks=pytest.mark.slow), NETWORKS[1]])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["mvsplat", NETWORKS[1]])
 def test_geometry_stays_exact_where_the_network_runs_in_lower_precision(name):
     """On a CPU, where this can be tried: each Gaussian lies on the ray of its own pixel."""
     cameras = camera_pair()

@@ -70,6 +70,8 @@ def test_voxels_with_neighbours_agree_with_the_authors_code():
     check(Case.load(FIXTURES / "v2_64x64_vox0.02.npz"))
 
 
+# `test_voxels_with_neighbours_agree_with_the_authors_code` has other sizes.
+@pytest.mark.slow
 def test_voxels_of_the_published_size_agree_with_the_authors_code(shared):
     check(Case.load(shared / "fixtures" / "volsplat" / "v2_64x64_vox0.001.npz"))
 

@@ -264,6 +264,7 @@ def test_a_process_that_refuses_its_input_says_why(tmp_path):
         run_command(["complete", str(tmp_path / "nowhere"), "--out", str(tmp_path / "out")])
 
 
+@pytest.mark.slow
 def test_a_process_tells_its_own_memory_and_not_its_parents():
     ballast = torch.ones(2**28)  # 1 GiB
     seconds, cpu, peak_bytes = run_command(["models", "--json"])

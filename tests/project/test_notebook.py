@@ -45,6 +45,8 @@ def read_small_notebook():
     return notebook
 
 
+# `test_snippets.py` runs the same calls.
+@pytest.mark.slow
 def test_a_scene_is_completed_and_saved(tmp_path, monkeypatch):
     """Run the cells before those with a splat of one's own, without a kernel of Jupyter."""
     monkeypatch.chdir(tmp_path)

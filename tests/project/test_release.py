@@ -93,6 +93,8 @@ def test_the_wheel_holds_the_package_the_viewer_and_the_licences(wheel):
     assert all("permission" in text.lower() for text in libraries["licences"].values())
 
 
+# `make dist` builds the package.
+@pytest.mark.slow
 def test_the_same_sources_give_the_same_bytes_wherever_they_lie(
     wheel, unpacked, tmp_path, monkeypatch
 ):

@@ -109,6 +109,8 @@ def test_additions_in_one_place_are_dropped(monkeypatch):
         assert after > before - 0.05
 
 
+# `test_additions_in_one_place_are_dropped` thins out.
+@pytest.mark.slow
 def test_a_surface_that_is_thinned_out_has_no_holes_from_elsewhere():
     elsewhere = camera_at(0.45, size=SIZE)
     covered = RENDERER.render(WHOLE, elsewhere).alpha

@@ -101,6 +101,7 @@ def test_a_geometry_without_an_area_is_refused():
         place(line)
 
 
+@pytest.mark.slow
 def test_a_symmetric_room_is_placed_by_any_of_its_symmetries():
     empty = Room((BOX,))
     placed = place(move_elsewhere(make_mesh(empty)), empty)
@@ -118,7 +119,9 @@ def test_a_room_that_is_symmetric_as_far_as_it_is_seen_is_refused():
         place(move_elsewhere(mesh), Room((BOX,)))
 
 
-@pytest.mark.parametrize("shown", [pytest.param("wall", marks=pytest.mark.slow), "corner"])
+# `test_a_room_that_is_symmetric_as_far_as_it_is_seen_is_refused` is refused for the same reason.
+@pytest.mark.slow
+@pytest.mark.parametrize("shown", ["wall", "corner"])
 def test_geometry_that_slides_along_all_that_is_seen_is_refused(shown):
     """At any scale, about the corner too, it counts as in the same place: it has no other walls."""
     mesh = make_mesh(Room((BOX,)))

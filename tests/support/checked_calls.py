@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 from beartype import beartype
 
-MOST_CHECKS = 20
+MOST_CHECKS = 4
 """Checks of a function in a test: of its arguments, and of the result with them."""
 
 num_checks: Counter[tuple[str, str]] = Counter()

@@ -173,6 +173,7 @@ def test_a_loop_that_ends_early_is_over():
     assert written(console).splitlines() == ["poses", "report"]
 
 
+@pytest.mark.slow
 def test_a_completion_names_the_stages_of_the_paper(room, tmp_path, monkeypatch, capfd):
     assert run(monkeypatch, "complete", room, *SMALL, "--out", tmp_path / "out") == 0
     out, log = capfd.readouterr()

@@ -116,6 +116,7 @@ def test_a_moderate_mismatch_is_noticed_and_mended(views, splat):
     assert_takes_to(found.transform, larger, 0.03)
 
 
+@pytest.mark.slow
 def test_any_similarity_is_found_by_the_images(views, splat):
     found = find(views, splat, ARBITRARY, points=points_of(splat))
     assert found.method == "similarity"

@@ -142,6 +142,7 @@ def test_names_agree_without_ending_and_where_folders_repeat_them_with_folders()
     assert match_names(rig, ["1", "2"]) == []
 
 
+@pytest.mark.slow
 def test_a_remote_scene_takes_a_splat_in_a_frame_of_its_own(room, splat, tmp_path):
     put_on_map(room, UTM)
     origin = open_photographs(room).origin
