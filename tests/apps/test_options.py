@@ -4,6 +4,7 @@ import sys
 from collections import defaultdict
 from dataclasses import dataclass
 from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -11,6 +12,7 @@ import pytest
 from command import run
 from gscompleter.apps.command_line.old_spellings import OLD_SPELLINGS
 from gscompleter.apps.command_line.words import list_options
+from gscompleter.apps.commands.shared_options import list_inputs
 from gscompleter.cli import OptionClasses, parse_command
 from gscompleter.config.settings import Settings
 from gscompleter.system.errors import InputError
@@ -95,3 +97,13 @@ def test_an_old_spelling_is_no_option_of_its_command(command, name):
     assert name not in list_options(OptionClasses()[command])
     with pytest.raises(InputError, match=f"{command} has no option --{name} any more; "):
         parse_command([command, f"--{name.replace('-', '_')}", "x"])
+
+
+def test_the_number_of_a_photograph_is_no_path(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "8").mkdir()
+    (tmp_path / "cameras.json").touch()
+    words = ["complete", "scene", "--target", "8", "cameras.json", "--out", "8"]
+    inputs = list_inputs(parse_command(words))
+    assert Path("8") not in inputs
+    assert Path("cameras.json") in inputs

@@ -283,6 +283,7 @@ def test_a_damaged_holes_file_is_refused(scene, holes, tmp_path, monkeypatch, ca
         (["--path"], "is a video of what --export-holes writes"),
         (["--export-holes", "NEW", "--dry-run"], "completes nothing"),
         (["--export-holes", "NEW", "--video"], "completes nothing"),
+        (["--export-holes", "NEW", "--save-as", ".spz"], "completes nothing"),
         (["--export-holes", "OUT"], "have to lie apart from each other"),
         (["--export-holes", "OUT/holes"], "have to lie apart from each other"),
         (["--export-holes", "SCENE"], "is the input"),
@@ -293,7 +294,6 @@ def test_options_that_exclude_each_other_are_refused(
     scene, tmp_path, monkeypatch, capsys, more, part
 ):
     (tmp_path / "EMPTY").mkdir()
-    (tmp_path / "OUT").mkdir()
     monkeypatch.chdir(tmp_path)
     more = [scene if word == "SCENE" else word for word in more]
     assert part in refused(monkeypatch, capsys, *words(scene, "OUT", *more))

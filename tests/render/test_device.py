@@ -76,6 +76,9 @@ def test_a_mac_that_is_none_is_refused():
         choose_devices("cpu", networks="mps")
     with pytest.raises(InputError, match="no GPU of a Mac; choose cpu") as refused:
         choose_devices("mps")
+    with pytest.raises(InputError) as raised:
+        choose_devices("cuda", renderer="cpu")
+    assert raised.value.argument == "device"
     assert refused.value.argument == "device"
 
 

@@ -31,10 +31,12 @@ def choose_devices(
     renderer: RendererDevice | None = None,
     networks: NetworkDevice | None = None,
 ) -> Devices:
-    """Choose both devices: `device` for both, unless one is given for the renderer or networks."""
+    """Choose both devices: that of `renderer` or `networks` if it is given, else `device`."""
     return Devices(
         choose_device(device) if renderer is None else choose_device(renderer, "renderer-device"),
-        choose_network_device(device if networks is None else networks),
+        choose_network_device(device, "device")
+        if networks is None
+        else choose_network_device(networks),
     )
 
 
@@ -59,7 +61,7 @@ def choose_device(device: Device = "auto", option: str = "device") -> RendererDe
     if device == "cuda":
         # A GPU that torch sees still runs the networks.
         hint = ""
-        if torch.cuda.is_available():
+        if option == "device" and torch.cuda.is_available():
             hint = ", or the GPU for networks alone (--renderer-device cpu)"
         raise InputError(
             f"The device cuda cannot draw: {missing}. docs/install.md lists all steps; choose the "

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from gscompleter import InputError
-from gscompleter.system.files.overlap import refuse_input_file, refuse_overlap
+from gscompleter.system.files.overlap import do_overlap, refuse_input_file, refuse_overlap
 
 
 @pytest.fixture
@@ -59,6 +59,13 @@ def test_other_folders_are_accepted(scene, tmp_path, monkeypatch, out):
 
 
 @pytest.mark.linux
+def test_outputs_that_do_not_exist_yet_may_overlap(tmp_path):
+    assert do_overlap(tmp_path / "r", tmp_path / "r")
+    assert do_overlap(tmp_path / "r" / "holes", tmp_path / "r")
+    assert do_overlap(tmp_path / "r", tmp_path / "r" / "out")
+    assert not do_overlap(tmp_path / "r", tmp_path / "s")
+
+
 def test_links_hide_no_overlap(scene, tmp_path):
     (tmp_path / "link").symlink_to(scene)
     (scene / "depth").symlink_to(tmp_path / "archive" / "depth")

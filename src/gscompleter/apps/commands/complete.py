@@ -32,7 +32,7 @@ from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import GeneratorOptions, PaintedOptions
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.overlap import refuse_overlap
+from gscompleter.system.files.overlap import do_overlap, refuse_overlap
 from gscompleter.system.process import import_without_collection
 
 
@@ -48,8 +48,8 @@ class CompleteOptions(CompletingOptions):
     cameras.json, nerfstudio's camera_path.json, COLMAP's images.txt, SuperSplat poses).
     If not given, cameras that see holes are searched for and written to targets.json."""
     mask: tuple[Path, ...] = ()
-    """Masks of what goes, white there. An image for each target camera, in their order: what it
-    marks is wrong, goes, is a hole whatever stands behind it, and is filled; `strip` puts it
+    """Masks of what goes, white there. An image for each target camera, in their order. What is
+    marked is removed, counts as a hole whatever stands behind it, and is filled; `strip` puts it
     back."""
     auto: Annotated[int, Interval(ge=1, le=254)] | None = None
     """Most cameras to search for if no target is given; 4 if no number follows."""
@@ -83,14 +83,12 @@ class CompleteOptions(CompletingOptions):
         if folder is None:
             return
         refuse_overlap(folder, list_inputs(self), "export-holes", may_continue=False)
-        try:
-            refuse_overlap(folder, [self.out], may_continue=False)
-        except InputError as error:
+        if do_overlap(folder, self.out):
             raise InputError(
                 f"{quote_value(folder)} and OUT have to lie apart from each other, since what is "
                 "painted is an input of the completion; name another folder.",
                 "export-holes",
-            ) from error
+            )
 
 
 def decide_completion(options: CompleteOptions) -> Request:
@@ -194,15 +192,15 @@ def check_ending(options: CompleteOptions) -> None:
             "command again with the images alone.",
             "images",
         )
-    if is_export and (options.dry_run or options.video):
+    if is_export and (options.dry_run or options.video or options.save_as):
         raise InputError(
-            "--export-holes completes nothing; leave --dry-run and --video out.",
+            "--export-holes completes nothing; leave --dry-run, --video and --save-as out.",
             "export-holes",
         )
 
 
 def check_painted(options: CompleteOptions) -> None:
-    """Refuse what images that were painted elsewhere leave nothing to do for."""
+    """Refuse options that have no effect on images that were painted elsewhere."""
     if options.synthesis not in (GeneratorOptions(), GeneratorOptions("painted")):
         raise InputError(
             "--images takes the place of a generator; leave --generator and its options out.",

@@ -12,7 +12,7 @@ from annotated_types import Interval
 
 from gscompleter.apps.command_line.chosen_config import ChosenConfig
 from gscompleter.apps.requests.answer import AnswerRequest
-from gscompleter.apps.requests.scene import NUM_VIDEO_FRAMES, Names, Size
+from gscompleter.apps.requests.scene import FRAME_NUMBER, NUM_VIDEO_FRAMES, Names, Size
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Device, Seed, Settings
 from gscompleter.system.files.overlap import refuse_overlap
@@ -244,12 +244,16 @@ class EngineOptions(Options):
 
 
 def list_inputs(options: Settings) -> list[Path]:
-    """List the paths that a command reads: those of all its options but the outputs."""
+    """List the paths that a command reads: those of its options but the outputs.
+
+    A number is a photograph, whatever the working folder holds.
+    """
     inputs: list[Path] = []
     for name, value in vars(options).items():
         values = value if isinstance(value, tuple) else (value,)
         if name in WORDS_OR_PATHS:
-            inputs += [Path(word) for word in values if isinstance(word, str)]
+            words = [word for word in values if isinstance(word, str)]
+            inputs += [Path(word) for word in words if not FRAME_NUMBER.fullmatch(word)]
         elif isinstance(value, Settings):
             inputs += list_inputs(value)
         elif name not in OUTPUTS:

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
 from gscompleter.apps.inputs.task import Target
+from gscompleter.apps.requests.scene import FRAME_NUMBER
 from gscompleter.data.camera_files import is_in_splat_frame
 from gscompleter.data.panorama import has_panoramas
 from gscompleter.data.photographs import Photographs, Resolution
@@ -17,10 +17,6 @@ from gscompleter.data.sfm.poses import PHOTOGRAPH_ENDINGS, list_photograph_files
 from gscompleter.data.video import is_video
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.names import fold_name, make_colmap_name
-
-FRAME_NUMBER = re.compile("-?[0-9]{1,9}")
-"""Words that are numbers of photographs. Longer ones are names, such as times in nanoseconds; one
-below 0 is refused as a number, not searched for as a name."""
 
 PhotographNames = Sequence[int | str]
 """Photographs by number, from 0, or by name."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -17,6 +18,9 @@ Size = tuple[int, int] | int | Literal["full"]
 """Height and width, the longest side, or `full` for the photographs' own size."""
 Names = tuple[int | str, ...]
 """Photographs by number or by name."""
+FRAME_NUMBER = re.compile("-?[0-9]{1,9}")
+"""Words that are numbers of photographs. Longer ones are names, such as times in nanoseconds; one
+below 0 is refused as a number, not searched for as a name."""
 
 
 @dataclass(frozen=True)

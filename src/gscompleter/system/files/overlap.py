@@ -45,6 +45,15 @@ def refuse_overlap(
                 )
 
 
+def do_overlap(one: Path, other: Path) -> bool:
+    """Return True if one of two outputs, which need not exist yet, is or holds the other."""
+    places = [Path(os.path.realpath(path)) for path in (one, other)]
+    holds = [place in (last, *last.parents) for place, last in (places, places[::-1])]
+    chains = [list(_identify_chain(path)) for path in (one, other)]
+    # On a disk that ignores case the same folder has several names.
+    return any(holds) or _relate(one, chains[0], other) is not None
+
+
 def refuse_input_file(file: Path, inputs: Iterable[Path], argument: str = "out") -> None:
     """Raise an InputError if the output `file` is an input, or lies in an input folder.
 
