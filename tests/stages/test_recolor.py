@@ -49,9 +49,8 @@ def darker(scene, camera) -> View:
 def recolored(scene, camera=TARGET, weight=LEFT, held=None, config=CONFIG, renderer=RENDERER):
     held = hold(scene, config) if held is None else held
     frozen, wanted = renderer.freeze(scene, camera), darker(scene, camera)
-    return fit_image_colors(
-        scene, scene.sh.shape[1], frozen, wanted, weight, held, renderer, config
-    )
+    scenes = SceneRenderer(renderer)
+    return fit_image_colors((scene,), frozen, wanted, weight, held, scenes, config)
 
 
 def change(scene, **kwargs):
