@@ -25,6 +25,7 @@ from torch import Tensor
 from gscompleter.config.settings import COVERED
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.display import Displayed
+from gscompleter.system.files.mapping import select_rows
 from gscompleter.system.tensor_checks import (
     BOOLS,
     BYTE_DTYPES,
@@ -506,8 +507,7 @@ class Gaussians(Displayed, TensorDataclass):
             # Every property would look for the rows of a mask by itself.
             chosen = index.nonzero()[:, 0] if index.dtype == torch.bool else index
             chosen = chosen.to(self.means.device)
-            # It copies rows as they are, in a quarter of the time of `value[chosen]`.
-            rows = {name: value.index_select(0, chosen) for name, value in values.items()}
+            rows = {name: select_rows(value, chosen) for name, value in values.items()}
         return replace(self, **rows)
 
     def hide(self, hidden: Bool[Tensor, "n"]) -> Gaussians:

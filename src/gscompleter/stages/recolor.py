@@ -102,7 +102,7 @@ def fit_image_colors(
     scenes: SceneRenderer,
     config: RecolorConfig = RecolorConfig(),
 ) -> tuple[Int64[Tensor, "c"], Float[Tensor, "c k 3"]]:
-    """Fit colours towards `reference`; return rows of the context and the change of their harmonics.
+    """Fit colours towards `reference`; return rows of the context and how their harmonics change.
 
     `parts` are the context, whose Gaussians alone may change, as far as the `held` views allow, and
     what was added to it; `frozen` are these at the camera of `reference`. The context has k

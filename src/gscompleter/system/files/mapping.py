@@ -1,0 +1,92 @@
+"""Numbers that lie in mapped files, so that memory holds only those that are read at the moment.
+
+The system keeps pages that were read, as memory of the process, until these are released.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Int64
+from torch import Tensor
+
+from gscompleter.system.files.writing import convert_write_errors
+
+SELECTED_ROWS = 8192
+"""Rows that are selected at a time, before their pages are released."""
+
+
+def move_to_file(values: Tensor, beside: Path) -> Tensor:
+    """Copy values to a temporary file beside a path, and return them as they are mapped from there.
+
+    The file has no name: nothing is left of it once nobody holds the values, or after a kill. On a
+    system other than Linux, and from a GPU, the values are returned as they are. Raises
+    OutputError, as on a full disk.
+    """
+    if sys.platform != "linux" or values.device.type != "cpu" or values.numel() == 0:
+        return values
+    folder = beside.absolute().parent
+    while not folder.is_dir():
+        folder = folder.parent
+    with (
+        convert_write_errors(folder / "temporary file"),
+        tempfile.TemporaryFile(dir=folder) as file,
+    ):
+        # Written, and not stored through the map: there a full disk would end the process.
+        file.write(values.contiguous().numpy().data)
+        file.flush()
+        name = f"/proc/self/fd/{file.fileno()}"
+        mapped = torch.from_file(name, shared=True, size=values.numel(), dtype=values.dtype)
+    return mapped.view(values.shape)
+
+
+def select_rows(values: Tensor, rows: Int64[Tensor, "m"]) -> Tensor:
+    """Select rows; of a mapped file, pages are read in their order and released behind."""
+    if not is_mapped(values):
+        # It copies rows as they are, in a quarter of the time of `values[rows]`.
+        return values.index_select(0, rows)
+    selected = values.new_empty((len(rows), *values.shape[1:]))
+    for part, places in zip(*(each.split(SELECTED_ROWS) for each in rows.sort()), strict=True):
+        selected.index_copy_(0, places, values.index_select(0, part))
+        release_pages(values[part[0] : part[-1] + 1])
+    return selected
+
+
+def is_mapped(values: Tensor) -> bool:
+    """Return True for values that `move_to_file` mapped, or a part of them."""
+    return values.device.type == "cpu" and values.untyped_storage().filename is not None
+
+
+def release_pages(rows: np.ndarray | Tensor) -> None:
+    """Release the memory of consecutive rows of a mapped file; they are read again if needed.
+
+    Rows that are not mapped, or on a system without this advice to its kernel, stay as they are.
+    """
+    if isinstance(rows, Tensor):
+        if not is_mapped(rows):
+            return
+        rows = rows.detach().numpy()
+    owner: Any = rows
+    while isinstance(owner, np.ndarray) and owner.base is not None:
+        owner = owner.base
+    if isinstance(owner, memoryview):
+        owner = owner.obj
+    if not hasattr(mmap, "MADV_DONTNEED") or rows.size == 0:
+        return
+    # The advice is about whole pages, of which the first and the last one have other rows, too.
+    if isinstance(owner, mmap.mmap):
+        first = rows.ctypes.data - np.frombuffer(owner, np.uint8).ctypes.data
+        begin = first - first % mmap.PAGESIZE
+        owner.madvise(mmap.MADV_DONTNEED, begin, first + rows.nbytes - begin)
+    elif isinstance(owner, Tensor) and is_mapped(owner):
+        # torch maps whole files, from a page on, and has no advice of its own.
+        begin = rows.ctypes.data - rows.ctypes.data % mmap.PAGESIZE
+        size = rows.ctypes.data + rows.nbytes - begin
+        ctypes.CDLL(None).madvise(ctypes.c_void_p(begin), ctypes.c_size_t(size), mmap.MADV_DONTNEED)
