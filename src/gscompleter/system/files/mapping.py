@@ -24,19 +24,17 @@ SELECTED_ROWS = 8192
 
 
 def move_to_file(values: Tensor, beside: Path) -> Tensor:
-    """Copy values to a temporary file beside a path, and return them as they are mapped from there.
+    """Copy values to a temporary file in or beside a folder, and return them mapped from there.
 
-    The file has no name: nothing is left of it once nobody holds the values, or after a kill. On a
-    system other than Linux, and from a GPU, the values are returned as they are. Raises
-    OutputError, as on a full disk.
+    The file has no name, so that nothing is left of it once nobody holds the values, or after a
+    kill. Linux only: elsewhere, and from a GPU, values are returned as they are. Raises
+    OutputError, as on a full disk, which names `beside`.
     """
     if sys.platform != "linux" or values.device.type != "cpu" or values.numel() == 0:
         return values
-    folder = beside.absolute().parent
-    while not folder.is_dir():
-        folder = folder.parent
+    folder = next(each for each in (beside, *beside.absolute().parents) if each.is_dir())
     with (
-        convert_write_errors(folder / "temporary file"),
+        convert_write_errors(beside),
         tempfile.TemporaryFile(dir=folder) as file,
     ):
         # Written, and not stored through the map: there a full disk would end the process.
@@ -49,7 +47,7 @@ def move_to_file(values: Tensor, beside: Path) -> Tensor:
 
 def select_rows(values: Tensor, rows: Int64[Tensor, "m"]) -> Tensor:
     """Select rows; of a mapped file, pages are read in their order and released behind."""
-    if not is_mapped(values):
+    if not is_mapped(values) or len(rows) == 0:
         # It copies rows as they are, in a quarter of the time of `values[rows]`.
         return values.index_select(0, rows)
     selected = values.new_empty((len(rows), *values.shape[1:]))
