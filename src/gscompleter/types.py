@@ -572,7 +572,13 @@ def merge(parts: Sequence[Gaussians]) -> Gaussians:
     origin = next((part.origin for part in parts if part.origin is not None), None)
     parts = [part if part.origin is None else part.move_origin(origin) for part in parts]
     k = max(part.sh.shape[1] for part in parts)
-    sh = [torch.nn.functional.pad(part.sh, (0, 0, 0, k - part.sh.shape[1])) for part in parts]
+    # Padding by nothing would copy, too.
+    sh = [
+        part.sh
+        if part.sh.shape[1] == k
+        else torch.nn.functional.pad(part.sh, (0, 0, 0, k - part.sh.shape[1]))
+        for part in parts
+    ]
     encoded = None
     if any(part.encoded is not None for part in parts):
         # NaN is unequal to anything, so that the writer encodes these rows again.
