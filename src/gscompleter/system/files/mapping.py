@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gscompleter.system.files.writing import convert_write_errors
 
-SELECTED_ROWS = 8192
+SELECTED_BLOCK = 8192
 """Rows that are selected at a time, before their pages are released."""
 
 
@@ -51,7 +51,7 @@ def select_rows(values: Tensor, rows: Int64[Tensor, "m"]) -> Tensor:
         # It copies rows as they are, in a quarter of the time of `values[rows]`.
         return values.index_select(0, rows)
     selected = values.new_empty((len(rows), *values.shape[1:]))
-    for part, places in zip(*(each.split(SELECTED_ROWS) for each in rows.sort()), strict=True):
+    for part, places in zip(*(each.split(SELECTED_BLOCK) for each in rows.sort()), strict=True):
         selected.index_copy_(0, places, values.index_select(0, part))
         release_pages(values[part[0] : part[-1] + 1])
     return selected
