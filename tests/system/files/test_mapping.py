@@ -60,6 +60,18 @@ def test_numbers_in_memory_stay():
     assert torch.equal(values, make_values())
 
 
+def test_changes_of_a_file_that_somebody_else_mapped_stay(tmp_path):
+    """As those of `torch.load(mmap=True)`: with their page they would go back to the file's."""
+    path = tmp_path / "values"
+    path.write_bytes(bytes(4 * 10_000))
+    values = torch.from_file(str(path), shared=False, size=10_000, dtype=torch.float32)
+    values += 1
+    assert not is_mapped(values)
+    release_pages(values)
+    release_pages(values.numpy())
+    assert (values == 1).all()
+
+
 @pytest.mark.parametrize("count", [0, 5, ROWS, 3 * ROWS])
 def test_rows_are_selected_in_any_order_with_few_pages(tmp_path, count):
     values = make_values()

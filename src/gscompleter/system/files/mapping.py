@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import ctypes
 import mmap
+import os
 import sys
 import tempfile
 from pathlib import Path
@@ -19,6 +20,8 @@ from torch import Tensor
 
 from gscompleter.system.files.writing import convert_write_errors
 
+OPEN_FILES = "/proc/self/fd"
+"""Folder of Linux in which open files have names, also those that have none elsewhere."""
 SELECTED_BLOCK = 8192
 """Rows that are selected at a time, before their pages are released."""
 
@@ -27,10 +30,11 @@ def move_to_file(values: Tensor, beside: Path) -> Tensor:
     """Copy values to a temporary file in or beside a folder, and return them mapped from there.
 
     The file has no name, so that nothing is left of it once nobody holds the values, or after a
-    kill. Linux only: elsewhere, and from a GPU, values are returned as they are. Raises
+    kill. Linux with /proc only: elsewhere, and from a GPU, values are returned as they are. Raises
     OutputError, as on a full disk, which names `beside`.
     """
-    if sys.platform != "linux" or values.device.type != "cpu" or values.numel() == 0:
+    can_map = sys.platform == "linux" and os.path.isdir(OPEN_FILES)
+    if not can_map or values.device.type != "cpu" or values.numel() == 0:
         return values
     folder = next(each for each in (beside, *beside.absolute().parents) if each.is_dir())
     with (
@@ -40,7 +44,7 @@ def move_to_file(values: Tensor, beside: Path) -> Tensor:
         # Written, and not stored through the map: there a full disk would end the process.
         file.write(values.contiguous().numpy().data)
         file.flush()
-        name = f"/proc/self/fd/{file.fileno()}"
+        name = f"{OPEN_FILES}/{file.fileno()}"
         mapped = torch.from_file(name, shared=True, size=values.numel(), dtype=values.dtype)
     return mapped.view(values.shape)
 
@@ -58,8 +62,15 @@ def select_rows(values: Tensor, rows: Int64[Tensor, "m"]) -> Tensor:
 
 
 def is_mapped(values: Tensor) -> bool:
-    """Return True for values that `move_to_file` mapped, or a part of them."""
-    return values.device.type == "cpu" and values.untyped_storage().filename is not None
+    """Return True for values that `move_to_file` mapped, or a part of them.
+
+    Not for those of other mapped files: what was changed in a private map would be lost with its
+    page.
+    """
+    if values.device.type != "cpu":
+        return False
+    name = values.untyped_storage().filename
+    return name is not None and name.startswith(f"{OPEN_FILES}/")
 
 
 def release_pages(rows: np.ndarray | Tensor) -> None:
