@@ -25,6 +25,7 @@ from torch import Tensor
 from gscompleter.config.settings import COVERED
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.display import Displayed
+from gscompleter.system.files.mapping import select_rows
 from gscompleter.system.tensor_checks import (
     BOOLS,
     BYTE_DTYPES,
@@ -506,8 +507,7 @@ class Gaussians(Displayed, TensorDataclass):
             # Every property would look for the rows of a mask by itself.
             chosen = index.nonzero()[:, 0] if index.dtype == torch.bool else index
             chosen = chosen.to(self.means.device)
-            # It copies rows as they are, in a quarter of the time of `value[chosen]`.
-            rows = {name: value.index_select(0, chosen) for name, value in values.items()}
+            rows = {name: select_rows(value, chosen) for name, value in values.items()}
         return replace(self, **rows)
 
     def hide(self, hidden: Bool[Tensor, "n"]) -> Gaussians:
@@ -572,7 +572,13 @@ def merge(parts: Sequence[Gaussians]) -> Gaussians:
     origin = next((part.origin for part in parts if part.origin is not None), None)
     parts = [part if part.origin is None else part.move_origin(origin) for part in parts]
     k = max(part.sh.shape[1] for part in parts)
-    sh = [torch.nn.functional.pad(part.sh, (0, 0, 0, k - part.sh.shape[1])) for part in parts]
+    # Padding by nothing would copy, too.
+    sh = [
+        part.sh
+        if part.sh.shape[1] == k
+        else torch.nn.functional.pad(part.sh, (0, 0, 0, k - part.sh.shape[1]))
+        for part in parts
+    ]
     encoded = None
     if any(part.encoded is not None for part in parts):
         # NaN is unequal to anything, so that the writer encodes these rows again.

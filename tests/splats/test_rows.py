@@ -14,7 +14,8 @@ from gscompleter.splats.conversion import Conversion, convert_splat
 from gscompleter.splats.layout import is_same_scene, save_like
 from gscompleter.splats.morton import argsort_nearby, sort_nearby
 from gscompleter.splats.ply import encode, make_row_type, make_rows, save_parts
-from gscompleter.system.files.ply import read_ply_file, release_pages
+from gscompleter.system.files.mapping import release_pages
+from gscompleter.system.files.ply import read_ply_file
 from scenes import random_gaussians
 
 ODD = (float("nan"), float("inf"), -float("inf"), 2e18, -2e18)

@@ -15,7 +15,7 @@ from gscompleter.render.spherical_harmonics import evaluate_sh_basis
 from gscompleter.stages.recolor import fit_image_colors
 from gscompleter.trust import HeldViews
 from gscompleter.trust.photometric import load_trust, sum_weights
-from gscompleter.types import ContextScene, View
+from gscompleter.types import ContextScene, View, merge
 from scenes import Room, camera_at, gaussians_of, view_of
 from target_views import begin_with
 
@@ -49,9 +49,8 @@ def darker(scene, camera) -> View:
 def recolored(scene, camera=TARGET, weight=LEFT, held=None, config=CONFIG, renderer=RENDERER):
     held = hold(scene, config) if held is None else held
     frozen, wanted = renderer.freeze(scene, camera), darker(scene, camera)
-    return fit_image_colors(
-        scene, scene.sh.shape[1], frozen, wanted, weight, held, renderer, config
-    )
+    scenes = SceneRenderer(renderer)
+    return fit_image_colors((scene,), frozen, wanted, weight, held, scenes, config)
 
 
 def change(scene, **kwargs):
@@ -193,6 +192,31 @@ def test_what_stays_is_drawn_and_not_copied(monkeypatch):
     # What may change alone; here that is less than a half.
     assert len(rows) > 0
     assert 0 < sum(copied) < 0.5 * len(scene)
+
+
+class Merging(SceneRenderer):
+    """Draws a scene as one, of which all are copies."""
+
+    def freeze(self, parts, camera):
+        return self.renderer.freeze(merge(parts), camera)
+
+
+def test_additions_are_drawn_beside_the_scene_with_the_same_result():
+    scene = splat()
+    added = replace(scene[::7], means=scene.means[::7] + 0.05)
+    parts = (scene, added)
+    frozen, wanted = RENDERER.freeze(merge(parts), TARGET), darker(merge(parts), TARGET)
+    held = hold(scene)
+    apart, merged = (
+        fit_image_colors(parts, frozen, wanted, LEFT, held, kind(RENDERER), CONFIG)
+        for kind in (SceneRenderer, Merging)
+    )
+    assert len(apart[0]) > 0
+    assert apart[0].max() < len(scene)
+    assert torch.equal(apart[0], merged[0])
+    assert torch.equal(apart[1], merged[1])
+    # They hide a part of the scene.
+    assert not torch.equal(apart[0], recolored(scene, held=held)[0])
 
 
 def test_the_number_of_threads_does_not_matter():

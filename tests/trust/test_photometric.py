@@ -25,6 +25,7 @@ from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.morton import argsort_nearby
 from gscompleter.splats.ply import load_ply, save_ply
 from gscompleter.stages.error_budgets import compute_squared_error
+from gscompleter.system.files.mapping import is_mapped, move_to_file
 from gscompleter.system.memory import estimate_bytes
 from gscompleter.trust import Trust
 from gscompleter.trust.photometric import (
@@ -211,6 +212,31 @@ def test_the_command_recolours_and_strip_puts_back(tmp_path, monkeypatch, worth)
     assert (out / "images" / "target1_support.png").is_file()
     assert run(monkeypatch, "strip", out / "completed.ply", "--out", tmp_path / "back.ply") == 0
     assert (tmp_path / "back.ply").read_bytes() == splat.read_bytes()
+
+
+@pytest.mark.linux
+def test_colours_of_a_large_scene_lie_in_a_file_and_nothing_else_changes(tmp_path, monkeypatch):
+    monkeypatch.setattr("gscompleter.apps.completing.preparation.MIN_PROXY_GAUSSIANS", 0)
+    scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
+    splat = labelled(tmp_path / "splat.ply", SCENE)
+    files = []
+    for name, begins in (("in-memory", lambda values, _: values), ("in-file", move_to_file)):
+        mapped = []
+
+        def move(values, beside, begins=begins, mapped=mapped):
+            moved = begins(values, beside)
+            mapped.append(is_mapped(moved))
+            return moved
+
+        monkeypatch.setattr("gscompleter.apps.completing.preparation.move_to_file", move)
+        out = tmp_path / name
+        assert run(monkeypatch, *complete(scene, splat, out)) == 0
+        assert set(mapped) == {name == "in-file"}
+        files.append([(out / file).read_bytes() for file in ("completed.ply", "removed.ply")])
+    assert files[0] == files[1]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        *("in-file", "in-memory", "scene", "splat.ply")
+    ]
 
 
 def test_a_sorted_scene_is_the_same_in_the_order_of_its_file():

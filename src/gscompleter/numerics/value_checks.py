@@ -17,10 +17,13 @@ from torch import Tensor
 from gscompleter.numerics.kernels.parallel import share
 from gscompleter.numerics.kernels.splat_rows import mark_usable
 from gscompleter.system.errors import InputError
+from gscompleter.system.files.mapping import release_pages
 from gscompleter.system.memory import check_image_memory
 from gscompleter.system.tensor_checks import describe, name_dtype
 from gscompleter.types import Camera, DepthMap, Gaussians, View
 
+CHECKED_BLOCK = 500_000
+"""Gaussians that are checked at a time."""
 LARGEST = 1e18
 """Largest coordinate, scale and component of a quaternion: the sum of their squares is finite."""
 LARGEST_SH = 1e6
@@ -42,8 +45,12 @@ def find_finite(gaussians: Gaussians) -> Bool[Tensor, "n"]:
         values[-1] = values[-1].flatten(1)
         arrays = [value.contiguous().numpy() for value in values]
         usable = np.empty(len(gaussians), np.bool_)
-        bounds = map(np.float32, (LARGEST, LARGEST_SH, MIN_QUAT_LENGTH))
-        share(mark_usable, len(gaussians), *arrays, *bounds, usable)
+        bounds = [np.float32(bound) for bound in (LARGEST, LARGEST_SH, MIN_QUAT_LENGTH)]
+        # Harmonics may lie in a file, of which no more than a block is kept in memory.
+        for start in range(0, len(gaussians), CHECKED_BLOCK):
+            parts = [array[start : start + CHECKED_BLOCK] for array in (*arrays, usable)]
+            share(mark_usable, len(parts[0]), *parts[:-1], *bounds, parts[-1])
+            release_pages(parts[-2])
         return torch.from_numpy(usable)
     good = torch.ones(len(gaussians), dtype=torch.bool, device=gaussians.means.device)
     for name in names:

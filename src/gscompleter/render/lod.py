@@ -24,6 +24,7 @@ from gscompleter.numerics.kernels.parallel import share
 from gscompleter.numerics.kernels.project import GaussianArrays
 from gscompleter.render.cpu import to_arrays
 from gscompleter.render.viewpoint import to_float32
+from gscompleter.system.files.mapping import release_pages
 from gscompleter.system.memory import count_fitting_gaussians
 from gscompleter.types import Camera, ContextScene, Gaussians
 
@@ -37,6 +38,8 @@ MAX_GROWTH = 8.0
 """Largest factor on MAX_REACH and MAX_RUN_DEVIATION, if the proxy would be too large otherwise."""
 FAR_AWAY = 1e4
 """Distance, in radii of the scene, of a camera to which all of it is equally far."""
+MERGED_BLOCK = 200_000
+"""Runs that are merged at a time."""
 BISECTIONS = 20
 """Steps of the search for the distance within which Gaussians are merged: to a thousandth."""
 
@@ -71,7 +74,12 @@ def merge_runs(scene: Gaussians, start: Int64[ndarray, "bounds"]) -> Gaussians:
         *[np.empty((num_runs, *array.shape[1:]), np.float32) for array in arrays]
     )
     shares = np.empty(len(scene), np.float32)
-    share(kernels.merge_run_range, num_runs, start, arrays, shares, merged_arrays)
+    # Harmonics may lie in a file, of which no more than a block is kept in memory.
+    for begin in range(0, num_runs, MERGED_BLOCK):
+        bounds = start[begin : begin + MERGED_BLOCK + 1]
+        merged = GaussianArrays(*[array[begin : begin + MERGED_BLOCK] for array in merged_arrays])
+        share(kernels.merge_run_range, len(bounds) - 1, bounds, arrays, shares, merged)
+        release_pages(arrays.sh[bounds[0] : bounds[-1]])
 
     first = torch.from_numpy(start[:-1])
     return Gaussians(

@@ -18,7 +18,10 @@ from gscompleter.numerics.kernels.parallel import run_calls, share, split_range
 from gscompleter.numerics.kernels.project import CameraArrays, GaussianArrays
 from gscompleter.numerics.kernels.simd import TILE
 from gscompleter.system.errors import InputError
+from gscompleter.system.files.mapping import release_pages
 
+PROJECTED_BLOCK = 500_000
+"""Gaussians that are projected at a time."""
 MAX_ENTRIES = np.iinfo(np.int32).max
 """Largest total length of the tiles' lists, which kernels number in 32 bits."""
 
@@ -89,7 +92,13 @@ class Viewpoint:
         columns = np.empty((n, project.NUM_SPLAT_COLUMNS), np.float32)
         boxes = np.empty((n, 4), self.box_dtype)
         factors = np.zeros(n, np.float32) if is_antialiased else None
-        self.share(project.project_splats, n, gaussians, self.pinhole, columns, boxes, factors)
+        # Harmonics may lie in a file, of which no more than a block is kept in memory.
+        for start in range(0, n, PROJECTED_BLOCK):
+            block = slice(start, start + PROJECTED_BLOCK)
+            part = GaussianArrays(*[array[block] for array in gaussians])
+            result = (columns[block], boxes[block], None if factors is None else factors[block])
+            self.share(project.project_splats, len(part.means), part, self.pinhole, *result)
+            release_pages(part.sh)
         opacities = gaussians.opacities if factors is None else gaussians.opacities * factors
         return Splats(columns, opacities, boxes, factors)
 

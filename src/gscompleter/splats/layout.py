@@ -56,7 +56,8 @@ from gscompleter.splats.ply import (
 from gscompleter.splats.provenance import RunRecord, make_comment_lines
 from gscompleter.splats.table import get_written_format
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.ply import release_pages, write_ply_file
+from gscompleter.system.files.mapping import release_pages
+from gscompleter.system.files.ply import write_ply_file
 from gscompleter.system.files.writing import REMOVED_FILE
 from gscompleter.types import NUM_SH, Gaussians, merge
 

@@ -43,13 +43,13 @@ from gscompleter.splats.provenance import (
 )
 from gscompleter.splats.splat_format import PLY_MAGIC, SplatFormat
 from gscompleter.system.errors import InputError, quote_value, require_path
+from gscompleter.system.files.mapping import release_pages
 from gscompleter.system.files.ply import (
     Element,
     PlyFile,
     make_header,
     read_header,
     read_ply_file,
-    release_pages,
     write_ply_file,
 )
 from gscompleter.system.files.reading import open_file
@@ -102,6 +102,8 @@ BLOCK_ROWS = 8192
 """Rows processed at a time, so that all their columns stay in the cache."""
 CHUNK_ROWS = 16 * BLOCK_ROWS
 """Rows of a file that are copied at a time."""
+SELECTED_ROWS = 32 * BLOCK_ROWS
+"""Gaussians that are selected at a time, for which all pages of a mapped scene are read once."""
 
 
 @dataclass(frozen=True)
@@ -613,9 +615,10 @@ def save_parts(
 
     def generate_blocks() -> Iterator[ndarray]:
         for scene, order in parts:
-            for block in iterate_blocks(len(order)):
-                rows = scene[order[block].to(scene.means.device)].detach().to("cpu")
-                yield make_rows(merge([form, rows]), provenance)
+            for chunk in order.split(SELECTED_ROWS):
+                rows = scene[chunk.to(scene.means.device)].detach().to("cpu")
+                for block in iterate_blocks(len(rows)):
+                    yield make_rows(merge([form, rows[block]]), provenance)
 
     count = sum(len(order) for _, order in parts)
     header = add_comments(make_scene_header(form, provenance), made_by)

@@ -18,7 +18,8 @@ from torch.nn.functional import normalize
 from gscompleter.config import RecolorConfig
 from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.parts import PartOrigin
-from gscompleter.render.protocols import ColorErrors, FrozenScene, Renderer
+from gscompleter.render.cache import Parts, SceneRenderer
+from gscompleter.render.protocols import ColorErrors, FrozenScene
 from gscompleter.render.spherical_harmonics import evaluate_sh_basis
 from gscompleter.stages.synthesize import GeneratedView
 from gscompleter.stages.target_view import TargetView
@@ -26,7 +27,7 @@ from gscompleter.state import Completion
 from gscompleter.system.threads import use_one_torch_thread
 from gscompleter.system.timing import timed_stage
 from gscompleter.trust import HeldViews
-from gscompleter.types import Camera, Gaussians, View, merge
+from gscompleter.types import Camera, Gaussians, View
 
 UNSEEN_WEIGHT = 1e-3
 """Summed weight, in pixels, up to which a Gaussian is not seen."""
@@ -71,13 +72,12 @@ def recolor(reference: GeneratedView, view: TargetView, origin: PartOrigin) -> R
     if reference.is_inconsistent or not weight.any():
         return unchanged
     rows, delta = fit_image_colors(
-        merge(state.parts),
-        context.sh.shape[1],
+        state.parts,
         view.frozen,
         reference,
         weight,
         state.trust.held,
-        view.scenes.renderer,
+        view.scenes,
         state.config.recolor,
     )
     if len(rows) == 0:
@@ -94,91 +94,92 @@ def recolor(reference: GeneratedView, view: TargetView, origin: PartOrigin) -> R
 
 
 def fit_image_colors(
-    scene: Gaussians,
-    num_sh: int,
+    parts: Parts,
     frozen: FrozenScene,
     reference: View,
     weight: Float[Tensor, "h w"],
     held: HeldViews,
-    renderer: Renderer,
+    scenes: SceneRenderer,
     config: RecolorConfig = RecolorConfig(),
 ) -> tuple[Int64[Tensor, "c"], Float[Tensor, "c k 3"]]:
-    """Fit colours towards `reference`; return rows of `scene` and the change of their harmonics.
+    """Fit colours towards `reference`; return rows of the context and how their harmonics change.
 
-    `frozen` is `scene` at the camera of `reference`. Only the m Gaussians of the context, which are
-    the first of `scene`, may change, as far as the `held` views allow; they have k = `num_sh`
+    `parts` are the context, whose Gaussians alone may change, as far as the `held` views allow, and
+    what was added to it; `frozen` are these at the camera of `reference`. The context has k
     coefficients per channel, where additions may have more. Where `weight`, in [0, 1], is low, the
-    render of `scene` is wanted instead. Equations: "Recolouring" in docs/method.md.
+    render of `parts` is wanted instead. Equations: "Recolouring" in docs/method.md.
     """
     # Gaussians are open to change if they show in a pixel that wants another colour. Three
     # channels are backprojected at once: all pixels, wanting pixels, and nothing.
+    context, *added = parts
     layers = torch.stack([torch.ones_like(weight), weight, torch.zeros_like(weight)], dim=-1)
-    sums, open_sums, _ = frozen.backproject(layers).unbind(-1)
+    sums, open_sums, _ = frozen.backproject(layers)[: held.sums.shape[1]].unbind(-1)
     is_open = open_sums > UNSEEN_WEIGHT
-    num_context = held.sums.shape[1]
-    is_open[num_context:] = False
     rows = torch.nonzero(is_open)[:, 0]
-    sh = scene.sh[rows, :num_sh]
     if len(rows) == 0 or config.iterations == 0:
-        return rows[:0], sh[:0]
+        return rows[:0], context.sh[:0]
 
     # A Gaussian has k coefficients per channel, of which the target sees one combination, bᵀ sh. Of
     # all changes of that colour, A⁻¹ b is the one that costs the held views least. So one number s
     # per channel is left, and the colour changes by γ s.
-    means = scene.means[rows]
-    basis, change = solve_directions(
-        means, num_sh, rows, sums[rows], reference.camera, held, config.ridge
+    opened = context[rows]
+    change, colors, gains = solve_directions(
+        opened, rows, sums[rows], reference.camera, held, config.ridge
     )
-    colors = 0.5 + torch.einsum("nk,nkc->nc", basis, sh.double())
-    gains = (basis * change).sum(dim=1, keepdim=True)  # γ = bᵀ A⁻¹ b
 
     wanted = torch.lerp(frozen.render.image, reference.image, weight[..., None])
-    errors = renderer.freeze(scene.hide(is_open), reference.camera).vary_colors(scene[rows])
+    others = scenes.freeze((context.hide(is_open), *added), reference.camera)
+    errors = others.vary_colors(opened)
     steps = fit_steps(errors, wanted, colors, gains, config.iterations)
 
     # Changes that nobody sees would only mark Gaussians as generated. Leaving them out changes a
     # fifth as many, for the same gain (decision 038).
     is_changed = (gains * steps).abs().amax(dim=1) > config.min_change
     delta = change[is_changed, :, None] * steps[is_changed, None]
-    return rows[is_changed], delta.to(sh)
+    return rows[is_changed], delta.to(context.sh)
 
 
 def solve_directions(
-    means: Float[Tensor, "c 3"],
-    k: int,
+    opened: Gaussians,
     rows: Int64[Tensor, "c"],
     sums: Float[Tensor, "c"],
     camera: Camera,
     held: HeldViews,
     ridge: float,
-) -> tuple[Float64[Tensor, "c k"], Float64[Tensor, "c k"]]:
-    """Return the basis b at `camera` and the cheapest change of k harmonics, A⁻¹ b, of some rows.
+) -> tuple[Float64[Tensor, "c k"], Float64[Tensor, "c 3"], Float64[Tensor, "c 1"]]:
+    """Return the cheapest change of the k harmonics, A⁻¹ b, of the Gaussians at `rows`.
 
+    Also returns their colours bᵀ sh at `camera`, and the gains γ = bᵀ A⁻¹ b, for the basis b there.
     A = Σ_v weight_v sum_v b_v b_vᵀ + ridge (sum + Σ_v sum_v) I over the held views v, where sums
     are the compositing weights of a Gaussian in an image; `sums` [c] are those at `camera`.
     """
     centers = torch.cat([held.centers, camera.center.to(held.centers)[None]])
+    k = opened.sh.shape[1]
+    # Chunks are written where they belong: joined at the end they would take the memory twice.
+    change = opened.sh.new_empty((len(rows), k), dtype=torch.float64)
+    colors = change.new_empty((len(rows), 3))
+    gains = change.new_empty((len(rows), 1))
 
-    def solve(
-        places: Float[Tensor, "_ 3"], chunk: Int64[Tensor, "_"], own: Float[Tensor, "_"]
-    ) -> Float64[Tensor, "2 _ k"]:
+    def solve(start: int) -> None:
         # In float64, since views beside each other have nearly equal b, and A is close to singular.
-        rays = normalize(places[:, None].double() - centers.double(), dim=-1)
+        chunk = slice(start, start + CHUNK)
+        rays = normalize(opened.means[chunk, None].double() - centers.double(), dim=-1)
         basis = evaluate_sh_basis(rays.flatten(0, 1), k).unflatten(0, rays.shape[:2])
         held_basis = basis[:, :-1]
         target_basis = basis[:, -1]
-        held_sums = held.sums[:, chunk].double().T
+        held_sums = held.sums[:, rows[chunk]].double().T
         cost = held_basis.mT @ (held_basis * (held_sums * held.weights)[..., None])
         # The ridge grows with all weights, so that the result does not depend on image sizes.
-        cost.diagonal(dim1=1, dim2=2).add_(ridge * (own + held_sums.sum(dim=1))[:, None])
-        change = torch.cholesky_solve(target_basis[..., None], torch.linalg.cholesky(cost))
-        return torch.stack([target_basis, change[..., 0]])
+        own = sums[chunk] + held_sums.sum(dim=1)
+        cost.diagonal(dim1=1, dim2=2).add_(ridge * own[:, None])
+        solved = torch.cholesky_solve(target_basis[..., None], torch.linalg.cholesky(cost))[..., 0]
+        change[chunk] = solved
+        colors[chunk] = 0.5 + torch.einsum("nk,nkc->nc", target_basis, opened.sh[chunk].double())
+        gains[chunk] = (target_basis * solved).sum(dim=1, keepdim=True)
 
     with use_one_torch_thread():
-        parts = (means.split(CHUNK), rows.split(CHUNK), sums.split(CHUNK))
-        chunks = map_in_parallel(solve, *parts)
-    basis, change = torch.cat(chunks, dim=1)
-    return basis, change
+        map_in_parallel(solve, range(0, len(rows), CHUNK))
+    return change, colors, gains
 
 
 def fit_steps(

@@ -145,6 +145,7 @@ def decide_splat(options: SceneOptions, path: Path) -> SplatRequest:
         options.drop_nonfinite,
         options.ignore_properties,
         options.forget_edits,
+        options.out,
     )
 
 

@@ -66,6 +66,7 @@ from gscompleter.splats.morton import sort_nearby
 from gscompleter.stages.context import prepare_single
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.mapping import move_to_file
 from gscompleter.system.process import give_large_arrays_own_pages
 from gscompleter.system.progress import show_preparation, stage
 from gscompleter.system.timing import record_seconds, timed_stage
@@ -287,6 +288,7 @@ def read_inputs(
     device = work.models.device
     splat = work.splat
     given = None
+    splat_file = None
     with compile_beside(list_parts(work)):
         with show_preparation("reading photographs"):
             has_splat = splat is not None
@@ -298,9 +300,11 @@ def read_inputs(
                 given = read_splat(splat)
                 if device == "cpu":
                     check_scene(task, given)
-    if splat is None or given is None:
+                given, splat_file = sort_splat(given, splat, device)
+    if given is None or splat_file is None:
         return task
-    task = add_splat(task, splat, given, opened)
+    with show_preparation("aligning the scene"):
+        task = move_to_splat(task, given, splat_file, opened)
     if device == "cuda":
         check_gpu(task)
     return task
@@ -451,27 +455,23 @@ def read_splat(splat: SplatRequest) -> Gaussians:
     return gaussians
 
 
-def add_splat(
-    task: CompletionTask, splat: SplatRequest, gaussians: Gaussians, opened: Opened
-) -> CompletionTask:
-    """Add the input splat to the task."""
-    with show_preparation("aligning the scene"):
-        gaussians, splat_file = sort_splat(
-            gaussians, locate_splat(splat.path, splat.drop_nonfinite)
-        )
-        return move_to_splat(task, gaussians, splat_file, opened)
-
-
 def sort_splat(
-    gaussians: Gaussians, splat_file: InputSplatFile
+    gaussians: Gaussians, splat: SplatRequest, device: str
 ) -> tuple[Gaussians, InputSplatFile]:
-    """Sort a large splat along a Morton curve, in place, and keep the order of its file."""
+    """Sort a large splat along a Morton curve, in place, and keep the order of its file.
+
+    Three quarters of it are harmonics, which stages seldom read: they go to a temporary file.
+    """
     # Gaussians of a file lie in random order, and each tile of an image would read memory all over
     # (decision 025). Files are written in the order of the given file, which `file_order` leads
     # back to.
+    splat_file = locate_splat(splat.path, splat.drop_nonfinite)
     if len(gaussians) < MIN_PROXY_GAUSSIANS:
         return gaussians, splat_file
-    return gaussians, replace(splat_file, file_order=sort_nearby(gaussians))
+    order = sort_nearby(gaussians)
+    if splat.beside is not None and device == "cpu":
+        gaussians = replace(gaussians, sh=move_to_file(gaussians.sh, splat.beside))
+    return gaussians, replace(splat_file, file_order=order)
 
 
 def read_splat_alone(
@@ -491,9 +491,7 @@ def read_splat_alone(
     # What can be wrong is read before anything that takes time.
     load_completer(work.models, work.config, ())
     with show_preparation("reading the scene"):
-        gaussians = read_splat(splat)
-        splat_file = locate_splat(splat.path, splat.drop_nonfinite)
-        gaussians, splat_file = sort_splat(gaussians, splat_file)
+        gaussians, splat_file = sort_splat(read_splat(splat), splat, device)
     compile_kernels(list_parts(work))
 
     request = RenderRequest(

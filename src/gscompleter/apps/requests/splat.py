@@ -20,6 +20,9 @@ class SplatRequest:
     """True to read a file whose further properties change what is seen."""
     forget_edits: bool = False
     """True to use photographs also where they show what earlier edits took out."""
+    beside: Path | None = None
+    """Where, beside the results, a large splat keeps its colours in a temporary file; None to keep
+    them in memory."""
 
 
 @dataclass(frozen=True)

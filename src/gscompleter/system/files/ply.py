@@ -6,7 +6,6 @@ little-endian ones are written. What the columns mean is up to the callers: Gaus
 
 from __future__ import annotations
 
-import mmap
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -161,24 +160,6 @@ def _map_rows(file: BinaryIO, dtype: np.dtype, start: int, count: int | None = N
     if number == 0:
         return np.empty(0, dtype)
     return np.asarray(np.memmap(file, dtype, "r", start, (number,)))
-
-
-def release_pages(rows: np.ndarray) -> None:
-    """Release the memory of consecutive rows of a mapped file; they are read again if needed.
-
-    Rows that are not mapped, or on a system without this advice to its kernel, stay as they are.
-    """
-    owner: Any = rows
-    while isinstance(owner, np.ndarray) and owner.base is not None:
-        owner = owner.base
-    if isinstance(owner, memoryview):
-        owner = owner.obj
-    if not isinstance(owner, mmap.mmap) or not hasattr(mmap, "MADV_DONTNEED") or rows.size == 0:
-        return
-    # The advice is about whole pages, of which the first and the last one have other rows, too.
-    first = rows.ctypes.data - np.frombuffer(owner, np.uint8).ctypes.data
-    begin = first - first % mmap.PAGESIZE
-    owner.madvise(mmap.MADV_DONTNEED, begin, first + rows.nbytes - begin)
 
 
 def _read_ascii_rows(file: BinaryIO, vertex: Element, path: Path) -> np.ndarray:

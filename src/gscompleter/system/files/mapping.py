@@ -1,0 +1,101 @@
+"""Numbers that lie in mapped files, so that memory holds only those that are read at the moment.
+
+The system keeps pages that were read, as memory of the process, until these are released.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+import os
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from jaxtyping import Int64
+from torch import Tensor
+
+from gscompleter.system.files.writing import convert_write_errors
+
+OPEN_FILES = "/proc/self/fd"
+"""Folder of Linux in which open files have names, also those that have none elsewhere."""
+SELECTED_BLOCK = 8192
+"""Rows that are selected at a time, before their pages are released."""
+
+
+def move_to_file(values: Tensor, beside: Path) -> Tensor:
+    """Copy values to a temporary file in or beside a folder, and return them mapped from there.
+
+    The file has no name, so that nothing is left of it once nobody holds the values, or after a
+    kill. Linux with /proc only: elsewhere, and from a GPU, values are returned as they are. Raises
+    OutputError, as on a full disk, which names `beside`.
+    """
+    can_map = sys.platform == "linux" and os.path.isdir(OPEN_FILES)
+    if not can_map or values.device.type != "cpu" or values.numel() == 0:
+        return values
+    folder = next(each for each in (beside, *beside.absolute().parents) if each.is_dir())
+    with (
+        convert_write_errors(beside),
+        tempfile.TemporaryFile(dir=folder) as file,
+    ):
+        # Written, and not stored through the map: there a full disk would end the process.
+        file.write(values.contiguous().numpy().data)
+        file.flush()
+        name = f"{OPEN_FILES}/{file.fileno()}"
+        mapped = torch.from_file(name, shared=True, size=values.numel(), dtype=values.dtype)
+    return mapped.view(values.shape)
+
+
+def select_rows(values: Tensor, rows: Int64[Tensor, "m"]) -> Tensor:
+    """Select rows; of a mapped file, pages are read in their order and released behind."""
+    if not is_mapped(values) or len(rows) == 0:
+        # It copies rows as they are, in a quarter of the time of `values[rows]`.
+        return values.index_select(0, rows)
+    selected = values.new_empty((len(rows), *values.shape[1:]))
+    for part, places in zip(*(each.split(SELECTED_BLOCK) for each in rows.sort()), strict=True):
+        selected.index_copy_(0, places, values.index_select(0, part))
+        release_pages(values[part[0] : part[-1] + 1])
+    return selected
+
+
+def is_mapped(values: Tensor) -> bool:
+    """Return True for values that `move_to_file` mapped, or a part of them.
+
+    Not for those of other mapped files: what was changed in a private map would be lost with its
+    page.
+    """
+    if values.device.type != "cpu":
+        return False
+    name = values.untyped_storage().filename
+    return name is not None and name.startswith(f"{OPEN_FILES}/")
+
+
+def release_pages(rows: np.ndarray | Tensor) -> None:
+    """Release the memory of consecutive rows of a mapped file; they are read again if needed.
+
+    Rows that are not mapped, or on a system without this advice to its kernel, stay as they are.
+    """
+    if isinstance(rows, Tensor):
+        if not is_mapped(rows):
+            return
+        rows = rows.detach().numpy()
+    owner: Any = rows
+    while isinstance(owner, np.ndarray) and owner.base is not None:
+        owner = owner.base
+    if isinstance(owner, memoryview):
+        owner = owner.obj
+    if not hasattr(mmap, "MADV_DONTNEED") or rows.size == 0:
+        return
+    # The advice is about whole pages, of which the first and the last one have other rows, too.
+    if isinstance(owner, mmap.mmap):
+        first = rows.ctypes.data - np.frombuffer(owner, np.uint8).ctypes.data
+        begin = first - first % mmap.PAGESIZE
+        owner.madvise(mmap.MADV_DONTNEED, begin, first + rows.nbytes - begin)
+    elif isinstance(owner, Tensor) and is_mapped(owner):
+        # torch maps whole files, from a page on, and has no advice of its own.
+        begin = rows.ctypes.data - rows.ctypes.data % mmap.PAGESIZE
+        size = rows.ctypes.data + rows.nbytes - begin
+        ctypes.CDLL(None).madvise(ctypes.c_void_p(begin), ctypes.c_size_t(size), mmap.MADV_DONTNEED)

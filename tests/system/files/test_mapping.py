@@ -1,0 +1,102 @@
+"""Numbers in a mapped file take memory only while they are read."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+
+from gscompleter.system.files.mapping import is_mapped, move_to_file, release_pages, select_rows
+
+pytestmark = pytest.mark.linux
+
+ROWS = 40_000
+"""Rows of 48 floats: 7.7 MB, many pages."""
+
+
+def make_values() -> torch.Tensor:
+    return torch.arange(ROWS * 48, dtype=torch.float32).reshape(ROWS, 16, 3)
+
+
+def read_resident(values: torch.Tensor) -> int:
+    """Read how many bytes of mapped values are in memory, from the list of all maps."""
+    begin = f"{values.data_ptr():x}-"
+    lines = iter(Path("/proc/self/smaps").read_text().splitlines())
+    assert any(line.startswith(begin) for line in lines)
+    return next(1024 * int(line.split()[1]) for line in lines if line.startswith("Rss:"))
+
+
+def test_values_in_a_file_are_the_same_and_leave_no_file(tmp_path):
+    values = make_values()
+    mapped = move_to_file(values, tmp_path / "out")
+    assert is_mapped(mapped)
+    assert not is_mapped(values)
+    assert mapped.shape == values.shape
+    assert torch.equal(mapped, values)
+    assert os.listdir(tmp_path) == []
+
+
+def test_pages_leave_the_memory_and_are_read_again(tmp_path):
+    values = make_values()
+    mapped = move_to_file(values, tmp_path)
+    assert read_resident(mapped) < 0.1 * values.nbytes
+    assert torch.equal(mapped, values)
+    assert read_resident(mapped) > 0.9 * values.nbytes
+    # Also of an array that is a part of them, as kernels get it.
+    release_pages(mapped.flatten(1).numpy()[: ROWS // 2])
+    assert 0.4 * values.nbytes < read_resident(mapped) < 0.6 * values.nbytes
+    release_pages(mapped)
+    assert read_resident(mapped) < 0.1 * values.nbytes
+    assert torch.equal(mapped, values)
+
+
+def test_numbers_in_memory_stay():
+    """Released, they would become zeros."""
+    values = make_values()
+    release_pages(values)
+    release_pages(values.numpy()[100:])
+    assert torch.equal(values, make_values())
+
+
+def test_changes_of_a_file_that_somebody_else_mapped_stay(tmp_path):
+    """As those of `torch.load(mmap=True)`: with their page they would go back to the file's."""
+    path = tmp_path / "values"
+    path.write_bytes(bytes(4 * 10_000))
+    values = torch.from_file(str(path), shared=False, size=10_000, dtype=torch.float32)
+    values += 1
+    assert not is_mapped(values)
+    release_pages(values)
+    release_pages(values.numpy())
+    assert (values == 1).all()
+
+
+@pytest.mark.parametrize("count", [0, 5, ROWS, 3 * ROWS])
+def test_rows_are_selected_in_any_order_with_few_pages(tmp_path, count):
+    values = make_values()
+    mapped = move_to_file(values, tmp_path)
+    rows = torch.randint(ROWS, (count,), generator=torch.Generator().manual_seed(0))
+    selected = select_rows(mapped, rows)
+    assert torch.equal(selected, values[rows])
+    assert not is_mapped(selected)
+    # The system reads some pages around each one.
+    assert read_resident(mapped) < 0.2 * values.nbytes
+
+
+def test_a_full_disk_is_one_sentence(tmp_path):
+    code = (
+        "import resource, sys, torch; from pathlib import Path\n"
+        "from gscompleter.system.errors import FullDiskError\n"
+        "from gscompleter.system.files.mapping import move_to_file\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))\n"
+        "try: move_to_file(torch.ones(100_000), Path(sys.argv[1]))\n"
+        "except FullDiskError as error: print(error)\n"
+    )
+    out = tmp_path / "out"
+    done = subprocess.run(
+        [sys.executable, "-c", code, str(out)], capture_output=True, text=True, check=False
+    )
+    assert done.stdout.startswith("Cannot write"), done.stderr
+    assert str(out) in done.stdout
+    assert os.listdir(tmp_path) == []
