@@ -24,6 +24,7 @@ from gscompleter.render.viewpoint import (
     Splats,
     Viewpoint,
     bin_layer,
+    find_touched_tiles,
     order_by_use,
     to_float32,
 )
@@ -122,7 +123,18 @@ class CpuFrozenScene:
         layer, (context_rows, new_rows) = join_layers(self.layer, added, tile_start, entries)
         rows = np.concatenate([self.rows[context_rows], order[new_rows] + np.int32(self.count)])
         frame = frame._replace(used=used)
+        # They may be limits of `freeze_occluders`. Those of what is shown never grow.
+        np.minimum(depth_limits, self.depth_limits, out=depth_limits)
         return CpuFrozenScene(self.viewpoint, layer, frame, depth_limits, rows, count)
+
+    def freeze_occluders(self, others: Gaussians) -> CpuFrozenScene:
+        """Freeze `others` as far as the last frozen Gaussian of each tile, and not beside these."""
+        # A list ends with the splat behind all others. No depth is below 0.
+        limits = np.full(self.viewpoint.tiles, -1, np.float32)
+        touched = find_touched_tiles(self.layer)
+        last = self.layer.entries[self.layer.tile_start[touched + 1] - 1]
+        limits[touched] = self.layer.splats[last, project.DEPTH]
+        return replace(freeze_nothing(self.viewpoint), depth_limits=limits).extend(others)
 
     def repaint(self, rows: Int64[Tensor, "m"], painted: Gaussians) -> CpuFrozenScene:
         """Composite the frozen lists once more, in the new colours: nothing is sorted or binned."""

@@ -33,6 +33,9 @@ class FrozenScene(Protocol):
     def extend(self, new: Gaussians) -> FrozenScene:
         """Add `new` to the frozen scene, after its Gaussians."""
 
+    def freeze_occluders(self, others: Gaussians) -> FrozenScene:
+        """Freeze `others` alone; those that hide none of the frozen Gaussians may be left out."""
+
     def repaint(self, rows: Int64[Tensor, "m"], painted: Gaussians) -> FrozenScene:
         """Give the Gaussians at distinct `rows` the colours of `painted`, the same Gaussians."""
 

@@ -297,10 +297,10 @@ def read_inputs(
         if splat is not None:
             with show_preparation("reading the scene"):
                 task = add_check_views(task, opened)
-                given = read_splat(splat)
+                given, splat_file = sort_splat(read_splat(splat), splat, device)
+                # Harmonics that lie in a file take no memory.
                 if device == "cpu":
                     check_scene(task, given)
-                given, splat_file = sort_splat(given, splat, device)
     if given is None or splat_file is None:
         return task
     with show_preparation("aligning the scene"):
