@@ -254,14 +254,13 @@ def find_revealed(
     # then their pieces. Of these, the inner ones go in any case.
     first = state.rendered_context
     others = first.hide(unused)
-    pieces = merge([inner, outer])
     gone = torch.cat([unused, unused.new_ones(len(inner)), unused.new_zeros(len(outer))])
     # Areas do not depend on colours, which take the most memory.
-    uncolored = merge([replace(part, sh=part.sh[:, :1]) for part in (others, pieces)])
+    uncolored = merge([replace(part, sh=part.sh[:, :1]) for part in (others, inner, outer)])
 
     added = state.parts[1:]
     views = [photo.view for photo in state.photos]
-    frozen = scenes.freeze_at((others, pieces, *added), [view.camera for view in views])
+    frozen = scenes.freeze_at((others, inner, outer, *added), [view.camera for view in views])
     before = gather_observations(uncolored, views, frozen, state.config.trust_settings)
     del frozen
     confirmed_area = (before.areas * before.agreement).amax(dim=0)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gscompleter.types import Camera, Gaussians, Render
@@ -67,6 +67,14 @@ class JointScene(Protocol):
 
     def composite_beside(self, new: Gaussians, other: Camera) -> tuple[Render, Render]:
         """Render the scene with `new`, and `new` alone from another camera."""
+
+
+@runtime_checkable
+class HidingScene(Protocol):
+    """A frozen scene that is frozen again, without some Gaussians, only where it showed these."""
+
+    def hide(self, hidden: Bool[Tensor, "n"], parts: Sequence[Gaussians]) -> FrozenScene:
+        """Freeze all n Gaussians again: `parts`, in which the `hidden` ones are transparent."""
 
 
 @runtime_checkable
