@@ -66,6 +66,8 @@ def remove_gaussians(
 
     inner, outer = cut(source.gaussians[chosen], contains)
     gone, is_outer_revealed = find_revealed(state, unused, inner, outer, scenes)
+    # Frozen views of what is not all there any more would be held until they are replaced.
+    scenes.clear()
     if gone.all():
         raise InputError("Nothing would be left of the splat; choose fewer Gaussians.")
 
