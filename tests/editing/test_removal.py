@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from copies import watch_copies
 from gscompleter import GSCompleter
 from gscompleter.config import CompleterConfig
 from gscompleter.editing.cutting import cut
@@ -19,11 +20,13 @@ from gscompleter.editing.removal import (
     remove_gaussians,
     restore_surroundings,
 )
+from gscompleter.evaluation.verdict.held_out import render_before_after
 from gscompleter.guards import load_guards
 from gscompleter.guards.free_space import Observed, ignore_removed, is_before_surface
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.parts import NOT_INVENTED
 from gscompleter.planning.remove import contain_nothing
+from gscompleter.render.loading import load_renderer
 from gscompleter.render.removed import find_removed
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
@@ -201,6 +204,25 @@ def test_what_is_revealed_is_what_is_seen_anew_with_everything_drawn_again(begun
     assert torch.equal(is_outer_revealed, expected[len(expected) - len(outer) :])
     assert len(outer) > 0
     assert (gone & ~unused)[len(begun.context) :].sum() > 10
+
+
+@pytest.mark.parametrize("name", ["cpu", "reference"])
+def test_what_is_left_is_drawn_without_copying_it(removed, monkeypatch, name):
+    renderer = load_renderer(name)
+    first = removed.rendered_context
+    is_dyed = first.means[:, 0] < 0
+    dyed = replace(first, sh=first.sh + 0.3 * is_dyed[:, None, None])
+    state = replace(removed, rendered_context=dyed)
+    expected = renderer.render(state.scene, CAMERAS[0])
+    num_recolored = len(state.recolored)
+    assert 0 < num_recolored < len(first)
+    copied = watch_copies(monkeypatch)
+    pair = render_before_after(state, CAMERAS[0], renderer)
+    # The slow renderer joins what it freezes.
+    assert name == "reference" or sum(copied) == 0
+    assert torch.equal(pair.before.image, renderer.render(state.context, CAMERAS[0]).image)
+    assert torch.equal(pair.after.image, expected.image)
+    assert not torch.equal(pair.after.image, pair.before.image)
 
 
 def test_space_in_which_something_was_removed_is_not_free(removed, begun):

@@ -212,7 +212,7 @@ def test_an_extended_view_is_the_frozen_view_of_both(renderer, antialiased):
 def test_what_hides_gaussians_shows_as_much_of_them_as_the_whole_scene(
     renderer, block, antialiased, monkeypatch
 ):
-    monkeypatch.setattr(cpu, "FROZEN_BLOCK", block)
+    monkeypatch.setattr(cpu, "OCCLUDER_BLOCK", block)
     context, new = context_and_new(antialiased)
     few = new[:3]
     values = torch.cat([torch.zeros(len(context)), torch.ones(len(few))])

@@ -34,6 +34,8 @@ from gscompleter.types import Camera, Gaussians, Render
 
 FROZEN_BLOCK = 4_000_000
 """Gaussians that are frozen at a time."""
+OCCLUDER_BLOCK = 500_000
+"""Gaussians of which at a time is found what hides others."""
 MAX_TILED_SIDE = TILE * np.iinfo(np.int16).max
 """Largest side of an image in pixels, since kernels number tiles in 16 bits."""
 
@@ -135,7 +137,11 @@ class CpuFrozenScene:
         touched = find_touched_tiles(self.layer)
         last = self.layer.entries[self.layer.tile_start[touched + 1] - 1]
         limits[touched] = self.layer.splats[last, project.DEPTH]
-        return replace(freeze_nothing(self.viewpoint), depth_limits=limits).extend(others)
+        frozen = replace(freeze_nothing(self.viewpoint), depth_limits=limits)
+        # Few enter any list, so that many small blocks cost no time.
+        for start in range(0, len(others), OCCLUDER_BLOCK):
+            frozen = frozen._extend(others[start : start + OCCLUDER_BLOCK])
+        return frozen
 
     def hide(self, hidden: Bool[Tensor, "n"], parts: Sequence[Gaussians]) -> CpuFrozenScene:
         """Draw tiles that showed `hidden` Gaussians again, and keep the lists of the others."""
