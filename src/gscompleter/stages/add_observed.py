@@ -42,7 +42,7 @@ from gscompleter.stages.thin_additions import drop_doubled
 from gscompleter.state import Completion
 from gscompleter.system.progress import track
 from gscompleter.trust.photometric import compute_color_differences
-from gscompleter.types import DepthMap, Gaussians, Reconstruction, Render, View, merge
+from gscompleter.types import DepthAffine, DepthMap, Gaussians, Reconstruction, Render, View, merge
 
 MAX_RECONSTRUCTIONS = 3
 """Most reconstructions. One fills what it sees; a further one serves photographs elsewhere."""
@@ -220,15 +220,12 @@ def reconstruct_lacking(
         views.append(replace(photo.view, image=image))
     reconstruction = run_part_reconstructor(reconstructor, views, needed)
 
-    # D_pred is Ψ's depth of a photograph, D_ctx that of the scene there, where it is not wrong.
-    affines = []
+    affines = register_photographs(photos, views, reconstruction.depths, rng)
     masks = []
-    for photo, predicted in zip(photos, reconstruction.depths, strict=True):
-        scene = photo.frozen.render.depth_map()
-        affine = fit_affine(predicted, replace(scene, valid=scene.valid & ~photo.lack.mask), rng)
+    for photo, predicted, affine in zip(photos, reconstruction.depths, affines, strict=True):
         depth = replace(predicted, depth=affine.scale * predicted.depth + affine.shift)
+        scene = photo.frozen.render.depth_map()
         masks.append(select_pixels(photo.lack, depth, scene, state.config.holes.dilation))
-        affines.append(affine)
 
     shown = find_photographed(reconstruction, views, masks)
     if reconstruction.view_index is None:
@@ -247,6 +244,19 @@ def reconstruct_lacking(
     # that follows makes up for them.
     sh = part.sh[:, : state.context.sh.shape[1]]
     return replace(part, sh=sh, encoded=None), reconstruction.notes
+
+
+def register_photographs(
+    photos: Sequence[Evidence], views: Sequence[View], depths: Sequence[DepthMap], rng
+) -> list[DepthAffine]:
+    """Register."""
+    # D_pred is Ψ's depth of a photograph, D_ctx that of the scene there, where it is not wrong.
+    affines = []
+    for photo, predicted in zip(photos, depths, strict=True):
+        scene = photo.frozen.render.depth_map()
+        affine = fit_affine(predicted, replace(scene, valid=scene.valid & ~photo.lack.mask), rng)
+        affines.append(affine)
+    return affines
 
 
 def select_pixels(
