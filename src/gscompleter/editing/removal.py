@@ -4,7 +4,7 @@ A Gaussian that reaches out of the chosen place is cut at its border. Behind an 
 splat has Gaussians that no photograph ever showed. They are removed with it, or else they would
 fill its hole; at the end those return that photographs need elsewhere. The photographs still show
 the object, so their pixels are ignored there. From then on the scene has full trust: only its holes
-are completed.
+are completed. The trust from before is kept for holes elsewhere.
 """
 
 from __future__ import annotations

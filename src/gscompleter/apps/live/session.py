@@ -177,7 +177,7 @@ def remove_step(session: Session, step: SessionStep, camera: Camera) -> tuple[Co
 
 
 def repair_step(session: Session, step: SessionStep, camera: Camera) -> tuple[Completion, str]:
-    """Remove what is marked, and fill its place."""
+    """Remove what is marked, and fill its place, but no hole that was there before."""
     marked = read_step_marks(step, camera)
     filled, count = repair_marked(
         session.completer, session.first_config, session.latest, camera, marked

@@ -141,6 +141,7 @@ def fill_region(
         added=merge([result.added[:0], *(part.gaussians for part in new)]),
         after=completer.scenes.freeze(shown.parts, state.with_depth_range(camera)).render,
         hole_mask=holes,
+        num_outside=0,
         # Other holes stay empty on purpose.
         unfilled=Unfilled(),
     )
