@@ -62,7 +62,7 @@ def complete_at(
     Places of what was removed come first, by the settings of a removal, which know no other holes.
     If the camera sees others, too, all that is left is then completed as before the removal.
     """
-    places = find_places(completer, state, camera)
+    places = find_removed_places(completer, state, camera)
     filled = Filled(state)
     if places.any():
         filled = filled.then(completer.advance(state, camera))
@@ -85,7 +85,7 @@ def fill_marked(
     A hole counts as a whole, also where something was removed before a larger one. The settings are
     those of `complete_at`. Without any hole there are no results.
     """
-    places = find_places(completer, state, camera)
+    places = find_removed_places(completer, state, camera)
     holes, empty = find_holes(completer, set_apart(first, state), camera)
     if places.any():
         opened, opened_empty = find_holes(completer, state, camera)
@@ -164,7 +164,9 @@ def rejoin(state: Completion, completed: Completion) -> Completion:
     )
 
 
-def find_places(completer: GSCompleter, state: Completion, camera: Camera) -> Bool[Tensor, "h w"]:
+def find_removed_places(
+    completer: GSCompleter, state: Completion, camera: Camera
+) -> Bool[Tensor, "h w"]:
     """Find the places of what was removed from the context, as a camera sees them."""
     if not len(state.source.removed):
         size = (camera.height, camera.width)
@@ -199,7 +201,7 @@ def repair_marked(
     The place of an addition is what it alone had covered: before a surface that is none.
     """
     changed, count = remove_marked(completer, state, camera, marked)
-    before, places = (find_places(completer, one, camera) for one in (state, changed))
+    before, places = (find_removed_places(completer, one, camera) for one in (state, changed))
     place = marked | (places & ~before)
     filled = Filled(changed)
     if (places & place).any():
