@@ -222,7 +222,10 @@ def repair_marked(
 def remove_marked(
     completer: GSCompleter, state: Completion, camera: Camera, marked: Bool[Tensor, "h w"]
 ) -> tuple[Completion, int]:
-    """Remove what marks show, as `repair` does, and count it; its place is a hole from then on."""
+    """Remove what marks show, as `repair` does, and count it.
+
+    The place of what is removed from the context is a hole from then on.
+    """
     ranged = state.with_depth_range(camera)
     with stage("removing"):
         chosen = find_marked(state.scene, [ranged], [marked], completer.renderer)
