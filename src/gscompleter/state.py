@@ -74,6 +74,9 @@ class Completion(Displayed):
     confirmation: Trust | None = None
     """How far photographs confirm what a removal left, although all of it has full trust; None if
     they do not decide what stays (`keeps_confirmed`)."""
+    trust_elsewhere: Trust | None = None
+    """Trust in `rendered_context` where nothing was removed: that from before a removal, of which
+    the rest has full trust; None before one."""
     models: Mapping[str, str] = field(default_factory=dict)
     """Names of the `reconstructor`, its `depth` and the `generator`, for those who read files."""
 

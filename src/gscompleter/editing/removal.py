@@ -4,7 +4,7 @@ A Gaussian that reaches out of the chosen place is cut at its border. Behind an 
 splat has Gaussians that no photograph ever showed. They are removed with it, or else they would
 fill its hole; at the end those return that photographs need elsewhere. The photographs still show
 the object, so their pixels are ignored there. From then on the scene has full trust: only its holes
-are completed.
+are completed. The trust from before is kept for holes elsewhere.
 """
 
 from __future__ import annotations
@@ -80,8 +80,15 @@ def remove_gaussians(
     # Outer pieces are no Gaussians of the file: they are added to it.
     rest = make_part(PartOrigin("piece"), outer[~is_outer_revealed])
     parts = (*state.added_parts, rest) if len(rest) else state.added_parts
+    kept = (~gone).nonzero()[:, 0]
+    trust = state.trust if state.trust_elsewhere is None else state.trust_elsewhere
     changed = replace(
-        state, source=remaining, rendered_context=context, added_parts=parts, trust=Trust()
+        state,
+        source=remaining,
+        rendered_context=context,
+        added_parts=parts,
+        trust=Trust(),
+        trust_elsewhere=trust.thin(kept, torch.ones_like(context.opacities)),
     )
 
     # The photographs still show the object. Its pixels are ignored and painted over, so that no
