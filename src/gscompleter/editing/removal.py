@@ -81,7 +81,12 @@ def remove_gaussians(
     rest = make_part(PartOrigin("piece"), outer[~is_outer_revealed])
     parts = (*state.added_parts, rest) if len(rest) else state.added_parts
     changed = replace(
-        state, source=remaining, rendered_context=context, added_parts=parts, trust=Trust()
+        state,
+        source=remaining,
+        rendered_context=context,
+        added_parts=parts,
+        trust=Trust(),
+        is_restored=False,
     )
 
     # The photographs still show the object. Its pixels are ignored and painted over, so that no
@@ -108,11 +113,13 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
     """Let photographs be as good as before where they do not show what was removed.
 
     What was generated is faded until none is worse than with all revealed Gaussians behind it. Of
-    these, the needed return. At last the colours of all additions are fitted.
+    these, the needed return. At last the colours of all additions are fitted. A state without a
+    removal, or that is restored already, is returned as it is: colours that are fitted again change
+    again.
     """
     source = state.source
     views = [photo.view for photo in state.photos]
-    if len(source.removed) == 0:
+    if len(source.removed) == 0 or state.is_restored:
         return state
 
     # Outer pieces of what was cut, and what photographs showed before, are among the additions, but
@@ -157,6 +164,7 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
         source=remaining,
         rendered_context=first,
         added_parts=tuple(split_into_parts(fitted, parts)),
+        is_restored=True,
     )
 
 
