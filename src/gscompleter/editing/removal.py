@@ -89,6 +89,7 @@ def remove_gaussians(
         added_parts=parts,
         trust=Trust(),
         trust_elsewhere=trust.thin(kept, torch.ones_like(context.opacities)),
+        is_restored=False,
     )
 
     # The photographs still show the object. Its pixels are ignored and painted over, so that no
@@ -115,11 +116,13 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
     """Let photographs be as good as before where they do not show what was removed.
 
     What was generated is faded until none is worse than with all revealed Gaussians behind it. Of
-    these, the needed return. At last the colours of all additions are fitted.
+    these, the needed return. At last the colours of all additions are fitted. A state without a
+    removal, or that is restored already, is returned as it is: colours that are fitted again change
+    again.
     """
     source = state.source
     views = [photo.view for photo in state.photos]
-    if len(source.removed) == 0:
+    if len(source.removed) == 0 or state.is_restored:
         return state
 
     # Outer pieces of what was cut, and what photographs showed before, are among the additions, but
@@ -164,6 +167,7 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
         source=remaining,
         rendered_context=first,
         added_parts=tuple(split_into_parts(fitted, parts)),
+        is_restored=True,
     )
 
 
