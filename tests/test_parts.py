@@ -95,4 +95,3 @@ def test_new_colours_are_told_from_colours_and_not_from_labels():
     state = replace(begin_with(scene, VIEWS), rendered_context=dyed)
     assert torch.equal(state.recolored_mask, rows)
     assert torch.equal(state.scene.sh, dyed.sh)
-    assert torch.equal(merge([*state.iterate_kept(5)]).sh, dyed.sh)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -230,26 +230,6 @@ class Completion(Displayed):
         """The recoloured context without removed Gaussians."""
         gone = self.source.gone_mask
         return self.recolored_context[~gone] if gone.any() else self.recolored_context
-
-    def iterate_kept(self, count: int) -> Iterator[Gaussians]:
-        """Yield `kept_context` from `count` Gaussians of the context at a time, to save memory."""
-        is_recolored = self.recolored_mask
-        is_gone = self.source.gone_mask
-        first = 0
-        for start in range(0, max(len(self.context), 1), count):
-            block = slice(start, start + count)
-            part = self.context[block]
-            # Only what was recoloured takes memory of its own.
-            rows = is_recolored[block].nonzero()[:, 0]
-            if len(rows) > 0:
-                new = self.recolored[first : first + len(rows)]
-                first += len(rows)
-                part = replace(
-                    part,
-                    sh=part.sh.index_copy(0, rows, new.sh),
-                    generated=part.generated.index_copy(0, rows, new.generated),
-                )
-            yield part[~is_gone[block]] if is_gone[block].any() else part
 
     @property
     def next_target_id(self) -> int:

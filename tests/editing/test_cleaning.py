@@ -11,6 +11,7 @@ import torch
 
 from command import run
 from copies import watch_copies
+from gscompleter.apps.completing import preparation
 from gscompleter.config import CleaningConfig
 from gscompleter.editing.cleaning import find_removable, find_superfluous
 from gscompleter.evaluation.metrics.image import psnr
@@ -18,6 +19,7 @@ from gscompleter.render.loading import load_renderer
 from gscompleter.splats.ply import load_ply
 from gscompleter.stages.error_budgets import compute_squared_error
 from gscompleter.stages.superfluous import exclude_needed, predict_error_change
+from gscompleter.system.files.mapping import is_mapped, move_to_file
 from gscompleter.types import View, merge, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, labelled, photographed, view_of
 
@@ -167,6 +169,32 @@ def test_the_command_cleans_and_strip_puts_back(scene, tmp_path, monkeypatch):
     assert summary["seconds"]["total"] > 0
     assert run(monkeypatch, "strip", out / "completed.ply", "--out", tmp_path / "back.ply") == 0
     assert (tmp_path / "back.ply").read_bytes() == splat.read_bytes()
+
+
+@pytest.mark.linux
+@pytest.mark.parametrize("has_photographs", [True, False])
+def test_colours_of_a_large_splat_lie_in_a_file_and_nothing_else_changes(
+    scene, tmp_path, monkeypatch, has_photographs
+):
+    splat = labelled(tmp_path / "splat.ply", SCENE)
+    results = []
+    mapped = []
+
+    def move(values, beside):
+        moved = move_to_file(values, beside)
+        mapped.append(is_mapped(moved))
+        return moved
+
+    monkeypatch.setattr(preparation, "move_to_file", move)
+    for worth in (len(SCENE) + 1, len(SCENE)):
+        monkeypatch.setattr(preparation, "MIN_PROXY_GAUSSIANS", worth)
+        out = tmp_path / str(worth)
+        words = clean(scene, splat, out)
+        assert run(monkeypatch, *(words if has_photographs else ["clean", *words[2:]])) == 0
+        names = ("completed.ply", "removed.ply", "removed.png")
+        results.append([(out / name).read_bytes() for name in names])
+        assert mapped == [True] * (worth == len(SCENE))
+    assert results[0] == results[1]
 
 
 def test_the_command_says_what_it_did(scene, tmp_path, monkeypatch, capsys):

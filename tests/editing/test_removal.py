@@ -7,17 +7,30 @@ from dataclasses import replace
 import pytest
 import torch
 
+from copies import watch_copies
 from gscompleter import GSCompleter
 from gscompleter.config import CompleterConfig
-from gscompleter.editing.removal import find_outside, remove_gaussians, restore_surroundings
+from gscompleter.editing.cutting import cut
+from gscompleter.editing.removal import (
+    MAX_LAYERS,
+    MIN_REVEALED,
+    MIN_SHOWN_BEFORE,
+    find_outside,
+    find_revealed,
+    remove_gaussians,
+    restore_surroundings,
+)
+from gscompleter.evaluation.verdict.held_out import render_before_after
 from gscompleter.guards import load_guards
 from gscompleter.guards.free_space import Observed, ignore_removed, is_before_surface
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.parts import NOT_INVENTED
 from gscompleter.planning.remove import contain_nothing
+from gscompleter.render.loading import load_renderer
 from gscompleter.render.removed import find_removed
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
+from gscompleter.trust.photometric import PhotoObservations, gather_observations
 from gscompleter.types import Gaussians, make_observed, merge, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, view_of
 
@@ -151,9 +164,72 @@ def test_what_photographs_need_elsewhere_returns(begun):
 def test_what_shows_in_the_hole_alone_does_not_return(removed):
     views = [photo.view for photo in removed.photos]
     wall = removed.context[~removed.source.gone_mask][::50]
-    found = find_outside(merge([make_junk(), wall]), removed.scene, views, COMPLETER.renderer)
+    scene = removed.scene
+    frozen = [COMPLETER.renderer.freeze(scene, view.camera) for view in views]
+    found = find_outside(merge([make_junk(), wall]), frozen, views)
     assert not found[:3].any()
     assert found[3:].float().mean() > 0.5
+
+
+def find_revealed_plainly(
+    state: Completion, unused: torch.Tensor, inner: Gaussians, outer: Gaussians
+) -> torch.Tensor:
+    """Draw all that is left at all photographs after each layer; return what is gone."""
+    whole = merge([state.rendered_context.hide(unused), inner, outer])
+    gone = torch.cat([unused, torch.ones(len(inner)).bool(), torch.zeros(len(outer)).bool()])
+    views = [photo.view for photo in state.photos]
+
+    def observe(left: torch.Tensor) -> PhotoObservations:
+        scene = whole[left]
+        frozen = [COMPLETER.renderer.freeze(scene, view.camera) for view in views]
+        return gather_observations(scene, views, frozen, state.config.trust_settings)
+
+    before = observe(torch.ones_like(gone))
+    confirmed = (before.areas * before.agreement).amax(dim=0)
+    for _ in range(MAX_LAYERS):
+        areas = torch.zeros_like(before.areas)
+        areas[:, ~gone] = observe(~gone).areas
+        revealed = (areas - before.areas).amax(dim=0) > MIN_REVEALED * areas.amax(dim=0)
+        gone = gone | (revealed & (confirmed < MIN_SHOWN_BEFORE * areas.amax(dim=0)))
+    return gone
+
+
+def test_what_is_revealed_is_what_is_seen_anew_with_everything_drawn_again(begun):
+    """Walls behind walls: each layer comes to light after the one in front of it."""
+    room = begun.context
+    layers = [
+        replace(room, means=factor * room.means, scales=factor * room.scales)
+        for factor in (1.0, 1.1, 1.2)
+    ]
+    state = COMPLETER.begin([photo.view for photo in begun.photos], merge(layers), [])
+    scene = state.rendered_context
+    unused = is_crate(scene.means)
+    inner, outer = cut(scene[unused], is_crate)
+    gone, is_outer_revealed = find_revealed(state, unused, inner, outer, COMPLETER.scenes)
+    expected = find_revealed_plainly(state, unused, inner, outer)
+    assert torch.equal(gone, expected[: len(scene)])
+    assert torch.equal(is_outer_revealed, expected[len(expected) - len(outer) :])
+    assert len(outer) > 0
+    assert (gone & ~unused)[len(begun.context) :].sum() > 10
+
+
+@pytest.mark.parametrize("name", ["cpu", "reference"])
+def test_what_is_left_is_drawn_without_copying_it(removed, monkeypatch, name):
+    renderer = load_renderer(name)
+    first = removed.rendered_context
+    is_dyed = first.means[:, 0] < 0
+    dyed = replace(first, sh=first.sh + 0.3 * is_dyed[:, None, None])
+    state = replace(removed, rendered_context=dyed)
+    expected = renderer.render(state.scene, CAMERAS[0])
+    num_recolored = len(state.recolored)
+    assert 0 < num_recolored < len(first)
+    copied = watch_copies(monkeypatch)
+    pair = render_before_after(state, CAMERAS[0], renderer)
+    # The slow renderer joins what it freezes.
+    assert name == "reference" or sum(copied) == 0
+    assert torch.equal(pair.before.image, renderer.render(state.context, CAMERAS[0]).image)
+    assert torch.equal(pair.after.image, expected.image)
+    assert not torch.equal(pair.after.image, pair.before.image)
 
 
 def test_space_in_which_something_was_removed_is_not_free(removed, begun):

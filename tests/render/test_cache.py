@@ -2,12 +2,15 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.cpu import CpuRenderer
+from gscompleter.types import merge
 from render_scenes import CAMERA, SCENES
+from scenes import Room, camera_at, gaussians_of, view_of
 
 SCENE, ADDED = SCENES["harmonics"][::2], SCENES["harmonics"][1::2]
 
@@ -62,4 +65,48 @@ def test_another_scene_is_frozen_anew(frozen_scenes, change):
     scenes = SceneRenderer(CpuRenderer())
     scenes.freeze_at((SCENE,), [CAMERA])
     scenes.freeze_at((replace(SCENE, **change),), [CAMERA])
+    assert len(frozen_scenes) == 2
+
+
+@pytest.mark.parametrize("antialiased", [False, True], ids=["classic", "antialiased"])
+def test_what_is_hidden_is_drawn_again_only_where_it_showed(frozen_scenes, antialiased):
+    camera = camera_at(size=96)
+    wall = replace(gaussians_of(view_of(Room(), camera)), is_antialiased=antialiased)
+    behind = replace(wall, means=1.2 * wall.means, scales=1.2 * wall.scales)
+    scene = merge([wall, behind])
+    parts = (scene, replace(ADDED[::2], is_antialiased=antialiased))
+    later = replace(ADDED[1::2], is_antialiased=antialiased)
+    scenes = SceneRenderer(CpuRenderer())
+    (before,) = scenes.freeze_at(parts, [camera])
+
+    left = wall.means[:, 0] < -0.5
+    gone = torch.cat([left, torch.zeros(len(behind)).bool()])
+    for hidden in (gone, gone | (scene.means[:, 1] < -0.9)):
+        # Once more, so that what was hidden before stays hidden.
+        parts = (parts[0].hide(hidden), *parts[1:])
+        (ours,) = scenes.freeze_at(parts, [camera])
+        assert len(frozen_scenes) == 1
+        truth = CpuRenderer().freeze(scene.hide(hidden), camera).extend(parts[1])
+        frozen_scenes.pop()
+        assert not torch.equal(ours.render.image, before.render.image)
+        assert (ours.render.image == before.render.image).all(dim=-1).float().mean() > 0.3
+        image = torch.rand(truth.render.image.shape, generator=torch.Generator().manual_seed(0))
+        assert torch.equal(ours.backproject(image), truth.backproject(image))
+        values = image.flatten()[: len(scene) + len(parts[1])]
+        assert torch.equal(ours.splat(values), truth.splat(values))
+        for drawn, expected in (
+            (ours.render, truth.render),
+            (ours.composite(later), truth.composite(later)),
+            (ours.extend(later).render, truth.extend(later).render),
+        ):
+            for name in ("image", "depth", "alpha"):
+                assert torch.equal(getattr(drawn, name), getattr(expected, name)), name
+        assert np.array_equal(ours.depth_limits, truth.depth_limits)
+        assert len(ours.rows) == len(set(ours.rows.tolist())) == len(truth.rows)
+
+
+def test_what_appears_is_frozen_anew(frozen_scenes):
+    scenes = SceneRenderer(CpuRenderer())
+    scenes.freeze_at((SCENE.hide(SCENE.means[:, 0] < 0),), [CAMERA])
+    scenes.freeze_at((SCENE,), [CAMERA])
     assert len(frozen_scenes) == 2

@@ -10,7 +10,7 @@ import stand_in_gsplat
 from gscompleter import Gaussians, InputError, Render, load_renderer, merge
 from gscompleter.numerics.geometry import compute_z_depths, move_to_depths, pad_camera
 from gscompleter.numerics.kernels import composite
-from gscompleter.render import device
+from gscompleter.render import cpu, device
 from gscompleter.render.cpu import CpuRenderer
 from gscompleter.render.gsplat import CudaRenderer
 from gscompleter.render.redraw import RedrawnScene
@@ -204,6 +204,27 @@ def test_an_extended_view_is_the_frozen_view_of_both(renderer, antialiased):
     ):
         for name in DRAWN:
             assert torch.equal(getattr(ours, name), getattr(truth, name)), name
+
+
+@MODES
+@pytest.mark.parametrize("block", [7, 1000])
+@pytest.mark.parametrize("renderer", [CPU, REFERENCE], ids=["cpu", "reference"])
+def test_what_hides_gaussians_shows_as_much_of_them_as_the_whole_scene(
+    renderer, block, antialiased, monkeypatch
+):
+    monkeypatch.setattr(cpu, "OCCLUDER_BLOCK", block)
+    context, new = context_and_new(antialiased)
+    few = new[:3]
+    values = torch.cat([torch.zeros(len(context)), torch.ones(len(few))])
+    whole = renderer.freeze(context, CAMERA).extend(few)
+    expected = whole.splat(values)
+    assert 0 < (expected > 0.01).float().mean() < 0.9
+    hiding = renderer.freeze(few, CAMERA).freeze_occluders(context)
+    assert torch.equal(hiding.extend(few).splat(values), expected)
+    if renderer is CPU:
+        assert len(hiding.layer.entries) < 0.7 * len(whole.layer.entries)
+    nowhere = renderer.freeze(few[:0], CAMERA).freeze_occluders(context).extend(few[:0])
+    assert not nowhere.splat(values[: len(context)]).any()
 
 
 @MODES

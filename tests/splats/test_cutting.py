@@ -7,6 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from gscompleter.editing import cutting
 from gscompleter.editing.cutting import cut, split
 from gscompleter.numerics.geometry import axis_angle_to_matrix, rotations_to_quats
 from gscompleter.render.loading import load_renderer
@@ -47,6 +48,23 @@ def test_pieces_look_like_the_whole(opacity):
     image, composed = show(whole), show(pieces)
     assert (composed - image).abs().max() < 0.15 * image.max()
     assert (composed - image).mean().abs() < 0.08 * image.mean()
+
+
+def test_gaussians_are_cut_as_one_by_one(monkeypatch):
+    discs = [make_disc(x, opacity) for x in (-1.0, 0.0, 0.1) for opacity in (0.3, 0.9)]
+    pairs = [cut(disc, is_left) for disc in discs]
+    wholes = [inner for inner, _ in pairs if len(inner) == 1]
+    pieces = [inner for inner, _ in pairs if len(inner) > 1]
+    assert wholes
+    assert len(pieces) > 1
+    for block in (1, 2, 1000):
+        monkeypatch.setattr(cutting, "CUT_BLOCK", block)
+        inner, outer = cut(merge(discs), is_left)
+        for name in ("means", "quats", "scales", "opacities", "sh", "generated"):
+            parts = [getattr(part, name) for part in (*wholes, *pieces)]
+            assert torch.equal(getattr(inner, name), torch.cat(parts)), name
+            parts = [getattr(part, name) for _, part in pairs]
+            assert torch.equal(getattr(outer, name), torch.cat(parts)), name
 
 
 def test_balls_and_needles_are_divided_as_well():

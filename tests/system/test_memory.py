@@ -59,6 +59,17 @@ def test_the_estimate_of_a_scene_with_harmonics_holds_what_was_measured():
     assert 0.95 * 3.92e9 < needed < 2 * 3.92e9
 
 
+def test_the_estimate_leaves_out_what_lies_in_a_file():
+    """Peak resident memory in GB of `complete`, eight photographs; 48 of 64 numbers are filed."""
+    sizes = [144 * 256] * 8
+    held, filed = (estimate_scene_bytes(4 * 10**6, 64, sizes, num_filed=n) for n in (0, 48))
+    assert held - filed == 4 * 48 * 4 * 10**6
+    needed = estimate_bytes(144 * 256, 9) + filed
+    assert 2.24e9 < needed < 1.6 * 2.24e9
+    # While it is read, a splat is held as a whole.
+    assert estimate_scene_bytes(10**7, 64, [1], num_filed=48) == 64 * 4 * 10**7
+
+
 def test_memory_grows_less_than_with_each_photograph_of_a_large_scene():
     one, many = (estimate_scene_bytes(10**7, 18, WITNESSES[:n]) for n in (8, 30))
     assert many - one < 22 * 10**7 * 16 + 22 * 10**8

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from gscompleter import __version__
 from gscompleter.apps.command_line.answers import print_answer
-from gscompleter.apps.completing.preparation import open_input, read_splat
+from gscompleter.apps.completing.preparation import file_harmonics, open_input, read_splat
 from gscompleter.apps.completing.run_info import describe_run_values
 from gscompleter.apps.inputs.depth_range import apply_splat_range
 from gscompleter.apps.inputs.describing import describe_opening, print_lines
@@ -149,7 +149,7 @@ def clean_by_photographs(
     # The splat is also read before cameras are searched for, so that a damaged file is refused
     # within seconds: the search takes minutes.
     opened = open_input(photographs, splat, console, partial(load_given_splat, splat))
-    loaded = load_given_splat(splat)
+    loaded = file_harmonics(load_given_splat(splat), splat, device)
     splat_file = locate_splat(splat.path, splat.drop_nonfinite)
 
     def read(opened: Opened) -> CompletionTask:
@@ -203,7 +203,7 @@ def clean_alone(request: CleaningRequest) -> Cleaning:
     """Find floaters by statistics of the splat alone."""
     splat = request.splat
     device = request.device
-    given = load_given_splat(splat).to(device)
+    given = file_harmonics(load_given_splat(splat).to(device), splat, device)
     renderer = load_renderer(device)
     compile_kernels([device])
     floaters = request.config.strengthen(request.strength).floaters

@@ -24,6 +24,8 @@ PIECE_DISTANCE = 2 / 3
 """Distance of neighbouring pieces, in standard deviations of their Gaussian."""
 PIECES_PER_SIDE = 4
 """Pieces on either side of the middle one, along an axis."""
+CUT_BLOCK = 4096
+"""Gaussians that are divided at a time, which bounds the memory."""
 MIN_LENGTH = 0.25
 """Length, relative to the longest axis, from which on the second axis is divided as well."""
 MAX_DIVIDED_OPACITY = 0.99
@@ -43,10 +45,16 @@ def cut(gaussians: Gaussians, contains: Region) -> tuple[Gaussians, Gaussians]:
     is_inside = torch.stack([contains(move(gaussians, end)) for end in ends]).all(dim=0)
     is_whole = is_inside | ~contains(gaussians.means)
 
-    pieces = split(gaussians[~is_whole])
-    is_piece_inside = contains(pieces.means)
-    kept = merge([gaussians[is_whole], pieces[is_piece_inside]])
-    return kept, pieces[~is_piece_inside]
+    # Of a Gaussian there are up to 81 pieces, most of them too faint to be drawn.
+    divided = gaussians[~is_whole]
+    inner = [gaussians[is_whole]]
+    outer = []
+    for start in range(0, max(len(divided), 1), CUT_BLOCK):
+        pieces = split(divided[start : start + CUT_BLOCK])
+        is_piece_inside = contains(pieces.means)
+        inner.append(pieces[is_piece_inside])
+        outer.append(pieces[~is_piece_inside])
+    return merge(inner), merge(outer)
 
 
 def move(

@@ -9,7 +9,7 @@ are completed. The trust from before is kept for holes elsewhere.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 
 import torch
@@ -19,16 +19,17 @@ from torch import Tensor
 from gscompleter.editing.cutting import Region, cut
 from gscompleter.guards import prepare_guards
 from gscompleter.parts import Part, PartOrigin, make_part, split_into_parts
-from gscompleter.render.cache import SceneRenderer
+from gscompleter.render.cache import Parts, SceneRenderer
 from gscompleter.render.fit_colors import RELAXATION, fit_colors
-from gscompleter.render.protocols import FrozenScene, Renderer
+from gscompleter.render.protocols import FrozenScene, OpacityRender, Renderer
 from gscompleter.render.removed import mask_removed
+from gscompleter.render.view_map import get_view_map
 from gscompleter.stages.error_budgets import meet_error_budgets, set_error_budgets
-from gscompleter.stages.superfluous import exclude_needed, limit_errors
+from gscompleter.stages.superfluous import exclude_needed_additions, limit_errors
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
 from gscompleter.trust import Trust
-from gscompleter.trust.photometric import PhotoObservations, gather_observations, load_trust
+from gscompleter.trust.photometric import gather_observations, load_trust, measure_agreement
 from gscompleter.types import ContextScene, Gaussians, View, merge
 
 REVEALED_TOLERANCE = 0.003
@@ -65,6 +66,8 @@ def remove_gaussians(
 
     inner, outer = cut(source.gaussians[chosen], contains)
     gone, is_outer_revealed = find_revealed(state, unused, inner, outer, scenes)
+    # Frozen views of what is not all there any more would be held until they are replaced.
+    scenes.clear()
     if gone.all():
         raise InputError("Nothing would be left of the splat; choose fewer Gaussians.")
 
@@ -129,39 +132,42 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
     # were not invented.
     rest = [part for part in state.added_parts if not part.origin.is_invented]
     invented = [part for part in state.added_parts if part.origin.is_invented]
-    known = merge([state.rendered_context, *(part.gaussians for part in rest)])
+    first = state.rendered_context
+    known = merge([first[:0], *(part.gaussians for part in rest)])
     is_revealed = source.revealed_mask
     revealed = source.gaussians[is_revealed]
-    invented = fade_harmful(invented, merge([known, revealed]), state, renderer)
-    added = merge([known[:0], *(part.gaussians for part in invented)])
+    invented = fade_harmful(invented, (first, known, revealed), state, renderer)
+
+    # The context is frozen once. What is compared with it is added, since it is much smaller; at
+    # one photograph at a time, to save memory.
+    context = [renderer.freeze(first, view.camera) for view in views]
+    added = merge([first[:0], *(part.gaussians for part in invented)])
+    is_needed = find_needed_revealed(revealed, context, known, added, views)
 
     # Revealed Gaussians that return follow those that are rendered, as rows of their own.
-    is_needed = find_needed_revealed(revealed, known, added, views, renderer)
-    returned = revealed[is_needed]
-    is_returned = is_revealed.masked_scatter(is_revealed, is_needed)
-    rows = len(source.rendered) + torch.arange(len(returned), device=is_returned.device)
-    remaining = replace(
-        source,
-        rendered=merge([source.rendered, returned]),
-        proxy_index=source.stand_ins.masked_scatter(is_returned, rows),
-        revealed_mask=is_revealed & ~is_returned,
-    )
-    first = (
-        remaining.rendered
-        if state.rendered_context is source.rendered
-        else merge([state.rendered_context, returned])
-    )
+    remaining = source
+    if is_needed.any():
+        returned = revealed[is_needed]
+        is_returned = is_revealed.masked_scatter(is_revealed, is_needed)
+        rows = len(source.rendered) + torch.arange(len(returned), device=is_returned.device)
+        remaining = replace(
+            source,
+            rendered=merge([source.rendered, returned]),
+            proxy_index=source.stand_ins.masked_scatter(is_returned, rows),
+            revealed_mask=is_revealed & ~is_returned,
+        )
+        first = remaining.rendered if first is source.rendered else merge([first, returned])
+        context = [scene.extend(returned) for scene in context]
 
     # Additions reach beyond the hole, where photographs tell their colours. Ignored pixels show the
     # scene itself, so that colours stay as they are in the hole.
-    frozen = [renderer.freeze(first, view.camera) for view in views]
     parts = [*rest, *invented]
     added = merge([first[:0], *(part.gaussians for part in parts)])
     images = [
         view.paint_ignored(scene.composite(added).image.clamp(0, 1))
-        for view, scene in zip(views, frozen, strict=True)
+        for view, scene in zip(views, context, strict=True)
     ]
-    fitted = fit_colors(added, frozen, images, [RELAXATION] * HOLE_COLOR_ROUNDS)
+    fitted = fit_colors(added, context, images, [RELAXATION] * HOLE_COLOR_ROUNDS)
     return replace(
         state,
         source=remaining,
@@ -173,38 +179,46 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
 
 def find_needed_revealed(
     revealed: Gaussians,
+    context: Sequence[FrozenScene],
     known: Gaussians,
     added: Gaussians,
     views: Sequence[View],
-    renderer: Renderer,
 ) -> Bool[Tensor, "n"]:
     """Find the revealed Gaussians that photographs need where they do not show the removed ones.
 
-    What shows hardly anywhere but in the hole is not needed.
+    `context` is frozen at the views; `known` and `added` belong to the scene as well. What shows
+    hardly anywhere but in the hole is not needed.
     """
-    is_outside = find_outside(revealed, merge([known, added]), views, renderer)
+    others = merge([known, added])
+    is_outside = find_outside(revealed, (scene.extend(others) for scene in context), views)
     candidates = revealed[is_outside]
 
     # The scene with all candidates, but without additions, sets the limit of each photograph.
-    # Candidates are rows of the scene between what is known and what was added.
-    whole = merge([known, candidates])
-    images = (renderer.render(whole, view.camera).image for view in views)
+    images = (scene.extend(known).extend(candidates).render.image for scene in context)
     limits = limit_errors(images, views, REVEALED_TOLERANCE)
-    row = torch.arange(len(whole) + len(added), device=is_outside.device)
-    is_candidate = (row >= len(known)) & (row < len(whole))
-    superfluous = exclude_needed(merge([whole, added]), is_candidate, views, limits, renderer)
-    return is_outside.masked_scatter(is_outside, ~superfluous[len(known) : len(whole)])
+
+    def iterate_plans() -> Iterator[OpacityRender]:
+        for scene in context:
+            yield scene.extend(others).vary_opacities(candidates)
+
+    everything = torch.ones_like(candidates.opacities, dtype=torch.bool)
+    superfluous = exclude_needed_additions(
+        iterate_plans, candidates.opacities, everything, views, limits
+    )
+    return is_outside.masked_scatter(is_outside, ~superfluous)
 
 
 def find_outside(
-    revealed: Gaussians, others: Gaussians, views: Sequence[View], renderer: Renderer
+    revealed: Gaussians, others: Iterable[FrozenScene], views: Sequence[View]
 ) -> Bool[Tensor, "n"]:
-    """Find the revealed Gaussians that photographs see outside of the hole as well."""
-    scene = merge([others, revealed])
+    """Find the revealed Gaussians that photographs see outside of the hole as well.
+
+    `others` is the scene without them, frozen at the views.
+    """
     sums = torch.zeros_like(revealed.means)
-    for view in views:
-        frozen = renderer.freeze(scene, view.camera)
-        sums += sum_in_mask(frozen, view.valid_mask.to(sums))[len(others) :]
+    for scene, view in zip(others, views, strict=True):
+        shown = sum_in_mask(scene.extend(revealed), view.valid_mask.to(sums))
+        sums += shown[len(shown) - len(revealed) :]
     # Valid pixels are those outside of the hole, since those in it are ignored.
     return sums[:, 0] > MIN_OUTSIDE * sums.sum(dim=1)
 
@@ -216,27 +230,24 @@ def sum_in_mask(frozen: FrozenScene, inside: Float[Tensor, "h w"]) -> Float[Tens
 
 
 def fade_harmful(
-    parts: Sequence[Part], context: Gaussians, state: Completion, renderer: Renderer
+    parts: Sequence[Part], scene: Parts, state: Completion, renderer: Renderer
 ) -> list[Part]:
-    """Fade what was invented until no photograph is worse than `context` alone.
+    """Fade what was invented until no photograph is worse than with `scene` alone.
 
     Gaussians that faded altogether stay, unless all of them did.
     """
-    added = merge([context[:0], *(part.gaussians for part in parts)])
+    if not parts:
+        return []
+    added = merge([scene[0][:0], *(part.gaussians for part in parts)])
     config = state.config.psnr_guard
     config = replace(config, max_drop=max(config.max_drop, REVEALED_TOLERANCE))
     views = [photo.view for photo in state.photos]
-    frozen = [renderer.freeze(context, view.camera) for view in views]
+    frozen = SceneRenderer(renderer).freeze_at(scene, [view.camera for view in views])
     budgets = [
-        set_error_budgets(
-            view,
-            scene.render.image,
-            ~view.valid_mask,
-            config,
-        )
-        for view, scene in zip(views, frozen, strict=True)
+        set_error_budgets(view, shown.render.image, ~view.valid_mask, config)
+        for view, shown in zip(views, frozen, strict=True)
     ]
-    plans = [scene.vary_opacities(added) for scene in frozen]
+    plans = [shown.vary_opacities(added) for shown in frozen]
     faded = meet_error_budgets(added, frozen, budgets, plans, config)
     return list(split_into_parts(faded, parts)) if len(faded) else []
 
@@ -256,15 +267,24 @@ def find_revealed(
     # then their pieces. Of these, the inner ones go in any case.
     first = state.rendered_context
     others = first.hide(unused)
-    state = replace(state, rendered_context=merge([others, inner, outer]))
     gone = torch.cat([unused, unused.new_ones(len(inner)), unused.new_zeros(len(outer))])
+    # Areas do not depend on colours, which take the most memory.
+    uncolored = merge([replace(part, sh=part.sh[:, :1]) for part in (others, inner, outer)])
 
-    before = observe(state, torch.ones_like(gone), scenes)
+    added = state.parts[1:]
+    views = [photo.view for photo in state.photos]
+    frozen = scenes.freeze_at((others, inner, outer, *added), [view.camera for view in views])
+    before = gather_observations(uncolored, views, frozen, state.config.trust_settings)
+    del frozen
     confirmed_area = (before.areas * before.agreement).amax(dim=0)
+    areas = before.areas.clone()
+    revealed = gone
     # A round reveals the next layer: what is behind it was hidden until then.
     for _ in range(MAX_LAYERS):
-        areas = torch.zeros_like(before.areas)
-        areas[:, ~gone] = observe(state, ~gone, scenes).areas
+        # A photograph that showed none of what went last shows what it did.
+        changed = [k for k, area in enumerate(areas) if area[revealed].any()]
+        parts = (uncolored.hide(gone), *added)
+        areas[changed] = measure_areas(parts, [views[k] for k in changed], scenes)
         largest = areas.amax(dim=0)
         revealed = (areas - before.areas).amax(dim=0) > MIN_REVEALED * largest
         # What a photograph showed before, in the right colours, was trained on and stays.
@@ -275,14 +295,23 @@ def find_revealed(
     return gone[: len(first)], gone[len(gone) - len(outer) :]
 
 
-def observe(
-    state: Completion, remaining: Bool[Tensor, "m"], scenes: SceneRenderer
-) -> PhotoObservations:
-    """Observe the remaining Gaussians of the first part in all photographs."""
-    views = [photo.view for photo in state.photos]
-    context = state.rendered_context[remaining]
-    frozen = scenes.freeze_at((context, *state.parts[1:]), [view.camera for view in views])
-    return gather_observations(context, views, frozen, state.config.trust_settings)
+def measure_areas(
+    parts: Parts, views: Sequence[View], scenes: SceneRenderer
+) -> Float[Tensor, "k m"]:
+    """Measure the visible area of each Gaussian of the first part in photographs."""
+    means = parts[0].means
+    areas = means.new_zeros((len(views), len(means)))
+    frozen = scenes.freeze_at(parts, [view.camera for view in views])
+
+    def measure(k: int) -> None:
+        # No area depends on what agrees.
+        nothing = torch.zeros_like(views[k].image[..., 0])
+        areas[k], _ = measure_agreement(frozen[k], means, views[k], nothing)
+
+    # The map is lazy on a GPU: each photograph is measured when its result is asked for.
+    for _ in get_view_map(means)(measure, range(len(views))):
+        pass
+    return areas
 
 
 def hide_removed(view: View, source: ContextScene, renderer: Renderer) -> View:

@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 
+from jaxtyping import Bool
+from torch import Tensor
+from torch.nn.functional import pad
+
 from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, thin_gaussians
-from gscompleter.render.protocols import FrozenScene, Renderer
+from gscompleter.render.protocols import FrozenScene, HidingScene, Renderer
 from gscompleter.render.view_map import get_view_map
 from gscompleter.types import Camera, Gaussians
 
@@ -58,12 +62,21 @@ class SceneRenderer:
         """Extend a frozen scene if the new one begins with its parts, else freeze anew.
 
         Parts are immutable, so that an identical object is an equal part. A first one that was only
-        recoloured is repainted.
+        recoloured is repainted, and one of which some were hidden is drawn again where it showed.
         """
         if frozen is not None and known[0] is not parts[0] and differ_in_color(known[0], parts[0]):
             rows = (known[0].sh != parts[0].sh).any(dim=(1, 2)).nonzero()[:, 0]
             frozen = frozen.repaint(rows, parts[0][rows])
             known = (parts[0], *known[1:])
+        if (
+            isinstance(frozen, HidingScene)
+            and known[0] is not parts[0]
+            and has_first_parts(parts[1:], known[1:])
+            and (hidden := find_hidden(known[0], parts[0])) is not None
+        ):
+            known = (parts[0], *known[1:])
+            hidden = pad(hidden, (0, sum(map(len, known[1:]))))
+            frozen = frozen.hide(hidden, known)
         shared = 0
         while shared < min(len(known), len(parts)) and known[shared] is parts[shared]:
             shared += 1
@@ -88,6 +101,23 @@ def differ_in_color(one: Gaussians, other: Gaussians) -> bool:
     is_same = all(getattr(one, name) is getattr(other, name) for name in names)
     has_same_form = one.sh.shape == other.sh.shape and one.is_antialiased == other.is_antialiased
     return is_same and has_same_form
+
+
+def find_hidden(one: Gaussians, other: Gaussians) -> Bool[Tensor, "n"] | None:
+    """Find what is transparent in another scene alone; None if these differ in anything else."""
+    names = ("means", "quats", "scales", "sh")
+    is_same = all(getattr(one, name) is getattr(other, name) for name in names)
+    if not is_same or one.is_antialiased != other.is_antialiased:
+        return None
+    hidden = one.opacities != other.opacities
+    return None if other.opacities[hidden].any() else hidden
+
+
+def has_first_parts(parts: Parts, first: Parts) -> bool:
+    """Check whether parts begin with others."""
+    return len(parts) >= len(first) and all(
+        part is other for part, other in zip(parts, first, strict=False)
+    )
 
 
 def make_camera_key(camera: Camera) -> Hashable:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import numba
 import numpy as np
 import torch
-from jaxtyping import Float, Float32, Int32, Int64
+from jaxtyping import Bool, Float, Float32, Int32, Int64
 from numpy import ndarray
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -24,6 +25,7 @@ from gscompleter.render.viewpoint import (
     Splats,
     Viewpoint,
     bin_layer,
+    find_touched_tiles,
     order_by_use,
     to_float32,
 )
@@ -32,6 +34,8 @@ from gscompleter.types import Camera, Gaussians, Render
 
 FROZEN_BLOCK = 4_000_000
 """Gaussians that are frozen at a time."""
+OCCLUDER_BLOCK = 500_000
+"""Gaussians of which at a time is found what hides others."""
 MAX_TILED_SIDE = TILE * np.iinfo(np.int16).max
 """Largest side of an image in pixels, since kernels number tiles in 16 bits."""
 
@@ -122,7 +126,74 @@ class CpuFrozenScene:
         layer, (context_rows, new_rows) = join_layers(self.layer, added, tile_start, entries)
         rows = np.concatenate([self.rows[context_rows], order[new_rows] + np.int32(self.count)])
         frame = frame._replace(used=used)
+        # They may be limits of `freeze_occluders`. Those of what is shown never grow.
+        np.minimum(depth_limits, self.depth_limits, out=depth_limits)
         return CpuFrozenScene(self.viewpoint, layer, frame, depth_limits, rows, count)
+
+    def freeze_occluders(self, others: Gaussians) -> CpuFrozenScene:
+        """Freeze `others` as far as the last frozen Gaussian of each tile, and not beside these."""
+        # A list ends with the splat behind all others. No depth is below 0.
+        limits = np.full(self.viewpoint.tiles, -1, np.float32)
+        touched = find_touched_tiles(self.layer)
+        last = self.layer.entries[self.layer.tile_start[touched + 1] - 1]
+        limits[touched] = self.layer.splats[last, project.DEPTH]
+        frozen = replace(freeze_nothing(self.viewpoint), depth_limits=limits)
+        # Few enter any list, so that many small blocks cost no time.
+        for start in range(0, len(others), OCCLUDER_BLOCK):
+            frozen = frozen._extend(others[start : start + OCCLUDER_BLOCK])
+        return frozen
+
+    def hide(self, hidden: Bool[Tensor, "n"], parts: Sequence[Gaussians]) -> CpuFrozenScene:
+        """Draw tiles that showed `hidden` Gaussians again, and keep the lists of the others."""
+        old = self.layer
+        is_entry_hidden = hidden.numpy()[self.rows][old.entries]
+        tile_of_entry = np.repeat(np.arange(self.viewpoint.tiles), np.diff(old.tile_start))
+        is_drawn = np.zeros(self.viewpoint.tiles, np.bool_)
+        is_drawn[tile_of_entry[is_entry_hidden]] = True
+        # No depth is below 0: nothing enters the other tiles.
+        limits = np.where(is_drawn, np.float32(np.inf), np.float32(-1))
+        drawn = replace(freeze_nothing(self.viewpoint), depth_limits=limits)
+        for part in parts:
+            drawn = drawn.extend(part)
+
+        # Entries of either layer, tile by tile, by the rows of their Gaussians; of a Gaussian that
+        # is in both layers, either splat will do.
+        new = drawn.layer
+        starts = np.where(is_drawn, len(old.entries) + new.tile_start[:-1], old.tile_start[:-1])
+        counts = np.where(is_drawn, np.diff(new.tile_start), np.diff(old.tile_start))
+        tile_start = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+        places = np.arange(tile_start[-1]) + np.repeat(starts - tile_start[:-1], counts)
+        splats = np.concatenate([old.entries, new.entries + np.int32(len(old.splats))])[places]
+        rows_of_entries = np.concatenate([self.rows, drawn.rows])[splats]
+        splat_of_row = np.full(self.count, -1, np.int32)
+        splat_of_row[rows_of_entries] = splats
+        rows = np.flatnonzero(splat_of_row >= 0).astype(np.int32)
+        kept = splat_of_row[rows]
+        splat_of_row[rows] = np.arange(len(rows), dtype=np.int32)
+        layer = Layer(
+            np.concatenate([old.splats, new.splats])[kept],
+            np.concatenate([old.opacities, new.opacities])[kept],
+            np.concatenate([old.boxes, new.boxes])[kept],
+            tile_start,
+            splat_of_row[rows_of_entries],
+        )
+
+        height, width = self.frame.alpha.shape
+        tiles = is_drawn.reshape(-1, self.viewpoint.tiles_x)
+        pixels = tiles.repeat(TILE, axis=0).repeat(TILE, axis=1)[:height, :width]
+
+        def join(name: str, where: ndarray) -> ndarray:
+            mine, other = getattr(self.frame, name), getattr(drawn.frame, name)
+            return np.where(
+                where.reshape(where.shape + (1,) * (mine.ndim - where.ndim)), other, mine
+            )
+
+        of_tiles = ("used", "full")
+        frame = RasterFrame(
+            *[join(name, is_drawn if name in of_tiles else pixels) for name in RasterFrame._fields]
+        )
+        depth_limits = np.where(is_drawn, drawn.depth_limits, self.depth_limits)
+        return CpuFrozenScene(self.viewpoint, layer, frame, depth_limits, rows, self.count)
 
     def repaint(self, rows: Int64[Tensor, "m"], painted: Gaussians) -> CpuFrozenScene:
         """Composite the frozen lists once more, in the new colours: nothing is sorted or binned."""

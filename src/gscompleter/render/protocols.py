@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
-from jaxtyping import Float, Int64
+from jaxtyping import Bool, Float, Int64
 from torch import Tensor
 
 from gscompleter.types import Camera, Gaussians, Render
@@ -32,6 +32,9 @@ class FrozenScene(Protocol):
 
     def extend(self, new: Gaussians) -> FrozenScene:
         """Add `new` to the frozen scene, after its Gaussians."""
+
+    def freeze_occluders(self, others: Gaussians) -> FrozenScene:
+        """Freeze `others` alone; those that hide none of the frozen Gaussians may be left out."""
 
     def repaint(self, rows: Int64[Tensor, "m"], painted: Gaussians) -> FrozenScene:
         """Give the Gaussians at distinct `rows` the colours of `painted`, the same Gaussians."""
@@ -64,6 +67,14 @@ class JointScene(Protocol):
 
     def composite_beside(self, new: Gaussians, other: Camera) -> tuple[Render, Render]:
         """Render the scene with `new`, and `new` alone from another camera."""
+
+
+@runtime_checkable
+class HidingScene(Protocol):
+    """A frozen scene that is frozen again, without some Gaussians, only where it showed these."""
+
+    def hide(self, hidden: Bool[Tensor, "n"], parts: Sequence[Gaussians]) -> FrozenScene:
+        """Freeze all n Gaussians again: `parts`, in which the `hidden` ones are transparent."""
 
 
 @runtime_checkable

@@ -44,6 +44,10 @@ class RedrawnScene:
         """Add `new` to the scene."""
         return replace(self, scene=merge([self.scene, new]))
 
+    def freeze_occluders(self, others: Gaussians) -> FrozenScene:
+        """Freeze `others`, all of them."""
+        return self.renderer.freeze(others, self.camera)
+
     def repaint(self, rows: Int64[Tensor, "m"], painted: Gaussians) -> RedrawnScene:
         """Give Gaussians of the scene the harmonics of `painted`."""
         sh = self.scene.sh.index_copy(0, rows, painted.sh.to(self.scene.sh))

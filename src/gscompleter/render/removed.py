@@ -51,4 +51,5 @@ def mark_shown(
     """Mark the pixels that show Gaussians among others."""
     # With a value of 1 for these and 0 for the others, the image is their weight.
     values = torch.cat([torch.zeros_like(others.opacities), torch.ones_like(gaussians.opacities)])
-    return renderer.freeze(others, camera).extend(gaussians).splat(values) > MIN_REMOVED_WEIGHT
+    hiding = renderer.freeze(gaussians, camera).freeze_occluders(others)
+    return hiding.extend(gaussians).splat(values) > MIN_REMOVED_WEIGHT

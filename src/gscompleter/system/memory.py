@@ -78,10 +78,13 @@ def check_bytes(needed: int, number: str, remedy: str, argument: str | None = No
         )
 
 
-def estimate_scene_bytes(count: int, numbers: int, photographs: Sequence[int]) -> int:
+def estimate_scene_bytes(
+    count: int, numbers: int, photographs: Sequence[int], num_filed: int = 0
+) -> int:
     """Estimate the additional peak memory for `count` Gaussians of an input splat.
 
-    Each has `numbers` float32 values; `photographs` are the pixels of each, at working resolution.
+    Each has `numbers` float32 values, of which `num_filed` lie in a file once the splat was read;
+    `photographs` are the pixels of each, at working resolution.
     """
     # A scene is held once. Measured on 4 M and 10 M Gaussians of degree 3 with 40 photographs: 3.8
     # and 5.7 GB for `complete`, where this gives 4.8 and 6.7 GB with the program.
@@ -90,7 +93,8 @@ def estimate_scene_bytes(count: int, numbers: int, photographs: Sequence[int]) -
     views = number * rendered * BYTES_PER_SPLAT
     observed = 2 * 4 * number * rendered  # areas and agreement of every Gaussian
     fitted = BYTES_PER_PHOTO_PIXEL * sum(photographs)
-    return count * (4 * numbers + FREEZING_BYTES) + views + observed + fitted
+    stages = count * (4 * (numbers - num_filed) + FREEZING_BYTES) + views + observed + fitted
+    return max(4 * count * numbers, stages)
 
 
 def estimate_gpu_bytes(count: int, harmonics: int, shown: Sequence[int], pixels: int) -> int:

@@ -297,10 +297,10 @@ def read_inputs(
         if splat is not None:
             with show_preparation("reading the scene"):
                 task = add_check_views(task, opened)
-                given = read_splat(splat)
+                given, splat_file = sort_splat(read_splat(splat), splat, device)
+                # Harmonics that lie in a file take no memory.
                 if device == "cpu":
                     check_scene(task, given)
-                given, splat_file = sort_splat(given, splat, device)
     if given is None or splat_file is None:
         return task
     with show_preparation("aligning the scene"):
@@ -458,10 +458,7 @@ def read_splat(splat: SplatRequest) -> Gaussians:
 def sort_splat(
     gaussians: Gaussians, splat: SplatRequest, device: str
 ) -> tuple[Gaussians, InputSplatFile]:
-    """Sort a large splat along a Morton curve, in place, and keep the order of its file.
-
-    Three quarters of it are harmonics, which stages seldom read: they go to a temporary file.
-    """
+    """Sort a large splat along a Morton curve, in place, and keep the order of its file."""
     # Gaussians of a file lie in random order, and each tile of an image would read memory all over
     # (decision 025). Files are written in the order of the given file, which `file_order` leads
     # back to.
@@ -469,9 +466,17 @@ def sort_splat(
     if len(gaussians) < MIN_PROXY_GAUSSIANS:
         return gaussians, splat_file
     order = sort_nearby(gaussians)
-    if splat.beside is not None and device == "cpu":
-        gaussians = replace(gaussians, sh=move_to_file(gaussians.sh, splat.beside))
-    return gaussians, replace(splat_file, file_order=order)
+    return file_harmonics(gaussians, splat, device), replace(splat_file, file_order=order)
+
+
+def file_harmonics(gaussians: Gaussians, splat: SplatRequest, device: str) -> Gaussians:
+    """Move the harmonics of a large splat to a temporary file.
+
+    They are three quarters of it, and seldom read.
+    """
+    if len(gaussians) < MIN_PROXY_GAUSSIANS or splat.beside is None or device != "cpu":
+        return gaussians
+    return replace(gaussians, sh=move_to_file(gaussians.sh, splat.beside))
 
 
 def read_splat_alone(

@@ -9,6 +9,7 @@ from torch import Tensor
 
 from gscompleter.apps.inputs.task import CompletionTask
 from gscompleter.numerics.geometry import is_inside, project
+from gscompleter.system.files.mapping import is_mapped
 from gscompleter.system.memory import (
     check_bytes,
     check_gpu_bytes,
@@ -65,5 +66,6 @@ def estimate_memory(task: CompletionTask, scene: Gaussians | None) -> int:
     cameras = [view.camera for view in (*task.views, *(task.check_views or ()))]
     parts = [part for part in vars(scene).values() if isinstance(part, Tensor)]
     numbers = sum(part[0].numel() for part in parts)
+    num_filed = sum(part[0].numel() for part in parts if is_mapped(part))
     sizes = [camera.width * camera.height for camera in cameras]
-    return needed + estimate_scene_bytes(len(scene), numbers, sizes)
+    return needed + estimate_scene_bytes(len(scene), numbers, sizes, num_filed)

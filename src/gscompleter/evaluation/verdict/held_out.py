@@ -14,15 +14,13 @@ from gscompleter.evaluation.metrics.image import compute_masked_psnr, compute_ma
 from gscompleter.evaluation.metrics.unused_photographs import measure_likeness, shrink_view
 from gscompleter.evaluation.verdict.rows import HeldOutRow, ScoreRow
 from gscompleter.numerics.image_ops import compute_mask_fraction
-from gscompleter.render.protocols import Renderer
+from gscompleter.render.protocols import HidingScene, Renderer
 from gscompleter.render.view_map import get_view_map
 from gscompleter.state import Completion
 from gscompleter.types import Camera, View
 
 Drawing = Callable[[View], RenderPair]
 """Renders the context and the completed scene at the camera of a photograph."""
-COPIED_BLOCK = 1_000_000
-"""Gaussians of a changed context that are copied at a time."""
 
 
 @dataclass(frozen=True)
@@ -39,13 +37,16 @@ def render_before_after(completion: Completion, camera: Camera, renderer: Render
     with torch.no_grad():
         frozen = renderer.freeze(completion.context, camera)
         before = frozen.render
-        # What a removed Gaussian hid comes to light, so that the rest is projected anew. New
-        # colours alone change no depth and no opacity, and the frozen scene is painted over.
-        if completion.source.gone_mask.any():
-            frozen = renderer.freeze(completion.context[:0], camera)
-            for part in completion.iterate_kept(COPIED_BLOCK):
-                frozen = frozen.extend(part)
-        elif len(completion.recolored) > 0:
+        # What a removed Gaussian hid comes to light.
+        gone = completion.source.gone_mask
+        if gone.any():
+            kept = completion.context.hide(gone)
+            if isinstance(frozen, HidingScene):
+                frozen = frozen.hide(gone, (kept,))
+            else:
+                frozen = renderer.freeze(kept, camera)
+        # New colours change no depth and no opacity, and the frozen scene is painted over.
+        if len(completion.recolored) > 0:
             rows = completion.recolored_mask.nonzero()[:, 0]
             frozen = frozen.repaint(rows, completion.recolored)
         return RenderPair(before, frozen.composite(completion.added))
