@@ -74,6 +74,12 @@ class Completion(Displayed):
     confirmation: Trust | None = None
     """How far photographs confirm what a removal left, although all of it has full trust; None if
     they do not decide what stays (`keeps_confirmed`)."""
+    trust_elsewhere: Trust | None = None
+    """Trust in `rendered_context` where nothing was removed: that from before a removal, of which
+    the rest has full trust; None before one."""
+    is_restored: bool = False
+    """True if photographs look as before around what was removed (`restore_surroundings`); a target
+    or removal after it makes it False."""
     models: Mapping[str, str] = field(default_factory=dict)
     """Names of the `reconstructor`, its `depth` and the `generator`, for those who read files."""
 
@@ -123,8 +129,9 @@ class Completion(Displayed):
         Args:
             out: New or empty folder; with `overwrite`, also one of an earlier run.
             unused_views: As in `score`.
-            splat: File that the scene was loaded from, in whose layout and order `completed.ply`
-                is then written, so that `strip` takes back recolouring and removal, too.
+            splat: File that the scene was loaded from, and that still has its values. In its layout
+                and order `completed.ply` is then written, so that `strip` takes back recolouring
+                and removal, too.
             overwrite: True to replace the files of an earlier run.
 
         Raises:
@@ -243,7 +250,8 @@ class Completion(Displayed):
         """Append the result of one more target, and what it `added`, in the order of addition."""
         parts = (*self.added_parts, *(part for part in added if len(part)))
         targets = (*self.targets, result)
-        return replace(self, added_parts=parts, targets=targets).plus_seconds(seconds)
+        changed = replace(self, added_parts=parts, targets=targets, is_restored=False)
+        return changed.plus_seconds(seconds)
 
     def plus_seconds(self, seconds: Mapping[str, float]) -> Completion:
         """Add wall times stage by stage."""

@@ -910,6 +910,23 @@ def test_a_stroke_is_replayed_to_the_same_bytes(
         assert (saved / name).read_bytes() == (other / name).read_bytes(), name
 
 
+# `test_live_steps.py` does such a step.
+@pytest.mark.slow
+def test_a_step_with_two_targets_is_saved_and_replayed(
+    splat_ready, without_crate, splat, room, tmp_path, monkeypatch
+):
+    removed, _ = without_crate
+    session, _ = complete_camera(removed, HOLES[1])
+    serving.save_session(splat_ready, session)
+    saved, other = splat_ready.request.out, tmp_path / "other"
+    frames = json.loads((saved / "targets.json").read_text())["frames"]
+    assert len(frames) == len(json.loads((saved / "summary.json").read_text())["targets"]) == 2
+    words = ("repair", room, "--scene", splat, "--strokes", saved, "--out", other, "--quiet")
+    assert run(monkeypatch, *words) == 0
+    for name in ("completed.ply", "targets.json"):
+        assert (saved / name).read_bytes() == (other / name).read_bytes(), name
+
+
 # `test_a_stroke_is_replayed_to_the_same_bytes` does so with one step.
 @pytest.mark.slow
 def test_a_saved_session_is_replayed_to_the_same_bytes(

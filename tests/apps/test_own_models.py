@@ -204,7 +204,7 @@ def test_evaluate_says_what_the_reconstructor_says_of_photographs(tmp_path, monk
     cases.write_text(json.dumps({"resolution": [64, 64], "cases": [row]}))
     words = ("--depth", f"{tmp_path / 'waves.py'}:depth", "--methods", "context")
     assert run(monkeypatch, "evaluate", cases, *words, "--out", tmp_path / "out") == 0
-    sentence = "The predicted depth is not used in photographs 0, 1"
+    sentence = "The predicted depth is not used in photograph"
     assert f": {sentence}" in capsys.readouterr().err
     (file,) = (tmp_path / "out" / "tasks").glob("*/context.json")
     (note,) = json.loads(file.read_text())["context_notes"]

@@ -3,15 +3,21 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 import gscompleter as gsc
 from command import run
+from gscompleter.apps.inputs.task import InputSplatFile
+from gscompleter.apps.report.results import find_splat_file, prepare_judged
 from gscompleter.apps.report.schema import read_summary
+from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.system.errors import InputError
+from gscompleter.types import ContextScene
 
 NEAR_FAR = {"near": 0.5, "far": 20.0}
 
@@ -47,7 +53,9 @@ def test_scores_are_those_of_the_command(saved, completed_room):
     assert ours["targets"] == theirs["targets"]
     assert ours["context"] == theirs["context"]
     assert ours["gaussians"] == theirs["gaussians"]
-    assert ours["coverage"]["cameras"] == theirs["coverage"]["cameras"]
+    # The photograph at the target is one of the scene, too.
+    assert ours["scene"]["photographs"] == theirs["scene"]["photographs"] == 3
+    assert ours["coverage"] == theirs["coverage"]
 
 
 def test_other_commands_read_the_folder(saved, monkeypatch, tmp_path):
@@ -67,6 +75,27 @@ def test_scores_are_on_the_result(completion, room):
     assert scored["held_out"] == []
     (target,) = scored["targets"]
     assert target["psnr_after"] > target["psnr_before"]
+
+
+def test_scores_are_the_same_whatever_the_script_has_switched(completion):
+    torch.set_default_dtype(torch.float64)
+    try:
+        with torch.inference_mode():
+            switched = completion.score()
+    finally:
+        torch.set_default_dtype(torch.float32)
+    assert switched == completion.scores
+
+
+def test_cameras_of_photographs_are_listed_once_in_the_order_of_their_frames(completion, room):
+    views = gsc.load_views(room, frames=[0, 1, 2], **NEAR_FAR)
+    # As if photograph 1 had checked a splat, and were given again.
+    checked = replace(completion, num_context=1)
+    found = prepare_judged(checked, [views[2], views[1]]).cameras
+    pairs = zip(found, (view.camera for view in views), strict=True)
+    assert all(is_same_camera(*pair) for pair in pairs)
+    nameless = [replace(view, frame=None) for view in views[1:]]
+    assert len(prepare_judged(checked, nameless).cameras) == 4
 
 
 def test_the_page_alone(completion, tmp_path):
@@ -95,6 +124,9 @@ def test_a_removal_is_undone_by_strip(completion, room, saved, monkeypatch, tmp_
     )
     assert len(without.added) > 0
     out = without.save(tmp_path / "out", splat=file)
+    # Nothing is fitted once more on the way to the file.
+    written = gsc.load_ply(out / "completed.ply")
+    assert (written.sh - without.scene.sh).abs().max() < 1e-6 * without.scene.sh.abs().max()
     back = tmp_path / "back.ply"
     assert run(monkeypatch, "strip", out / "completed.ply", "--out", back) == 0
     assert back.read_bytes() == file.read_bytes()
@@ -119,6 +151,34 @@ def test_another_file_is_refused(completion, saved):
         completion.save(saved.parent / "other", splat=saved / "completed.ply")
     with pytest.raises(InputError, match="There is no splat"):
         completion.save(saved.parent / "other", splat=saved / "none.ply")
+
+
+def test_a_scene_whose_values_were_changed_is_another_one(completion, saved):
+    path = saved / "context.ply"
+    scene = gsc.load_splat(path)
+
+    def find(changed: gsc.Gaussians) -> InputSplatFile:
+        return find_splat_file(path, replace(completion, source=ContextScene.whole(changed)))
+
+    assert find(scene).path == path
+    for name in ("quats", "scales", "opacities", "sh"):
+        values = getattr(scene, name).clone()
+        values[-1] *= 0.5
+        with pytest.raises(InputError, match="holds another scene"):
+            find(replace(scene, **{name: values}))
+
+
+def test_a_scene_of_which_gaussians_were_dropped_is_that_of_its_file(completion, saved, tmp_path):
+    scene = gsc.load_splat(saved / "context.ply")
+    path = tmp_path / "broken.ply"
+    data = bytearray((saved / "context.ply").read_bytes())
+    begin = data.index(b"end_header\n") + len(b"end_header\n")
+    row = (len(data) - begin) // len(scene)
+    data[begin + 3 * row : begin + 3 * row + 4] = np.float32(np.nan).tobytes()
+    path.write_bytes(data)
+    kept = gsc.load_splat(path, drop_nonfinite=True)
+    found = find_splat_file(path, replace(completion, source=ContextScene.whole(kept)))
+    assert found.context_mask.nonzero()[:, 0].tolist() == [0, 1, 2, *range(4, len(scene))]
 
 
 def test_an_impossible_removal_is_refused(room, saved):

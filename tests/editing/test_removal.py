@@ -152,6 +152,13 @@ def test_what_photographs_need_elsewhere_returns(begun):
     assert not restored.source.gone_mask[-1]
     assert torch.equal(restored.source.chosen_mask, chosen)
     assert restore_surroundings(begun, COMPLETER.renderer) is begun
+    # Once more, colours would change again; after a further target or removal, they have to.
+    assert restore_surroundings(restored, COMPLETER.renderer) is restored
+    further = COMPLETER.advance(restored, CAMERAS[1])
+    again = remove_gaussians(restored, chosen, is_crate, COMPLETER.scenes)
+    assert restored.is_restored
+    assert not further.is_restored
+    assert not again.is_restored
 
 
 def test_what_shows_in_the_hole_alone_does_not_return(removed):

@@ -21,6 +21,7 @@ from gscompleter.evaluation.metrics.st_lpips import (
     halve_smoothly,
     load_weights,
 )
+from gscompleter.evaluation.tables import ABSENT_NOTES
 
 CHANNELS = (64, 192, 384, 256, 256)
 SIZES = ((MIN_NETWORK_SIDE, MIN_NETWORK_SIDE), (64, 80), (255, 130))
@@ -108,6 +109,7 @@ def test_equal_images_have_no_distance_and_colours_are_clipped(tmp_path, monkeyp
     assert compute_st_lpips(image + 5 * (image == 1), other) == score
     assert compute_st_lpips(image[: MIN_NETWORK_SIDE - 1], other[: MIN_NETWORK_SIDE - 1]) is None
     assert compute_st_lpips(image[:MIN_NETWORK_SIDE], other[:MIN_NETWORK_SIDE]) is not None
+    assert f"{MIN_NETWORK_SIDE} pixels or more" in ABSENT_NOTES["st_lpips"]
     assert ST_LPIPS_PACKAGE not in sys.modules
 
 

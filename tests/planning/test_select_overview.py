@@ -44,6 +44,10 @@ def test_two_photographs_in_one_place_are_no_pair():
     cameras = [camera_at(), camera_at(), camera_at(yaw=180)]
     assert not has_partner(0, [0, 1, 2], cameras, points(cameras))
     assert select_overview(cameras[:2], points(cameras), 8) == [0, 1]
+    # Nor are two of which the second stands a thousandth of the distance aside.
+    cameras = [camera_at(), camera_at(0.003), camera_at(0.1)]
+    assert not has_partner(0, [0, 1], cameras, points(cameras))
+    assert has_partner(0, [0, 2], cameras, points(cameras))
 
 
 def test_no_more_are_chosen_than_are_wanted():

@@ -17,6 +17,7 @@ from gscompleter.reconstructors.plane_sweep import PlaneSweep, reconstructor
 from gscompleter.reconstructors.plane_sweep.hidden_blocks import WEIGHT
 from gscompleter.reconstructors.plane_sweep.predicted_depth import (
     CONTRADICTED,
+    DISAGREEING,
     UNTESTED,
     add_prediction,
 )
@@ -106,14 +107,42 @@ def test_a_prediction_is_anchored_and_fills_what_is_not_measured():
 
 
 @pytest.mark.parametrize(
-    "inverse",
-    [1 / WAVES, 1.5 - 1 / TRUE, np.full_like(TRUE, 0.5)],
-    ids=["waves", "inverted", "flat"],
+    ("inverse", "refusal"),
+    [
+        (1 / TRUE + 0.38 / WAVES, CONTRADICTED),
+        (1 / WAVES, DISAGREEING),
+        (1.5 - 1 / TRUE, DISAGREEING),
+        (TRUE, DISAGREEING),
+    ],
+    ids=["waves on it", "waves", "inverted", "disparity"],
 )
-def test_a_prediction_that_stereo_contradicts_changes_nothing(inverse):
+def test_a_prediction_that_stereo_contradicts_changes_nothing(inverse, refusal):
     part = add_prediction(FOUND, predict(inverse), GREY, NO_SKY)
     assert part.measured is FOUND
-    assert part.refusal == CONTRADICTED
+    assert part.refusal == refusal
+
+
+def test_a_prediction_without_near_and_far_changes_nothing():
+    part = add_prediction(FOUND, predict(np.full_like(TRUE, 0.5)), GREY, NO_SKY)
+    assert part.measured is FOUND
+    assert part.refusal in (CONTRADICTED, DISAGREEING)
+
+
+def test_infinity_is_tested_as_any_other_depth():
+    """What is far away where stereo sees a surface is as wrong at infinity as short of it."""
+    refusals = []
+    for inverse in (0.0, 1e-6):
+        wrong = np.where((X + Y) % 0.2 < 0.1, np.float32(inverse), 1 / TRUE).astype(np.float32)
+        with np.errstate(divide="ignore"):
+            refusals.append(add_prediction(FOUND, predict(wrong), GREY, NO_SKY).refusal)
+    assert refusals[0] == refusals[1] != ""
+    # Where stereo measures nothing, infinity says "far", which costs nothing elsewhere.
+    far = np.where(KNOWN > 0, 1 / TRUE, 0).astype(np.float32)
+    with np.errstate(divide="ignore"):
+        part = add_prediction(FOUND, predict(far), GREY, NO_SKY)
+    assert part.share == pytest.approx((KNOWN == 0).mean())
+    corner = part.measured.index[: SIZE // 3, : SIZE // 5]
+    assert corner.max() < FOUND.index[KNOWN > 0].min()
 
 
 def test_a_prediction_that_nothing_tests_changes_nothing():
@@ -136,11 +165,11 @@ def test_true_depth_helps_at_a_blank_wall():
 
 
 def test_a_wrong_prediction_changes_no_bit_and_a_line_says_so(plain):
-    misled = reconstruct(lambda v: torch.from_numpy(WAVES))
+    misled = reconstruct(lambda v: 1 / v.depth)
     assert torch.equal(misled.gaussians.means, plain.gaussians.means)
     assert torch.equal(misled.gaussians.sh, plain.gaussians.sh)
     assert misled.notes == (
-        f"The predicted depth is not used in photographs 0, 1, because {CONTRADICTED}.",
+        f"The predicted depth is not used in photographs 0, 1, because {DISAGREEING}.",
     )
     assert plain.notes == ()
 
@@ -184,13 +213,12 @@ def test_notes_reach_the_completion_and_its_summary(tmp_path):
     )
     views = [replace(view, depth=None) for view in photographs()]
     done = GSCompleter(reconstructor=psi).begin(views)
-    assert done.context_notes == (
-        f"The predicted depth is not used in photographs 0, 1, because {CONTRADICTED}.",
-    )
+    (note,) = done.context_notes
+    assert f"The predicted depth is not used in photograph 0, because {DISAGREEING}." in note
     done.save(tmp_path / "out")
     summary = read_summary(tmp_path / "out")
     assert summary.context_notes == done.context_notes
-    assert done.context_notes[0] in [note.text for note in list_notes(summary)]
+    assert note in [line.text for line in list_notes(summary)]
 
 
 def test_a_reconstructor_that_uses_no_depth_refuses_it(monkeypatch):

@@ -11,6 +11,7 @@ from completions.cases import multiply_gaussians
 from gscompleter.completer import GSCompleter
 from gscompleter.config import CompleterConfig, TrustConfig
 from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.numerics.kernels.lod import RUN_BLOCK
 from gscompleter.render import lod as proxies
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.loading import load_renderer
@@ -18,6 +19,7 @@ from gscompleter.render.lod import (
     MAX_REACH,
     MAX_RUN_DEVIATION,
     build_proxy,
+    merge_nearby,
     simplify_scene,
     thin_gaussians,
 )
@@ -162,6 +164,35 @@ def test_of_a_proxy_as_much_is_believed_as_of_the_scene():
     ours, truth = trusted_alpha(PROXY.rendered), trusted_alpha(CROWD)
     assert truth.std() > 0.2
     assert (ours - truth).abs().mean() < 0.05
+
+
+def test_flat_gaussians_are_kept_as_often_as_thick_ones():
+    """A scale of exactly 0 is allowed, and such a Gaussian covers as much as another."""
+    scene = random_gaussians(1000)
+    scales = torch.full((1000, 3), 0.1)
+    scales[:500, 1] = 0
+    scene = replace(scene, scales=scales, opacities=torch.full((1000,), 0.5))
+    kept = thin_gaussians(scene, 100)
+    assert len(kept) == pytest.approx(100, abs=1)
+    assert (kept.scales.amin(dim=1) == 0).float().mean() == pytest.approx(0.5, abs=0.02)
+
+
+@pytest.mark.parametrize("count", [2, 20, 100])
+def test_a_scene_of_several_blocks_is_merged_to_as_few_as_are_wanted(count):
+    scene = in_order(random_gaussians(2 * RUN_BLOCK + 10))
+    assert 0.7 * count <= len(merge_nearby(scene, count)) <= count
+    # Of two provenances that alternate nothing is merged.
+    mixed = replace(scene, generated=(torch.arange(len(scene)) % 2).to(torch.uint8))
+    assert len(merge_nearby(mixed, count)) == len(scene)
+
+
+@pytest.mark.parametrize("away", [1e1, 1e6, 1e9])
+def test_a_floater_far_away_does_not_merge_the_others(away):
+    scene = random_gaussians(2000)
+    means = scene.means.clone()
+    means[0] = away
+    scene = in_order(replace(scene, means=means))
+    assert 0.95 * 1800 <= len(merge_nearby(scene, 1800)) <= 1800
 
 
 def test_evidence_of_the_scene_and_of_its_proxy_is_the_same():

@@ -71,6 +71,48 @@ def test_a_hole_that_photographs_show_is_filled_from_them():
     assert torch.equal(state.scene.means[: len(CUT)], CUT.means)
 
 
+def measure_misplacement(scene: Gaussians) -> float:
+    """Compute the median error of the z-depth of Gaussians, relative to the depth.
+
+    Each counts at the photograph where it is least: others may not see it.
+    """
+    errors = []
+    for photo in PHOTOS:
+        pixels, z = project(scene.means, photo.camera)
+        column, row = pixels.long().clamp(0, SIZE - 1).unbind(dim=1)
+        errors.append((z / photo.depth[row, column] - 1).abs())
+    return torch.stack(errors).amin(dim=0).median().item()
+
+
+@pytest.mark.parametrize("scale", [0.85, 1.0, 1.2])
+def test_depths_of_another_scale_are_registered(scale):
+    def reconstruct_in_another_scale(views: list[View]) -> Reconstruction:
+        return reconstruction_of(views, [scale * view.depth for view in views])
+
+    state = GSCompleter(reconstruct_in_another_scale, config=SPLAT).begin(
+        PHOTOS[:2], CUT, PHOTOS[2:]
+    )
+    assert state.num_observed > 100
+    assert measure_misplacement(state.added) < 0.01
+    for before, after in zip(score(CUT), score(state.scene), strict=True):
+        assert after > before + 8
+
+
+def test_a_far_wall_that_is_a_little_off_moves_nothing_near():
+    """A far wall of Ψ is 1 % off; an affine at each photograph brought the box nearer."""
+
+    def reconstruct_with_a_far_wall(views: list[View]) -> Reconstruction:
+        depths = [view.depth for view in views]
+        return reconstruction_of(views, [torch.where(d > 4.5, 1.01 * d, d) for d in depths])
+
+    completer = GSCompleter(reconstruct_with_a_far_wall, config=SPLAT)
+    state = completer.begin(PHOTOS[:2], CUT, PHOTOS[2:])
+    assert state.num_observed > 100
+    near = state.added[project(state.added.means, PHOTOS[2].camera)[1] < 4.0]
+    assert len(near) > 100
+    assert measure_misplacement(near) < 0.01
+
+
 def test_a_reconstructor_of_parts_is_asked_for_what_is_lacking():
     class Exact:
         """An ideal Ψ, which returns the Gaussians of the pixels that are asked for."""

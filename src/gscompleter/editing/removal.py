@@ -4,7 +4,7 @@ A Gaussian that reaches out of the chosen place is cut at its border. Behind an 
 splat has Gaussians that no photograph ever showed. They are removed with it, or else they would
 fill its hole; at the end those return that photographs need elsewhere. The photographs still show
 the object, so their pixels are ignored there. From then on the scene has full trust: only its holes
-are completed.
+are completed. The trust from before is kept for holes elsewhere.
 """
 
 from __future__ import annotations
@@ -83,8 +83,16 @@ def remove_gaussians(
     # Outer pieces are no Gaussians of the file: they are added to it.
     rest = make_part(PartOrigin("piece"), outer[~is_outer_revealed])
     parts = (*state.added_parts, rest) if len(rest) else state.added_parts
+    kept = (~gone).nonzero()[:, 0]
+    trust = state.trust if state.trust_elsewhere is None else state.trust_elsewhere
     changed = replace(
-        state, source=remaining, rendered_context=context, added_parts=parts, trust=Trust()
+        state,
+        source=remaining,
+        rendered_context=context,
+        added_parts=parts,
+        trust=Trust(),
+        trust_elsewhere=trust.thin(kept, torch.ones_like(context.opacities)),
+        is_restored=False,
     )
 
     # The photographs still show the object. Its pixels are ignored and painted over, so that no
@@ -111,11 +119,13 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
     """Let photographs be as good as before where they do not show what was removed.
 
     What was generated is faded until none is worse than with all revealed Gaussians behind it. Of
-    these, the needed return. At last the colours of all additions are fitted.
+    these, the needed return. At last the colours of all additions are fitted. A state without a
+    removal, or that is restored already, is returned as it is: colours that are fitted again change
+    again.
     """
     source = state.source
     views = [photo.view for photo in state.photos]
-    if len(source.removed) == 0:
+    if len(source.removed) == 0 or state.is_restored:
         return state
 
     # Outer pieces of what was cut, and what photographs showed before, are among the additions, but
@@ -163,6 +173,7 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
         source=remaining,
         rendered_context=first,
         added_parts=tuple(split_into_parts(fitted, parts)),
+        is_restored=True,
     )
 
 

@@ -25,6 +25,7 @@ from gscompleter.evaluation.columns import (
 )
 from gscompleter.evaluation.methods import METHODS
 from gscompleter.evaluation.metrics.perceptual import compute_fid
+from gscompleter.evaluation.metrics.st_lpips import MIN_NETWORK_SIDE
 from gscompleter.evaluation.run_facts import RunFacts, read_run_facts, spell_greek
 from gscompleter.evaluation.store import (
     get_step_path,
@@ -57,8 +58,9 @@ ABSENT_NOTES = {
         "time, a connection; then score the run again to add the columns."
     ),
     "st_lpips": (
-        "ST-LPIPS: not installed. Run `pip install stlpips-pytorch`, which holds its weights; then "
-        "score the run again to add the column."
+        f"ST-LPIPS: not available. It needs images whose sides have {MIN_NETWORK_SIDE} pixels or "
+        "more, and `pip install stlpips-pytorch`, which holds its weights; then score the run "
+        "again to add the column."
     ),
     "hole_flip": (
         "FLIP: not installed. Run `pip install 'gscompleter[evaluation]'`; then score the run "

@@ -12,6 +12,10 @@ HYPOTHESES_PER_BATCH = 32
 """Hypotheses that are scored together, so few that their residuals stay in the cache."""
 RESIDUAL_THRESHOLD = 0.05
 """Largest residual of an inlier, relative to `y`."""
+NUM_RATIOS = 100
+"""Quantiles of the ratios of depths that are tried as their scale."""
+SCALE_ROUNDS = 3
+"""Rounds in which a scale is fitted to its inliers, whose set changes with it."""
 TRIMMED_ROUNDS = 5
 """Number of trimmed fits; each one leaves out the outliers of the previous one."""
 
@@ -65,6 +69,22 @@ def fit_line_ransac(
             break
         scale, shift = torch.linalg.solve(normal, design.T @ (y[agree] * weight)).tolist()
     return scale, shift
+
+
+def fit_scale(x: Float[Tensor, "n"], y: Float[Tensor, "n"]) -> float:
+    """Fit the scale of `y = scale * x` with the most inliers, both being positive.
+
+    It is the median ratio of its inliers. The median of all ratios would be off where many pixels
+    show different surfaces.
+    """
+    ratios = y / x
+    levels = torch.arange(0.5, NUM_RATIOS, dtype=x.dtype, device=x.device) / NUM_RATIOS
+    scales = ratios.quantile(levels)
+    counts = torch.stack([find_affine_inliers(x, y, scale, 0.0).sum() for scale in scales.tolist()])
+    scale = scales[counts.argmax()].item()
+    for _ in range(SCALE_ROUNDS):
+        scale = ratios[find_affine_inliers(x, y, scale, 0.0)].median().item()
+    return scale
 
 
 def fit_robust_affine(

@@ -14,6 +14,8 @@ from torch import Tensor
 
 from gscompleter.numerics.geometry import embed_cameras, is_inside, project, select_spread_cameras
 from gscompleter.planning.select_context import (
+    BEST_CONTEXT_ANGLE,
+    NARROW_FALLOFF,
     compute_angles,
     compute_directions,
     find_visible_points,
@@ -28,8 +30,10 @@ MAX_MEDOID_ROUNDS = 20
 """Most iterations of k-medoids."""
 MIN_SHARED_FRACTION = 0.3
 """Smallest fraction of visible points that the other camera of a pair must see, too."""
+MIN_ANGLE = BEST_CONTEXT_ANGLE - NARROW_FALLOFF
 MAX_ANGLE = 30.0
-"""Largest triangulation angle of a pair, in degrees."""
+"""Smallest and largest triangulation angle of a pair, in degrees. At the smallest, `select_context`
+scores a pair by a third of the best."""
 
 
 def summarize_cameras(cameras: Sequence[Camera]) -> list[Camera]:
@@ -40,9 +44,9 @@ def summarize_cameras(cameras: Sequence[Camera]) -> list[Camera]:
 def select_overview(
     cameras: Sequence[Camera], points: Float[Tensor, "n 3"], count: int
 ) -> list[int]:
-    """Select up to `count` cameras that together see most of the scene; return sorted indices.
+    """Select up to `count` cameras, but at least two, that together see most of the scene.
 
-    `points` are on or near surfaces, in world coordinates; at least one.
+    `points` are on or near surfaces, in world coordinates; at least one. Returns sorted indices.
     """
     # Partners take places of medoids, so there are fewer medoids until both are at most `count`.
     # Two are needed in any case: one medoid and its partner.
@@ -86,7 +90,7 @@ def has_partner(
     for other, directions in zip(chosen, others, strict=True):
         camera = cameras[other]
         angles = compute_angles(own, directions)
-        shared = (angles > 0) & (angles < MAX_ANGLE)
+        shared = (angles > MIN_ANGLE) & (angles < MAX_ANGLE)
         shared &= is_inside(*project(visible, camera), camera)
         if other != index and shared.float().mean().item() >= MIN_SHARED_FRACTION:
             return True

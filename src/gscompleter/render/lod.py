@@ -41,11 +41,20 @@ FAR_AWAY = 1e4
 MERGED_BLOCK = 200_000
 """Runs that are merged at a time."""
 BISECTIONS = 20
-"""Steps of the search for the distance within which Gaussians are merged: to a thousandth."""
+"""Steps of the search for the distance within which Gaussians are merged, on its logarithm: to less
+than a part in ten thousand."""
+NEAREST, NEAREST_STEP, NEAREST_STEPS = 1e-6, 1e-3, 3
+"""Least distance of that search, in radii of the scene, and how often it is lowered by which factor
+if so many Gaussians lie within it: a floater may be a million times as far away as all others."""
+MIN_BLOCK_RUNS = 16
+"""Runs per block of the kernel below which a scene is merged in two passes."""
 
 
 def build_proxy(scene: Gaussians, cameras: Sequence[Camera]) -> ContextScene:
-    """Build the LOD proxy of a large `scene`; one that is small or on a GPU is its own."""
+    """Build the LOD proxy of a large `scene`; one that is small or on a GPU is its own.
+
+    Runs are found and merged on the CPU, and a proxy is to save its time and memory.
+    """
     if len(scene) < MIN_PROXY_GAUSSIANS or scene.means.is_cuda:
         return ContextScene.whole(scene)
     return simplify_scene(scene, cameras)
@@ -98,20 +107,27 @@ def merge_nearby(scene: Gaussians, max_gaussians: int) -> Gaussians:
     """Merge adjacent Gaussians of one provenance until about so many are left; on the CPU.
 
     A run lies within a distance of its first Gaussian, the smallest that is enough. The scene has
-    to be sorted along a Morton curve.
+    to be sorted along a Morton curve. More are left where provenances alternate along it.
     """
+    # No run reaches beyond a block. Of few runs the blocks would decide what is merged, and one of
+    # each would be left, so that a first pass merges many blocks into one.
+    num_blocks = -(-len(scene) // kernels.RUN_BLOCK)
+    least = MIN_BLOCK_RUNS * num_blocks
+    if num_blocks > 1 and max_gaussians < least < len(scene):
+        fewer = merge_nearby(scene, least)
+        if len(fewer) < len(scene):
+            return merge_nearby(fewer, max_gaussians)
     arrays = to_arrays(scene)
     labels = scene.generated.numpy()
     centre = scene.means.mean(dim=0)
     radius = max((scene.means - centre).abs().max().item(), 1e-30)
 
     def find_starts(distance: float) -> Int64[ndarray, "bounds"]:
-        # A camera that is so far away that its pixel is `distance` everywhere; of Gaussians of any
-        # size.
+        # A camera so far away that a pixel is `distance` wide everywhere. Gaussians of any size may
+        # join (largest = infinity).
         focal = np.array([FAR_AWAY * radius / distance], np.float32)
         place = to_float32(centre + FAR_AWAY * radius * torch.tensor([0.0, 0.0, 1.0]))[None]
         begins = np.empty(len(scene), np.bool_)
-        num_blocks = -(-len(scene) // kernels.RUN_BLOCK)
         share(
             kernels.mark_run_starts,
             num_blocks,
@@ -120,8 +136,12 @@ def merge_nearby(scene: Gaussians, max_gaussians: int) -> Gaussians:
         )
         return np.append(np.flatnonzero(begins), len(scene))
 
-    # Bisection on the logarithm: between a millionth of the extent and all of it.
-    low = 1e-6 * radius
+    # Bisection on the logarithm: between a millionth of the extent, or less, and all of it.
+    low = NEAREST * radius
+    for _ in range(NEAREST_STEPS):
+        if len(find_starts(low)) - 1 >= max_gaussians:
+            break
+        low *= NEAREST_STEP
     high = 4 * radius
     for _ in range(BISECTIONS):
         middle = math.sqrt(low * high)
@@ -168,7 +188,7 @@ def find_run_starts(
         growth *= 2
 
 
-MAX_GAUSSIANS = 400_000
+DEFAULT_THINNED = 400_000
 """Largest number of Gaussians that are kept by default."""
 MAX_PREVIEW_GAUSSIANS = 25_000
 """Largest number that is kept for previews: several per pixel of a small image."""
@@ -176,7 +196,7 @@ SIZE_SAMPLE = 100_000
 """Gaussians from which the distribution of sizes is estimated."""
 
 
-def thin_gaussians(scene: Gaussians, max_gaussians: int = MAX_GAUSSIANS) -> Gaussians:
+def thin_gaussians(scene: Gaussians, max_gaussians: int = DEFAULT_THINNED) -> Gaussians:
     """Reduce a scene to about `max_gaussians` Gaussians, enlarged to cover the same area.
 
     Gaussians are kept with a probability proportional to their size. No random number takes part,
@@ -190,7 +210,7 @@ def thin_gaussians(scene: Gaussians, max_gaussians: int = MAX_GAUSSIANS) -> Gaus
 
 
 def choose_thinned_rows(
-    scene: Gaussians, max_gaussians: int = MAX_GAUSSIANS
+    scene: Gaussians, max_gaussians: int = DEFAULT_THINNED
 ) -> tuple[Int[Tensor, "m"], Float[Tensor, "m"]]:
     """Select the rows to keep, and the factor by which their standard deviations grow."""
     if len(scene) <= max_gaussians:
@@ -211,8 +231,10 @@ def compute_keep_probabilities(scene: Gaussians, max_gaussians: int) -> Float[Te
 
     The largest 1 % is clamped: floaters and sky are large, few, and useless for matching.
     """
-    # The product of the two longer standard deviations: the area of the largest face.
-    cross_section = scene.scales.prod(dim=1) / scene.scales.amin(dim=1).clamp_min(1e-30)
+    # The product of the two longer standard deviations: the area of the largest face, as
+    # `_compute_cross_section` of the kernels has it. The shortest may be exactly 0.
+    a, b, c = scene.scales.unbind(dim=1)
+    cross_section = (a * b).maximum(b * c).maximum(c * a)
     size = (cross_section * scene.opacities).sqrt()
     sample = size[:: max(1, len(size) // SIZE_SAMPLE)]
     size = size.clamp(max=sample.quantile(0.99)).clamp_min(1e-30)

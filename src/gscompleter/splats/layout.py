@@ -167,7 +167,11 @@ def _can_hold(layout: SceneFile, added: Gaussians) -> bool:
 def _is_read_from(
     layout: SceneFile, numbers: Int[ndarray, "m"], context: Gaussians, order: Int64[Tensor, "k"]
 ) -> bool:
-    """Return True if the positions of rows are those of Gaussians of the context, one by one."""
+    """Return True if the positions of rows are those of Gaussians of the context, one by one.
+
+    They tell that the order is the same. Whoever takes a scene of which other values may have been
+    changed compares all of them before (`has_same_values`).
+    """
     if len(numbers) != len(order) or layout.origin != context.origin:
         return False
     for block, rows in iterate_rows(layout, numbers):
@@ -217,11 +221,16 @@ def is_same_scene(path: Path, other: Path) -> bool:
     for start in range(0, len(scenes[0].rows), CHUNK_ROWS):
         rows = slice(start, start + CHUNK_ROWS)
         first, second = (decode_gaussians(replace(s, rows=s.rows[rows])) for s in scenes)
-        if (first.is_antialiased, first.origin) != (second.is_antialiased, second.origin):
-            return False
-        if not all(torch.equal(getattr(first, f), getattr(second, f)) for f in _STORED):
+        if first.origin != second.origin or not has_same_values(first, second):
             return False
     return True
+
+
+def has_same_values(first: Gaussians, second: Gaussians) -> bool:
+    """Return True if two splats have the same Gaussians with the same labels in the same order."""
+    return first.is_antialiased == second.is_antialiased and all(
+        torch.equal(getattr(first, name), getattr(second, name)) for name in _STORED
+    )
 
 
 def strip(path: Path, out: Path) -> tuple[int, int]:

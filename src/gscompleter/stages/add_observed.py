@@ -3,8 +3,8 @@
 Φ warps photographs through the depth of the scene, and a hole has none: the image at a target is a
 blur where eight photographs show a box. So Ψ reconstructs the photographs that show what is
 missing, as it reconstructs a context without a scene. Its Gaussians of these pixels are registered
-to the scene by Eq. 8 and 9 at the photographs, selected by Eq. 12 at the photographs, and refined
-against all of them, since each is a true image (decision 051).
+to the scene by one scale of their depths (decision 133) and Eq. 9, selected by Eq. 12 at the
+photographs, and refined against all of them, since each is a true image (decision 051).
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from gscompleter.render.fit_colors import RELAXATION, fit_colors
 from gscompleter.render.protocols import FrozenScene
 from gscompleter.render.reference import adapt_to_mode
 from gscompleter.stages.additions import Additions, Refined, accept
-from gscompleter.stages.align_paper import fit_affine
+from gscompleter.stages.align_photographs import align_photographs
 from gscompleter.stages.error_budgets import meet_error_budgets, share_budgets
 from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.stages.new_photos import match_exposure
@@ -42,7 +42,15 @@ from gscompleter.stages.thin_additions import drop_doubled
 from gscompleter.state import Completion
 from gscompleter.system.progress import track
 from gscompleter.trust.photometric import compute_color_differences
-from gscompleter.types import DepthMap, Gaussians, Reconstruction, Render, View, merge
+from gscompleter.types import (
+    DepthAffine,
+    DepthMap,
+    Gaussians,
+    Reconstruction,
+    Render,
+    View,
+    merge,
+)
 
 MAX_RECONSTRUCTIONS = 3
 """Most reconstructions. One fills what it sees; a further one serves photographs elsewhere."""
@@ -221,32 +229,66 @@ def reconstruct_lacking(
     reconstruction = run_part_reconstructor(reconstructor, views, needed)
 
     # D_pred is Ψ's depth of a photograph, D_ctx that of the scene there, where it is not wrong.
-    affines = []
-    masks = []
-    for photo, predicted in zip(photos, reconstruction.depths, strict=True):
-        scene = photo.frozen.render.depth_map()
-        affine = fit_affine(predicted, replace(scene, valid=scene.valid & ~photo.lack.mask), rng)
-        depth = replace(predicted, depth=affine.scale * predicted.depth + affine.shift)
-        masks.append(select_pixels(photo.lack, depth, scene, state.config.holes.dilation))
-        affines.append(affine)
+    scenes = [photo.frozen.render.depth_map() for photo in photos]
+    right = [
+        replace(scene, valid=scene.valid & ~photo.lack.mask)
+        for scene, photo in zip(scenes, photos, strict=True)
+    ]
+    affine = align_photographs(reconstruction.depths, right, rng)
+    aligned = [
+        replace(predicted, depth=affine.scale * predicted.depth + affine.shift)
+        for predicted in reconstruction.depths
+    ]
+    masks = [
+        select_pixels(photo.lack, depth, scene, state.config.holes.dilation)
+        for photo, depth, scene in zip(photos, aligned, scenes, strict=True)
+    ]
 
-    shown = find_photographed(reconstruction, views, masks)
     if reconstruction.view_index is None:
         # A Ψ that is not pixel-aligned does not say from which camera a Gaussian could slide.
+        shown = find_photographed(reconstruction, views, masks)
         parts = [
             adapt_to_mode(state.rendered_context, reconstruction.gaussians[shown], views[0].camera)
         ]
     else:
+        # Moved before they are selected: what a photograph shows of the Gaussians of another one
+        # depends on where they stand.
+        moved = replace(move_all(reconstruction, affine, views), depths=tuple(aligned))
+        shown = find_photographed(moved, views, masks)
         parts = []
-        for number, (view, affine) in enumerate(zip(views, affines, strict=True)):
-            own = shown & (reconstruction.view_index == number)
-            moved = apply_affine(reconstruction.gaussians[own], affine, view.camera)
-            parts.append(adapt_to_mode(state.rendered_context, moved, view.camera))
+        for number, view in enumerate(views):
+            own = shown & (moved.view_index == number)
+            parts.append(adapt_to_mode(state.rendered_context, moved.gaussians[own], view.camera))
     part = merge(parts)
     # No more harmonics than the scene has, whose file has no place for them. The fit of colours
     # that follows makes up for them.
     sh = part.sh[:, : state.context.sh.shape[1]]
     return replace(part, sh=sh, encoded=None), reconstruction.notes
+
+
+def move_all(
+    reconstruction: Reconstruction, affine: DepthAffine, views: Sequence[View]
+) -> Reconstruction:
+    """Move the Gaussians of a pixel-aligned Ψ along the rays of their photographs (Eq. 9).
+
+    They come out in the order of their photographs; depth maps stay.
+    """
+    assert reconstruction.view_index is not None
+    owned = [
+        torch.nonzero(reconstruction.view_index == number)[:, 0] for number in range(len(views))
+    ]
+    moved = [
+        apply_affine(reconstruction.gaussians[rows], affine, view.camera)
+        for rows, view in zip(owned, views, strict=True)
+    ]
+    order = torch.cat(owned)
+    pixels = reconstruction.pixel_index
+    return replace(
+        reconstruction,
+        gaussians=merge(moved),
+        view_index=reconstruction.view_index[order],
+        pixel_index=None if pixels is None else pixels[order],
+    )
 
 
 def select_pixels(
@@ -295,8 +337,8 @@ def accept_photographed(
 ) -> Additions:
     """Accept Gaussians that photographs show, `frozen` being the scene at all of these.
 
-    They are placed already, by Eq. 8 and 9, and selected by Eq. 12. Guards judge what an image at a
-    target adds, and have no say: here every image is a photograph.
+    They are placed already, by the scale of their depths, and selected by Eq. 12. Guards judge what
+    an image at a target adds, and have no say: here every image is a photograph.
     """
     if len(candidates.gaussians) == 0:
         return candidates

@@ -35,6 +35,7 @@ better, with 100 their scores are a tenth lower."""
 NUM_IMPROVED = 20
 """Best cameras that are moved a little, in each of two rounds."""
 NUM_MOVES = 3
+"""Moves of each, in each round."""
 PITCH = (-0.75, 0.35)
 """Range of the sine of the angle by which a camera looks up."""
 MIN_NEAREST = 0.04
@@ -42,12 +43,16 @@ MIN_NEAREST = 0.04
 FREE_NEAREST = 0.12
 """The same, from which on it does not matter."""
 APART = (0.35, 0.6)
-"""Distance, in radii of the core, and angle, in radians, of standpoints that count as others."""
+"""Distance, in radii of the core, and angle, in radians, of standpoints that count as others; both
+shares are summed."""
 MIN_RELATIVE_SCORE = 0.3
 """Least score of a standpoint, relative to the best."""
 
 DISTANCES = (2.5, 4.0, 6.0)
 """Distances of cameras around a place, in its radii."""
+AROUND_NEAR = 0.05
+"""Near plane of the images that are compared, in radii of the place, which begins 1.5 of them from
+the nearest camera. It is small, so that what stands close before a camera hides the place."""
 AZIMUTH_STEP = 20
 ELEVATIONS = (0, 20, 45)
 """Directions of cameras around a place, in degrees."""
@@ -77,7 +82,8 @@ def find_standpoints(
     """Find up to `count` cameras where a photographer may have stood, the best first.
 
     Random cameras inside and around the core, level up to a pitch, are rated by what they see; the
-    best are improved. `side` is the size of their images, in pixels.
+    best are improved. `up` is in world axes, of any length. `side` is the size of their images, in
+    pixels. The cameras have no near plane.
     """
     core = measure_core(scene.means)
     small = thin_gaussians(scene, MAX_PREVIEW_GAUSSIANS)
@@ -123,7 +129,9 @@ def choose_cameras_around_place(
 ) -> list[Camera]:
     """Choose up to `count` cameras that see chosen Gaussians unhidden, from several sides.
 
-    A camera counts by its quality and by the share of the place that it shows.
+    A camera counts by its quality and by the share of the place that it shows. `up` is in world
+    axes, of any length. `side` is the size of their images, in pixels. The cameras have no near
+    plane.
     """
     core = measure_core(scene.means)
     up = normalize(up, dim=0)
@@ -137,7 +145,7 @@ def choose_cameras_around_place(
         distance, azimuth, elevation = place
         aside = make_direction(up, math.radians(azimuth), math.radians(elevation))
         center = middle + distance * radius * aside
-        camera = make_standpoint_camera(center, -aside, up, 0.05 * radius)
+        camera = make_standpoint_camera(center, -aside, up, AROUND_NEAR * radius)
         frozen = renderer.freeze(small, camera)
         # A ball of that radius covers this share of the image.
         expected = math.pi / distance**2 / (4 * half**2)
@@ -164,9 +172,11 @@ def choose_apart(
     count: int,
     min_share: float,
 ) -> list[Camera]:
-    """Choose cameras greedily by score, each as far apart from the others as counts in full.
+    """Choose cameras greedily.
 
-    With a larger `count` the first ones are the same.
+    The gain of a camera is its score times its distance from the nearest chosen one, at most its
+    score (`measure_apart`: 1 or more is another place). None is chosen whose gain is below
+    `min_share` of the best score. With a larger `count` the first ones are the same.
     """
     best = max((one.score for one in found), default=0.0)
     # The gain of a camera is at most its score, so that none of the others is ever chosen.
@@ -203,7 +213,10 @@ def thin_with_values(
 
 
 def sample_camera(core: Core, up: Float[Tensor, "3"], generator: torch.Generator) -> Camera:
-    """Draw a camera in the core or around it, which looks across or at the middle."""
+    """Draw a camera in the core or around it, which looks across or at the middle.
+
+    The numbers are ranges of the search only; results are rated, so none is a limit but `PITCH`.
+    """
 
     def draw(low: float, high: float) -> float:
         return low + (high - low) * torch.rand((), generator=generator).item()
@@ -231,7 +244,10 @@ def shift_camera(
     reach: float,
     generator: torch.Generator,
 ) -> Camera:
-    """Move and turn a camera a little."""
+    """Move and turn a camera a little, the less the smaller `reach` is.
+
+    The numbers are ranges of the search only; results are rated, so none is a limit but `PITCH`.
+    """
     steps = torch.randn((2, 3), generator=generator).to(up)
     center = camera.center + 0.15 * reach * core.radius * steps[0]
     forward = limit_pitch(camera.forward + 0.25 * reach * steps[1], up)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -18,9 +18,11 @@ from gscompleter.apps.live.steps import (
     fill_marked,
     remove_in_box,
     remove_marked,
+    repair_marked,
 )
 from gscompleter.apps.viewer.exhibit import move_scene_camera
 from gscompleter.completer import GSCompleter
+from gscompleter.config import CompleterConfig
 from gscompleter.data.photographs import Resolution
 from gscompleter.data.scene import describe_camera, parse_camera
 from gscompleter.splats.alignment.similarity import transform_camera_exactly
@@ -35,7 +37,9 @@ Action = Literal["complete", "fill", "remove", "repair"]
 UPRIGHT = (1.0, 0.0, 0.0, 0.0)
 """Rotation of a box that is not rotated, as a quaternion wxyz."""
 ELSEWHERE = " “Find a hole” leads to one; what is wrong and not empty has to be painted over."
-UNMARKED = "Nothing is marked: choose Brush or Lasso, and paint over what is meant."
+UNMARKED = "Nothing is marked; paint over what is meant."
+NO_HOLE_MARKED = "The marks touch no hole."
+NO_HOLE_LEFT = "That leaves no hole: what stands behind is shown."
 
 
 @dataclass(frozen=True)
@@ -66,6 +70,7 @@ class Session:
     origin: Float[np.ndarray, "3"]
     """Local origin of the coordinates, in the frame of the photographs."""
     resolution: Resolution = None
+    """Working size at which saved cameras are read; None for their own."""
     steps: tuple[SessionStep, ...] = ()
     """The steps, one for each completion but the first."""
     splat_origin: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
@@ -79,14 +84,20 @@ class Session:
         return self.completions[-1]
 
     @property
+    def first_config(self) -> CompleterConfig:
+        """The settings that the session began with; a removal leaves others, for its place."""
+        return self.completions[0].config
+
+    @property
     def cameras(self) -> tuple[Camera, ...]:
         """Camera of each target that was completed, in the frame of the photographs."""
-        # A step that only removes has no target.
+        # A step that only removes has no target, and one that completed places of what was removed
+        # and other holes has two.
         counts = [len(completion.targets) for completion in self.completions]
         return tuple(
             step.camera
             for step, before, after in zip(self.steps, counts, counts[1:], strict=False)
-            if after > before
+            for _ in range(after - before)
         )
 
     def extended(self, completion: Completion, step: SessionStep) -> Session:
@@ -102,7 +113,7 @@ class Session:
 def save_camera(session: Session, camera: Camera) -> Camera:
     """Move a camera from the frame of the result to that of the photographs, in which it is saved.
 
-    `place_saved_camera` is the inverse.
+    `place_saved_camera` is the inverse up to rounding, for a camera of the working size.
     """
     return transform_camera_exactly(camera, np.linalg.inv(session.transform))
 
@@ -132,19 +143,18 @@ def check_step(step: SessionStep) -> None:
 
 def complete_step(session: Session, step: SessionStep, camera: Camera) -> tuple[Completion, str]:
     """Complete all holes that the camera sees."""
-    # The settings that the session began with: a removal leaves others, for its own hole.
-    first = session.completions[0].config
-    completion = complete_at(session.completer, first, session.latest, camera)
-    changed, text = keep_change(session, completion)
-    if changed is session.latest and text.endswith(NOTHING_TO_COMPLETE):
+    filled = complete_at(session.completer, session.first_config, session.latest, camera)
+    text = describe_results(filled.results)
+    if text.endswith(NOTHING_TO_COMPLETE):
         text += ELSEWHERE
-    return changed, text
+    return filled.completion, text
 
 
 def fill_step(session: Session, step: SessionStep, camera: Camera) -> tuple[Completion, str]:
     """Fill the holes that the marks touch."""
     marked = read_step_marks(step, camera)
-    return keep_change(session, fill_marked(session.completer, session.latest, camera, marked))
+    filled = fill_marked(session.completer, session.first_config, session.latest, camera, marked)
+    return filled.completion, describe_results(filled.results) or NO_HOLE_MARKED
 
 
 def remove_step(session: Session, step: SessionStep, camera: Camera) -> tuple[Completion, str]:
@@ -167,11 +177,16 @@ def remove_step(session: Session, step: SessionStep, camera: Camera) -> tuple[Co
 
 
 def repair_step(session: Session, step: SessionStep, camera: Camera) -> tuple[Completion, str]:
-    """Remove what is marked, and fill its place."""
+    """Remove what is marked, and fill its place, but no hole that was there before."""
     marked = read_step_marks(step, camera)
-    changed, count = remove_marked(session.completer, session.latest, camera, marked)
-    completion = session.completer.advance(changed, camera)
-    text = describe_outcome(completion.targets[-1])
+    filled, count = repair_marked(
+        session.completer, session.first_config, session.latest, camera, marked
+    )
+    completion = filled.completion
+    if not any(result.has_changed_scene for result in filled.results):
+        # The report tells why the place stays empty.
+        completion = replace(completion, targets=(*completion.targets, *filled.results[-1:]))
+    text = describe_results(filled.results) or NO_HOLE_LEFT
     return completion, f"{count:,} Gaussians are removed. {text}"
 
 
@@ -184,11 +199,13 @@ PERFORM: dict[Action, Callable[[Session, SessionStep, Camera], tuple[Completion,
 """Function of each action: the completion after it, and a sentence about what it did."""
 
 
-def keep_change(session: Session, completion: Completion) -> tuple[Completion, str]:
-    """Return the completion, or the latest one if its last target changed nothing."""
-    result = completion.targets[-1]
-    kept = completion if result.has_changed_scene else session.latest
-    return kept, describe_outcome(result)
+def describe_results(results: Sequence[TargetResult]) -> str:
+    """Describe what targets at one camera changed; empty for none.
+
+    What was skipped is told only if nothing else was done.
+    """
+    told = [result for result in results if not result.skip_reason] or results[-1:]
+    return "\n".join(map(describe_outcome, told))
 
 
 def describe_outcome(result: TargetResult) -> str:

@@ -7,7 +7,7 @@ Cameras and marks are in the frame of the result.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -29,7 +29,7 @@ from gscompleter.render.removed import mask_removed
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
 from gscompleter.system.progress import stage
-from gscompleter.target_result import Unfilled
+from gscompleter.target_result import TargetResult, Unfilled
 from gscompleter.types import Camera, merge
 
 NOTHING_MARKED = "The marks show no Gaussian; paint over what the picture shows."
@@ -38,57 +38,148 @@ EMPTY_BOX = "The box contains nothing; drag it, or make it larger."
 BoxNumbers = tuple[float, ...]
 
 
+@dataclass(frozen=True)
+class Filled:
+    """A scene after targets at one camera, one for each kind of hole that it was completed for."""
+
+    completion: Completion
+    """With the targets that changed it, and no others."""
+    results: tuple[TargetResult, ...] = ()
+    """All results, also of targets that changed nothing."""
+
+    def then(self, completed: Completion) -> Filled:
+        """Go on with one more target, the last of `completed`."""
+        result = completed.targets[-1]
+        kept = completed if result.has_changed_scene else self.completion
+        return Filled(kept, (*self.results, result))
+
+
 def complete_at(
     completer: GSCompleter, first: CompleterConfig, state: Completion, camera: Camera
-) -> Completion:
+) -> Filled:
     """Complete all holes that a camera sees; `first` are the settings that the session began with.
 
-    After a removal only its own hole is filled where the camera sees it. Elsewhere all is as it
-    was before the removal.
+    Places of what was removed come first, by the settings of a removal, which know no other holes.
+    If the camera sees others, too, all that is left is then completed as before the removal.
     """
-    if not len(state.source.removed) or sees_removed(completer, state, camera):
-        return completer.advance(state, camera)
-    config = replace(state.config, guards=first.guards, holes=first.holes)
-    completed = completer.advance(replace(state, config=config), camera)
-    return replace(completed, config=state.config)
-
-
-def sees_removed(completer: GSCompleter, state: Completion, camera: Camera) -> bool:
-    """Return True if a camera sees the place of something that was removed."""
-    ranged = state.with_depth_range(camera)
-    return bool(mask_removed(state.source, ranged, completer.renderer).any())
+    places = find_removed_places(completer, state, camera)
+    filled = Filled(state)
+    if places.any():
+        filled = filled.then(completer.advance(state, camera))
+        holes, _ = find_holes(completer, set_apart(first, filled.completion), camera)
+        if not (holes & ~places).any():
+            return filled
+    begun = set_apart(first, filled.completion)
+    return filled.then(rejoin(filled.completion, completer.advance(begun, camera)))
 
 
 def fill_marked(
-    completer: GSCompleter, state: Completion, camera: Camera, marked: Bool[Tensor, "h w"]
+    completer: GSCompleter,
+    first: CompleterConfig,
+    state: Completion,
+    camera: Camera,
+    marked: Bool[Tensor, "h w"],
+) -> Filled:
+    """Fill the holes that marks touch, and no others; no colours change.
+
+    A hole counts as a whole, also where something was removed before a larger one. The settings are
+    those of `complete_at`. Without any hole there are no results.
+    """
+    places = find_removed_places(completer, state, camera)
+    holes, empty = find_holes(completer, set_apart(first, state), camera)
+    if places.any():
+        opened, opened_empty = find_holes(completer, state, camera)
+        holes, empty = holes | opened, empty | opened_empty
+    touched = find_touched(holes, marked)
+    filled = Filled(state)
+    # What is covered without being trusted takes colours alone, and none change here.
+    if not (touched & empty).any():
+        return filled
+    if (touched & empty & places).any():
+        filled = filled.then(fill_region(completer, state, camera, touched))
+    return fill_elsewhere(completer, first, filled, camera, touched & ~places)
+
+
+def fill_elsewhere(
+    completer: GSCompleter,
+    first: CompleterConfig,
+    filled: Filled,
+    camera: Camera,
+    region: Bool[Tensor, "h w"],
+) -> Filled:
+    """Fill holes of a region in which nothing was removed; no colours change."""
+    begun = set_apart(first, filled.completion)
+    _, empty = find_holes(completer, begun, camera)
+    if not (empty & region).any():
+        return filled
+    return filled.then(rejoin(filled.completion, fill_region(completer, begun, camera, region)))
+
+
+def fill_region(
+    completer: GSCompleter, state: Completion, camera: Camera, region: Bool[Tensor, "h w"]
 ) -> Completion:
-    """Fill the holes that marks touch, and no others; no colours change."""
-    # Colours would change all over the image, not only in the marks.
+    """Fill the holes of a completion in a region, by its settings; no colours change."""
+    # Colours would change all over the image, not only in the region.
     config = replace(state.config, recolor=replace(state.config.recolor, iterations=0))
     completed = completer.advance(replace(state, config=config), camera)
+    completed = replace(completed, config=state.config)
     result = completed.targets[-1]
     if not len(result.added):
-        return replace(completed, config=state.config)
+        return completed
 
     # Gaussians are added in the dilated hole mask (decision 037).
-    touched = find_touched(result.hole_mask, marked)
-    region = dilate(touched, config.holes.dilation)
+    holes = result.hole_mask & region
+    dilated = dilate(holes, config.holes.dilation)
     new = [
-        replace(part, gaussians=part.gaussians[look_up(region, part.gaussians, result.target)])
+        replace(part, gaussians=part.gaussians[look_up(dilated, part.gaussians, result.target)])
         for part in completed.added_parts[len(state.added_parts) :]
     ]
     parts = (*state.added_parts, *(part for part in new if len(part)))
-    shown = replace(completed, config=state.config, added_parts=parts)
+    shown = replace(completed, added_parts=parts)
     filled = replace(
         result,
         added=merge([result.added[:0], *(part.gaussians for part in new)]),
         after=completer.scenes.freeze(shown.parts, state.with_depth_range(camera)).render,
-        hole_mask=touched,
+        hole_mask=holes,
+        num_outside=0,
         # Other holes stay empty on purpose.
         unfilled=Unfilled(),
     )
-    targets = (*completed.targets[:-1], filled)
-    return replace(shown, targets=targets)
+    return replace(shown, targets=(*completed.targets[:-1], filled))
+
+
+def set_apart(first: CompleterConfig, state: Completion) -> Completion:
+    """Return a completion with the settings and the trust that hold where nothing was removed."""
+    if state.trust_elsewhere is None:
+        return state
+    return replace(state, config=first, trust=state.trust_elsewhere)
+
+
+def rejoin(state: Completion, completed: Completion) -> Completion:
+    """Return what was completed by `set_apart` with the settings and the trust of a removal."""
+    if state.trust_elsewhere is None:
+        return completed
+    return replace(
+        completed, config=state.config, trust=state.trust, trust_elsewhere=completed.trust
+    )
+
+
+def find_removed_places(
+    completer: GSCompleter, state: Completion, camera: Camera
+) -> Bool[Tensor, "h w"]:
+    """Find the places of what was removed from the context, as a camera sees them."""
+    if not len(state.source.removed):
+        size = (camera.height, camera.width)
+        return torch.zeros(size, dtype=torch.bool, device=state.context.means.device)
+    return mask_removed(state.source, state.with_depth_range(camera), completer.renderer)
+
+
+def find_holes(
+    completer: GSCompleter, state: Completion, camera: Camera
+) -> tuple[Bool[Tensor, "h w"], Bool[Tensor, "h w"]]:
+    """Find the holes that a camera sees by the settings of a completion, and the empty ones."""
+    view = completer.observe(state, camera)
+    return view.camera.crop(view.holes), view.camera.crop(view.empty)
 
 
 def find_touched(holes: Bool[Tensor, "h w"], marked: Bool[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
@@ -98,10 +189,43 @@ def find_touched(holes: Bool[Tensor, "h w"], marked: Bool[Tensor, "h w"]) -> Boo
     return holes & torch.isin(labels, labels[marked])
 
 
+def repair_marked(
+    completer: GSCompleter,
+    first: CompleterConfig,
+    state: Completion,
+    camera: Camera,
+    marked: Bool[Tensor, "h w"],
+) -> tuple[Filled, int]:
+    """Remove what marks show, count it, and fill its place, but no hole that was there before.
+
+    The place of an addition is what it alone had covered: before a surface that is none.
+    """
+    changed, count = remove_marked(completer, state, camera, marked)
+    before, places = (find_removed_places(completer, one, camera) for one in (state, changed))
+    place = marked | (places & ~before)
+    filled = Filled(changed)
+    if (places & place).any():
+        holes, _ = find_holes(completer, changed, camera)
+        if not (holes & before & ~place).any():
+            filled = filled.then(completer.advance(changed, camera))
+        elif (holes & place).any():
+            filled = filled.then(fill_region(completer, changed, camera, place))
+    if len(changed.added) == len(state.added):
+        return filled, count
+    # Additions were removed, too, and so may have been elsewhere.
+    covered, opened = (
+        find_holes(completer, set_apart(first, one), camera)[1] for one in (state, changed)
+    )
+    return fill_elsewhere(completer, first, filled, camera, opened & ~covered & ~places), count
+
+
 def remove_marked(
     completer: GSCompleter, state: Completion, camera: Camera, marked: Bool[Tensor, "h w"]
 ) -> tuple[Completion, int]:
-    """Remove what marks show, as `repair` does, and count it; its place is a hole from then on."""
+    """Remove what marks show, as `repair` does, and count it.
+
+    The place of what is removed from the context is a hole from then on.
+    """
     ranged = state.with_depth_range(camera)
     with stage("removing"):
         chosen = find_marked(state.scene, [ranged], [marked], completer.renderer)
@@ -155,12 +279,15 @@ def remove_chosen(
         raise InputError(nothing)
 
     # What is removed from the context is marked, so that its hole may be filled. What was added is
-    # simply taken out.
+    # simply taken out: its place is as it was before, and has no settings of a removal.
     left = tuple(
         replace(part, gaussians=part.gaussians[~mask])
         for part, mask in zip(state.added_parts, added, strict=True)
     )
-    begun = replace(state, added_parts=left, config=config)
+    has_context = bool(context.any())
+    begun = replace(state, added_parts=left, config=config if has_context else state.config)
+    if not has_context and not len(state.source.removed):
+        return begun, sum(int(mask.sum()) for mask in added)
     changed = remove_gaussians(begun, context, contains, completer.scenes)
     gone = changed.source.gone_mask & ~state.source.gone_mask
     count = sum(int(mask.sum()) for mask in (gone, *added))

@@ -11,7 +11,7 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gscompleter.apps.report.pictures import join_images
-from gscompleter.render.lod import MAX_GAUSSIANS, MAX_PREVIEW_GAUSSIANS, thin_gaussians
+from gscompleter.render.lod import DEFAULT_THINNED, MAX_PREVIEW_GAUSSIANS, thin_gaussians
 from gscompleter.render.outside import DISTANCE, list_outside_cameras, measure_extent
 from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map
@@ -118,7 +118,7 @@ def draw_removal_rows(
     given: Gaussians, removed: Bool[Tensor, "n"], cameras: Sequence[Camera], renderer: Renderer
 ) -> Float[Tensor, "h w 3"]:
     """Draw a row for each camera: before, what goes in red over a dim grey, and after."""
-    kept, gone = split_thinned(given, removed, MAX_GAUSSIANS)
+    kept, gone = split_thinned(given, removed, DEFAULT_THINNED)
     both = merge([kept, gone])
     goes = mark_last(both, len(gone)).to(both.means)
     rows = []

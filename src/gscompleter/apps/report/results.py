@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -14,7 +15,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
 from gscompleter.apps.inputs.splat import locate_splat
 from gscompleter.apps.inputs.task import InputSplatFile, Target
@@ -40,6 +40,7 @@ from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
 from gscompleter.splats.edits import EDITS, EditDraft
 from gscompleter.splats.formats import load_splat
+from gscompleter.splats.layout import has_same_values
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value, require_path
 from gscompleter.system.files.output_folder import open_output_folder
@@ -72,26 +73,42 @@ VALUES_FORMAT = "python"
 
 @dataclass(frozen=True)
 class Judged:
-    """A finished completion with the photographs that score it."""
+    """A completion, with its surroundings restored after a removal, and what scores it."""
 
     completion: Completion
     targets: Sequence[Target]
     held_out: Sequence[HeldOut]
+    """Photographs that were not used, without those at targets."""
     renderer: Renderer
 
     @property
     def cameras(self) -> tuple[Camera, ...]:
-        """Cameras of all photographs."""
-        photos = [photo.view.camera for photo in self.completion.photos]
-        return (*photos, *(photograph.view.camera for photograph in self.held_out))
+        """Cameras of all photographs, those of targets included, in the order of their frames.
+
+        It is that of the command, so that coverage is measured from the same places.
+        """
+        photos = [photo.view for photo in self.completion.photos]
+        unused = [
+            *(target.view for target in self.targets if target.view is not None),
+            *(photograph.view for photograph in self.held_out),
+        ]
+        # A photograph that checked the splat, in a smaller size, may be among the unused ones.
+        known = {view.frame for view in unused} - {None}
+        views = [*(view for view in photos if view.frame not in known), *unused]
+        # Those without a frame come last, as they were given.
+        views.sort(key=lambda view: math.inf if view.frame is None else view.frame)
+        return tuple(view.camera for view in views)
 
 
 def prepare_judged(completion: Completion, unused_views: Sequence[View]) -> Judged:
-    """Finish a removal, and tell photographs of targets from others; raises as `judge`."""
+    """Finish a removal that is not yet restored, and tell photographs of targets from others.
+
+    Raises InputError if an unused view is none, or is a part of the context.
+    """
     held_out = prepare_held_out(completion, unused_views)
     renderer = load_renderer(completion.context.means.device.type)
-    # After a removal, photographs must look as before where they do not show what was removed.
-    # Without one this returns the completion as it is.
+    # After a removal, photographs must look as before where they do not show what was removed. What
+    # `gsc.remove` returns is restored already, and is written as it is.
     completion = restore_surroundings(completion, renderer)
 
     targets = []
@@ -108,6 +125,8 @@ def prepare_judged(completion: Completion, unused_views: Sequence[View]) -> Judg
     return Judged(completion, targets, others, renderer)
 
 
+@show_in_notebook()
+@run_in_plain_torch
 def score_result(completion: Completion, unused_views: Sequence[View]) -> dict[str, Any]:
     """Score a completion: the verdict, coverage, photographs and targets; see `Completion`."""
     judged = prepare_judged(completion, unused_views)
@@ -183,7 +202,12 @@ def write_result(folder: Path, judged: Judged, splat_file: InputSplatFile | None
 
 
 def describe_judged(judged: Judged, splat_file: InputSplatFile | None) -> Mapping[str, Any]:
-    """Describe the input and the settings for `summary.json`, as `describe_run_values` does."""
+    """Describe the input and the settings for `summary.json`, as `describe_run_values` does.
+
+    What only a command is told is missing: format, frames and context of a folder, the use of
+    masks, of given depth and of refined poses, and the change of these. `near` and `far` are those
+    that were used, which the command has in `depth_range` alone if it found them.
+    """
     completion = judged.completion
     camera = completion.views[0].camera
     origin = np.array(completion.context.origin or (0.0, 0.0, 0.0))
@@ -219,15 +243,19 @@ def describe_judged(judged: Judged, splat_file: InputSplatFile | None) -> Mappin
 
 
 def find_splat_file(path: Path, completion: Completion) -> InputSplatFile:
-    """Describe the file of a given scene; raise InputError if it holds another one."""
+    """Describe the file of a given scene; raise InputError if it holds another one.
+
+    All values count, since the file's own rows are written again. Rows that are not finite may have
+    been dropped when it was loaded.
+    """
     if not os.path.isfile(path):
         raise InputError(f"There is no splat {quote_value(path)}; name the file of the scene.")
     context = completion.context
     # It was completed as it is, and perhaps relative to another origin.
-    loaded = load_splat(path, ignore_properties=True).move_origin(context.origin)
-    if len(loaded) != len(context) or not torch.equal(loaded.means, context.means.cpu()):
+    loaded = load_splat(path, drop_nonfinite=True, ignore_properties=True)
+    if not has_same_values(loaded.move_origin(context.origin), context.to("cpu")):
         raise InputError(
             f"{quote_value(path)} holds another scene than the one that was completed; name its "
             "own file, or none."
         )
-    return locate_splat(path, drop_nonfinite=False)
+    return locate_splat(path, drop_nonfinite=True)

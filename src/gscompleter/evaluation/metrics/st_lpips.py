@@ -27,8 +27,8 @@ LAYERS = (
     ("slice4.11", 1, None),
     ("slice5.13", 1, None),
 )
-"""Name and padding of each convolution, and where it is halved: between it and its rectifier, or
-before it, after a maximum over 3 x 3 pixels."""
+"""Name and padding of each convolution, and when the size is halved: `before` its rectifier; `after
+pooling`, before the convolution, behind a maximum over 3 x 3 pixels; or never."""
 MIN_NETWORK_SIDE = 21
 """Shortest side of an image of which the third layer can still be halved, in pixels."""
 
@@ -72,7 +72,10 @@ def compute_features(images: Float[Tensor, "n 3 h w"], weights: Weights) -> list
 
 
 def halve_smoothly(values: Float[Tensor, "n c h w"]) -> Float[Tensor, "n c half_h half_w"]:
-    """Halve the size after a binomial filter of 3 x 3 pixels, with 2 mirrored ones around."""
+    """Halve the size after a binomial filter of 3 x 3 pixels, with 2 mirrored ones around.
+
+    n pixels become (n + 1) // 2 + 1, as in the authors' code.
+    """
     line = values.new_tensor([1.0, 2.0, 1.0]) / 4
     channels = values.shape[1]
     kernel = (line[:, None] * line).expand(channels, 1, 3, 3)

@@ -40,7 +40,9 @@ def contradicts_stereo(image: StereoImage, stereo: Measurement) -> bool:
     """
     if not is_dense(image):
         return False
-    errors = compare_in_hidden_blocks(image.given, stereo.resize_to(image.size), image.image)
+    full = stereo.resize_to(image.size)
+    # A pixel without a given depth has an inverse depth of 0.
+    errors = compare_in_hidden_blocks(image.given, image.given > 0, full, image.image)
     # Where stereo measures too little, the given depth is believed.
     return errors is not None and errors.ratio > MAX_GIVEN_RATIO
 

@@ -63,13 +63,18 @@ class BlockErrors:
     """With the surfaces continued from around the blocks."""
 
     @property
+    def is_anchored(self) -> bool:
+        """True if a positive scale brings the depth to stereo."""
+        return math.isfinite(self.supported)
+
+    @property
     def ratio(self) -> float:
         """Error with the depth over that without it; below 1 the depth tells more."""
         return self.supported / max(self.continued, 1e-9)
 
 
 def anchor_depth(guess: Map, measured: Measurement, anchors: Mask) -> Map | None:
-    """Bring inverse depths, 0 where unknown, to the measured ones at the pixels of `anchors`.
+    """Bring inverse depths, 0 at infinity, to the measured ones at the pixels of `anchors`.
 
     RANSAC fits scale and shift; the ratio that is left is interpolated smoothly. None if no
     positive scale fits: far things would be near, or nothing would be nearer than anything else.
@@ -104,14 +109,16 @@ def support(measured: Measurement, inverse: Map, known: Mask) -> Measurement:
 
 def compare_in_hidden_blocks(
     guess: Map,
+    known: Mask,
     measured: Measurement,
     image: ColorImage,
     iterations: int = SMOOTHING_ITERATIONS // 2,
 ) -> BlockErrors | None:
-    """Compare what inverse depths, 0 where unknown, tell about hidden blocks of stereo.
+    """Compare what inverse depths tell about hidden blocks of stereo.
 
-    Against them stand the surfaces that are continued without them. Every measured block is hidden
-    once. None if too little is measured to compare with.
+    They are used at `known` pixels, and are 0 at infinity. Against them stand the surfaces that are
+    continued without them. Every measured block is hidden once. None if too little is measured to
+    compare with.
     """
     # The blocks grow with the image, so that small ones test the same.
     step = max(1, min(guess.shape) // TEST_SIDE)
@@ -123,9 +130,9 @@ def compare_in_hidden_blocks(
         ),
     )
     guess = np.ascontiguousarray(guess[::step, ::step])
+    known = np.ascontiguousarray(known[::step, ::step])
     image = np.ascontiguousarray(image[::step, ::step])
 
-    known = guess > 0
     sure = known & (measured.confidence >= MIN_CONFIDENCE)
     if sure.sum() < MIN_SURE_SHARE * known.sum():
         return None
