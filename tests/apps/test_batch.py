@@ -634,4 +634,4 @@ def test_the_page_of_a_batch_leads_with_outcomes_and_not_with_seconds(tmp_path):
     assert "The scene is completed; it gained." in page
     assert "20.0 → 23.0" in page
     assert "43.27" not in page
-    assert "A job took 43 s (median)" in page
+    assert "A job that is done took 43 s (median)" in page
