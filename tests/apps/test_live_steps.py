@@ -1,4 +1,4 @@
-"""Which holes the steps of a session fill, after removals as well."""
+"""Fill the holes that a step of a session is about, also after removals."""
 
 from __future__ import annotations
 

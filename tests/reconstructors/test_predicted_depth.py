@@ -129,7 +129,7 @@ def test_a_prediction_without_near_and_far_changes_nothing():
 
 
 def test_infinity_is_tested_as_any_other_depth():
-    """What is far away where stereo sees a surface is as wrong at infinity as short of it."""
+    """Judge an infinite depth as a very large one: stereo measures a surface there."""
     refusals = []
     for inverse in (0.0, 1e-6):
         wrong = np.where((X + Y) % 0.2 < 0.1, np.float32(inverse), 1 / TRUE).astype(np.float32)

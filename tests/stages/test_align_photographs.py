@@ -73,7 +73,7 @@ def test_depths_that_only_a_shift_explains_get_one():
 
 
 def test_a_photograph_with_little_to_compare_does_not_decide_for_itself():
-    """Of the last photograph only a strip of wall is compared, whose depths have another slope."""
+    """Fit all photographs together: depths of the last one, a strip of wall, have another slope."""
     scene = everywhere(EMPTY)
     strip = torch.zeros(SIZE, SIZE, dtype=torch.bool)
     strip[:, :6] = True

@@ -275,16 +275,12 @@ def find_revealed(
     views = [photo.view for photo in state.photos]
     frozen = scenes.freeze_at((others, inner, outer, *added), [view.camera for view in views])
     before = gather_observations(uncolored, views, frozen, state.config.trust_settings)
+    # Each photograph may hold a million sorted Gaussians; the rounds below make others.
     del frozen
     confirmed_area = (before.areas * before.agreement).amax(dim=0)
-    areas = before.areas.clone()
-    revealed = gone
     # A round reveals the next layer: what is behind it was hidden until then.
     for _ in range(MAX_LAYERS):
-        # A photograph that showed none of what went last shows what it did.
-        changed = [k for k, area in enumerate(areas) if area[revealed].any()]
-        parts = (uncolored.hide(gone), *added)
-        areas[changed] = measure_areas(parts, [views[k] for k in changed], scenes)
+        areas = measure_areas((uncolored.hide(gone), *added), views, scenes)
         largest = areas.amax(dim=0)
         revealed = (areas - before.areas).amax(dim=0) > MIN_REVEALED * largest
         # What a photograph showed before, in the right colours, was trained on and stays.

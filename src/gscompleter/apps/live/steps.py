@@ -89,7 +89,8 @@ def fill_marked(
     holes, empty = find_holes(completer, set_apart(first, state), camera)
     if places.any():
         opened, opened_empty = find_holes(completer, state, camera)
-        holes, empty = holes | opened, empty | opened_empty
+        holes = holes | opened
+        empty = empty | opened_empty
     touched = find_touched(holes, marked)
     filled = Filled(state)
     # What is covered without being trusted takes colours alone, and none change here.

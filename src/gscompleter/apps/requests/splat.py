@@ -21,8 +21,8 @@ class SplatRequest:
     forget_edits: bool = False
     """True to use photographs also where they show what earlier edits took out."""
     beside: Path | None = None
-    """Where, beside the results, a large splat keeps its colours in a temporary file; None to keep
-    them in memory."""
+    """Keep the harmonics of a large splat in a temporary file in this folder, that of the results;
+    None to keep them in memory."""
 
 
 @dataclass(frozen=True)
