@@ -93,6 +93,13 @@ def test_a_photograph_that_is_gone_is_left_out(scene, tmp_path, monkeypatch, cap
     assert len(content["frames"]) == len(CAMERAS) - 1
 
 
+def test_a_scene_without_any_photograph_is_refused(scene, tmp_path, monkeypatch, capsys):
+    for frame in open_photographs(scene).frames:
+        frame.file.path.unlink()
+    assert run(monkeypatch, "poses", scene, "--out", tmp_path / "out") == 2
+    assert "None of the photographs" in capsys.readouterr().err
+
+
 def test_photographs_that_colmap_left_out_are_not_called_refined(room):
     some = given_poses.RefinedCameras(room, replace(DONE, photographs=1), "")
     assert "cameras of 1 of 2 photographs are refined" in some.describe(Path("out"))

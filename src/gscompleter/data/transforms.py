@@ -242,13 +242,17 @@ def describe_transforms(photographs: Photographs, home: Path) -> dict[str, Any]:
     """Describe the cameras of the photographs that exist for nerfstudio, in their files' frame.
 
     Paths of photographs and masks are relative to `home`, the folder that the file is for, or
-    absolute on another drive. Depth and points are not named. Raises InputError for photographs
-    inside a container, masks whose white hides, lenses that the format does not have, and fisheye
-    beside other lenses.
+    absolute on another drive. Depth and points are not named. Raises InputError if no photograph
+    exists, for photographs inside a container, masks whose white hides, lenses that the format does
+    not have, and fisheye beside other lenses.
     """
     # A path with .. that passes a link leads to another place than its words say.
     home = Path(os.path.realpath(home))
     frames = [describe_frame(photographs.frame(number), home) for number in photographs.present]
+    require(
+        bool(frames),
+        f"None of the photographs of {photographs.title} is there; put them where it names them.",
+    )
     models = {frame["camera_model"] for frame in frames}
     require(
         len(models) == 1,
