@@ -23,6 +23,7 @@ from gscompleter.apps.requests.completion import FillingRequest
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, join_names, print_error
 from gscompleter.system.files.overlap import refuse_overlap
+from gscompleter.system.jobs.claims import claim_share
 from gscompleter.system.jobs.jobs import (
     JOBS,
     Engine,
@@ -58,8 +59,6 @@ class PreparedBatch:
     """A job for each row."""
     share: Sequence[Job]
     """Those of this process; all without `--shard`."""
-    left: Sequence[Job]
-    """Those of the share without a result, and failures that are repeated."""
 
 
 def complete_batch(request: BatchRequest, decide_row: DecideRow) -> int:
@@ -77,7 +76,9 @@ def complete_batch(request: BatchRequest, decide_row: DecideRow) -> int:
             names = join_names([path.name for path in results], MAX_NAMED_FAILURES)
             console.print(f"Left out, as results and no scenes: {names}.", soft_wrap=True)
 
-        run_left_jobs(batch, request.retries, decide_row, console)
+        with claim_share(batch.out, request.engine.share):
+            left = find_missing_jobs(batch.share, batch.out, request.repeats_failures)
+            run_jobs_left(batch, left, request.retries, decide_row, console)
         with show_preparation("table"):
             write_batch_results(batch.out, batch.jobs)
 
@@ -85,7 +86,7 @@ def complete_batch(request: BatchRequest, decide_row: DecideRow) -> int:
     rows = [row for job in batch.share if (row := read_row(job, batch.out)) is not None]
     failed = [row for row in rows if row["state"] == "failed"]
     print_failures(console, [f"{row['job']}: {row['reason']}" for row in failed], len(batch.share))
-    summary = summarize_share({row["job"] for row in failed}, batch.share, batch.left)
+    summary = summarize_share({row["job"] for row in failed}, batch.share, left)
     console.print(f"{summary} All results: {request.out}/index.html", soft_wrap=True)
     if request.answer.json:
         print_json({"out": str(request.out), "failed": len(failed), "rows": rows})
@@ -93,10 +94,7 @@ def complete_batch(request: BatchRequest, decide_row: DecideRow) -> int:
 
 
 def prepare_batch(request: BatchRequest) -> PreparedBatch:
-    """Read the manifest, claim the output folder, and find the jobs that are left.
-
-    The rows of failures that are to be repeated are removed.
-    """
+    """Read the manifest, and claim the output folder for results of this kind."""
     share_number, num_shares = request.engine.share
     jobs = read_manifest(request.manifest, request.common, request.out)
     refuse_overlap(request.out, list_input_paths(jobs))
@@ -105,22 +103,24 @@ def prepare_batch(request: BatchRequest) -> PreparedBatch:
     engine = make_engine(request.engine, out)
     claim_folder(out, "batch", {"version": 1, "kind": "batch"})
 
-    share = jobs[share_number::num_shares]
-    left = find_missing_jobs(share, out, request.repeats_failures)
-    return PreparedBatch(out=out, engine=engine, jobs=jobs, share=share, left=left)
+    return PreparedBatch(out=out, engine=engine, jobs=jobs, share=jobs[share_number::num_shares])
 
 
-def run_left_jobs(
-    batch: PreparedBatch, retries: int, decide_row: DecideRow, console: Console
+def run_jobs_left(
+    batch: PreparedBatch,
+    left: Sequence[Job],
+    retries: int,
+    decide_row: DecideRow,
+    console: Console,
 ) -> None:
-    """Run the jobs that are left, and print a line as each of them ends.
+    """Run the jobs of a batch that are left, and print a line as each of them ends.
 
     A job is tried `retries` times more if its process was killed or it failed unexpectedly.
     """
     out = batch.out
     perform = partial(perform_job, out=out, retries=retries, decide_row=decide_row)
-    ended = run_jobs(batch.left, perform, partial(has_row, out=out), batch.engine, retries)
-    total = len(batch.left)
+    ended = run_jobs(left, perform, partial(has_row, out=out), batch.engine, retries)
+    total = len(left)
     for number, job in enumerate(track(ended, "completing", total, has_lines=False), start=1):
         state = describe_state(read_row(job, out))
         console.print(f"{number} of {total}: {job.name}, {state}", soft_wrap=True)

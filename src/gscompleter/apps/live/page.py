@@ -60,7 +60,7 @@ class Outcome:
     """Camera to go to, in the frame of the result; None to stay."""
 
 
-FindHole = Callable[[Completion], Camera | None]
+FindHole = Callable[[Session], Camera | None]
 Save = Callable[[Session], str]
 
 
@@ -163,7 +163,7 @@ class LivePage:
 
     def find(self, request: PageRequest) -> Outcome:
         """Find the camera with the most to gain, for the page that asks."""
-        camera = self._find_hole(self.session.latest)
+        camera = self._find_hole(self.session)
         return Outcome(NO_HOLE) if camera is None else Outcome(FOUND_HOLE, camera)
 
     def save(self, request: PageRequest) -> Outcome:

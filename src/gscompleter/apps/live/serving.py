@@ -27,6 +27,7 @@ from gscompleter.apps.live.saving import (
 )
 from gscompleter.apps.live.server import LiveServer
 from gscompleter.apps.live.session import Session
+from gscompleter.apps.live.steps import set_apart
 from gscompleter.apps.live.strokes import list_steps
 from gscompleter.apps.report.results import COMPLETE_COMMAND
 from gscompleter.apps.viewer import packages
@@ -34,7 +35,6 @@ from gscompleter.apps.viewer.exhibit import ViewerCamera, ViewerContent, shrink_
 from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.apps.viewer.page import make_page
 from gscompleter.data.photograph_names import name_photograph
-from gscompleter.state import Completion
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.image import convert_to_pixels
@@ -119,7 +119,7 @@ def build_page(
         session,
         page,
         PageScene(scene),
-        lambda completion: find_next_target(ready, completion),
+        lambda session: find_next_target(ready, session),
         lambda session: save_session(prepared, session),
         journal,
     )
@@ -140,7 +140,13 @@ def serve(request: LiveRequest, page: LivePage) -> None:
     server.close()
 
 
-def find_next_target(ready: Prepared, completion: Completion) -> Camera | None:
-    """Find the next-best target camera."""
-    choices = ready.explorer.plan(completion, list(ready.cameras.values()), 1)
-    return choices[0].camera if choices else None
+def find_next_target(ready: Prepared, session: Session) -> Camera | None:
+    """Find the next-best target camera: first for what was removed, then for other holes."""
+    # The settings of a removal know no other holes.
+    removal = session.latest
+    elsewhere = set_apart(session.first_config, removal)
+    for state in (removal,) if elsewhere is removal else (removal, elsewhere):
+        choices = ready.explorer.plan(state, list(ready.cameras.values()), 1)
+        if choices:
+            return choices[0].camera
+    return None

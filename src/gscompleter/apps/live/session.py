@@ -40,6 +40,8 @@ ELSEWHERE = " “Find a hole” leads to one; what is wrong and not empty has to
 UNMARKED = "Nothing is marked; paint over what is meant."
 NO_HOLE_MARKED = "The marks touch no hole."
 NO_HOLE_LEFT = "That leaves no hole: what stands behind is shown."
+NOTHING_MARKED = "The marks show no Gaussian; paint over what the picture shows."
+EMPTY_BOX = "The box contains nothing; drag it, or make it larger."
 
 
 @dataclass(frozen=True)
@@ -163,11 +165,15 @@ def remove_step(session: Session, step: SessionStep, camera: Camera) -> tuple[Co
     if step.box is None:
         marked = read_step_marks(step, camera)
         changed, count = remove_marked(completer, session.latest, camera, marked)
+        if not count:
+            return session.latest, NOTHING_MARKED
         return changed, f"{count:,} Gaussians are removed; fill their place, or undo."
 
     changed, count = remove_in_box(
         completer, session.latest, step.box, step.box_rotation, session.splat_origin
     )
+    if not count:
+        return session.latest, EMPTY_BOX
     corners = " ".join(format_corners(step.box[:3], step.box[3:]))
     rotation = " ".join(f"{number:.4g}" for number in step.box_rotation)
     return changed, (
@@ -182,6 +188,8 @@ def repair_step(session: Session, step: SessionStep, camera: Camera) -> tuple[Co
     filled, count = repair_marked(
         session.completer, session.first_config, session.latest, camera, marked
     )
+    if not count:
+        return session.latest, NOTHING_MARKED
     completion = filled.completion
     if not any(result.has_changed_scene for result in filled.results):
         # The report tells why the place stays empty.

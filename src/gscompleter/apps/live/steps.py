@@ -27,13 +27,9 @@ from gscompleter.numerics.image_ops import dilate, label_regions
 from gscompleter.planning.remove import contain_nothing
 from gscompleter.render.removed import mask_removed
 from gscompleter.state import Completion
-from gscompleter.system.errors import InputError
 from gscompleter.system.progress import stage
 from gscompleter.target_result import TargetResult, Unfilled
 from gscompleter.types import Camera, merge
-
-NOTHING_MARKED = "The marks show no Gaussian; paint over what the picture shows."
-EMPTY_BOX = "The box contains nothing; drag it, or make it larger."
 
 BoxNumbers = tuple[float, ...]
 
@@ -202,6 +198,8 @@ def repair_marked(
     The place of an addition is what it alone had covered: before a surface that is none.
     """
     changed, count = remove_marked(completer, state, camera, marked)
+    if not count:
+        return Filled(state), 0
     before, places = (find_removed_places(completer, one, camera) for one in (state, changed))
     place = marked | (places & ~before)
     filled = Filled(changed)
@@ -236,9 +234,7 @@ def remove_marked(
         context = torch.zeros_like(state.source.gone_mask)
         context[~state.source.gone_mask] = kept
         config = state.config.for_marks()
-        return remove_chosen(
-            completer, state, config, context, added, contain_nothing, NOTHING_MARKED
-        )
+        return remove_chosen(completer, state, config, context, added, contain_nothing)
 
 
 def remove_in_box(
@@ -260,7 +256,7 @@ def remove_in_box(
         context = contains(state.context.means) & ~state.source.gone_mask
         added = [contains(part.means) for part in state.parts[1:]]
         config = state.config.for_removal()
-        return remove_chosen(completer, state, config, context, added, contains, EMPTY_BOX)
+        return remove_chosen(completer, state, config, context, added, contains)
 
 
 def remove_chosen(
@@ -270,14 +266,13 @@ def remove_chosen(
     context: Bool[Tensor, "n"],
     added: Sequence[Bool[Tensor, "_m"]],
     contains: Region,
-    nothing: str,
 ) -> tuple[Completion, int]:
-    """Remove chosen Gaussians of the context and of each added part; `nothing` refuses none.
+    """Remove chosen Gaussians of the context and of each added part, and count them.
 
     Gaussians of the context that only they hid go with them, and are counted.
     """
     if not any(bool(mask.any()) for mask in (context, *added)):
-        raise InputError(nothing)
+        return state, 0
 
     # What is removed from the context is marked, so that its hole may be filled. What was added is
     # simply taken out: its place is as it was before, and has no settings of a removal.

@@ -1,0 +1,59 @@
+"""Claims of jobs: no two commands run the same jobs of a folder at once."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.unfinished import (
+    LEASE_SECONDS,
+    give_signs,
+    list_unfinished,
+    make_unfinished_name,
+)
+from gscompleter.system.files.writing import convert_write_errors
+
+CLAIM = "jobs in this folder"
+"""What the unfinished entries of claims are named after."""
+
+
+@contextmanager
+def claim_share(out: Path, share: tuple[int, int]) -> Iterator[None]:
+    """Claim the jobs i, i + n, … of an existing folder during the block, with `share` (i, n).
+
+    Raise InputError if another run, on this machine or elsewhere, claims one of them. Of two that
+    begin at the same moment both may be refused.
+    """
+    claim = out / make_unfinished_name(CLAIM)
+    try:
+        with convert_write_errors(out):
+            claim.write_text(json.dumps(share), "ascii")
+        for entry in list_unfinished(out, CLAIM):
+            # Asked last, as it may have to look at the clock of the disk.
+            if entry.path != claim and overlaps(share, entry.path) and entry.is_running():
+                raise InputError(
+                    f"Another run (process {entry.pid}) is doing jobs of this one in "
+                    f"{quote_value(out)}; wait for its end, or give each run its own shard; if it "
+                    f"was killed, try again in {LEASE_SECONDS / 60:.0f} minutes.",
+                    "shard",
+                )
+        with give_signs(claim):
+            yield
+    finally:
+        claim.unlink(missing_ok=True)
+
+
+def overlaps(share: tuple[int, int], claim: Path) -> bool:
+    """Return True if any job is in a share and in that of a claim; one half written has all."""
+    try:
+        number, count = json.loads(claim.read_bytes())
+    except FileNotFoundError:
+        return False
+    except ValueError:
+        return True
+    # Some k is i modulo n and j modulo m just if gcd(n, m) divides i - j.
+    return (number - share[0]) % math.gcd(count, share[1]) == 0
