@@ -15,7 +15,7 @@ from gscompleter.reconstructors.features.consistency import (
     count_consistent_matches,
     measure_pose_errors,
 )
-from gscompleter.types import Render
+from gscompleter.types import Render, View
 from scenes import Room, camera_at, view_of
 
 ROOM = Room()
@@ -64,6 +64,20 @@ def test_a_small_view_averages_areas_and_keeps_its_rays():
     masked.ignore_mask[0, 1] = True
     assert shrink_view(masked, 48).ignore_mask.nonzero().tolist() == [[0, 0]]
     assert shrink_view(OTHER, 200) is OTHER
+
+
+@pytest.mark.parametrize(("width", "height"), [(640, 427), (1000, 667), (1920, 1280)])
+def test_a_small_view_without_a_mask_ignores_nothing(width, height):
+    camera = replace(OTHER.camera, width=width, height=height)
+    small = shrink_view(View(torch.zeros(height, width, 3), camera))
+    assert small.valid_mask.all()
+
+
+def test_the_best_single_colour_has_a_mean_of_each_channel():
+    green = torch.tensor([0.1, 0.8, 0.1]).expand(OTHER.image.shape)
+    likeness = measure_likeness(render_of(green), replace(OTHER, image=green), [USED.image])
+    assert likeness is not None
+    assert likeness.above_color == pytest.approx(0, abs=1e-6)
 
 
 def test_ssim_of_a_region_is_that_of_its_pixels_alone():

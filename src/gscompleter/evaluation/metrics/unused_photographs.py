@@ -32,25 +32,30 @@ MIN_COVERED = 0.2
 class Likeness:
     """Likeness of a render to an unused photograph, in dB over the covered pixels.
 
-    Each image is compared after fitting its exposure, so that only the content counts.
+    The exposure of the render and of each photograph in use is fitted, so that only the content
+    counts.
     """
 
     above_color: float
-    """PSNR above that of the best single colour."""
+    """PSNR above that of the best single colour, the mean of the covered pixels."""
     above_photograph: float
-    """PSNR above that of the best photograph that was used, which stays as it is."""
+    """PSNR above that of the best photograph that was used, seen from its own camera."""
 
 
 def shrink_view(view: View, side: int = JUDGED_SIDE) -> View:
-    """Shrink a photograph and its camera to `side` pixels, by areas; a smaller one stays."""
+    """Shrink a photograph and its camera to a longer side of `side` pixels, by areas.
+
+    A smaller one stays.
+    """
     camera = shrink_camera(view.camera, side)
     size = camera.width, camera.height
     if size == (view.camera.width, view.camera.height):
         return view
-    valid = resize_by_area(view.valid_mask.float(), size)
+    # A pixel of the small image is ignored if any part of it is. The share that is ignored tells
+    # that exactly: averages of zeros are 0, and those of ones are not always 1 in float32.
+    ignored_share = resize_by_area((~view.valid_mask).float(), size)
     image = resize_by_area(view.image, size)
-    # A pixel of the small image is ignored if any part of it is.
-    return View(image, camera, view.frame, ignore_mask=valid < 1)
+    return View(image, camera, view.frame, ignore_mask=ignored_share > 0)
 
 
 def resize_by_area(pixels: Float[Tensor, "h w *c"], size: tuple[int, int]) -> Float[Tensor, "..."]:
@@ -72,9 +77,11 @@ def measure_likeness(
     truth = photograph.image
     size = photograph.camera.width, photograph.camera.height
     shown = compute_fitted_psnr(render.image, truth, covered)
-    # A render of black is fitted to the best single colour.
-    plain = compute_fitted_psnr(torch.zeros_like(truth), truth, covered)
-    # Left as it is, without a camera: what a photograph of the same place has in common.
+    # The best single colour has the mean of each channel, which no fit of an exposure gives it.
+    colors = truth[covered].double()
+    plain = convert_to_psnr((colors - colors.mean(dim=0)).square().mean())
+    # Not rendered from the camera of the unused photograph: what two photographs of the same place
+    # have in common anyway.
     as_they_are = [
         compute_fitted_psnr(resize_by_area(image, size), truth, covered) for image in used
     ]
