@@ -9,7 +9,11 @@ from torch import Tensor
 
 from gscompleter import GSCompleter
 from gscompleter.config import CompleterConfig
-from gscompleter.guards.dynamic_masks import find_dynamic_masks
+from gscompleter.guards.dynamic_masks import (
+    compare_photographs,
+    find_dynamic_masks,
+    shrink_photo,
+)
 from gscompleter.numerics.geometry import project, sample, unproject
 from gscompleter.state import Completion
 from gscompleter.target_result import TargetResult
@@ -65,6 +69,13 @@ def test_a_room_in_which_nothing_moved_is_trusted():
     cameras = (camera_at(-0.1, size=SIZE), camera_at(0.2, size=SIZE))
     begun = GSCompleter().begin([view_of(Room(), camera) for camera in cameras])
     assert all((~view.static_mask).float().mean() <= 0.005 for view in begun.views)
+
+
+def test_every_pixel_without_a_mask_that_two_photographs_show_is_compared():
+    views = [view_of(Room(), camera_at(x, yaw=yaw)) for x, yaw in ((-0.1, 0), (0.1, 5))]
+    one, other = map(shrink_photo, views, as_seen(views))
+    compared = compare_photographs(one, other, min_difference=0.1)
+    assert torch.equal(compared.valid_mask, compared.in_frame_mask & one.valid_mask)
 
 
 def test_exposure_is_no_contradiction():

@@ -200,8 +200,9 @@ def compare_photographs(photo: SmallPhoto, other: SmallPhoto, min_difference: fl
     pixels, z = project(unproject(photo.depth, photo.camera), other.camera)
     in_frame = is_inside(pixels - IGNORED_BORDER, z, other.camera)
     in_frame &= is_inside(pixels + IGNORED_BORDER, z, other.camera)
-    # Bilinear samples are 1 only if all pixels around are valid.
-    is_valid_there = sample(other.valid_mask[..., None].float(), pixels)[..., 0] == 1
+    # Bilinear samples of what is invalid are 0 only if all pixels around are valid. Those of ones
+    # are not always 1 in float32.
+    is_valid_there = sample((~other.valid_mask)[..., None].float(), pixels)[..., 0] == 0
     known = in_frame & photo.valid_mask & is_valid_there
     visible = known & find_unoccluded(pixels, z, other.depth)
     if int(visible.sum()) < MIN_SHARED_PIXELS:
