@@ -13,11 +13,12 @@ import torch
 from command import run
 from gscompleter import load_ply, save_ply
 from gscompleter.apps.inputs.removal import (
+    describe_masks_in_vain,
     find_by_position,
     find_in_boxes,
     find_in_masks,
     find_in_region,
-    find_masks,
+    find_masks_of,
     widen_regions,
 )
 from gscompleter.apps.report.removal_pictures import find_largest
@@ -227,13 +228,21 @@ def test_boxes_are_rotated_about_their_centres():
 def test_masks_choose_what_lies_in_them(scene, tmp_path):
     photographs, splat = open_photographs(scene), load_ply(scene / "splat.ply")
     cameras = {number: photographs.camera(number) for number in range(len(CAMERAS))}
-    names = [frame.name for frame in photographs.frames]
-    masks = find_masks(write_masks(tmp_path / "masks"), names)
+    masks = find_masks_of(photographs, write_masks(tmp_path / "masks"))
     assert sorted(masks) == [0, 3]
     chosen = find_in_masks(masks, splat, photographs, cameras, None, RENDERER)
     crate = find_in_boxes(splat.means, CRATE, UPRIGHT)
     assert chosen[crate].float().mean() > 0.8
     assert chosen[~crate].float().mean() < 0.05
+
+
+def test_masks_of_photographs_without_a_camera_are_said(scene, tmp_path):
+    photographs = open_photographs(scene)
+    folder = write_masks(tmp_path / "masks")
+    (folder / "typo.png").write_bytes(b"")
+    cameras = {number: photographs.camera(number) for number in (0, 1)}
+    (line,) = describe_masks_in_vain(photographs, cameras, folder)
+    assert line.endswith("are named as no photograph with a camera: 3.png, typo.png.")
 
 
 def test_a_selection_is_found_by_position():
@@ -328,8 +337,7 @@ def test_masks_of_the_fox_choose_the_fox(fox, tmp_path):
         weight = RENDERER.freeze(splat, camera).splat(inside.float())
         name = Path(photographs.frames[number].name).stem
         write_image(tmp_path / f"{name}.png", weight > 0.5)
-    names = [frame.name for frame in photographs.frames]
-    masks = find_masks(tmp_path, names)
+    masks = find_masks_of(photographs, tmp_path)
     chosen = find_in_masks(masks, splat, photographs, cameras, 160, RENDERER)
     seen = torch.zeros(len(splat))
     for camera in cameras.values():

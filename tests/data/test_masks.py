@@ -15,7 +15,13 @@ from exact_room import ExactCamera, make_cameras, write_colmap, write_transforms
 from gscompleter import InputError
 from gscompleter.data.file_names import FolderListings
 from gscompleter.data.formats import open_photographs
-from gscompleter.data.masks import fill_hidden, find_mask, leave_out_masks, load_mask
+from gscompleter.data.masks import (
+    fill_hidden,
+    find_mask,
+    find_masks_in,
+    leave_out_masks,
+    load_mask,
+)
 from gscompleter.data.sfm.poses import list_all_photographs, write_upright
 from gscompleter.system.files.image import ORIENTATION, read_mask
 
@@ -235,12 +241,56 @@ def test_copies_for_colmap_take_their_masks_and_alpha_along(tmp_path):
 def test_a_mask_of_a_named_folder_lies_there_by_path_or_by_name(tmp_path):
     for name in ("a/x.png", "y.jpg.png"):
         save(tmp_path / name, np.zeros((4, 4), np.uint8))
-    found = {
-        name: find_mask(tmp_path / "images" / name, name, FolderListings(), tmp_path)
-        for name in ("a/x.jpg", "b/y.jpg", "z.jpg")
-    }
-    assert found == {
-        "a/x.jpg": tmp_path / "a/x.png",
-        "b/y.jpg": tmp_path / "y.jpg.png",
-        "z.jpg": None,
-    }
+    found = find_masks_in(tmp_path, ["a/x.jpg", "b/y.jpg", "z.jpg"], [None] * 3)
+    assert found == [tmp_path / "a/x.png", tmp_path / "y.jpg.png", None]
+
+
+def make_files(folder: Path, *names: str) -> list[Path]:
+    """Write images of one pixel below a folder, and return their paths."""
+    paths = [folder / name for name in names]
+    for path in paths:
+        save(path, np.zeros((1, 1), np.uint8))
+    return paths
+
+
+def test_no_photograph_is_a_mask_of_itself_or_of_another(tmp_path):
+    names = ["a.jpg", "b/a.jpg", "c.png"]
+    photographs = make_files(tmp_path, *names)
+    assert find_masks_in(tmp_path, names, photographs) == [None, None, None]
+    beside, below = make_files(tmp_path, "a.jpg.png", "b/a.png")
+    assert find_masks_in(tmp_path, names, photographs) == [beside, below, None]
+
+
+@pytest.mark.parametrize("name", ["../images/a.jpg", "..\\images\\a.jpg", "/HOME/images/a.jpg"])
+def test_masks_are_looked_for_in_the_folder_that_was_named(tmp_path, name):
+    name = name.replace("/HOME", str(tmp_path))
+    photographs = make_files(tmp_path, "images/a.jpg")
+    (mask, _) = make_files(tmp_path, "goes/a.png", "images/a.jpg.png")
+    assert find_masks_in(tmp_path / "goes", [name], photographs) == [mask]
+    mask.unlink()
+    assert find_masks_in(tmp_path / "goes", [name], photographs) == [None]
+
+
+def test_a_mask_of_several_photographs_is_refused(tmp_path):
+    names = ["cam0/1.jpg", "cam1/1.jpg"]
+    photographs = make_files(tmp_path / "images", *names)
+    make_files(tmp_path / "masks", "1.png")
+    with pytest.raises(InputError, match=r"1\.png may be the mask of several photographs"):
+        find_masks_in(tmp_path / "masks", names, photographs)
+    same = [photographs[0], photographs[0]]
+    assert None not in find_masks_in(tmp_path / "masks", names, same)
+    names.append("1.jpg")
+    photographs += make_files(tmp_path / "images", "1.jpg")
+    found = find_masks_in(tmp_path / "masks", names, photographs)
+    assert [mask is None for mask in found] == [True, True, False]
+
+
+def test_masks_that_are_named_as_no_photograph_are_said(tmp_path):
+    scene = write_transforms(tmp_path / "room", small_cameras())
+    make_files(tmp_path / "masks", "photo_000.png", "photo_0001.png", "._photo_001.png")
+    photographs = open_photographs(scene).take_masks_of(tmp_path / "masks")
+    (note,) = photographs.notes
+    assert "1 mask in" in note
+    assert note.endswith("is named as no photograph with a camera: photo_0001.png.")
+    (tmp_path / "masks/photo_0001.png").unlink()
+    assert open_photographs(scene).take_masks_of(tmp_path / "masks").notes == ()

@@ -12,7 +12,12 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path, PurePosixPath, PureWindowsPath
 
-from gscompleter.system.files.names import fold_name, make_colmap_name
+from gscompleter.system.files.names import fold_name, is_hidden_name, make_colmap_name
+
+PHOTOGRAPH_ENDINGS = (
+    ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".avif",
+)  # fmt: skip
+"""Endings of photographs, in any case."""
 
 
 class FolderListings:
@@ -66,6 +71,11 @@ def _exists(path: Path) -> bool:
     with suppress(OSError, ValueError):
         return os.path.exists(path)
     return False
+
+
+def is_photograph_name(name: str) -> bool:
+    """Check whether a file is named as a photograph, and not hidden."""
+    return not is_hidden_name(name) and name.lower().endswith(PHOTOGRAPH_ENDINGS)
 
 
 def list_endings(written: str) -> list[str]:

@@ -20,6 +20,7 @@ from gscompleter.data.driving.mmdet3d import has_infos, open_infos
 from gscompleter.data.driving.pandaset import has_pandaset, open_pandaset
 from gscompleter.data.driving.waymo import list_segments, open_waymo
 from gscompleter.data.ego_vehicle import attach_vehicle_detector
+from gscompleter.data.file_names import is_photograph_name
 from gscompleter.data.frame import FOLDERS, describe_moved, describe_unposed
 from gscompleter.data.limits import check_planes, require
 from gscompleter.data.llff import has_llff, open_llff
@@ -35,10 +36,11 @@ from gscompleter.data.real_estate import (
     open_chunks,
 )
 from gscompleter.data.rgbd import has_replica, has_scannet, open_replica, open_scannet
-from gscompleter.data.sfm.poses import PHOTOGRAPH_ENDINGS, is_own, list_unplaced
+from gscompleter.data.sfm.poses import is_own, list_unplaced
 from gscompleter.data.transforms import has_transforms, open_transforms
 from gscompleter.data.unused_files import list_unused
 from gscompleter.system.errors import InputError, join_names, quote_value, require_path
+from gscompleter.system.files.names import is_hidden_name
 from gscompleter.system.files.reading import list_folders
 
 
@@ -166,7 +168,7 @@ def refuse_scenes_below(path: Path) -> None:
 
     if not os.path.isdir(path) or has_image_folder(path):
         return
-    if any(name.lower().endswith(PHOTOGRAPH_ENDINGS) for name in os.listdir(path)):
+    if any(is_photograph_name(name) for name in os.listdir(path)):
         return
 
     # Two levels down: a folder of scenes, or one of such folders.
@@ -194,7 +196,7 @@ def refuse_scenes_below(path: Path) -> None:
 def refuse_unread(path: Path) -> None:
     """Refuse photographs in a file format that is not read, by its name and with the way out."""
     names = sorted(os.listdir(path)) if os.path.isdir(path) else [path.name]
-    unread = [name for name in names if name.lower().endswith(UNREAD)]
+    unread = [name for name in names if not is_hidden_name(name) and name.lower().endswith(UNREAD)]
     if unread:
         raise InputError(
             f"{quote_value(path)} holds {len(unread)} photographs such as "

@@ -20,10 +20,10 @@ from jaxtyping import Bool, UInt8
 from PIL import Image
 
 from gscompleter.data.cameras import has_same_aspect
-from gscompleter.data.file_names import FolderListings
+from gscompleter.data.file_names import FolderListings, is_photograph_name, list_endings
 from gscompleter.data.frame import FOLDERS, MASKS, Frame
 from gscompleter.data.photograph import StoredPhotograph
-from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.image import HALF_OPAQUE, read_mask, turn_upright
 
 MASK_FOLDERS = (MASKS, "mask")
@@ -34,6 +34,8 @@ FORMS = tuple(product(("{}_mask", "{}.mask", "{}-mask"), MASK_ENDINGS))
 """Names of masks by those of their photographs, and their endings."""
 INVERTED = "dynamic_mask_"
 """Beginning of the names of instant-ngp's masks, in which white is ignored."""
+MAX_NAMED_OWNERS = 3
+"""Most photographs, or masks without one, that a sentence names."""
 
 
 def attach_masks(frames: Sequence[Frame]) -> tuple[Frame, ...]:
@@ -62,44 +64,107 @@ class GivenPhotograph:
 def find_given(
     folder: Path, names: Sequence[str], named: Path | None = None
 ) -> list[GivenPhotograph]:
-    """Find photographs of a folder and their masks; `named` is as in `find_mask`."""
+    """Find photographs of a folder and their masks, in the folder `named` by --ignore if any."""
     listings = FolderListings()
+    paths = [folder / name for name in names]
+    if named is None:
+        masks = [find_mask(path, name, listings) for path, name in zip(paths, names, strict=True)]
+    else:
+        masks = find_masks_in(named, names, paths)
     return [
-        GivenPhotograph(name, StoredPhotograph(path), path, find_mask(path, name, listings, named))
-        for name, path in ((name, folder / name) for name in names)
+        GivenPhotograph(name, StoredPhotograph(path), path, mask)
+        for name, path, mask in zip(names, paths, masks, strict=True)
     ]
 
 
-def find_mask_in(folder: Path, name: str, listings: FolderListings) -> Path | None:
-    """Find the mask of the photograph `name` in a folder of masks that the user named."""
-    path = PurePosixPath(name)
-    # Of a/x.jpg: in the folder a of the masks, or else in their folder itself.
-    names = [*list_mask_names(path, is_beside=False)]
-    names += list_mask_names(PurePosixPath(path.name), is_beside=False)
-    found = (listings.find(folder, mask) for mask in names)
-    return next((mask for mask in found if mask is not None and os.path.isfile(mask)), None)
+def find_masks_in(
+    folder: Path, names: Sequence[str], photographs: Sequence[Path | None], option: str = "ignore"
+) -> list[Path | None]:
+    """Find the mask of each photograph in a folder of masks that the user named by an option.
+
+    `photographs` are the files of these `names`, None for one without a file. None of them is a
+    mask. Raises InputError if a mask may be of several photographs.
+    """
+    listings = FolderListings()
+    taken = {os.path.realpath(path) for path in photographs if path is not None}
+
+    def find_one(ending: str) -> Path | None:
+        named = list_mask_names(PurePosixPath(ending), is_beside=False)
+        found = (listings.find(folder, mask) for mask in named)
+        masks = (mask for mask in found if mask is not None and os.path.isfile(mask))
+        return next((mask for mask in masks if os.path.realpath(mask) not in taken), None)
+
+    # By mask: how many folders of the name it lacks, and the number of the photograph.
+    claims: dict[Path, list[tuple[int, int]]] = {}
+    for number, name in enumerate(names):
+        for lacking, ending in enumerate(list_inner_endings(name)):
+            mask = find_one(ending)
+            if mask is not None:
+                claims.setdefault(mask, []).append((lacking, number))
+                break
+
+    masks: list[Path | None] = [None] * len(names)
+    for mask, claimed in claims.items():
+        # 1.png is of 1.jpg rather than of a/1.jpg.
+        least = min(claimed)[0]
+        owners = [number for lacking, number in claimed if lacking == least]
+        # The frames of a file may name a photograph twice.
+        if len({photographs[number] or names[number] for number in owners}) > 1:
+            several = join_names([names[number] for number in owners], MAX_NAMED_OWNERS)
+            raise InputError(
+                f"{quote_value(mask)} may be the mask of several photographs ({several}); put "
+                "masks into folders as the photographs are in.",
+                option,
+            )
+        for number in owners:
+            masks[number] = mask
+    return masks
 
 
-def make_no_mask_error(folder: Path, names: Sequence[str]) -> InputError:
-    """Make the error for a folder of `--ignore` without a mask of a photograph of these names."""
+def list_inner_endings(name: str) -> list[str]:
+    """List the ends of a name, the longest first, that stay inside of the folder they are in."""
+    # As of another machine: no end of such a name begins at the root.
+    return [end for end in list_endings(f"/{name}") if ".." not in PurePosixPath(end).parts]
+
+
+def describe_unnamed_masks(
+    folder: Path, masks: Collection[Path | None], photographs: Collection[Path | None]
+) -> list[str]:
+    """Describe images in a folder of masks that are neither used as `masks` nor `photographs`."""
+    used = {os.path.realpath(path) for path in (*masks, *photographs) if path is not None}
+    # Among photographs, or in a whole scene, most images are meant as something else.
+    home = os.path.realpath(folder) + os.sep
+    if any(path is not None and os.path.realpath(path).startswith(home) for path in photographs):
+        return []
+    files = (
+        Path(place, name)
+        for place, _, names in os.walk(folder)
+        for name in names
+        if is_photograph_name(name)
+    )
+    unused = sorted(path for path in files if os.path.realpath(path) not in used)
+    if not unused:
+        return []
+    count = "1 mask" if len(unused) == 1 else f"{len(unused)} masks"
+    verb = "is" if len(unused) == 1 else "are"
+    shown = join_names([path.relative_to(folder) for path in unused], MAX_NAMED_OWNERS)
+    return [
+        f"{count} in {quote_value(folder)} {verb} named as no photograph with a camera: {shown}."
+    ]
+
+
+def make_no_mask_error(folder: Path, names: Sequence[str], option: str = "ignore") -> InputError:
+    """Make the error for a folder of masks without one of a photograph of these names."""
     example = f", such as {quote_value(PurePosixPath(names[0]).stem)}.png" if names else ""
     return InputError(
         f"{quote_value(folder)} has no mask that is named as a photograph{example}; name the "
         "folder of the masks.",
-        "ignore",
+        option,
     )
 
 
-def find_mask(
-    photograph: Path, name: str, listings: FolderListings, named: Path | None = None
-) -> Path | None:
-    """Find the mask of a photograph; `name` is its path below the scene or its image folder.
-
-    A folder of masks that the user `named` takes the place of all others.
-    """
-    if named is not None:
-        return find_mask_in(named, name, listings)
-
+def find_mask(photograph: Path, name: str, listings: FolderListings) -> Path | None:
+    """Find the mask of a photograph; `name` is its path below the scene or its image folder."""
     # The folder that `name` counts from: as many levels above the photograph as it has parts.
     parts = PurePosixPath(name).parts
     is_plain = not PurePosixPath(name).is_absolute() and ".." not in parts

@@ -13,13 +13,13 @@ import numpy as np
 from jaxtyping import UInt8
 
 from gscompleter.data.cameras import Intrinsics
+from gscompleter.data.file_names import PHOTOGRAPH_ENDINGS
 from gscompleter.data.frame import Frame
 from gscompleter.data.limits import require
 from gscompleter.data.panorama import has_panoramas
 from gscompleter.data.photograph import FULL_FRAME_DIAGONAL, StoredPhotograph
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.sfm.poses import (
-    PHOTOGRAPH_ENDINGS,
     iterate_photographs,
 )
 from gscompleter.system.errors import quote_value

@@ -21,11 +21,16 @@ from PIL import Image
 from torch import Tensor
 
 from gscompleter.data.cameras import compute_fov, compute_undistortion_map, find_pose_defect, remap
-from gscompleter.data.file_names import FolderListings
 from gscompleter.data.frame import Frame
 from gscompleter.data.ignored_regions import IgnoredRegions
 from gscompleter.data.local_origin import choose_local_origin, is_near
-from gscompleter.data.masks import fill_hidden, find_mask_in, find_masked, make_no_mask_error
+from gscompleter.data.masks import (
+    describe_unnamed_masks,
+    fill_hidden,
+    find_masked,
+    find_masks_in,
+    make_no_mask_error,
+)
 from gscompleter.data.moving_boxes import mask_moving
 from gscompleter.numerics.geometry import compute_sparse_depth
 from gscompleter.system.errors import InputError, join_names, quote_value
@@ -125,6 +130,11 @@ class Photographs:
         """Numbers of the frames whose camera is known and whose photograph exists."""
         return [number for number in self.posed if self.frame(number).has_photograph()]
 
+    @property
+    def files(self) -> list[Path | None]:
+        """File of each photograph by frame; None if it has none of its own."""
+        return [None if frame.file is None else frame.file.path for frame in self.frames]
+
     def load_predicted_depth(self, view: View) -> Float[Tensor, "h w"] | None:
         """Load the predicted depth beside a photograph at the size of its view; None without one.
 
@@ -146,15 +156,18 @@ class Photographs:
     def take_masks_of(self, folder: Path) -> Photographs:
         """Return a copy with the masks of a folder in place of its own; alpha stays as it is.
 
-        Raises InputError if none is named as a photograph.
+        A note names images of the folder that are masks of no photograph here. Raises InputError if
+        none is one, or if one may be of several photographs.
         """
-        listings = FolderListings()
-        masks = [find_mask_in(folder, frame.name, listings) for frame in self.frames]
+        names = [frame.name for frame in self.frames]
+        files = self.files
+        masks = find_masks_in(folder, names, files)
         if not any(masks):
-            raise make_no_mask_error(folder, [frame.name for frame in self.frames])
+            raise make_no_mask_error(folder, names)
+        notes = (*self.notes, *describe_unnamed_masks(folder, masks, files))
         pairs = zip(self.frames, masks, strict=True)
         frames = [replace(frame, mask=mask, has_inverted_mask=False) for frame, mask in pairs]
-        return replace(self, frames=tuple(frames))
+        return replace(self, frames=tuple(frames), notes=notes)
 
     def invert_masks(self) -> Photographs:
         """Return a copy whose mask images are read the other way round; alpha stays as it is."""

@@ -12,15 +12,13 @@ from contextlib import suppress
 from fnmatch import fnmatch
 from pathlib import Path
 
+from gscompleter.data.file_names import is_photograph_name
 from gscompleter.data.frame import FOLDERS, Frame
 from gscompleter.data.masks import leave_out_masks
 from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.image import open_image
+from gscompleter.system.files.names import is_hidden_name
 
-PHOTOGRAPHS = (
-    ".jpg", ".jpeg", ".png", ".tif", ".tiff", ".webp", ".bmp", ".heic", ".heif", ".avif",
-)  # fmt: skip
-"""Endings of photographs, in any case."""
 DEPTH_FOLDERS = (
     "depth", "depths", "depth_maps", "depth_map", "depths_any", "depth_any", "mono_depth",
     "sensor_depth", "lowres_depth", "highres_depth", "lidar_depth", "rendered_depth_maps",
@@ -72,7 +70,7 @@ def list_unused(folder: Path, frames: Sequence[Frame], has_found_cameras: bool) 
     """
     if not os.path.isdir(folder):
         return ()
-    names = sorted(name for name in os.listdir(folder) if not name.startswith("."))
+    names = sorted(name for name in os.listdir(folder) if not is_hidden_name(name))
     unused = []
     if not any(frame.depth or frame.predicted_depth for frame in frames):
         kept = [name for name in names if name.casefold() in DEPTH_FOLDERS]
@@ -111,7 +109,7 @@ def _count(folder: Path) -> str:
     """Count the files in a folder, or say that it is a file."""
     if not os.path.isdir(folder):
         return "a file"
-    return f"{sum(not name.startswith('.') for name in os.listdir(folder)):,} files"
+    return f"{sum(not is_hidden_name(name) for name in os.listdir(folder)):,} files"
 
 
 def _matches(name: str, patterns: Sequence[str]) -> bool:
@@ -146,7 +144,7 @@ def _list_without_camera(frames: Sequence[Frame]) -> list[str]:
     for home, used in _list_homes(frames).items():
         if home.name.casefold() not in FOLDERS:
             continue
-        images = [name for name in sorted(os.listdir(home)) if _is_photograph(name)]
+        images = [name for name in sorted(os.listdir(home)) if is_photograph_name(name)]
         # Names are compared as they are on the disk: `used` come from there, too.
         extra = [name for name in leave_out_masks(images) if name not in used]
         extra = [name for name in extra if not _matches(name, DEPTH_FILES)]
@@ -157,7 +155,3 @@ def _list_without_camera(frames: Sequence[Frame]) -> list[str]:
                 f"({join_names(extra, MAX_UNUSED_FILES)})"
             )
     return phrases
-
-
-def _is_photograph(name: str) -> bool:
-    return not name.startswith(".") and name.lower().endswith(PHOTOGRAPHS)

@@ -12,9 +12,10 @@ import re
 from contextlib import suppress
 from pathlib import Path
 
+from gscompleter.data.file_names import is_photograph_name
 from gscompleter.data.formats import find_format
 from gscompleter.data.frame import FOLDERS
-from gscompleter.data.sfm.poses import PHOTOGRAPH_ENDINGS, holds_packed_splat
+from gscompleter.data.sfm.poses import holds_packed_splat
 from gscompleter.splats.packing import ZIP_MAGIC
 from gscompleter.splats.sog import LOD_KEY, LOD_META, META
 from gscompleter.splats.splat_format import list_zip
@@ -106,7 +107,7 @@ def holds_splat_alone(folder: Path) -> bool:
     if find_newest_splat(folder) is None or find_format(folder) not in SPLAT_NEIGHBOURS:
         return False
     names = [name.lower() for name in os.listdir(folder)]
-    return not any(name in FOLDERS or name.endswith(PHOTOGRAPH_ENDINGS) for name in names)
+    return not any(name in FOLDERS or is_photograph_name(name) for name in names)
 
 
 def resolve_splat(path: Path) -> Path:

@@ -9,10 +9,12 @@ from typing import Any
 from rich.console import Console
 
 from gscompleter.apps.completing.preparation import Gone, Prepared, prepare_completion
+from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.inputs.removal import (
     check_removal_masks,
     check_selection,
     contain_points,
+    describe_masks_in_vain,
     select_with_masks,
     widen_regions,
 )
@@ -28,9 +30,13 @@ def prepare_removal(request: RemovalRequest, console: Console) -> Prepared:
     ready = prepare_completion(request.completion, console, place=selection)
     # Masks of photographs were checked when these were opened. Cameras of renders have names only
     # now.
+    photographs = ready.opened.photographs
     if selection.masks is not None and ready.opened.renders_from is not None:
-        names = [frame.name for frame in ready.opened.photographs.frames]
-        check_removal_masks(selection.masks, names, selection.mask_reading)
+        names = [frame.name for frame in photographs.frames]
+        check_removal_masks(selection.masks, names, photographs.files, selection.mask_reading)
+    if selection.masks is not None:
+        unused = describe_masks_in_vain(photographs, ready.cameras, selection.masks)
+        print_lines(console, *unused)
 
     # The request of a removal names a splat.
     assert ready.task.scene is not None

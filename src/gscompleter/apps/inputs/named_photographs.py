@@ -10,10 +10,11 @@ from pathlib import Path, PurePosixPath
 from gscompleter.apps.inputs.task import Target
 from gscompleter.apps.requests.scene import FRAME_NUMBER
 from gscompleter.data.camera_files import is_in_splat_frame
+from gscompleter.data.file_names import PHOTOGRAPH_ENDINGS
 from gscompleter.data.panorama import has_panoramas
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.data.scene import load_cameras
-from gscompleter.data.sfm.poses import PHOTOGRAPH_ENDINGS, list_photograph_files
+from gscompleter.data.sfm.poses import list_photograph_files
 from gscompleter.data.video import is_video
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.names import fold_name, make_colmap_name

@@ -21,7 +21,7 @@ from gscompleter.data.frame import FOLDERS
 from gscompleter.data.limits import check_planes
 from gscompleter.data.mask_checks import read_masks_as_asked, refuse_nothing_to_invert
 from gscompleter.data.mask_reading import MaskReading
-from gscompleter.data.masks import make_no_mask_error
+from gscompleter.data.masks import describe_unnamed_masks, make_no_mask_error
 from gscompleter.data.photographs import check_resolution
 from gscompleter.data.sfm.poses import (
     find_poses,
@@ -89,9 +89,10 @@ def open_scene(
         refuse_missing_photographs(folder, search.named, search.num_frames)
         if request.removal_masks is not None and not is_video(folder):
             names = list_all_photographs(folder)
-            check_removal_masks(request.removal_masks, names, request.removal_reading)
+            files = [folder / name for name in names]
+            check_removal_masks(request.removal_masks, names, files, request.removal_reading)
         if reading.folder is not None:
-            check_ignoring_masks(reading.folder, folder)
+            print_lines(console, *check_ignoring_masks(reading.folder, folder))
         check()
         # A folder of poses with a summary was written by us, and may be continued or replaced.
         kept = search.out / FOUND_POSES_FOLDER
@@ -112,7 +113,9 @@ def open_scene(
     # Masks of what is to be removed may lie in the scene, and are not those of what to ignore.
     if request.removal_masks is not None:
         names = [frame.name for frame in photographs.frames]
-        check_removal_masks(request.removal_masks, names, request.removal_reading)
+        check_removal_masks(
+            request.removal_masks, names, photographs.files, request.removal_reading
+        )
         photographs = photographs.leave_out_masks_in(request.removal_masks)
     if reading.folder is not None:
         photographs = photographs.take_masks_of(reading.folder)
@@ -131,8 +134,11 @@ def open_scene(
     return Opened(request, photographs, "photographs", num_photographs)
 
 
-def check_ignoring_masks(masks: Path, folder: Path) -> None:
-    """Refuse a folder of masks that is of no photograph in `folder`, or would be taken for some."""
+def check_ignoring_masks(masks: Path, folder: Path) -> list[str]:
+    """Refuse a folder of masks that is of no photograph in `folder`, or would be taken for some.
+
+    Returns a line on masks that are named as none.
+    """
     if is_video(folder):
         raise InputError(
             "The photographs of a video have no names before they are taken; run `gscompleter "
@@ -146,8 +152,10 @@ def check_ignoring_masks(masks: Path, folder: Path) -> None:
             "it out of their folder.",
             "ignore",
         )
-    if not list_given_masks(folder, names, masks):
+    found = list_given_masks(folder, names, masks)
+    if not found:
         raise make_no_mask_error(masks, names)
+    return describe_unnamed_masks(masks, found, [folder / name for name in names])
 
 
 def choose_working_size(opened: Opened, splat: Path, console: Console) -> Opened:

@@ -14,10 +14,14 @@ from torch import Tensor
 
 from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.apps.requests.splat import Selection
-from gscompleter.data.frame import TRIED_ENDINGS, find_file
 from gscompleter.data.mask_checks import check_selected_share, check_selecting_masks
 from gscompleter.data.mask_reading import MaskReading
-from gscompleter.data.masks import load_mask
+from gscompleter.data.masks import (
+    describe_unnamed_masks,
+    find_masks_in,
+    load_mask,
+    make_no_mask_error,
+)
 from gscompleter.data.photographs import Photographs, Resolution, resize_mask
 from gscompleter.editing.removal import sum_in_mask
 from gscompleter.numerics.geometry import quats_to_rotations
@@ -79,7 +83,7 @@ def select_with_masks(
     chosen = find_by_position(selection, scene, task.splat_origin)
     if selection.masks:
         photographs = opened.photographs
-        masks = find_masks(selection.masks, [frame.name for frame in photographs.frames])
+        masks = find_masks_of(photographs, selection.masks)
         if not masks.keys() & cameras.keys():
             raise InputError(
                 f"All masks in {quote_value(selection.masks)} are of photographs that cannot be "
@@ -229,34 +233,42 @@ def find_in_boxes(
     return inside
 
 
-def check_removal_masks(folder: Path, names: Sequence[str], reading: MaskReading) -> None:
+def check_removal_masks(
+    folder: Path, names: Sequence[str], files: Sequence[Path | None], reading: MaskReading
+) -> None:
     """Refuse masks of a removal that select nothing, or most of most of their photographs.
 
-    `names` are those of all photographs of the scene.
+    `names` are those of all photographs of the scene, and `files` theirs.
     """
-    masks = list(find_masks(folder, names).values())
+    masks = list(find_masks(folder, names, files).values())
     check_selecting_masks(masks, reading, "the photographs")
 
 
-def find_masks(folder: Path, names: Sequence[str]) -> dict[int, Path]:
-    """Find the masks that are named as photographs, by the index of the name in `names`."""
-    masks = {}
-    for number, name in enumerate(map(Path, names)):
-        # The mask of a/b.jpg is a/b.jpg.png, a/b.png, b.jpg.png or b.png, as annotation programs
-        # name them.
-        stems = (name, name.with_suffix(""), Path(name.name), Path(name.stem))
-        path = find_file(
-            [folder], [f"{stem}{ending}" for stem in stems for ending in TRIED_ENDINGS]
-        )
-        if path is not None:
-            masks[number] = path
+def find_masks(folder: Path, names: Sequence[str], files: Sequence[Path | None]) -> dict[int, Path]:
+    """Find the masks that are named as photographs, by the index of the name in `names`.
+
+    `files` are those of the photographs, None for one without. Raises InputError if there are no
+    masks, or if one may be of several photographs.
+    """
+    found = find_masks_in(folder, names, files, "mask")
+    masks = {number: mask for number, mask in enumerate(found) if mask is not None}
     if not masks:
-        raise InputError(
-            f"{quote_value(folder)} has no mask that is named as a photograph, such as "
-            f"{quote_value(Path(names[0]).stem)}.png.",
-            "mask",
-        )
+        raise make_no_mask_error(folder, names, "mask")
     return masks
+
+
+def find_masks_of(photographs: Photographs, folder: Path) -> dict[int, Path]:
+    """Find the masks of photographs by frame; errors as those of `find_masks`."""
+    return find_masks(folder, [frame.name for frame in photographs.frames], photographs.files)
+
+
+def describe_masks_in_vain(
+    photographs: Photographs, cameras: Mapping[int, Camera], folder: Path
+) -> list[str]:
+    """Describe the masks of a removal that no photograph with a camera in `cameras` has."""
+    masks = find_masks_of(photographs, folder)
+    used = [mask for number, mask in masks.items() if number in cameras]
+    return describe_unnamed_masks(folder, used, photographs.files)
 
 
 def find_in_masks(

@@ -27,6 +27,7 @@ from jaxtyping import Bool
 from PIL import Image, ImageOps
 
 from gscompleter.data.camera_files import refuse_other_exports
+from gscompleter.data.file_names import PHOTOGRAPH_ENDINGS, is_photograph_name
 from gscompleter.data.frame import DOWNSCALE_FACTORS, MASKS, Frame
 from gscompleter.data.limits import require
 from gscompleter.data.mask_checks import check_hiding_masks, refuse_nothing_to_invert
@@ -44,7 +45,6 @@ from gscompleter.data.photographs import Photographs
 from gscompleter.data.unused_files import (
     DEPTH_FOLDERS,
     OTHER_FOLDERS,
-    PHOTOGRAPHS,
     is_depth_map,
 )
 from gscompleter.data.video import NUM_FRAMES, extract_frames, is_video
@@ -56,15 +56,13 @@ from gscompleter.system.files.image import (
     open_image,
     turn_upright,
 )
-from gscompleter.system.files.names import make_colmap_name
+from gscompleter.system.files.names import is_hidden_name, make_colmap_name
 from gscompleter.system.files.output_folder import refuse_later_results, reserve_output
 from gscompleter.system.files.reading import read_json
 from gscompleter.system.files.writing import SUMMARY_FILE
 from gscompleter.system.progress import stage, track
 from gscompleter.system.threads import get_thread_count
 
-PHOTOGRAPH_ENDINGS = PHOTOGRAPHS
-"""Endings of photographs, in any case."""
 NO_PHOTOGRAPHS = (
     *(*MASK_FOLDERS, *DEPTH_FOLDERS, *OTHER_FOLDERS),
     *(f"images_{n}" for n in DOWNSCALE_FACTORS),
@@ -225,7 +223,7 @@ def find_poses(
 
 
 def list_given_masks(folder: Path, names: Sequence[str], named: Path | None = None) -> list[Path]:
-    """List the masks of photographs in a folder; `named` is as in `find_mask`."""
+    """List the masks of photographs in a folder; `named` is as in `find_given`."""
     return [given.mask for given in find_given(folder, names, named) if given.mask is not None]
 
 
@@ -365,9 +363,8 @@ def iterate_photographs(folder: Path) -> Iterator[Path]:
         images = [
             name
             for name in files
-            if not name.startswith(".") and Path(name).suffix.lower() in PHOTOGRAPH_ENDINGS
+            if is_photograph_name(name) and not is_depth_map(Path(home, name))
         ]
-        images = [name for name in images if not is_depth_map(Path(home, name))]
         yield from (Path(home, name) for name in leave_out_masks(images))
 
 
@@ -384,7 +381,7 @@ def holds_packed_splat(folder: Path) -> bool:
 
 def is_own(folder: Path) -> bool:
     """Check that a folder may hold photographs: not hidden, masks, depth, copies or our result."""
-    if folder.name.startswith(".") or folder.name.casefold() in NO_PHOTOGRAPHS:
+    if is_hidden_name(folder.name) or folder.name.casefold() in NO_PHOTOGRAPHS:
         return False
     return not os.path.isfile(folder / SUMMARY_FILE)
 

@@ -23,6 +23,14 @@ def make_colmap_name(name: str) -> str:
     return re.sub(r"[\s#]", "_", name)
 
 
+def is_hidden_name(name: str) -> bool:
+    """Check whether a file or folder is hidden.
+
+    macOS writes "._x.jpg", which is no image, for each "x.jpg" into archives and on other disks.
+    """
+    return name.startswith(".")
+
+
 def fold_name(name: str) -> str:
     """Fold a name to what all of its spellings share.
 
