@@ -69,6 +69,19 @@ def test_clean_refuses_all_of_them(splat, tmp_path, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
+    "setting", ["tolerance 0.5", "min-ratio 2", "idle 2", "probes 4", "floaters.max-gap 9"]
+)
+def test_clean_refuses_settings_of_what_does_not_decide(
+    splat, tmp_path, monkeypatch, capsys, setting
+):
+    option, value = f"--config.{setting}".split()
+    scene = [tmp_path] if "floaters" in option else []
+    words = ("clean", *scene, "--scene", splat, "--out", tmp_path / "out", option, value)
+    assert run(monkeypatch, *words) == 2
+    assert option in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
     "words",
     [
         ("complete",),

@@ -11,6 +11,7 @@ import torch
 
 from command import run
 from copies import watch_copies
+from gscompleter.apps.cleaning import describe_cleaning
 from gscompleter.apps.completing import preparation
 from gscompleter.config import CleaningConfig
 from gscompleter.editing.cleaning import find_removable, find_superfluous
@@ -169,6 +170,23 @@ def test_the_command_cleans_and_strip_puts_back(scene, tmp_path, monkeypatch):
     assert summary["seconds"]["total"] > 0
     assert run(monkeypatch, "strip", out / "completed.ply", "--out", tmp_path / "back.ply") == 0
     assert (tmp_path / "back.ply").read_bytes() == splat.read_bytes()
+
+
+def test_a_photograph_that_is_ignored_everywhere_has_no_part_in_the_mean():
+    rows = [
+        {"psnr_before": None, "psnr_after": None, "ignored": 1.0},
+        {"psnr_before": 20.0, "psnr_after": 21.0, "ignored": 0.0},
+    ]
+    summary = {
+        "gaussians": {"removed": 1, "given": 2},
+        "seconds": {"total": 0.1},
+        "reasons": {"idle": 1},
+        "photographs": rows,
+    }
+    line = describe_cleaning(summary, "removed")
+    assert line.endswith("20.00 dB before, 21.00 dB after, worst change +1.000 dB")
+    nowhere = describe_cleaning({**summary, "photographs": rows[:1]}, "removed")
+    assert nowhere.endswith("the photographs are ignored everywhere, and tell no PSNR")
 
 
 @pytest.mark.linux

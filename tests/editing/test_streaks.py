@@ -157,6 +157,7 @@ def test_a_dry_run_says_that_nothing_was_cleaned(splat, tmp_path, monkeypatch, c
     assert run(monkeypatch, "clean", "--scene", splat, "--out", out, *options) == 0
     lines = capsys.readouterr().out.splitlines()
     assert lines[0].startswith("Dry run: ")
+    assert " Gaussians would be removed, found in " in lines[0]
     assert "would go" in lines[1]
     assert lines[-1] == "Nothing was cleaned; leave out --dry-run to write completed.ply."
     assert not (out / "completed.ply").exists()

@@ -177,6 +177,7 @@ def clean_by_photographs(
     plan += f", written to {quote_value(request.results.out)}"
     print_lines(console, *describe_opening(opened, task), f"To do: {plan}.")
 
+    # Photographs decide, so that nothing reads `config.floaters`.
     config = request.config.strengthen(request.strength)
     with record_seconds(()) as seconds, timed_stage("clean"):
         reasons = find_superfluous(given, task.views, renderer, config)
@@ -206,6 +207,7 @@ def clean_alone(request: CleaningRequest) -> Cleaning:
     given = file_harmonics(load_given_splat(splat).to(device), splat, device)
     renderer = load_renderer(device)
     compile_kernels([device])
+    # Without photographs nothing reads the rest of the config.
     floaters = request.config.strengthen(request.strength).floaters
     with record_seconds(()) as seconds, timed_stage("clean"):
         reasons = find_floaters(given, floaters, renderer)
@@ -213,7 +215,7 @@ def clean_alone(request: CleaningRequest) -> Cleaning:
     removed = torch.stack(list(reasons.values())).any(dim=0)
     cameras: list[Camera] = []
     share = 0.0
-    # Of an empty splat there is no picture, and it is refused.
+    # If every Gaussian would go, nothing is left to draw, and the caller refuses it.
     if removed.any() and not removed.all():
         with stage("looking from outside"):
             cameras, share = choose_outside_cameras(given, removed, renderer)
@@ -251,8 +253,9 @@ def score_cleaning(
 ) -> tuple[list[dict[str, Any]], list[RemovalVisibility]]:
     """Compute PSNR (dB) of each photograph before and after, without the pixels of its mask.
 
-    `taken` are the Gaussians that go; `files` has the file of each photograph by frame. Also
-    returns what each photograph sees of them.
+    It is None for a photograph that is ignored everywhere. `taken` are the Gaussians that go;
+    `files` has the file of each photograph by frame. Also returns what each photograph sees of
+    them.
     """
     kept = given.hide(taken)
     rows = []
@@ -278,9 +281,9 @@ def describe_cleaned_files(summary: Mapping[str, Any], request: CleaningRequest)
     counts = summary["gaussians"]
     out = request.results.out
     if request.dry_run:
-        lines = [f"Dry run: {describe_cleaning(summary)}"]
+        lines = [f"Dry run: {describe_cleaning(summary, 'would be removed, found')}"]
     else:
-        lines = [describe_cleaning(summary)]
+        lines = [describe_cleaning(summary, "removed")]
     if counts["removed"] > 0:
         goes = "would go" if request.dry_run else "went"
         lines.append(
@@ -293,21 +296,28 @@ def describe_cleaned_files(summary: Mapping[str, Any], request: CleaningRequest)
     return lines
 
 
-def describe_cleaning(summary: Mapping[str, Any]) -> str:
-    """Describe the numbers of Gaussians, and the change of PSNR or the reasons."""
+def describe_cleaning(summary: Mapping[str, Any], done: str) -> str:
+    """Describe the numbers of Gaussians, and the change of PSNR or the reasons.
+
+    `done` says what happened to what goes.
+    """
     counts = summary["gaussians"]
     seconds = summary["seconds"]["total"]
-    text = f"{counts['removed']:,} of {counts['given']:,} Gaussians removed in {seconds:.1f} s; "
+    text = f"{counts['removed']:,} of {counts['given']:,} Gaussians {done} in {seconds:.1f} s; "
     reasons = ", ".join(f"{count:,} {name}" for name, count in summary["reasons"].items())
     if "photographs" not in summary:
         share = summary["seen_from_outside"]
         return f"{text}{reasons}; they are {share:.1%} of what is seen from outside"
 
-    before = torch.tensor([row["psnr_before"] for row in summary["photographs"]])
-    after = torch.tensor([row["psnr_after"] for row in summary["photographs"]])
-    unmasked = [1 - row["ignored"] for row in summary["photographs"]]
+    # A photograph that is ignored everywhere has no scores.
+    rows = [row for row in summary["photographs"] if row["psnr_before"] is not None]
+    if not rows:
+        return f"{text}{reasons}; the photographs are ignored everywhere, and tell no PSNR"
+    before = torch.tensor([row["psnr_before"] for row in rows])
+    after = torch.tensor([row["psnr_after"] for row in rows])
     change = (
         f"mean PSNR of the photographs {before.mean():.2f} dB before, {after.mean():.2f} dB after"
-        f"{describe_measured(unmasked)}, worst change {(after - before).min():+.3f} dB"
+        f"{describe_measured([1 - row['ignored'] for row in rows])}, worst change "
+        f"{(after - before).min():+.3f} dB"
     )
     return f"{text}{reasons}; {change}"

@@ -17,7 +17,7 @@ from gscompleter.apps.commands.shared_decisions import (
 )
 from gscompleter.apps.commands.shared_options import ChosenPhotographs, DeviceOptions, SceneOptions
 from gscompleter.apps.requests.cleaning import CleaningRequest
-from gscompleter.config import CleaningConfig
+from gscompleter.config import CleaningConfig, FloaterConfig
 from gscompleter.system.errors import InputError
 from gscompleter.system.process import import_without_collection
 
@@ -74,6 +74,7 @@ def decide_cleaning(options: CleanOptions) -> CleaningRequest:
                 raise InputError(
                     "There are no photographs to apply this to; name their SCENE.", name
                 )
+    refuse_unused_settings(options.config, options.folder is not None)
     photographs = None
     if options.folder is not None:
         photographs = decide_photographs(options, options.folder)
@@ -86,6 +87,27 @@ def decide_cleaning(options: CleanOptions) -> CleaningRequest:
         dry_run=options.dry_run,
         results=decide_results(options),
     )
+
+
+def refuse_unused_settings(config: CleaningConfig, has_photographs: bool) -> None:
+    """Refuse settings of what does not decide: photographs, or else neighbours (`floaters`)."""
+    usual = CleaningConfig()
+    if has_photographs:
+        for field in fields(FloaterConfig):
+            if getattr(config.floaters, field.name) != getattr(usual.floaters, field.name):
+                raise InputError(
+                    "Photographs decide what goes, and neighbours only without them; leave it or "
+                    "SCENE out.",
+                    f"config.floaters.{field.name.replace('_', '-')}",
+                )
+        return
+    for field in fields(CleaningConfig):
+        name = field.name
+        if name != "floaters" and getattr(config, name) != getattr(usual, name):
+            raise InputError(
+                "There are no photographs to apply this to; name their SCENE.",
+                f"config.{name.replace('_', '-')}",
+            )
 
 
 def run_clean(options: CleanOptions) -> None:
