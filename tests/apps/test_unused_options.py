@@ -75,7 +75,7 @@ def test_clean_refuses_settings_of_what_does_not_decide(
     splat, tmp_path, monkeypatch, capsys, setting
 ):
     option, value = f"--config.{setting}".split()
-    scene = [tmp_path] if "floaters" in option else []
+    scene = [splat.parent] if "floaters" in option else []
     words = ("clean", *scene, "--scene", splat, "--out", tmp_path / "out", option, value)
     assert run(monkeypatch, *words) == 2
     assert option in capsys.readouterr().err

@@ -72,7 +72,7 @@ def test_an_image_in_negative_is_no_colour_shift():
     assert not found.is_consistent
     assert found.residual < found.limit
     _, (note,) = paint_checked(lambda seed: 1 - TRUTH, 0, observed())
-    assert "after scaling the channels by -1.00, -1.00" in note
+    assert "only with channels scaled by -1.00, -1.00" in note
 
 
 @pytest.mark.parametrize("contrast", [0.5, 1.0])

@@ -68,10 +68,27 @@ def test_a_change_outside_of_the_mask_is_told_and_has_no_effect():
     assert abs(right - 30) <= 4
 
 
+def test_the_last_pixel_of_a_difference_is_inside_of_the_image():
+    image = pasted()
+    image[-12:, :20] = torch.tensor([1.0, 0.0, 1.0])
+    (note,) = use(Painting(image, TARGET)).notes
+    assert f" to {SIZE - 1})" in note
+    assert "(largest regions, in pixels: x 0 to " in note
+
+
 def test_the_image_of_another_camera_is_refused():
     other = view_of(Room(), camera_at(-0.5, yaw=-20, size=SIZE)).image
     with pytest.raises(InputError, match=r"^a\.png does not show what its camera sees"):
         use(Painting(other, TARGET, name="a.png"))
+
+
+def test_each_reason_of_a_refusal_has_its_own_sentence():
+    with pytest.raises(InputError, match=r"shifted by .* paint it in the exposure of the scene"):
+        use(Painting(pasted() / 2, TARGET))
+    spoilt = pasted()
+    spoilt[0, 0] = torch.nan
+    with pytest.raises(InputError, match="not finite"):
+        use(Painting(spoilt, TARGET))
 
 
 def test_what_is_transparent_continues_the_border():
@@ -103,7 +120,7 @@ def test_what_an_earlier_target_filled_in_another_way_is_no_difference():
 
 def test_a_target_without_a_painting_is_refused():
     other = Painting(TRUTH, camera_at(0.1, size=SIZE))
-    with pytest.raises(InputError, match="has 1 images, none of them painted for the target"):
+    with pytest.raises(InputError, match="has 1 image, none of them painted for the target"):
         use(other)
 
 

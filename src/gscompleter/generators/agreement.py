@@ -46,6 +46,25 @@ class Agreement:
     image: Float[Tensor, "h w 3"]
     """The image; if it is consistent and correction is asked for, with the shift corrected."""
 
+    @property
+    def is_finite(self) -> bool:
+        """False if the image has NaN or infinity, and was not compared."""
+        return self.residual != float("inf")
+
+    def describe_difference(self) -> str:
+        """Describe in a clause why an image of finite colours is not consistent."""
+        gains = ", ".join(f"{gain:.2f}" for gain in self.gain.tolist())
+        if self.residual > self.limit:
+            return (
+                f"colours differ by {self.residual:.3f} ({self.limit:.3f} is the limit) after "
+                f"scaling the channels by {gains}"
+            )
+        offsets = ", ".join(f"{offset:+.2f}" for offset in self.offset.tolist())
+        return (
+            f"colours fit only with channels scaled by {gains} (at most {MAX_SHIFT_GAIN} or its "
+            f"inverse) and shifted by {offsets} (at most {MAX_OFFSET})"
+        )
+
 
 def paint_consistently(
     paint: Callable[[int], Float[Tensor, "h w 3"]],
@@ -70,7 +89,7 @@ def paint_consistently(
 
     # A consistent image may have a larger residual than one that was refused for its gain.
     best = min(attempts, key=lambda agreement: (not agreement.is_consistent, agreement.residual))
-    if best.residual == float("inf"):
+    if not best.is_finite:
         raise InputError(
             f"The generator painted no finite image ({len(attempts)} seed(s) tried); check that "
             "its weights are correct, or choose another generator."
@@ -78,13 +97,11 @@ def paint_consistently(
     if best.is_consistent:
         return GeneratorOutput(best.image)
 
-    gains = ", ".join(f"{gain:.2f}" for gain in best.gain.tolist())
     seeds = "" if len(attempts) == 1 else f" (best of {len(attempts)} seeds)"
     note = (
         "The synthesized image disagrees with the photographs: over the "
-        f"{observed.known.float().mean():.0%} of it that they show, colours differ by "
-        f"{best.residual:.3f} ({best.limit:.3f} is the limit) after scaling the channels by "
-        f"{gains}{seeds}."
+        f"{observed.known.float().mean():.0%} of it that they show, {best.describe_difference()}"
+        f"{seeds}."
     )
     return GeneratorOutput(best.image, (note,), is_inconsistent=True)
 

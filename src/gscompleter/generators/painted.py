@@ -1,6 +1,6 @@
 """Φ of any painter: images that another program, model or person painted for the targets.
 
-Only what the painter was asked for counts: the hole with its dark rim. What lies outside is
+Only what the painter was asked for counts: the hole with its rim. What lies outside is
 compared with the scene, which gives the exposure of the painting and tells whether it shows the
 target.
 """
@@ -80,7 +80,8 @@ class Painted:
         context = request.context
         painting = self.find_painting(target).to(target.K.device)
 
-        # The rim of a hole is dark, since it is rendered over black: it is painted, too.
+        # The rim is painted, too: depth is unsure there, and the image that a painter gets is over
+        # black, and so darker at the rim than `known_colors`.
         hole = context.holes
         rim = dilate(hole, BORDER_WIDTH)
         asked = rim if painting.asked is None else painting.asked
@@ -112,10 +113,11 @@ class Painted:
                 if isinstance(view, Painting):
                     return view
                 return Painting(view.image, view.camera, ignore_mask=view.ignore_mask)
+        count = len(self.paintings)
         raise InputError(
-            f"The generator 'painted' has {len(self.paintings)} images, none of them painted for "
-            "the target camera; export the holes of this target and paint them, or choose "
-            "'warp-inpaint'."
+            f"The generator 'painted' has {count} image{'' if count == 1 else 's'}, none of them "
+            "painted for the target camera; export the holes of this target and paint them, or "
+            "choose 'warp-inpaint'."
         )
 
 
@@ -182,10 +184,14 @@ def scale_layers(
 
 def describe_other_image(name: str, agreement: Agreement) -> str:
     """Write the sentence about an image that shows something else than its target."""
+    if not agreement.is_finite:
+        return f"{name} has colours that are not finite (NaN or infinity); paint or save it again."
+    advice = "it may be the image of another camera, or cropped or moved"
+    if agreement.residual <= agreement.limit:
+        advice = "paint it in the exposure of the scene"
     return (
-        f"{name} does not show what its camera sees of the scene: outside of the mask, colours "
-        f"differ by {agreement.residual:.2f} ({agreement.limit:.2f} is the limit) after a fit of "
-        "the exposure; it may be the image of another camera, or cropped or moved."
+        f"{name} does not show what its camera sees of the scene: outside of the mask, "
+        f"{agreement.describe_difference()}; {advice}."
     )
 
 
@@ -204,13 +210,14 @@ def describe_differences(
     share = differs.float().mean().item()
     if share < MIN_DIFFERING:
         return ""
+    # Right and bottom are the first pixels outside.
     boxes = "; ".join(
-        f"x {left} to {right}, y {top} to {bottom}"
+        f"x {left} to {right - 1}, y {top} to {bottom - 1}"
         for left, top, right, bottom in find_largest_regions(differs, 0, 0)
     )
     return (
-        f"Outside of its mask, {name} differs from the scene in {share:.1%} of the image ({boxes}, "
-        "pixels); only what the mask covers counts."
+        f"Outside of its mask, {name} differs from the scene in {share:.1%} of the image (largest "
+        f"regions, in pixels: {boxes}); only what the mask covers counts."
     )
 
 
