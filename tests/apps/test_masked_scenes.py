@@ -194,7 +194,7 @@ def test_evaluate_of_boxes_names_the_option_of_masks(scenes, tmp_path, monkeypat
     assert run(monkeypatch, "evaluate", scenes["masks"], *words) == 2
     said = capsys.readouterr().err
     assert "has no boxes of moving objects" in said
-    assert "Masks are always read (--no-masks leaves them out)" in said
+    assert "leave --ignore-moving out (masks are read without it)" in said
 
 
 @pytest.mark.slow

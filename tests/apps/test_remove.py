@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from command import run
-from gscompleter import load_ply, save_ply
+from gscompleter import InputError, load_ply, save_ply
 from gscompleter.apps.inputs.removal import (
     describe_masks_in_vain,
     find_by_position,
@@ -19,6 +19,7 @@ from gscompleter.apps.inputs.removal import (
     find_in_masks,
     find_in_region,
     find_masks_of,
+    require_chosen,
     widen_regions,
 )
 from gscompleter.apps.report.removal_pictures import find_largest
@@ -245,6 +246,13 @@ def test_masks_of_photographs_without_a_camera_are_said(scene, tmp_path):
     assert line.endswith("are named as no photograph with a camera: 3.png, typo.png.")
 
 
+def test_advice_after_an_empty_selection_is_of_what_was_given():
+    splat = random_gaussians(5)
+    nothing = torch.zeros(5, dtype=torch.bool)
+    with pytest.raises(InputError, match="is selected; mark in masks the whole of"):
+        require_chosen(nothing, Selection(masks=Path("masks")), splat, np.zeros(3))
+
+
 def test_a_selection_is_found_by_position():
     splat = random_gaussians(50)
     splat.means[3] = splat.means[7]
@@ -277,6 +285,7 @@ def test_a_selection_of_supersplat_is_found(tmp_path):
         (("--box", -50, -50, -50, 50, 50, 50), "Nothing would be left"),
         (("--sphere", 0, 0, 0, -1), "positive radius"),
         (("--sphere", 0, 0, 1, 1, "--box-rotation", 0, 0, 0, 0), "quaternion"),
+        (("--sphere", 0, 0, 1, 1, "--box-rotation", 1, 0, 0, 1), "There is no box to rotate"),
         (("--mask", "nowhere"), "There is no folder"),
         (("--mask", "EMPTY"), "no mask that is named as a photograph"),
         (("--select", "MOVED"), "No Gaussian of the splat"),

@@ -10,6 +10,11 @@ import pytest
 
 from apart import read_used_cases, select_scenes
 from command import run
+from gscompleter.apps.commands.evaluate import decide_evaluation
+from gscompleter.apps.evaluating import cases as collecting
+from gscompleter.cli import parse_command
+from gscompleter.data.formats import open_photographs
+from gscompleter.data.photographs import Photographs
 from gscompleter.evaluation.apart import APART_HEAD, LEDGER, record_uses
 from gscompleter.evaluation.case_file import read_case_file, read_scene_file
 from gscompleter.evaluation.cases import ScenePlace, list_places, read_cases
@@ -155,6 +160,47 @@ def test_a_file_of_scenes_is_data_of_a_protocol(rooms, tmp_path, monkeypatch, ca
     assert run(monkeypatch, *words, "--out", tmp_path / "out") == 0
     assert "1 scenes are left out" in capsys.readouterr().err
     assert read_run(tmp_path / "out")[0] == {"unseen"}
+
+
+def test_scenes_that_are_opened_in_vain_are_said_beside_what_is_apart(
+    rooms, tmp_path, monkeypatch, capsys
+):
+    index = {"version": 1, "protocol": "mine", "scenes": {"elsewhere": None, "left": None}}
+    (tmp_path / "index.json").write_text(json.dumps(index))
+    reasons = {
+        "n-9": "n-9 chooses none of its 3 frames",
+        tmp_path / "index.json": "the index mine does not name it",
+    }
+    for protocol, reason in reasons.items():
+        words = ("evaluate", rooms / "scenes.json", "--protocol", protocol, *QUICK)
+        assert run(monkeypatch, *words, "--out", tmp_path / "out") != 0
+        said = capsys.readouterr().err
+        assert "1 scenes are left out" in said
+        assert f"Skipped unseen: {reason}." in said
+
+
+def test_a_scene_is_opened_once_wherever_its_cases_stand(rooms, monkeypatch):
+    rows = [("seen", [0, 1], 2), ("unseen", [0, 1], 2), ("seen", [1, 2], 0)]
+    keys = ("scene", "context", "target")
+    content = {"cases": [dict(zip(keys, row, strict=True)) for row in rows]}
+    (rooms / "mixed.json").write_text(json.dumps({"resolution": [SIZE, SIZE], **content}))
+    opened = []
+
+    def open_scene(place: Path) -> Photographs:
+        opened.append(place.name)
+        return open_photographs(place)
+
+    monkeypatch.setattr(collecting, "open_photographs", open_scene)
+    options = parse_command(["evaluate", str(rooms / "mixed.json"), "--out", "out"])
+    tasks = collecting.collect_tasks(decide_evaluation(options).cases, [], [])
+    assert [task.scene for task in tasks] == ["seen", "unseen", "seen"]
+    assert opened == ["seen", "unseen"]
+
+
+def test_boxes_that_a_scene_lacks_are_refused_for_cases(rooms, tmp_path, monkeypatch, capsys):
+    words = ("evaluate", rooms / "cases.json", "--ignore-moving", "--out", tmp_path / "out")
+    assert run(monkeypatch, *words) == 2
+    assert "seen has no boxes of moving objects" in capsys.readouterr().err
 
 
 def test_nothing_but_what_is_apart_is_refused(tmp_path, monkeypatch, capsys):

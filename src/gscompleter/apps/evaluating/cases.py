@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import groupby, islice
+from itertools import islice
 from pathlib import Path
 
 from rich.console import Console
@@ -27,6 +27,7 @@ from gscompleter.evaluation.apart import (
 from gscompleter.evaluation.authors_loader import AuthorsLoader
 from gscompleter.evaluation.cases import (
     Case,
+    ScenePlace,
     SkippedScene,
     filter_usable,
     list_places,
@@ -44,13 +45,14 @@ def collect_tasks(
     """Collect the tasks of a request, and append to `skipped` and `notes`."""
     left_out: list[Apartable] = []
     if request.protocol:
+        listed = [place for path in request.paths for place in list_places(path)]
+        places = list(leave_out_apart(listed, request.apart, left_out))
+        notes += describe_apart(left_out, len(places), "scenes")
         # The iterator opens clips one by one, so those beyond the limit are not opened.
-        tasks = list(islice(iterate_tasks(request, skipped, notes, left_out), request.limit))
-        notes += describe_apart(left_out, len(tasks), "scenes")
-        return tasks
+        return list(islice(iterate_tasks(request, places, skipped, notes), request.limit))
 
-    listed = [case for path in request.paths for case in read_cases(find_cases_file(path))]
-    cases = list(leave_out_apart(listed, request.apart, left_out))
+    listed_cases = [case for path in request.paths for case in read_cases(find_cases_file(path))]
+    cases = list(leave_out_apart(listed_cases, request.apart, left_out))
     notes += describe_apart(left_out, len(cases), "cases")
     if request.one_per_scene:
         # The first case of a scene is the last that overwrites its entry in reversed order.
@@ -58,27 +60,53 @@ def collect_tasks(
         cases = [case for case in cases if case is first[case.scene]]
     cases = cases[: request.limit]
 
-    tasks = []
-    # Cases of one scene stand together in a file, so that each scene is opened once for its notes.
-    for scene, group in groupby(cases, lambda case: case.scene):
-        own = [protocols.make_case_task(apply_request(case, request)) for case in group]
-        own = [replace(task, refines_poses=request.refines_poses) for task in own]
-        clip = None
-        # A scene that cannot be opened fails later, and its row in the table has the reason.
-        with suppress(InputError):
-            clip = open_photographs(scene)
-        if clip is not None:
-            notes += clip.notes
-            clip = clip.leave_out_masks() if not request.uses_masks else clip
-            own = mark_masked(read_masks_as_asked(clip, request.masks), own, notes)
-        tasks += own
-    return tasks
+    # Each scene is opened once for its notes, wherever its cases stand in the files.
+    numbers_by_scene: dict[Path, list[int]] = {}
+    for number, case in enumerate(cases):
+        numbers_by_scene.setdefault(case.scene, []).append(number)
+    tasks: dict[int, protocols.Task] = {}
+    for scene, numbers in numbers_by_scene.items():
+        own = make_scene_tasks(scene, [cases[number] for number in numbers], request, notes)
+        tasks.update(zip(numbers, own, strict=True))
+    return [tasks[number] for number in range(len(cases))]
+
+
+def make_scene_tasks(
+    scene: Path, cases: Sequence[Case], request: CasesRequest, notes: list[str]
+) -> list[protocols.Task]:
+    """Make the tasks of the cases of one scene, and append its notes."""
+    tasks = [protocols.make_case_task(apply_request(case, request)) for case in cases]
+    tasks = [replace(task, refines_poses=request.refines_poses) for task in tasks]
+    clip = None
+    # A scene that cannot be opened fails later, and its row in the table has the reason.
+    with suppress(InputError):
+        clip = open_photographs(scene)
+    if clip is None:
+        return tasks
+    notes += clip.notes
+    if request.ignore_moving:
+        require_boxes(clip, request.uses_masks)
+    clip = clip if request.uses_masks else clip.leave_out_masks()
+    return mark_masked(read_masks_as_asked(clip, request.masks), tasks, notes)
 
 
 def describe_apart(left_out: Sequence[Apartable], kept: int, kind: str) -> list[str]:
-    """Describe what is left out, and how to use it; raise as `describe_left_out`."""
+    """Describe what is left out, and how to use it; raise as `describe_left_out`.
+
+    `kept` is the number of those of the `kind` that are used.
+    """
     lines = describe_left_out(left_out, kept, kind)
     return [f"{line} Add --apart to use them, which is noted in {LEDGER}." for line in lines]
+
+
+def require_boxes(clip: Photographs, reads_masks: bool) -> None:
+    """Raise InputError if a scene has no boxes of moving objects that could be ignored."""
+    if clip.has_boxes:
+        return
+    masks = " (masks are read without it)" if reads_masks else ""
+    raise InputError(
+        f"{clip.name} has no boxes of moving objects; leave --ignore-moving out{masks}."
+    )
 
 
 def mark_masked(
@@ -95,7 +123,10 @@ def mark_masked(
 
 
 def apply_request(case: Case, request: CasesRequest) -> Case:
-    """Return a case with masks, resolution and depth range of the request."""
+    """Return a case with resolution, depth range and what is ignored as the request asks.
+
+    What is ignored are masks, the vehicle that carries the camera, and boxes of moving objects.
+    """
     size = request.resolution
     return replace(
         case,
@@ -111,11 +142,11 @@ def apply_request(case: Case, request: CasesRequest) -> Case:
 
 def iterate_tasks(
     request: CasesRequest,
+    places: Sequence[ScenePlace],
     skipped: list[SkippedScene],
     notes: list[str],
-    left_out: list[Apartable],
 ) -> Iterator[protocols.Task]:
-    """Iterate over the tasks of the protocols, clip by clip."""
+    """Iterate over the tasks of the protocols in the scenes at some places, clip by clip."""
     rules = [protocols.parse_protocol(text) for text in request.protocol]
 
     # With a preset, images are cropped and scenes left out as by its authors' code (decision 047).
@@ -129,18 +160,14 @@ def iterate_tasks(
         size = parse_resolution(resolution)
     # Their code also keeps clips whose coordinates are large.
     max_translation = MAX_TRANSLATION if loader is None else None
-    listed = [place for path in request.paths for place in list_places(path)]
-    for place in leave_out_apart(listed, request.apart, left_out):
+    for place in places:
         for clip in filter_usable(open_clips(place.path), skipped, max_translation):
             notes += clip.notes
-            if request.ignore_moving and not clip.has_boxes:
-                raise InputError(
-                    f"{clip.name} has no boxes of moving objects; leave --ignore-moving out. Masks "
-                    "are always read (--no-masks leaves them out)."
-                )
-
-            # The authors' code scores every pixel of their data sets.
+            # The authors' code scores every pixel of their data sets: masks and the vehicle are
+            # not looked for. Boxes are ignored all the same where --ignore-moving asks for it.
             scores_all = loader is not None
+            if request.ignore_moving:
+                require_boxes(clip, request.uses_masks and not scores_all)
             if scores_all or not request.ego_mask:
                 clip = clip.keep_ego_vehicle()
             if scores_all or not request.uses_masks:
@@ -155,11 +182,11 @@ def iterate_tasks(
             clip = replace(clip, near=near, far=far)
 
             for rule in rules:
-                if isinstance(rule, protocols.FrameRule) and not rule.select_splits(clip):
-                    reason = f"{rule.name} chooses none of its {len(clip)} frames"
-                    skipped.append(SkippedScene(clip.name, reason))
+                if not rule.select_splits(clip):
+                    skipped.append(SkippedScene(clip.name, explain_no_split(rule, clip)))
                 kept = rule if loader is None else loader.choose_splits(rule, clip, skipped)
-                # The authors' loaders keep the order of the context; ours is ascending.
+                # The loader of the authors has sorted the frames already if theirs does so, and
+                # else the order is that of the index. Ours sorts the context.
                 keeps_order = loader is not None
                 tasks = protocols.make_tasks(kept, clip, size, keeps_order)
                 tasks = [replace(task, apart_by=place.apart_by) for task in tasks]
@@ -168,6 +195,14 @@ def iterate_tasks(
                 tasks = [replace(task, refines_poses=is_free) for task in tasks]
                 tasks = mark_masked(clip, tasks, notes)
                 yield from tasks[:1] if request.one_per_scene else tasks
+
+
+def explain_no_split(rule: protocols.EvaluationProtocol, clip: Photographs) -> str:
+    """Explain why a protocol has no task in a clip."""
+    if isinstance(rule, EvaluationIndex):
+        how = "leaves it out" if clip.name in rule.scenes else "does not name it"
+        return f"the index {rule.name} {how}"
+    return f"{rule.name} chooses none of its {len(clip)} frames"
 
 
 def find_authors_loader(request: CasesRequest) -> AuthorsLoader | None:

@@ -72,15 +72,15 @@ def score_methods(request: EvaluationRequest) -> Scored:
     notes: list[str] = []
     with show_progress(console), show_preparation("reading cases"):
         tasks = collect_tasks(cases, skipped, notes)
+    # Several clips can have the same note.
+    for note in dict.fromkeys(notes):
+        console.print(note, soft_wrap=True)
+    print_skipped(skipped, console)
     if cases.masks.is_inverted and not any(task.has_masks for task in tasks):
         raise InputError(
             "No scene has masks that could be read the other way round; leave it out.",
             "invert-masks",
         )
-    # Several clips can have the same note.
-    for note in dict.fromkeys(notes):
-        console.print(note, soft_wrap=True)
-    print_skipped(skipped, console)
     tasks = leave_poses_without_colmap(tasks, console)
 
     models = request.models

@@ -60,6 +60,8 @@ def check_selection(selection: Selection) -> None:
         raise InputError(
             "A rotation is a quaternion w x y z of numbers that are not all zero.", "box-rotation"
         )
+    if not selection.boxes and tuple(selection.box_rotation) != Selection().box_rotation:
+        raise InputError("There is no box to rotate; give --box, or leave it out.", "box-rotation")
     if selection.masks and not os.path.isdir(selection.masks):
         raise InputError(f"There is no folder {quote_value(selection.masks)}.", "mask")
     # Read to refuse a damaged file. Of its Gaussians only the positions count.
@@ -97,15 +99,15 @@ def select_with_masks(
         # Masks that are the other way round select most of the splat.
         check_selected_share(is_in_masks.float().mean().item(), selection.mask_reading)
         chosen |= is_in_masks
-    return require_chosen(chosen, scene, task.splat_origin)
+    return require_chosen(chosen, selection, scene, task.splat_origin)
 
 
 def select_without_masks(
     selection: Selection, scene: Gaussians, origin: Float[np.ndarray, "3"]
 ) -> Bool[Tensor, "n"]:
-    """Select the Gaussians of a splat without photographs, of which masks would be.
+    """Select Gaussians of a splat that has no photographs.
 
-    `origin` is that of `compute_file_points`.
+    Masks are refused: they are named as photographs. `origin` is that of `compute_file_points`.
     """
     if selection.masks:
         raise InputError(
@@ -113,7 +115,8 @@ def select_without_masks(
             "--select, or name cameras with --cameras and masks as these.",
             "mask",
         )
-    return require_chosen(find_by_position(selection, scene, origin), scene, origin)
+    chosen = find_by_position(selection, scene, origin)
+    return require_chosen(chosen, selection, scene, origin)
 
 
 def find_by_position(
@@ -149,7 +152,10 @@ def compute_file_points(
 
 
 def require_chosen(
-    chosen: Bool[Tensor, "n"], scene: Gaussians, origin: Float[np.ndarray, "3"]
+    chosen: Bool[Tensor, "n"],
+    selection: Selection,
+    scene: Gaussians,
+    origin: Float[np.ndarray, "3"],
 ) -> Bool[Tensor, "n"]:
     """Return the mask of chosen Gaussians, or raise InputError if it is empty."""
     if not chosen.any():
@@ -157,10 +163,23 @@ def require_chosen(
         low, high = format_corners(smallest.tolist(), largest.tolist())
         raise InputError(
             f"No Gaussian of the splat, which reaches from {low} to {high} in its own frame, is "
-            "selected; name another place, or selected Gaussians that were neither moved nor "
-            "rounded (an uncompressed .ply)."
+            f"selected; {advise_selection(selection)}."
         )
     return chosen
+
+
+def advise_selection(selection: Selection) -> str:
+    """Advise, in clauses, what to name instead of a selection that selects nothing."""
+    advice = []
+    if selection.boxes or selection.sphere:
+        advice.append("name another place")
+    if selection.masks:
+        advice.append("mark in masks the whole of what photographs show")
+    if selection.file:
+        advice.append(
+            "name selected Gaussians that were neither moved nor rounded (an uncompressed .ply)"
+        )
+    return ", or ".join(advice)
 
 
 def widen_regions(
