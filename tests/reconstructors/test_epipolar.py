@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from gscompleter.numerics.two_views import compute_sampson_distances
+from gscompleter.reconstructors.features.consistency import measure_pose_errors
 from gscompleter.reconstructors.features.epipolar import (
     fit_relative_pose,
     measure_pose_fit,
@@ -47,6 +48,30 @@ def test_matches_contradict_a_camera_that_is_turned(pair):
 def test_a_photograph_alone_and_cameras_in_one_place_contradict_nothing(pair):
     assert measure_pose_fit(pair[:1]) is None
     assert measure_pose_fit([pair[0], turn_view(pair[0], 1.0)]) is None
+
+
+@pytest.mark.parametrize("measure", [measure_pose_fit, lambda views: measure_pose_errors(views)[0]])
+def test_centres_that_differ_by_rounding_are_one_place(pair, measure):
+    """In float32, 10.000001 is the next number after 10."""
+    views = []
+    for x in (10.0, 10.000001, 10.0):
+        c2w = pair[0].camera.c2w.clone()
+        c2w[0, 3] = x
+        views.append(replace(pair[0], camera=replace(pair[0].camera, c2w=c2w)))
+    assert measure(views) is None
+
+
+def test_a_small_photograph_does_not_magnify_distances_in_large_ones(pair):
+    places = (-0.2, 0.0, 0.2)
+    views = [view_of(Room(), camera_at(x=x, size=256)) for x in places]
+    alone = measure_pose_fit(views)
+    blank = view_of(Room(), camera_at(x=0.1, size=32))
+    blank = replace(blank, image=torch.zeros_like(blank.image))
+    beside = measure_pose_fit([*views, blank])
+    assert alone is not None
+    assert beside is not None
+    # A photograph without features has no match, and so no part in the medians.
+    assert beside.given == pytest.approx(alone.given, rel=0.05)
 
 
 def test_the_distance_is_that_of_both_features_from_their_lines():

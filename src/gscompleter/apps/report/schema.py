@@ -69,7 +69,8 @@ class ContextRow(ScoreRow):
     """A photograph of the context, or one that checks an input splat."""
 
     exposure_gain: Vector | None = None
-    """Factor of each colour relative to the image that is used; None if not estimated."""
+    """Exposure of the original photograph over that of the scene, by channel: its colours are
+    divided by this for use. None if not estimated."""
     dynamic_fraction: float = 0.0
     """Share of the pixels that show what moved."""
     given_depth: float = 0.0
@@ -77,8 +78,9 @@ class ContextRow(ScoreRow):
     ignored: float = 0.0
     """Share of the pixels that are ignored, by masks for example."""
     pose_error: float | None = None
-    """Median distance, in pixels, of features that it shares with other photographs from where the
-    poses put them; None for fewer than three photographs, or few features."""
+    """Median distance, in pixels of the photographs at their working size, of features that it
+    shares with other photographs from where the poses put them; None for fewer than three
+    photographs, or few features."""
 
 
 @dataclass(frozen=True)
@@ -216,7 +218,7 @@ class PosesRow:
     """A refinement of poses, as in `PoseRefinement`.
 
     Errors are median distances of matches that were kept back from their epipolar lines, in pixels
-    of an image whose shorter side is 256.
+    of an image whose shorter side is 256, and not of the working size as `pose_error`.
     """
 
     photographs: int

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.numerics.geometry import measure_baseline
 from gscompleter.reconstructors.features.matches import fit_poses, measure_match_errors
 from gscompleter.reconstructors.features.neighbours import find_neighbours
-from gscompleter.reconstructors.features.stereo_image import make_stereo_images
+from gscompleter.reconstructors.features.stereo_image import has_baseline, make_stereo_images
 from gscompleter.types import View
 
 MAX_POSE_ERROR = 8.0
-"""Largest error, in pixels, of a match that is not false."""
+"""Largest error of a match that is not false, in pixels of the working size of the photograph that
+it is measured in."""
 MIN_POSE_MATCHES = 30
 """Fewest matches by which the pose of a photograph is judged, and those of a pair that count:
 photographs without a common surface have up to 25 false ones."""
@@ -52,11 +52,12 @@ def count_consistent_matches(views: Sequence[View]) -> MatchCount:
 def measure_pose_errors(views: Sequence[View]) -> list[float | None]:
     """Measure by how many pixels the pose of each photograph is off, None if that is not known.
 
-    It is the median distance of the features that it shares with the photographs around it from
-    where the poses put them, so that the error of a single photograph also shows at its neighbours.
+    Pixels are those of the views, at their working size. The error is the median distance of the
+    features that a photograph shares with those around it from where the poses put them, so that
+    the error of a single photograph also shows at its neighbours.
     Localization of the features alone gives 0.1 to 0.3 pixels.
     """
-    if not any(measure_baseline(views[0].camera, view.camera) for view in views):
+    if not has_baseline(views):
         return [None] * len(views)
     images, _ = make_stereo_images(views)
     errors: list[list[Float[np.ndarray, "k"]]] = [[] for _ in images]

@@ -14,12 +14,15 @@ import cv2
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.numerics.geometry import measure_baseline
 from gscompleter.numerics.two_views import ERROR_SIDE, Focals, Rays, compute_sampson_distances
 from gscompleter.reconstructors.features.consistency import MAX_POSE_ERROR, MIN_POSE_MATCHES
 from gscompleter.reconstructors.features.matches import Pixels, measure_match_errors
 from gscompleter.reconstructors.features.neighbours import find_neighbours
-from gscompleter.reconstructors.features.stereo_image import StereoImage, make_stereo_images
+from gscompleter.reconstructors.features.stereo_image import (
+    StereoImage,
+    has_baseline,
+    make_stereo_images,
+)
 from gscompleter.types import View
 
 MIN_CONTRADICTION = 0.12
@@ -29,13 +32,23 @@ MAX_FITTED_SHARE = 0.65
 """Largest share of that distance under fitted poses. It was 0.3 to 0.55 where poses are wrong, and
 0.75 to 1 where they are right."""
 
+STEP_SCALES = (1e-3, 1e-3, 1e-3, 1e-2, 1e-2)
+"""Usual sizes of the steps of a fit, in radians: of the turn about three axes, and of the direction
+of the shift across two. A turn of 1e-3 moves features by a third of a pixel at a focal length of
+300 pixels. The direction takes ten times that to move them as much, where the shift is a tenth of
+the depth."""
+
 RelativePose = tuple[Float[np.ndarray, "3 3"], Float[np.ndarray, "3"]]
 """Rotation and direction of the shift of points from a reference camera to a source camera."""
 
 
 @dataclass(frozen=True)
 class PoseFit:
-    """Median distances of matches from their epipolar lines, in pixels of `ERROR_SIDE`."""
+    """Median distances of matches from their epipolar lines, in pixels.
+
+    They are those of images whose shorter side is `ERROR_SIDE`: each pair is scaled by the smaller
+    of its photographs.
+    """
 
     given: float
     """Under the given poses."""
@@ -52,37 +65,39 @@ class PoseFit:
 def measure_pose_fit(views: Sequence[View]) -> PoseFit | None:
     """Measure how well the poses of views agree with matches; None with too few of these.
 
-    Each pair of neighbours is fitted alone: it tells that poses are wrong, but not which.
+    Each pair whose features `find_neighbours` matched, that is of cameras similar in place and
+    direction, is fitted alone: it tells that poses are wrong, but not which.
     """
-    if len(views) < 2 or not any(measure_baseline(views[0].camera, v.camera) for v in views):
+    if len(views) < 2 or not has_baseline(views):
         return None
     images, _ = make_stereo_images(views)
-    scale = ERROR_SIDE / min(min(image.size) for image in images)
     given = []
     pairs = []
     for (i, j), (in_i, in_j) in find_neighbours(images).matches.items():
         reference, source = images[i], images[j]
         errors, is_ahead = measure_match_errors(reference, source, in_i, in_j)
-        # What lies farther off is a false match.
+        # What lies farther off, in pixels of the source, is a false match.
         is_true = is_ahead & (errors < MAX_POSE_ERROR)
         if is_true.sum() < MIN_POSE_MATCHES:
             continue
         rays = (make_rays(reference, in_i[is_true]), make_rays(source, in_j[is_true]))
         focals = (reference.K.diagonal()[:2], source.K.diagonal()[:2])
         pose = compute_relative_pose(reference, source)
-        given.append(np.abs(compute_sampson_distances(*pose, rays, focals)))
-        pairs.append((pose, rays, focals))
+        # The smaller of both photographs limits how well features can be located.
+        scale = ERROR_SIDE / min(*reference.size, *source.size)
+        given.append(np.abs(compute_sampson_distances(*pose, rays, focals)) * scale)
+        pairs.append((pose, rays, focals, scale))
     if not given:
         return None
-    before = float(np.median(np.concatenate(given))) * scale
+    before = float(np.median(np.concatenate(given)))
     # Poses that agree as well as features can be located need no fit.
     if before <= MIN_CONTRADICTION:
         return PoseFit(before, before)
     fitted = []
-    for pose, rays, focals in pairs:
+    for pose, rays, focals, scale in pairs:
         best = fit_relative_pose(pose, rays, focals)
-        fitted.append(np.abs(compute_sampson_distances(*best, rays, focals)))
-    return PoseFit(before, float(np.median(np.concatenate(fitted))) * scale)
+        fitted.append(np.abs(compute_sampson_distances(*best, rays, focals)) * scale)
+    return PoseFit(before, float(np.median(np.concatenate(fitted))))
 
 
 def make_rays(image: StereoImage, pixels: Pixels) -> Rays:
@@ -102,7 +117,10 @@ def fit_relative_pose(
     rays: tuple[Rays, Rays],
     focals: tuple[Focals, Focals],
 ) -> RelativePose:
-    """Fit the relative pose with the smallest distances; those above a pixel count less."""
+    """Fit the relative pose with the smallest distances.
+
+    Those above a pixel of the photographs, as `focals` are in, count less.
+    """
     # Imported here, as most poses need no fit.
     from scipy.optimize import least_squares
 
@@ -118,6 +136,6 @@ def fit_relative_pose(
         lambda step: compute_sampson_distances(*change(step), rays, focals),
         np.zeros(5),
         loss="soft_l1",
-        x_scale=[1e-3, 1e-3, 1e-3, 1e-2, 1e-2],
+        x_scale=STEP_SCALES,
     )
     return change(solution.x)

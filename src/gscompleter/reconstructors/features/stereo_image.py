@@ -14,6 +14,8 @@ from gscompleter.types import View
 
 MIN_STEREO_SIDE = 8
 """Smallest side of an image that stereo can match, in pixels."""
+MAX_ROUNDING = 2e-7
+"""Largest rounding of a coordinate in float32, relative to the largest one."""
 MIN_GIVEN_DEPTH = np.float32(1e-6)
 """Smallest given depth, in units of the images; sensors write any number."""
 
@@ -61,10 +63,9 @@ def make_stereo_images(views: Sequence[View]) -> tuple[list[StereoImage], float]
     if is_single and near:
         return [_make_stereo_image(views[0], np.zeros(3), near)], near
 
-    # Baselines below the rounding of the coordinates count as none.
-    centers = np.stack([view.camera.center.detach().cpu().double().numpy() for view in views])
-    unit = float(np.linalg.norm(centers[:, None] - centers[None], axis=-1).max())
-    if unit <= 2e-7 * float(np.linalg.norm(centers, axis=-1).max()):
+    centers = stack_centers(views)
+    unit = measure_widest_baseline(centers)
+    if unit == 0:
         raise InputError(
             f"All {len(views)} cameras stand in one place, and depth needs a baseline between "
             "them; give photographs taken from different positions."
@@ -74,6 +75,22 @@ def make_stereo_images(views: Sequence[View]) -> tuple[list[StereoImage], float]
         _make_stereo_image(view, offset, unit) for view, offset in zip(views, offsets, strict=True)
     ]
     return images, unit
+
+
+def has_baseline(views: Sequence[View]) -> bool:
+    """Check whether the cameras of views stand in different places."""
+    return measure_widest_baseline(stack_centers(views)) > 0
+
+
+def stack_centers(views: Sequence[View]) -> Float[np.ndarray, "n 3"]:
+    """Stack the camera centres of views, in scene units."""
+    return np.stack([view.camera.center.detach().cpu().double().numpy() for view in views])
+
+
+def measure_widest_baseline(centers: Float[np.ndarray, "n 3"]) -> float:
+    """Measure the widest baseline of cameras; 0 if it is below the rounding of the coordinates."""
+    widest = float(np.linalg.norm(centers[:, None] - centers[None], axis=-1).max())
+    return widest if widest > MAX_ROUNDING * float(np.linalg.norm(centers, axis=-1).max()) else 0.0
 
 
 def _make_stereo_image(view: View, center: Float[np.ndarray, "3"], unit: float) -> StereoImage:
