@@ -11,6 +11,7 @@ import torch
 from PIL import Image
 
 from gscompleter import InputError, load_cameras
+from gscompleter.apps.inputs.captures import find_cameras_beside
 from gscompleter.data.camera_files import is_in_splat_frame
 from gscompleter.data.formats import SCENE_FORMATS, open_photographs
 from gscompleter.data.points import MIN_RANGE_POINTS, add_depth_range, compute_depth_range
@@ -61,6 +62,47 @@ def test_every_format_shows_the_room_from_where_it_says(tmp_path, kind):
     assert (photographs.name, photographs.notes) == ("room", ())
     assert photographs.camera(2, (32, 48)).K[0, 0] == pytest.approx(0.9 * 48)
     check_room(open_photographs(scene, format=name))
+
+
+def list_files_below(folder: Path) -> list[Path]:
+    return [path for path in sorted(folder.rglob("*")) if path.is_file()]
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_hidden_files_of_macos_count_in_no_format(tmp_path, kind):
+    scene = WRITERS[kind][1](tmp_path / "room")
+    for path in list_files_below(tmp_path):
+        path.with_name(f"._{path.name}").write_bytes(b"\0\5\x16\7")
+    photographs = open_photographs(scene)
+    assert len(photographs) == len(CAMERAS)
+    assert (photographs.notes, photographs.unused) == ((), ())
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_files_that_are_links_are_of_the_scene_that_they_lie_in(tmp_path, kind):
+    """As git-annex and DVC store them."""
+    scene = WRITERS[kind][1](tmp_path / "room")
+    for number, path in enumerate(list_files_below(tmp_path)):
+        stored = tmp_path / "store" / str(number) / f"object-{path.name}"
+        stored.parent.mkdir(parents=True)
+        path.rename(stored)
+        path.symlink_to(stored)
+    photographs = open_photographs(scene)
+    assert photographs.name == "room"
+    assert len(photographs) == len(CAMERAS)
+
+
+def test_cameras_are_found_beside_a_splat_that_is_a_link(tmp_path):
+    stored = tmp_path / "store" / "object.ply"
+    stored.parent.mkdir()
+    stored.write_bytes(b"ply")
+    (tmp_path / "room").mkdir()
+    splat = tmp_path / "room" / "splat.ply"
+    splat.symlink_to(stored)
+    beside = write_camera_list(tmp_path / "room" / "cameras.json")
+    assert find_cameras_beside(splat) == beside
+    beside.rename(stored.with_name("cameras.json"))
+    assert find_cameras_beside(splat) == stored.with_name("cameras.json")
 
 
 def test_every_format_is_tried_here_or_in_the_file_of_its_own():

@@ -46,6 +46,7 @@ from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import (
     MAX_JSON,
     is_json_list,
+    list_entries,
     parse_json,
     read_head,
     read_json,
@@ -136,7 +137,7 @@ def open_camera_list(path: Path) -> Iterator[Photographs]:
     file = path / INRIA_CAMERAS_FILE if os.path.isdir(path) else path
     frames = locate_images(read_camera_list(file), [file.parent])
     there, notes = keep_existing(frames, quote_value(file))
-    name = file.resolve().parent.name if file.name == INRIA_CAMERAS_FILE else file.stem
+    name = file.parent.resolve().name if file.name == INRIA_CAMERAS_FILE else file.stem
     yield replace(build_photographs(name, quote_value(file), there), notes=notes)
 
 
@@ -223,7 +224,7 @@ def refuse_other_exports(path: Path) -> None:
         f"{quote_value(path)} is a model without photographs and cameras, which is all that "
         "Scaniverse exports; record with Polycam, Record3D or 3d Scanner App, or take photographs.",
     )
-    inside = sorted(path.glob("*"))
+    inside = list_entries(path)
     for file, (endings, mark, (content, advice)) in product([path, *inside], EXPORTS):
         require(
             file.suffix.lower() not in endings or mark not in read_head(file, 4096),

@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics
+from gscompleter.data.file_names import list_homes_of
 from gscompleter.data.frame import Frame
 from gscompleter.data.json_fields import get_array, get_number, get_part, get_size
 from gscompleter.data.limits import require
@@ -60,7 +61,7 @@ def parse_camera_path(content: Any, path: Path) -> list[Frame]:
 
 def find_world(path: Path) -> Float[np.ndarray, "4 4"] | None:
     """Find the similarity from the frame of a path to that of the photographs; None if unknown."""
-    folders = [path.resolve().parent, path.resolve().parent.parent]
+    folders = [folder for home in list_homes_of(path) for folder in (home, home.parent)]
     files = [folder / DATAPARSER_FILE for folder in folders]
     dataparser = next((file for file in files if os.path.isfile(file)), None)
     if dataparser is None:

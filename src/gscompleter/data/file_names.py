@@ -73,6 +73,14 @@ def _exists(path: Path) -> bool:
     return False
 
 
+def list_homes_of(file: Path) -> list[Path]:
+    """List the folder of a file, and if it is a link also that of the file that it names.
+
+    git-annex and DVC keep large files elsewhere, and links to them where users put them.
+    """
+    return list(dict.fromkeys([file.parent.resolve(), file.resolve().parent]))
+
+
 def is_photograph_name(name: str) -> bool:
     """Check whether a file is named as a photograph, and not hidden."""
     return not is_hidden_name(name) and name.lower().endswith(PHOTOGRAPH_ENDINGS)

@@ -22,7 +22,7 @@ from gscompleter.data.limits import DEPTH_RANGE, require
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import FAR_FACTOR, NEAR_FACTOR
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.reading import check_file
+from gscompleter.system.files.reading import check_file, list_entries
 
 POSES_BOUNDS_FILE = "poses_bounds.npy"
 LLFF_ENDINGS = (".jpg", ".jpeg", ".png")
@@ -30,7 +30,7 @@ LLFF_ADVICE = "run LLFF's imgs2poses again"
 
 
 def has_llff(path: Path) -> bool:
-    """Check whether `path` is a `poses_bounds.npy`, or a folder with one."""
+    """Check whether `path` is a folder with a `poses_bounds.npy`, or a file whose name ends so."""
     return os.path.isfile(path / POSES_BOUNDS_FILE) or (
         path.name.endswith(POSES_BOUNDS_FILE) and os.path.isfile(path)
     )
@@ -51,7 +51,7 @@ def open_llff(path: Path) -> Iterator[Photographs]:
     ]
     near = NEAR_FACTOR * rows[:, 15].min().item()
     far = FAR_FACTOR * rows[:, 16].max().item()
-    scene = build_photographs(file.resolve().parent.name, quote_value(file), frames)
+    scene = build_photographs(file.parent.resolve().name, quote_value(file), frames)
     yield replace(scene, near=near, far=far)
 
 
@@ -91,7 +91,7 @@ def _read_pose_rows(path: Path) -> Float[np.ndarray, "n 17"]:
 def _find_photographs(file: Path, count: int) -> list[Path]:
     """List the photographs of the first folder with one for each row."""
     for folder in list_image_folders([file.parent]):
-        images = sorted(path for path in folder.iterdir() if path.suffix.lower() in LLFF_ENDINGS)
+        images = [path for path in list_entries(folder) if path.suffix.lower() in LLFF_ENDINGS]
         if len(images) == count:
             return images
     raise InputError(

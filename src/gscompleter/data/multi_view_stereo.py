@@ -30,7 +30,7 @@ from gscompleter.data.limits import MAX_NUMBER, require
 from gscompleter.data.number_files import parse_numbers
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.reading import read_bytes, read_zip_entry
+from gscompleter.system.files.reading import list_entries, read_bytes, read_zip_entry
 from gscompleter.types import MAX_IMAGE_SIDE
 
 CAMS = "cams"
@@ -51,7 +51,7 @@ MAX_LENS_SKEW = 1e-3
 
 def has_mvsnet(path: Path) -> bool:
     """Check whether a folder has cameras of MVSNet."""
-    return (path / CAMS).is_dir() and any((path / CAMS).glob(f"*{ENDING}"))
+    return (path / CAMS).is_dir() and bool(list_entries(path / CAMS, f"*{ENDING}"))
 
 
 def open_mvsnet(path: Path) -> Iterator[Photographs]:
@@ -59,7 +59,7 @@ def open_mvsnet(path: Path) -> Iterator[Photographs]:
     listings = FolderListings()
     folders = [path / name for name in MVS_FOLDERS]
     frames = []
-    for file in sorted((path / CAMS).glob(f"*{ENDING}")):
+    for file in list_entries(path / CAMS, f"*{ENDING}"):
         stem = file.name.removesuffix(ENDING)
         image = find_file(folders, [f"{stem}{ending}" for ending in MVS_ENDINGS], listings)
         depth = find_file([path / RENDERED_DEPTH_FOLDER], [f"{stem}.pfm"], listings)
@@ -144,7 +144,7 @@ def open_idr(path: Path) -> Iterator[Photographs]:
     file = _find_matrices(path)
     assert file is not None
     home = next(path / name for name in IDR_FOLDERS if (path / name).is_dir())
-    images = sorted(one for one in home.iterdir() if one.suffix.lower() in MVS_ENDINGS)
+    images = [one for one in list_entries(home) if one.suffix.lower() in MVS_ENDINGS]
     matrices = read_matrices(file)
     count = sum(name.startswith("world_mat_") and name[10:].isdecimal() for name in matrices)
     require(

@@ -26,7 +26,14 @@ from gscompleter.data.limits import require
 from gscompleter.data.photograph import StoredPhotograph
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.system.errors import InputError, join_names, quote_value, refuse_pointer
-from gscompleter.system.files.reading import check_file, open_file, read_head, read_json, read_lines
+from gscompleter.system.files.reading import (
+    check_file,
+    list_entries,
+    open_file,
+    read_head,
+    read_json,
+    read_lines,
+)
 
 INDEX = "index.json"
 
@@ -82,7 +89,7 @@ def _parse_line(line: str, number: int, path: Path) -> Frame:
 
 def list_camera_files(path: Path) -> list[Path]:
     """List the RealEstate10K camera files in a folder, or the given one."""
-    files = sorted(path.glob("*.txt")) if os.path.isdir(path) else [path]
+    files = list_entries(path, "*.txt") if os.path.isdir(path) else [path]
     return [file for file in files if file.suffix == ".txt" and read_head(file, 4) == b"http"]
 
 
@@ -104,14 +111,14 @@ def open_chunks(path: Path) -> Iterator[Photographs]:
     folder = path.parent if path.name == INDEX else _list_folders(path)[0]
     listed = _read_index(folder / INDEX) if os.path.isfile(folder / INDEX) else {}
     # Without an index, all chunks of the folder are opened.
-    files = sorted(set(listed.values())) or sorted(file.name for file in folder.glob("*.torch"))
+    files = sorted(set(listed.values())) or [file.name for file in list_entries(folder, "*.torch")]
     keys = {file: {key for key, chunk in listed.items() if chunk == file} for file in files}
     return (scene for file in files for scene in _open_chunk(folder / file, keys[file]))
 
 
 def _list_folders(path: Path) -> list[Path]:
     folders = (path, path / "test")
-    return [f for f in folders if os.path.isfile(f / INDEX) or any(f.glob("*.torch"))]
+    return [f for f in folders if os.path.isfile(f / INDEX) or list_entries(f, "*.torch")]
 
 
 def _read_index(index: Path) -> dict[str, str]:

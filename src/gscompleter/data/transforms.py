@@ -78,7 +78,7 @@ def open_transforms(path: Path) -> Iterator[Photographs]:
     frames = [frame for file in files for frame in read_frames(file)]
     if all(frame.image is not None for frame in frames):
         frames = sorted(frames, key=lambda frame: frame.name)
-    folder = files[0].resolve().parent
+    folder = files[0].parent.resolve()
     name = (folder.parent if folder.name in TRANSFORMS_HOMES else folder).name
     if len(files) == 1 and files[0].name not in (TRANSFORMS_FILE, *SPLITS):
         name = files[0].stem

@@ -130,7 +130,8 @@ def _list_depth_beside(frames: Sequence[Frame]) -> list[str]:
     """Name depth maps that lie between the photographs."""
     phrases = []
     for home, used in _list_homes(frames).items():
-        found = [n for n in sorted(os.listdir(home)) if _matches(n, DEPTH_FILES) and n not in used]
+        names = [name for name in sorted(os.listdir(home)) if not is_hidden_name(name)]
+        found = [name for name in names if _matches(name, DEPTH_FILES) and name not in used]
         if found:
             phrases.append(
                 f"{len(found):,} depth maps such as {quote_value(found[0])} in {home.name}"

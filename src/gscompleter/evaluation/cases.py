@@ -25,6 +25,7 @@ from gscompleter.evaluation.case_file import (
 )
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import holds_results
+from gscompleter.system.files.reading import list_entries
 from gscompleter.types import View
 
 REGION_SIDE = 512
@@ -139,7 +140,7 @@ def list_places(path: Path) -> list[ScenePlace]:
 
 def list_scenes(path: Path) -> list[Path]:
     """List the scenes in a folder of scenes, without results of ours; else the path itself."""
-    inside = [] if find_format(path) or not os.path.isdir(path) else sorted(path.iterdir())
+    inside = [] if find_format(path) or not os.path.isdir(path) else list_entries(path)
     folders = [
         child
         for child in inside

@@ -22,6 +22,7 @@ from gscompleter.splats.splat_format import list_zip
 from gscompleter.splats.spz import GZIP
 from gscompleter.splats.table import FILE_ENDINGS
 from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.reading import list_entries
 
 OF_STREAMED = (
     "in several levels of detail; write one of them to a .ply with `gscompleter convert`, and name "
@@ -90,7 +91,7 @@ def find_newest_splat(folder: Path) -> Path | None:
         return int(numbers[-1][:18]) if numbers else -1
 
     for pattern in _PATTERNS:
-        paths = [path for path in folder.glob(pattern) if path.is_file()]
+        paths = [path for path in list_entries(folder, pattern) if path.is_file()]
         if paths:
             return max(paths, key=lambda path: (get_iteration(path), str(path)))
     return None

@@ -116,7 +116,7 @@ def read_manifest_rows(manifest: Path, out: Path | None = None) -> list[OptionVa
     """Read the rows of a manifest as they are."""
     if os.path.isdir(manifest):
         results = list_results(manifest, out)
-        folders = [path for path in list_folders(manifest.resolve()) if path.name[0] != "."]
+        folders = list_folders(manifest.resolve())
         return [{FOLDER: str(path)} for path in folders if path not in results]
     parsers = {".csv": parse_csv, ".jsonl": parse_json_lines, ".ndjson": parse_json_lines}
     if manifest.suffix not in parsers:

@@ -17,6 +17,7 @@ from gscompleter.apps.requests.scene import DEFAULT_LONG_SIDE, SceneRequest
 from gscompleter.apps.requests.splat import Selection
 from gscompleter.config import HoleConfig
 from gscompleter.data.camera_files import INRIA_CAMERAS_FILE, has_camera_list
+from gscompleter.data.file_names import list_homes_of
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photograph_names import name_render
 from gscompleter.data.photographs import (
@@ -107,11 +108,12 @@ class Capture:
 
 def find_cameras_beside(splat: Path) -> Path | None:
     """Find the cameras.json beside a splat, or in the folder of its trainer; None without one."""
-    folder = splat.resolve().parent
-    # The trainers of 3DGS write point_cloud/iteration_30000/point_cloud.ply below cameras.json.
-    folders = [folder]
-    if folder.parent.name == "point_cloud":
-        folders.append(folder.parents[TRAINER_LEVELS - 1])
+    folders = []
+    for folder in list_homes_of(splat):
+        folders.append(folder)
+        # The trainers of 3DGS write point_cloud/iteration_30000/point_cloud.ply below cameras.json.
+        if folder.parent.name == "point_cloud":
+            folders.append(folder.parents[TRAINER_LEVELS - 1])
     found = [
         place / INRIA_CAMERAS_FILE
         for place in folders

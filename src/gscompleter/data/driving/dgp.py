@@ -47,7 +47,7 @@ def open_dgp(path: Path) -> Iterator[Photographs]:
     frames.sort(key=lambda frame: frame.name)
     require(frames, f"{quote_value(file)} lists no images; name a scene with cameras.")
     front = min(frame.sensor or "" for frame in frames)
-    yield build_photographs(file.resolve().parent.name, quote_value(file), frames, front=front)
+    yield build_photographs(file.parent.resolve().name, quote_value(file), frames, front=front)
 
 
 def _parse_datum(

@@ -24,7 +24,7 @@ from gscompleter.data.frame import Frame
 from gscompleter.data.limits import MAX_NUMBER, require
 from gscompleter.data.photographs import Photographs, build_drive, build_photographs
 from gscompleter.system.errors import quote_value
-from gscompleter.system.files.reading import MAX_LINE, read_head, read_lines
+from gscompleter.system.files.reading import MAX_LINE, list_entries, read_head, read_lines
 
 KITTI_POSES_FILE = "poses.txt"
 CALIBRATION = "calib.txt"
@@ -66,7 +66,7 @@ def open_kitti(path: Path) -> Iterator[Photographs]:
     """
     poses = _list_poses(path)[0]
     folder = path if os.path.isdir(path) else path.parent
-    sequence = poses.resolve().parent.parent / "sequences" / poses.stem
+    sequence = poses.parent.resolve().parent / "sequences" / poses.stem
     if poses == path and os.path.isdir(sequence):
         folder = sequence
     calibration = folder / CALIBRATION
@@ -111,7 +111,7 @@ def open_kitti_raw(path: Path) -> Iterator[Photographs]:
     intrinsics, first_from_camera, first_from_laser = _read_raw_camera(date, camera)
     laser_from_first = np.linalg.pinv(first_from_laser)
 
-    images = sorted((path / f"image_{camera}" / "data").iterdir())
+    images = list_entries(path / f"image_{camera}" / "data")
     readings = [_read_oxts(path / "oxts" / "data" / f"{image.stem}.txt") for image in images]
     # One scale of the map for all frames, that at the first latitude, so that it stays rigid.
     scale = float(np.cos(np.radians(readings[0][0])))
@@ -242,4 +242,4 @@ def _list_poses(path: Path) -> list[Path]:
 
 
 def _list_raw_cameras(path: Path) -> list[str]:
-    return [c for c in RAW_CAMERAS if any((path / f"image_{c}" / "data").glob("*.*"))]
+    return [c for c in RAW_CAMERAS if list_entries(path / f"image_{c}" / "data", "*.*")]

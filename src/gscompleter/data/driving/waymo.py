@@ -26,7 +26,7 @@ from gscompleter.data.limits import require
 from gscompleter.data.photograph import StoredPhotograph
 from gscompleter.data.photographs import Photographs, build_drive
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.reading import check_file
+from gscompleter.system.files.reading import check_file, list_entries
 
 WAYMO_ADVICE = "download it again"
 IMAGE_COMPONENT = "camera_image"
@@ -55,7 +55,7 @@ def open_waymo(path: Path) -> Iterator[Photographs]:
 
 def list_segments(path: Path) -> list[Path]:
     """List the photograph files of the segments in a folder, or the given one."""
-    files = sorted((path / IMAGE_COMPONENT).glob("*.parquet")) if os.path.isdir(path) else [path]
+    files = list_entries(path / IMAGE_COMPONENT, "*.parquet") if os.path.isdir(path) else [path]
     return [f for f in files if f.match(f"{IMAGE_COMPONENT}/*.parquet") and os.path.isfile(f)]
 
 

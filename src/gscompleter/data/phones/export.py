@@ -26,6 +26,7 @@ from gscompleter.data.transforms import OPENCV_FROM_OPENGL
 from gscompleter.system.damage import describe_damage
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import open_image
+from gscompleter.system.files.names import is_hidden_name
 from gscompleter.system.files.reading import check_file, read_bytes, read_zip_entry
 
 PHONE_EXPORT_ADVICE = "export the recording again"
@@ -54,8 +55,7 @@ def find_files(export: Path, pattern: str) -> Files:
             # `match` compares from the right, so that a folder around the export does not matter.
             paths = [entry for entry in entries if entry.match(pattern)]
         read = partial(_read_archive_entry, export)
-    # macOS adds "._x.jpg" for each "x.jpg" to an archive.
-    paths = sorted(path for path in paths if not path.name.startswith("."))
+    paths = sorted(path for path in paths if not is_hidden_name(path.name))
     require(
         len({path.parent for path in paths}) <= 1,
         f"{quote_value(export)} holds several recordings; unpack it, and name one of them.",

@@ -10,7 +10,10 @@ from jaxtyping import Float
 
 from gscompleter.reconstructors.features.matches import fit_poses, measure_match_errors
 from gscompleter.reconstructors.features.neighbours import find_neighbours
-from gscompleter.reconstructors.features.stereo_image import has_baseline, make_stereo_images
+from gscompleter.reconstructors.features.stereo_image import (
+    has_distinct_centers,
+    make_stereo_images,
+)
 from gscompleter.types import View
 
 MAX_POSE_ERROR = 8.0
@@ -57,7 +60,7 @@ def measure_pose_errors(views: Sequence[View]) -> list[float | None]:
     the error of a single photograph also shows at its neighbours.
     Localization of the features alone gives 0.1 to 0.3 pixels.
     """
-    if not has_baseline(views):
+    if not has_distinct_centers(views):
         return [None] * len(views)
     images, _ = make_stereo_images(views)
     errors: list[list[Float[np.ndarray, "k"]]] = [[] for _ in images]

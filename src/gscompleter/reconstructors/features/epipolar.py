@@ -20,7 +20,7 @@ from gscompleter.reconstructors.features.matches import Pixels, measure_match_er
 from gscompleter.reconstructors.features.neighbours import find_neighbours
 from gscompleter.reconstructors.features.stereo_image import (
     StereoImage,
-    has_baseline,
+    has_distinct_centers,
     make_stereo_images,
 )
 from gscompleter.types import View
@@ -68,7 +68,7 @@ def measure_pose_fit(views: Sequence[View]) -> PoseFit | None:
     Each pair whose features `find_neighbours` matched, that is of cameras similar in place and
     direction, is fitted alone: it tells that poses are wrong, but not which.
     """
-    if len(views) < 2 or not has_baseline(views):
+    if len(views) < 2 or not has_distinct_centers(views):
         return None
     images, _ = make_stereo_images(views)
     given = []

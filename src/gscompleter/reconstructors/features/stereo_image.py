@@ -77,7 +77,7 @@ def make_stereo_images(views: Sequence[View]) -> tuple[list[StereoImage], float]
     return images, unit
 
 
-def has_baseline(views: Sequence[View]) -> bool:
+def has_distinct_centers(views: Sequence[View]) -> bool:
     """Check whether the cameras of views stand in different places."""
     return measure_widest_baseline(stack_centers(views)) > 0
 

@@ -18,6 +18,7 @@ from jaxtyping import Float
 
 from gscompleter.data.camera_files import has_camera_list, read_camera_list
 from gscompleter.data.cameras import Poses, find_pose_defect
+from gscompleter.data.file_names import list_homes_of
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.transforms import DATAPARSER_FILE, read_dataparser_transforms
@@ -61,10 +62,10 @@ class InputSplat:
 
 def list_trainer_folders(splat: Path, photographs: Path) -> list[Path]:
     """List the folders where trainers leave files, the nearest to the splat first."""
-    near = splat.resolve().parent
-    model = [near.parent.parent] if near.name.startswith(ITERATION_PREFIX) else []
+    near = list_homes_of(splat)
+    model = [home.parent.parent for home in near if home.name.startswith(ITERATION_PREFIX)]
     scene = photographs if photographs.is_dir() else photographs.parent
-    return list(dict.fromkeys([near, *model, scene.resolve()]))
+    return list(dict.fromkeys([*near, *model, scene.resolve()]))
 
 
 def read_trainer_frames(

@@ -30,6 +30,7 @@ from typing import Any
 
 from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.early_results import describe_early
+from gscompleter.system.files.names import is_hidden_name
 from gscompleter.system.files.renaming import rename
 from gscompleter.system.files.result_format import RESULT_MARK, is_marked, refuse_later
 from gscompleter.system.files.unfinished import (
@@ -315,7 +316,7 @@ def _check_free(given: Path, target: Path, overwrite: bool) -> None:
         return  # only the cameras that an earlier run found
     if names and not overwrite:
         # What `ls` does not show is named.
-        is_hidden = all(name.startswith(".") for name in names)
+        is_hidden = all(is_hidden_name(name) for name in names)
         held = f" (it holds {join_names(names, MAX_FOREIGN_FILES)})" if is_hidden else ""
         raise InputError(
             f"The output folder {quote_value(given)} is not empty{held}; name another one, or "

@@ -15,6 +15,7 @@ from typing import Any, BinaryIO
 
 from gscompleter.system.damage import DamagedError, describe_damage
 from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.names import is_hidden_name
 
 MAX_BYTES = 1 << 33
 """Largest file that is read at once, in bytes."""
@@ -108,10 +109,15 @@ def read_lines(
             yield line
 
 
+def list_entries(folder: Path, pattern: str = "*") -> list[Path]:
+    """List what matches a pattern in a folder, by name and without what is hidden."""
+    return sorted(path for path in folder.glob(pattern) if not is_hidden_name(path.name))
+
+
 def list_folders(folder: Path) -> list[Path]:
-    """List the folders of a folder by name; none if it cannot be read."""
+    """List the folders of a folder by name, without hidden ones; none if it cannot be read."""
     try:
-        return sorted(child for child in folder.iterdir() if os.path.isdir(child))
+        return [child for child in list_entries(folder) if os.path.isdir(child)]
     except OSError:
         return []
 
