@@ -41,6 +41,13 @@ def test_a_wide_hole_its_rim_and_what_is_opaque_do_not_count():
     assert not find_thin_gaps(make_alpha(2, 0.9)).any()
 
 
+@pytest.mark.parametrize(("width", "counted"), [(2, 2), (3, 0)])
+def test_along_the_border_of_the_image_a_crack_is_thinner_than_three_pixels(width, counted):
+    alpha = torch.ones(SIDE, SIDE)
+    alpha[:, :width] = 0.6
+    assert measure_thin_gaps(alpha) == pytest.approx(counted / SIDE)
+
+
 def test_a_crack_beside_a_hole_counts():
     alpha = make_alpha(8, 0.0)
     alpha[:, 5] = 0.7

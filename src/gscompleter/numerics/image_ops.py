@@ -126,7 +126,11 @@ def dilate(mask: Bool[Tensor, "h w"], radius: int) -> Bool[Tensor, "h w"]:
 
 
 def keep_thin(mask: Bool[Tensor, "h w"], radius: int = THIN_RADIUS) -> Bool[Tensor, "h w"]:
-    """Keep the structures of a mask that no square of 2 radius + 1 pixels fits into."""
+    """Keep the structures of a mask that no square of 2 radius + 1 pixels fits into.
+
+    A mask goes on beyond the border of the image: what is `radius` pixels wide along it is thin,
+    and what is wider is not.
+    """
     # A morphological opening leaves what the square fits into. One pixel more, as rims of wide
     # structures are not straight.
     shrunk = ~dilate(~mask, radius)

@@ -161,7 +161,8 @@ class TargetRow(ScoreRow):
     anchor_file: str | None = None
     """File of the anchor's photograph."""
     thin_gaps: float = 0.0
-    """Share of the image of the completed scene that is cracks thinner than 5 pixels."""
+    """Share of the image of the completed scene that is cracks thinner than 5 pixels, or
+    than 3 along its border."""
     flight_thin_gaps: float = 0.0
     """The same at four cameras between the nearest photograph and the target, on average."""
     painter: str | None = None

@@ -59,7 +59,10 @@ class WorstGap:
 
 
 def find_thin_gaps(alpha: Float[Tensor, "h w"]) -> Bool[Tensor, "h w"]:
-    """Find the pixels below `OPAQUE_ALPHA` in structures thinner than 5 pixels."""
+    """Find the pixels below `OPAQUE_ALPHA` in structures thinner than 5 pixels.
+
+    Along the border of the image they are thinner than 3, since beyond it a gap may go on.
+    """
     return keep_thin(alpha < OPAQUE_ALPHA)
 
 

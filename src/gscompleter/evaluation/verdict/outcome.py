@@ -37,7 +37,9 @@ seven scenes: they are distorted, and still fit the photographs beside them.
 """
 MAX_ABOVE_COLOR = 10.0
 """Median over them, in dB above a single colour, from which a scene did reconstruct all the same:
-where the camera hardly moved, a photograph as it is comes near. Wrong poses reach 8.1 dB."""
+where the camera hardly moved, a photograph as it is comes near. Wrong poses reach 8.1 dB above the
+best grey, which is at most as near to a photograph as the best colour: by 0 to 0.9 dB in 54 runs
+with six of the scenes, whose verdicts are the same with either."""
 MIN_CONSISTENT = 0.3
 """Share of the matched features that has to fit the poses, where no unused photograph decides.
 
