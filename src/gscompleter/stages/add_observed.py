@@ -340,8 +340,6 @@ def accept_photographed(
     They are placed already, by the scale of their depths, and selected by Eq. 12. Guards judge what
     an image at a target adds, and have no say: here every image is a photograph.
     """
-    if len(candidates.gaussians) == 0:
-        return candidates
     guard = state.config.psnr_guard
 
     def keep_places(placed: Additions) -> Additions:
