@@ -172,7 +172,8 @@ def copy_photographs(case: BenchCase, folder: Path) -> BenchCase:
     scene = folder / "photographs"
     scene.mkdir(parents=True, exist_ok=True)
     views = [photographs.views([frame], None)[0] for frame in frames]
-    names = [f"{frame}.png" for frame in frames]
+    # Photographs are numbered in the order of their names.
+    names = [f"{frame:04d}.png" for frame in frames]
     for name, view in zip(names, views, strict=True):
         write_image(scene / name, view.image)
     write_cameras(scene / "transforms.json", [view.camera for view in views], names)

@@ -240,8 +240,7 @@ class GSCompleter:
 
             # The order of evidence: what photographs show goes in first, what the scene shows is
             # kept, and Φ invents only the rest (decision 051).
-            rng = torch.Generator().manual_seed(self.seed)
-            state = add_observed(self.reconstructor, state, self.scenes, rng)
+            state = add_observed(self.reconstructor, state, self.scenes)
             state = return_needed(state, contested, self.scenes)
             if state.num_observed or contested is not None:
                 # What photographs gained by it has to stay, too.

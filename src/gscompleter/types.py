@@ -12,7 +12,7 @@ numbers. The numbers in large tensors are checked where they enter (`value_check
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any, ClassVar, Literal, TypeVar
@@ -678,6 +678,10 @@ class DepthMap(Displayed, TensorDataclass):
         """List inverse depth, brighter where nearer and black where it is invalid."""
         inverse = torch.where(self.valid, 1 / self.depth, torch.zeros_like(self.depth))
         return {"inverse depth": inverse / inverse.max().clamp_min(1e-12)}
+
+
+ChooseMasks = Callable[[Sequence[DepthMap]], Sequence[Bool[Tensor, "_ _"]]]
+"""Chooses the pixels of each view that need Gaussians, by the depths of all views."""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,7 @@ from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -288,7 +289,7 @@ def test_the_frames_that_were_chosen_are_named(room, tmp_path):
 
 
 def test_a_hole_is_found_where_something_is_missing(ready, begun):
-    camera = serving.find_next_target(ready.scene, begun.latest)
+    camera = serving.find_next_target(ready.scene, begun)
     assert camera is not None
     session, _ = complete_camera(begun, camera)
     assert session.latest.targets[-1].hole_fraction > 0.05
@@ -337,8 +338,25 @@ def test_a_box_is_removed_and_undone(splat_begun, without_crate):
     rest = removed.latest.added  # of what reached out of the box
     assert len(removed.latest.scene) == len(begun.latest.scene) - count + len(rest)
     assert undo_step(removed) == begun
-    with pytest.raises(InputError, match="contains nothing"):
-        remove_box(removed, (50.0, 50.0, 50.0, 51.0, 51.0, 51.0))
+    # A replay goes on where nothing is left to remove.
+    unchanged, text = remove_box(removed, (50.0, 50.0, 50.0, 51.0, 51.0, 51.0))
+    assert unchanged is removed
+    assert "contains nothing" in text
+
+
+def test_after_a_removal_other_holes_are_found_too(splat_ready, without_crate, monkeypatch):
+    removed, _ = without_crate
+    tried = []
+
+    def plan(planner, state, cameras, count):
+        tried.append(state.config)
+        return [] if state is removed.latest else [SimpleNamespace(camera=cameras[1])]
+
+    monkeypatch.setattr(type(splat_ready.scene.explorer), "plan", plan)
+    camera = serving.find_next_target(splat_ready.scene, removed)
+    assert camera is list(splat_ready.scene.cameras.values())[1]
+    assert tried == [removed.latest.config, removed.first_config]
+    assert tried[0] != tried[1]
 
 
 # `test_live_opening.py` saves and undoes several steps, and `test_remove.py` strips a removal.

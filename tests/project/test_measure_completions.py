@@ -235,12 +235,15 @@ def test_the_cases_of_the_documentation_can_be_read():
     assert given.cases[0].splat == given.cases[0].scene / "splat.ply"
 
 
-def test_photographs_of_a_case_are_copied_without_the_others(scene, tmp_path):
-    case = BenchCase("room", scene, (2,), (0,), (SIZE, SIZE), splat=Path("splat.ply"))
+def test_photographs_of_a_case_are_copied_without_the_others(tmp_path):
+    scene = tmp_path / "room"
+    photographed(scene, [camera_at(x=0.1 * number, size=SIZE) for number in range(11)], Room())
+    # As names, 10 comes before 2.
+    case = BenchCase("room", scene, (2, 10), (0,), (SIZE, SIZE), splat=Path("splat.ply"))
     copied = copy_photographs(case, tmp_path)
     photographs = copied.open()
-    assert len(photographs) == 2
-    for frame, before in zip((*copied.context, *copied.targets), (2, 0), strict=True):
+    assert len(photographs) == 3
+    for frame, before in zip((*copied.context, *copied.targets), (2, 10, 0), strict=True):
         (view,) = photographs.views([frame], (SIZE, SIZE))
         (known,) = case.open().views([before], (SIZE, SIZE))
         assert torch.equal(view.image, known.image)

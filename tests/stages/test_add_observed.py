@@ -17,7 +17,7 @@ from gscompleter.stages.add_observed import (
     keep_large_regions,
     select_pixels,
 )
-from gscompleter.types import DepthMap, Gaussians, Reconstruction, View, merge
+from gscompleter.types import ChooseMasks, DepthMap, Gaussians, Reconstruction, View, merge
 from scenes import Room, camera_at, gaussians_of, reconstruction_of, view_of
 
 SIZE = 64
@@ -122,9 +122,10 @@ def test_a_reconstructor_of_parts_is_asked_for_what_is_lacking():
         def __call__(self, views: list[View]) -> Reconstruction:
             raise AssertionError("the whole is not needed")
 
-        def reconstruct_part(self, views: list[View], masks: list[torch.Tensor]) -> Reconstruction:
-            self.shares = tuple(mask.float().mean().item() for mask in masks)
+        def reconstruct_part(self, views: list[View], choose_masks: ChooseMasks) -> Reconstruction:
             whole = reconstruct_exactly(views)
+            masks = choose_masks(whole.depths)
+            self.shares = tuple(mask.float().mean().item() for mask in masks)
             rows = torch.cat([mask.flatten() for mask in masks])
             return replace(
                 whole,

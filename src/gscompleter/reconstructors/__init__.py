@@ -18,7 +18,7 @@ from gscompleter.reconstructors.own_models import load_own_model
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.plugins import is_in_file, load_plugins
 from gscompleter.system.tensor_checks import describe, is_whole_number, iterate_tensors, name_dtype
-from gscompleter.types import Reconstruction, View
+from gscompleter.types import ChooseMasks, Reconstruction, View
 
 
 @runtime_checkable
@@ -50,10 +50,11 @@ class Lifter(Protocol):
 class PartReconstructor(Protocol):
     """Interface of a Ψ that can reconstruct only what some pixels of its views show."""
 
-    def reconstruct_part(
-        self, views: Sequence[View], masks: Sequence[Bool[Tensor, "_ _"]]
-    ) -> Reconstruction:
-        """Reconstruct the depth of `views`, and the Gaussians that any shows in its mask."""
+    def reconstruct_part(self, views: Sequence[View], choose_masks: ChooseMasks) -> Reconstruction:
+        """Reconstruct the depth of `views`, and the Gaussians that any shows in its mask.
+
+        Depth comes first, and tells which pixels need Gaussians; there may be none.
+        """
 
 
 @runtime_checkable
@@ -87,14 +88,14 @@ def run_reconstructor(
 
 
 def run_part_reconstructor(
-    reconstructor: Reconstructor, views: Sequence[View], masks: Sequence[Bool[Tensor, "_ _"]]
+    reconstructor: Reconstructor, views: Sequence[View], choose_masks: ChooseMasks
 ) -> Reconstruction:
     """Run Ψ on `views`, of which only what any shows in its mask needs Gaussians.
 
     Ψ may return more. Raises InputError as `run_reconstructor`.
     """
     if isinstance(reconstructor, PartReconstructor):
-        return accept_reconstruction(reconstructor.reconstruct_part(views, masks), views)
+        return accept_reconstruction(reconstructor.reconstruct_part(views, choose_masks), views)
     return accept_reconstruction(reconstructor(views), views)
 
 

@@ -105,7 +105,7 @@ class Evidence:
 
 
 def add_observed(
-    reconstructor: Reconstructor, state: Completion, scenes: SceneRenderer, rng: torch.Generator
+    reconstructor: Reconstructor, state: Completion, scenes: SceneRenderer
 ) -> Completion:
     """Add what photographs show and the scene lacks, as parts of that origin.
 
@@ -124,7 +124,7 @@ def add_observed(
             break
         reconstructed.update(chosen)
         photos = [Evidence(views[i], frozen[i], lacks[i]) for i in chosen]
-        lacking, notes = reconstruct_lacking(reconstructor, photos, state, rng)
+        lacking, notes = reconstruct_lacking(reconstructor, photos, state)
         state = replace(state, context_notes=(*state.context_notes, *notes))
         candidates = Additions.begin(PartOrigin("photographs"), "select", lacking)
         part = accept_photographed(candidates, frozen, state).to_part()
@@ -213,36 +213,29 @@ def reconstruct_lacking(
     reconstructor: Reconstructor,
     photos: Sequence[Evidence],
     state: Completion,
-    rng: torch.Generator,
 ) -> tuple[Gaussians, tuple[str, ...]]:
     """Reconstruct photographs and keep the Gaussians of what the scene lacks, registered to it.
 
     Returns the sentences of Ψ, too.
     """
     views = []
-    needed = []
     for photo in photos:
-        needed.append(dilate(photo.lack.mask, state.config.holes.dilation))
         known = photo.view.valid_mask & ~photo.lack.mask
         image = match_exposure(photo.view.image, photo.frozen.render.image, known)
         views.append(replace(photo.view, image=image))
-    reconstruction = run_part_reconstructor(reconstructor, views, needed)
 
-    # D_pred is Ψ's depth of a photograph, D_ctx that of the scene there, where it is not wrong.
-    scenes = [photo.frozen.render.depth_map() for photo in photos]
-    right = [
-        replace(scene, valid=scene.valid & ~photo.lack.mask)
-        for scene, photo in zip(scenes, photos, strict=True)
-    ]
-    affine = align_photographs(reconstruction.depths, right, rng)
-    aligned = [
-        replace(predicted, depth=affine.scale * predicted.depth + affine.shift)
-        for predicted in reconstruction.depths
-    ]
-    masks = [
-        select_pixels(photo.lack, depth, scene, state.config.holes.dilation)
-        for photo, depth, scene in zip(photos, aligned, scenes, strict=True)
-    ]
+    # Depths tell what is added. Where that is nothing, as in a splat that only draws its surfaces
+    # a little wrong, Ψ builds nothing.
+    def place(depths: Sequence[DepthMap]) -> PlacedDepths:
+        return place_depths(depths, photos, state.config.holes, state.seed)
+
+    reconstruction = run_part_reconstructor(
+        reconstructor, views, lambda depths: place(depths).masks
+    )
+    placed = place(reconstruction.depths)
+    affine = placed.affine
+    aligned = placed.depths
+    masks = placed.masks
 
     if reconstruction.view_index is None:
         # A Ψ that is not pixel-aligned does not say from which camera a Gaussian could slide.
@@ -264,6 +257,43 @@ def reconstruct_lacking(
     # that follows makes up for them.
     sh = part.sh[:, : state.context.sh.shape[1]]
     return replace(part, sh=sh, encoded=None), reconstruction.notes
+
+
+@dataclass(frozen=True)
+class PlacedDepths:
+    """Depths of photographs that are moved to the scene, and the pixels that they add to it."""
+
+    affine: DepthAffine
+    depths: Sequence[DepthMap]
+    masks: Sequence[Bool[Tensor, "_ _"]]
+
+
+def place_depths(
+    depths: Sequence[DepthMap],
+    photos: Sequence[Evidence],
+    settings: HoleConfig,
+    seed: int,
+) -> PlacedDepths:
+    """Move Ψ's depths of photographs to the scene, and select the pixels whose Gaussians it lacks.
+
+    `seed` is that of the RANSAC samples.
+    """
+    # D_pred is Ψ's depth of a photograph, D_ctx that of the scene there, where it is not wrong.
+    scenes = [photo.frozen.render.depth_map() for photo in photos]
+    right = [
+        replace(scene, valid=scene.valid & ~photo.lack.mask)
+        for scene, photo in zip(scenes, photos, strict=True)
+    ]
+    affine = align_photographs(depths, right, torch.Generator().manual_seed(seed))
+    aligned = [
+        replace(predicted, depth=affine.scale * predicted.depth + affine.shift)
+        for predicted in depths
+    ]
+    masks = [
+        select_pixels(photo.lack, depth, scene, settings.dilation)
+        for photo, depth, scene in zip(photos, aligned, scenes, strict=True)
+    ]
+    return PlacedDepths(affine, aligned, masks)
 
 
 def move_all(
@@ -340,8 +370,6 @@ def accept_photographed(
     They are placed already, by the scale of their depths, and selected by Eq. 12. Guards judge what
     an image at a target adds, and have no say: here every image is a photograph.
     """
-    if len(candidates.gaussians) == 0:
-        return candidates
     guard = state.config.psnr_guard
 
     def keep_places(placed: Additions) -> Additions:

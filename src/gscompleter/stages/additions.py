@@ -86,6 +86,9 @@ def accept(
     Everything that is added goes through here: what is generated for a target, what closes the
     gaps beside it, and what photographs show.
     """
+    # Guards would look at the whole scene for nothing.
+    if len(candidates.gaussians) == 0:
+        return candidates
     placed = place(candidates)
     refined = refine(placed.gaussians)
     added = replace(placed.then("refine", refined.gaussians), losses=refined.losses)

@@ -26,7 +26,6 @@ from gscompleter.apps.live.session import (
     undo_step,
 )
 from gscompleter.data.scene import describe_camera
-from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
 from gscompleter.system.progress import notify_of_stages
 from gscompleter.types import Camera

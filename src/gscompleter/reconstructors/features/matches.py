@@ -6,19 +6,20 @@ from functools import lru_cache
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, UInt8
 
 from gscompleter.reconstructors.features.stereo_image import (
     StereoImage,
     compute_source_from_reference,
 )
 
-Features = tuple[Float[np.ndarray, "_ 2"], Float[np.ndarray, "_ 128"]]
+Features = tuple[Float[np.ndarray, "_ 2"], UInt8[np.ndarray, "_ 128"]]
 """Pixels (the centre of the top-left one is (0.5, 0.5)) and descriptors."""
 Pixels = Float[np.ndarray, "m 2"]
 
-CACHE_SIZE = 32
-"""Images whose features are cached, because each target matches them again."""
+CACHE_SIZE = 128
+"""Images whose features are cached, 0.3 MB each: poses, stereo, each target and the report match
+the same photographs."""
 MAX_EPIPOLAR_DISTANCE = 3.0
 """Largest distance of a match from its epipolar line, in pixels; poses are noisy."""
 MIN_DEPTH = 1e-6
@@ -44,21 +45,28 @@ def _detect_features(grey: bytes, size: tuple[int, int]) -> Features:
     image = np.frombuffer(grey, np.uint8).reshape(size)
     keypoints, descriptors = detector.detectAndCompute(image, None)
     if descriptors is None:
-        return np.zeros((0, 2)), np.zeros((0, 128))
-    return np.array([k.pt for k in keypoints], np.float64) + 0.5, descriptors.astype(np.float64)
+        return np.zeros((0, 2)), np.zeros((0, 128), np.uint8)
+    # Descriptors are whole numbers from 0 to 255, in floats.
+    return np.array([k.pt for k in keypoints], np.float64) + 0.5, descriptors.astype(np.uint8)
 
 
 def match_features(a: Features, b: Features) -> tuple[Pixels, Pixels]:
     """Match mutual nearest neighbours that pass the ratio test."""
     if len(a[0]) < 2 or len(b[0]) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
-    # Squared distances of all descriptors [features of a, features of b].
-    squares = (a[1] ** 2).sum(1)[:, None] + (b[1] ** 2).sum(1)[None] - 2 * a[1] @ b[1].T
+    # Squared distances of all descriptors [features of a, features of b]. Their length is about
+    # 512, so that sums of products are whole numbers below 2^24, which 32 bits hold exactly.
+    of_a = a[1].astype(np.float32)
+    of_b = b[1].astype(np.float32)
+    squares = (of_a**2).sum(1)[:, None] + (of_b**2).sum(1)[None] - 2 * of_a @ of_b.T
     forward = squares.argmin(1)
     backward = squares.argmin(0)
-    best, second = np.partition(squares, 1, axis=1)[:, :2].T
+    rows = np.arange(len(of_a))
+    best = squares[rows, forward]
+    squares[rows, forward] = np.inf
+    second = squares.min(1)
     # Ratio test (Lowe 2004): 0.8 times the second best distance, squared.
-    i = np.flatnonzero((backward[forward] == np.arange(len(a[0]))) & (best < 0.64 * second))
+    i = np.flatnonzero((backward[forward] == rows) & (best < 0.64 * second))
     return a[0][i], b[0][forward[i]]
 
 

@@ -72,9 +72,11 @@ class Neighbours:
 def find_neighbours(images: Sequence[StereoImage], count: int = NUM_SOURCES) -> Neighbours:
     """Select up to `count` best neighbours for each image, and one that covers the rest."""
     features = map_in_parallel(detect_features, images)
-    matches = {
-        (i, j): match_features(features[i], features[j]) for i, j in find_close_pairs(images)
-    }
+    pairs = find_close_pairs(images)
+    matched = map_in_parallel(
+        match_features, [features[i] for i, _ in pairs], [features[j] for _, j in pairs]
+    )
+    matches = dict(zip(pairs, matched, strict=True))
     # 0 for pairs that were not compared, which become no neighbours.
     scores = np.zeros((len(images), len(images)))
     for (i, j), (in_i, in_j) in matches.items():

@@ -91,6 +91,9 @@ class Splatter:
 
         # A disc for every pixel of every view, of which those that form the scene are kept.
         parts = [self.splat(view, depth) for view, depth in zip(normalized, depths, strict=True)]
+        if masks is not None and not any(bool(mask.any()) for mask in masks):
+            none = torch.zeros(0, dtype=torch.long, device=device)
+            return Reconstruction(parts[0][:0], tuple(depths), none, none)
         candidates = merge(parts).to("cpu")
         on_cpu = [view.to("cpu") for view in views]
         kept = self.select_pixels(candidates, on_cpu, layers, transforms)

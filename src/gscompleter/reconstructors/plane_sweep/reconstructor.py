@@ -49,7 +49,7 @@ from gscompleter.reconstructors.plane_sweep.sweep import (
 )
 from gscompleter.system.errors import join_names
 from gscompleter.system.torch_modes import run_in_plain_torch
-from gscompleter.types import DepthMap, Reconstruction, View
+from gscompleter.types import ChooseMasks, DepthMap, Reconstruction, View
 
 LIFT_ITERATIONS = SMOOTHING_ITERATIONS // 2
 """Iterations of the surfaces of a synthesized image, which registration corrects."""
@@ -78,11 +78,11 @@ class PlaneSweep(Splatter):
 
     @run_in_plain_torch
     def reconstruct_part(
-        self, views: Sequence[View], masks: Sequence[Bool[Tensor, "_ _"]] | None
+        self, views: Sequence[View], choose_masks: ChooseMasks | None
     ) -> Reconstruction:
         """Reconstruct the depth of every pixel, and what any view shows in its mask; None for all.
 
-        Most of the time is that of the fit to the photographs, which grows with what is fitted.
+        Half of the time is that of the fit to the photographs, which grows with what is fitted.
         """
         check_given_views(views)
         views = set_depth_range(views, *get_depth_range(views))
@@ -92,11 +92,21 @@ class PlaneSweep(Splatter):
         name = partial(name_photographs, views)
         measured, skies = measure_views(rig, views)
         parts = self.support(rig, views, measured, skies)
-        scene = self.build(rig, views, complete_layers(rig, measured, measured, skies), masks)
+        by_stereo = complete_layers(rig, measured, measured, skies)
+        by_prediction = None
         if any(part.share for part in parts):
             observed = [part.measured for part in parts]
-            layers = complete_layers(rig, observed, measured, skies)
-            supported = self.build(rig, views, layers, masks)
+            by_prediction = complete_layers(rig, observed, measured, skies)
+
+        # What is needed by either kind of depth is built with both, so that they can be compared.
+        masks = None
+        if choose_masks is not None:
+            kinds = [by_stereo] if by_prediction is None else [by_stereo, by_prediction]
+            chosen = [choose_masks(make_depth_maps(kind, rig.unit, views)) for kind in kinds]
+            masks = [torch.stack(of_view).any(dim=0) for of_view in zip(*chosen, strict=True)]
+        scene = self.build(rig, views, by_stereo, masks)
+        if by_prediction is not None:
+            supported = self.build(rig, views, by_prediction, masks)
             # Surfaces that are right do not hide what another photograph shows.
             judged = views if masks is None else ignore_outside(views, masks)
             losses = self.measure_losses(judged, scene, supported)
