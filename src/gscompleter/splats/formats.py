@@ -26,7 +26,12 @@ from PIL import Image
 from torch import Tensor
 
 from gscompleter.numerics.value_checks import check_gaussians
-from gscompleter.splats.foreign import refuse_folder, refuse_foreign, resolve_splat
+from gscompleter.splats.foreign import (
+    is_packed_folder,
+    refuse_folder,
+    refuse_foreign,
+    resolve_splat,
+)
 from gscompleter.splats.morton import sort_along_morton
 from gscompleter.splats.origin import measure_distance
 from gscompleter.splats.packing import BandError, UnsupportedError
@@ -262,7 +267,7 @@ def describe_rounding(path: Path, gaussians: Gaussians) -> str | None:
 def detect_splat_format(path: Path) -> str:
     """Detect the format of a file or folder, by name."""
     if path.is_dir():
-        if (path / META).is_file():
+        if is_packed_folder(path):
             return SOG_FOLDER.name
         refuse_folder(path)
     with open_file(path) as file:
