@@ -53,7 +53,7 @@ from gscompleter.splats.provenance import (
     Provenance,
     parse_provenance,
 )
-from gscompleter.splats.sog import META, SOG_FOLDER
+from gscompleter.splats.sog import SOG_FOLDER
 from gscompleter.splats.splat_format import SplatFormat
 from gscompleter.splats.table import SPLAT_FORMATS as SPLAT_FORMATS
 from gscompleter.splats.table import get_written_format, match_ending
