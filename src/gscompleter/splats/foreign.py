@@ -22,7 +22,7 @@ from gscompleter.splats.splat_format import list_zip
 from gscompleter.splats.spz import GZIP, GZIP_BITS
 from gscompleter.splats.table import FILE_ENDINGS
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.reading import make_read_error
+from gscompleter.system.files.reading import make_read_error, read_bytes
 
 OF_STREAMED = (
     "in several levels of detail; write one of them to a .ply with `gscompleter convert`, and name "
@@ -235,10 +235,9 @@ def _describe_json(path: Path) -> str | None:
     table: object = None
     # By its name, one that is too large to look into, or damaged.
     is_json = path.suffix.lower() in JSON_ENDINGS
-    with suppress(OSError, ValueError, RecursionError):
-        if os.path.getsize(path) <= MAX_SEARCHED_JSON:
-            table = json.loads(path.read_bytes())
-            is_json = True
+    with suppress(InputError, ValueError, RecursionError):
+        table = json.loads(read_bytes(path, MAX_SEARCHED_JSON))
+        is_json = True
     if not is_json:
         return None
     keys = set(table) if isinstance(table, dict) else set()

@@ -369,10 +369,9 @@ def is_meta_of_others(path: Path) -> bool:
 
 def _read_json_or_none(path: Path) -> object:
     """Read a JSON file, or return None for one that is damaged or too large."""
-    with suppress(OSError, ValueError, RecursionError):
-        if path.stat().st_size <= MAX_META:
-            table: object = json.loads(path.read_bytes())
-            return table
+    with suppress(InputError, ValueError, RecursionError):
+        table: object = json.loads(read_bytes(path, MAX_META))
+        return table
     return None
 
 
