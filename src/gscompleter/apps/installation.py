@@ -48,8 +48,8 @@ PURPOSES = {
 """Purpose of each extra, without those for developers (`test-core`, `test`, `dev`, `docs`)."""
 
 CPU_BUILD = "--index-url https://download.pytorch.org/whl/cpu"
-"""Option of pip for the CPU build of torch; as an --extra-index-url pip may pass over it in
-silence."""
+"""Option of pip for the CPU build of torch. Named as an extra index, beside the usual one, pip may
+pass over it in silence."""
 PACKAGE = "gscompleter"
 WEIGHT_USES: dict[str, Callable[[PublishedWeights], bool]] = {
     "reconstructor": lambda published: published.is_reconstructor,
