@@ -39,8 +39,8 @@ from gscompleter.models.weights import (
     get_cache_path,
     load_strictly,
     read_state_dict,
+    reading,
 )
-from gscompleter.models.weights import reading
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.system.errors import InputError

@@ -91,7 +91,8 @@ def compile_kernels(names: Collection[str]) -> float | None:
 def compile_beside(names: Collection[str]) -> Iterator[None]:
     """Compile the missing kernels of these parts, some of them beside the block, the rest after it.
 
-    Within the block only what needs no kernels should be done, such as reading photographs.
+    Within the block only what needs few kernels should be done, such as reading photographs and a
+    splat: they are compiled before the line that announces the others.
     """
     missing = list_uncompiled(names)
     # As in `compile_kernels`.
