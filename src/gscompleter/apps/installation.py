@@ -99,8 +99,8 @@ def inspect_installation() -> Iterator[Found]:
         version = find_installed_version(requirement)
         if version is None:
             told = "every command needs it"
-            command = f"pip install {shlex.quote(str(requirement))}"
-            yield Found("packages", requirement.name, False, told, command)
+            install = f"pip install {shlex.quote(str(requirement))}"
+            yield Found("packages", requirement.name, False, told, install)
         else:
             yield Found("packages", requirement.name, True, describe_build(requirement, version))
     for extra, purpose in PURPOSES.items():

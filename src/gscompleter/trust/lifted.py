@@ -26,7 +26,7 @@ MAX_SAMPLES = 8000
 """Gaussians that are compared."""
 MIN_COMPARED_OPACITY = 0.3
 """Least opacity of a Gaussian that is compared."""
-MIN_COMPARED = 8
+MIN_DECIDING = 8
 """Fewest Gaussians that decide: three coordinates and a ratio can be chosen so that they fit the
 sizes of about four, whatever these are."""
 SEARCH_SEED = 0
@@ -78,7 +78,7 @@ def find_pixel_center(scene: Gaussians) -> Float[Tensor, "3"] | None:
     """Find the centre of the camera of a pixel-aligned splat; None for other splats."""
     generator = torch.Generator().manual_seed(SEARCH_SEED)
     opaque = torch.nonzero(scene.opacities > MIN_COMPARED_OPACITY)[:, 0].cpu()
-    if len(opaque) < MIN_COMPARED:
+    if len(opaque) < MIN_DECIDING:
         return None
     chosen = opaque[torch.randperm(len(opaque), generator=generator)[:MAX_SAMPLES]]
     means = scene.means[chosen].cpu()
