@@ -35,6 +35,12 @@ def test_what_was_invented_has_the_number_of_its_target_and_all_else_255(part, l
     assert part.origin.is_invented is is_invented
 
 
+@pytest.mark.parametrize(("kind", "number"), [("target", 0), ("gap", 0), ("piece", 2)])
+def test_what_was_invented_and_nothing_else_has_the_number_of_a_target(kind, number):
+    with pytest.raises(ValueError, match=f"the kind {kind} has no target with the number {number}"):
+        PartOrigin(kind, number)
+
+
 def test_the_last_target_is_found_among_all_labels():
     assert find_last_target_id(merge([SCENE, SHOWN.gaussians])) == 0
     assert find_last_target_id(merge([SHOWN.gaussians, FILLED.gaussians])) == 7

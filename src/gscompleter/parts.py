@@ -16,10 +16,11 @@ import torch
 from gscompleter.types import Gaussians
 
 OBSERVED = 0
-"""Label of what was given, or reconstructed from photographs; bit for bit as it was."""
+"""Label of the context: what was given, or reconstructed from its photographs; bit for bit as it
+was."""
 NOT_INVENTED = 255
-"""Label of what is new or changed, and what nobody invented: photographs show it, or it is a piece
-of a Gaussian that was given and cut."""
+"""Label of what was added later or changed, and what nobody invented: photographs show it, or it
+is a piece of a Gaussian that was given and cut."""
 MAX_TARGET_ID = NOT_INVENTED - 1
 """Largest number of a target: `generated` is one byte per Gaussian."""
 
@@ -34,7 +35,12 @@ class PartOrigin:
 
     kind: PartKind
     target_id: int = 0
-    """Number of the target that they were invented for; 0 if nobody invented them."""
+    """Number of the target that they were invented for, from 1; 0 if nobody invented them."""
+
+    def __post_init__(self) -> None:
+        """Refuse a target without a number, whose Gaussians would count as given."""
+        if (self.target_id > 0) is not self.is_invented:
+            raise ValueError(f"the kind {self.kind} has no target with the number {self.target_id}")
 
     @property
     def is_invented(self) -> bool:

@@ -263,6 +263,15 @@ def test_the_nearest_views_are_the_closest_others():
     assert find_nearest_views(cameras, 2)[0].tolist() == expected
 
 
+def test_the_nearest_views_are_found_far_from_the_origin():
+    c2w = torch.eye(4).repeat(1, 30, 1, 1)
+    c2w[0, :, :3, 3] = torch.tensor([8000.0, 8000.0, 0.0])
+    c2w[0, :, 0, 3] += torch.arange(30) ** 2 / 64
+    ones = torch.ones(1, 30)
+    cameras = Cameras(c2w, torch.eye(3).repeat(1, 30, 1, 1), ones, 2 * ones)
+    assert find_nearest_views(cameras, 1)[0, :, 0].tolist() == [1, *range(29)]
+
+
 # Networks
 
 

@@ -27,6 +27,8 @@ pytest.importorskip("huggingface_hub", reason="needs gscompleter[models]")
 import huggingface_hub
 from huggingface_hub import constants
 
+from gscompleter.apps.commands.models import ModelsOptions
+from gscompleter.apps.published_weights import list_weights
 from gscompleter.cli import main
 from gscompleter.models.weights import (
     PUBLISHED,
@@ -37,6 +39,7 @@ from gscompleter.models.weights import (
     get_cache_path,
     load_strictly,
     read_state_dict,
+    reading,
 )
 from gscompleter.reconstructors import load_reconstructor
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
@@ -216,6 +219,23 @@ def test_the_cache_is_in_the_home_folder_unless_the_environment_says_otherwise(
     monkeypatch.delenv("GSCOMPLETER_HOME")
     folder = Path.home() / ".cache" / "gscompleter" / "weights"
     assert get_cache_path(MVSPLAT) == folder / "mvsplat" / "re10k.ckpt"
+
+
+@pytest.mark.parametrize(
+    ("wrong", "sentence"),
+    [("typo", "There are no weights 'typo'"), (MVSPLAT.name, "have no automatic download")],
+)
+def test_no_file_is_downloaded_before_all_names_are_checked(home, monkeypatch, wrong, sentence):
+    fetched: list[PublishedWeights] = []
+    monkeypatch.setattr(reading, "fetch_checked", fetched.append)
+    with pytest.raises(InputError, match=sentence):
+        list_weights(["da3-small", wrong], as_json=True)
+    assert fetched == []
+
+
+def test_the_example_of_a_download_can_be_downloaded():
+    (words,) = re.findall(r"models --download (.+)", ModelsOptions.__doc__ or "")
+    assert all(PUBLISHED[name].repository for name in words.split())
 
 
 def test_what_lies_on_google_drive_has_to_be_fetched_by_hand():

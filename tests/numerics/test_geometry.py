@@ -1,6 +1,7 @@
 """Rays and projection undo each other, and relations between cameras are right."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -8,6 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from gscompleter.numerics.geometry import (
     axis_angle_to_matrix,
+    embed_cameras,
     is_inside,
     is_same_camera,
     measure_baseline,
@@ -64,6 +66,16 @@ def test_the_same_camera_is_recognised_in_any_unit():
         assert is_same_camera(camera, camera_at(0.3, 0, 0, yaw=10, unit=unit))
         assert not is_same_camera(camera, camera_at(0.301, 0, 0, yaw=10, unit=unit))
         assert not is_same_camera(camera, camera_at(0.3, 0, 0, yaw=10.1, unit=unit))
+
+
+def test_distances_between_cameras_are_the_same_far_from_the_origin():
+    cameras = [camera_at(step / 64, step**2 / 64, size=16) for step in range(30)]
+    far = torch.tensor([8000.0, 8000.0, 0.0])
+    moved = [replace(camera, c2w=camera.c2w.clone()) for camera in cameras]
+    for camera in moved:
+        camera.c2w[:3, 3] += far
+    near, there = (embed_cameras(placed) for placed in (cameras, moved))
+    assert torch.allclose(torch.cdist(there, there), torch.cdist(near, near), atol=1e-3)
 
 
 def test_sampling_at_pixel_centres_returns_the_pixels():

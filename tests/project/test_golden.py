@@ -32,3 +32,14 @@ def test_another_result_is_a_difference():
     for machine in (KNOWN["machine"], {"processor": "another one"}):
         differences = golden.compare(KNOWN, {"machine": machine, "room": worse})
         assert any(line.startswith("room, default: ") for line in differences)
+
+
+def test_texts_recorded_on_another_machine_leave_that_of_the_bytes(tmp_path, monkeypatch):
+    file = tmp_path / "golden.json"
+    file.write_text(json.dumps({"machine": {"processor": "another one"}, "texts": {}}))
+    monkeypatch.setattr(golden, "run_texts", lambda: {"new": []})
+    words = ["golden.py", "record", "--only", "texts", "--file", str(file)]
+    monkeypatch.setattr("sys.argv", words)
+    golden.main()
+    expected = {"machine": {"processor": "another one"}, "texts": {"new": []}}
+    assert json.loads(file.read_text()) == expected

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import os
 import re
+import shlex
 import shutil
 import site
 import subprocess
 import sys
 import tarfile
+from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 from zipfile import ZipFile
 
@@ -21,14 +23,21 @@ import gscompleter
 import link_readme
 from command import run
 from gscompleter import __version__
+from gscompleter.apps import installation
 from gscompleter.apps.installation import (
     PURPOSES,
+    WEIGHT_USES,
     describe_build,
     find_installed_version,
+    inspect_extra,
+    inspect_kernels,
+    inspect_weights,
     is_required_by,
     make_install_command,
 )
 from gscompleter.apps.warmup import PARTS, compile_kernels
+from gscompleter.models.weights.published import PUBLISHED
+from gscompleter.numerics.kernels.cache import KernelCache
 from gscompleter.numerics.kernels.compiled import get_cache_folder
 from release_check import (
     IMPORT_EXTRA,
@@ -223,7 +232,22 @@ def test_doctor_tells_of_what_is_missing_and_for_what(monkeypatch, capsys):
     ("source", "command"),
     [
         (None, "pip install 'gscompleter[film]'"),
-        ({"url": "https://example.org/a.whl"}, "pip install 'gscompleter[film]'"),
+        (
+            {"url": "https://example.org/a.whl", "archive_info": {}},
+            "pip install 'gscompleter[film] @ https://example.org/a.whl'",
+        ),
+        (
+            {"url": "https://example.org/a.git", "vcs_info": {"vcs": "git", "commit_id": "0a1b"}},
+            "pip install 'gscompleter[film] @ git+https://example.org/a.git@0a1b'",
+        ),
+        (
+            {
+                "url": "file:///d/all",
+                "vcs_info": {"vcs": "git", "commit_id": "0a1b"},
+                "subdirectory": "code",
+            },
+            "pip install 'gscompleter[film] @ git+file:///d/all@0a1b#subdirectory=code'",
+        ),
         (
             {"url": "file:///d/gscompleter-0.1.0.whl", "archive_info": {}},
             "pip install 'gscompleter[film] @ file:///d/gscompleter-0.1.0.whl'",
@@ -244,6 +268,16 @@ def test_the_command_for_an_extra_is_that_of_this_installation(monkeypatch, sour
     assert make_install_command("film") == command
 
 
+def test_the_command_for_an_extra_may_be_given_to_a_shell(monkeypatch):
+    class Installed:
+        def read_text(self, name: str) -> str:
+            return json.dumps({"url": "file:///Ann's%20code", "dir_info": {}})
+
+    monkeypatch.setattr("importlib.metadata.distribution", lambda _: Installed())
+    words = shlex.split(make_install_command("film"))
+    assert words == ["pip", "install", str(Path("/Ann's code")) + "[film]"]
+
+
 def test_doctor_ends_with_an_error_where_a_needed_extra_is_missing(monkeypatch, capsys):
     lines = ["numpy>=1; extra == 'film'", "not-there; extra == 'poses'"]
     monkeypatch.setattr("importlib.metadata.requires", lambda _: lines)
@@ -256,10 +290,57 @@ def test_doctor_ends_with_an_error_where_a_needed_extra_is_missing(monkeypatch, 
     assert "There is no extra 'everything'" in capsys.readouterr().err
 
 
+def test_an_extra_needs_what_the_extras_of_its_packages_bring(monkeypatch):
+    lines = {
+        "gscompleter": ["numpy>=1", "scipy[plots]>=1; extra == 'film'"],
+        "scipy": ["pytest", "not-there; extra == 'plots'", "scipy[plots]; extra == 'plots'"],
+    }
+    monkeypatch.setattr("importlib.metadata.requires", lines.get)
+    found = inspect_extra("film", "videos")
+    assert (found.there, found.told) == (False, "not-there, for videos")
+    lines["scipy"] = ["not-there; extra == 'others'"]
+    assert inspect_extra("film", "videos").there
+
+
+def test_doctor_answers_where_the_package_is_not_installed(monkeypatch, capsys):
+    def refuse(name: str):
+        raise PackageNotFoundError(name)
+
+    monkeypatch.setattr("importlib.metadata.requires", refuse)
+    monkeypatch.setattr("importlib.metadata.distribution", refuse)
+    assert run(monkeypatch, "doctor") == 0
+    shown = capsys.readouterr().out
+    assert "missing: it runs from a folder and is not installed" in shown
+    assert "its packages are not known; for videos" in shown
+    assert "older than this extra" not in shown
+
+
+def test_without_a_folder_for_kernels_no_warmup_is_advised(monkeypatch):
+    monkeypatch.setattr(installation, "CACHE", KernelCache(None, "no folder"))
+    found = inspect_kernels()
+    assert (found.there, found.told, found.install) == (False, "compiled again in each run", None)
+
+
+def test_weights_are_told_by_the_option_that_takes_them(monkeypatch):
+    monkeypatch.setattr(installation, "find_cached", lambda weights: weights.name == "lama")
+    taken = {
+        option: list(filter(takes, PUBLISHED.values())) for option, takes in WEIGHT_USES.items()
+    }
+    found = {option: inspect_weights(option, published) for option, published in taken.items()}
+    assert found["generator"].told == "lama, for --generator"
+    assert found["generator"].install is None
+    assert not found["reconstructor"].there
+    assert not found["depth"].there
+    assert "moge-2" in [weights.name for weights in taken["depth"]]
+
+
 def test_torch_for_cuda_without_a_gpu_is_told(monkeypatch):
     monkeypatch.setattr("torch.version.cuda", "13.0")
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
-    assert "gigabytes smaller" in describe_build(Requirement("torch"), "2.13.0")
+    told = describe_build(Requirement("torch"), "2.13.0")
+    assert "gigabytes smaller" in told
+    # There may be one, which torch does not see.
+    assert "or its driver is older than CUDA 13.0" in told
     assert describe_build(Requirement("numpy"), "2.0") == "2.0"
 
 

@@ -14,6 +14,7 @@ import torch
 
 from gscompleter import InputError, load_splat, save_ply, save_splat
 from gscompleter.splats import ply
+from gscompleter.splats.foreign import refuse_folder
 from scenes import random_gaussians
 
 
@@ -28,11 +29,11 @@ def vertices(names: list[str], faces: bool = False) -> bytes:
     return file.getvalue()
 
 
-def archive(**files: bytes) -> bytes:
+def zipped(files: dict[str, bytes]) -> bytes:
     file = io.BytesIO()
     with zipfile.ZipFile(file, "w") as made:
         for name, data in files.items():
-            made.writestr(name.replace("__", "/").replace("_dot_", "."), data)
+            made.writestr(name, data)
     return file.getvalue()
 
 
@@ -76,10 +77,14 @@ FOREIGN = {
     "model.pth": (checkpoint(_use_new_zipfile_serialization=False), "is a checkpoint of a trainer"),
     "splat.ply.pt": (checkpoint(), "is a checkpoint of a trainer"),
     "renamed.ply": (checkpoint(), "is a checkpoint of a trainer"),
-    "photos.zip": (archive(a_dot_jpg=b"x"), "is a .zip archive without a splat"),
+    "photos.zip": (zipped({"a.jpg": b"x"}), "is a .zip archive without a splat"),
     "export.zip": (
-        archive(out__splat_dot_ply=b"ply"),
+        zipped({"out/splat.ply": b"ply"}),
         "is a .zip archive; unpack it, and name out/",
+    ),
+    "mac.zip": (
+        zipped({"__MACOSX/._a.ply": b"x", "a.ply": b"ply"}),
+        "unpack it, and name a.ply in it",
     ),
     "scene.ply.gz": (gzip.compress(b"ply\nformat"), "is packed with gzip; unpack it"),
     "scene.gltf": (json.dumps(GLTF).encode(), "is glTF with its data in other files"),
@@ -101,8 +106,13 @@ FOREIGN = {
     "scene.spx": (b"spx\x01" + bytes(124), "is a .spx of Reall3D"),
     "meta.lcc": (b'{"version": "4", "totalSplats": 5, "totalLevel": 3}', "a scene of XGRIDS"),
     "scene.lcc2": (b'{"totalSplats": 5, "splatType": ".sog"}', "a scene of XGRIDS"),
+    "room.ssproj": (zipped({"document.json": b"{}", "splat_0.ply": b"ply"}), "of SuperSplat"),
     "room.psht": (b"\x01\x02" + bytes(60), "is a project of Postshot"),
     "transforms.json": (b'{"frames": []}', "is a JSON file without Gaussians"),
+    "cut.json": (b'{"frames": [', "is a JSON file without Gaussians"),
+    "packed.splat": (gzip.compress(b"ply\nformat", mtime=0), "is packed with gzip; unpack it"),
+    "settings.splat": (b'{"a": 1}', "is a JSON file without Gaussians"),
+    "settings.txt": (b"[section]\nkey = 1\n", "holds no Gaussians in a format that is known"),
     "cameras.json": (b"[]", "is a JSON file without Gaussians"),
     "page.ply": (b"<!DOCTYPE html><html>", "is a web page; download the file"),
     "other.bin": (b"hello", "holds no Gaussians in a format that is known"),
@@ -127,6 +137,49 @@ def test_a_file_of_another_kind_is_named_for_what_it_is(tmp_path, name):
     assert not any(word in said for word in ("fetch", "damaged", "truncated", "again"))
     assert "\n" not in said
     assert len(said) <= 300
+
+
+@pytest.mark.parametrize("start", [b"{", b"[", b" \n{", b"\x1f\x8b", b"\x1f\x8b\x08"])
+def test_a_splat_without_a_header_may_begin_with_any_bytes(tmp_path, start):
+    """The first bytes of a .splat are those of a coordinate."""
+    scene = random_gaussians(5)
+    number = start + b"\x14\x9e\x3f"[len(start) - 1 :]
+    scene.means[0, 0] = np.frombuffer(number, "<f4")[0].item()
+    save_splat(tmp_path / "scene.splat", scene)
+    assert (tmp_path / "scene.splat").read_bytes().startswith(start)
+    assert load_splat(tmp_path / "scene.splat").means[0, 0] == scene.means[0, 0]
+
+
+@pytest.mark.parametrize("content", ['{"scene": "x"}', '[{"frame": 1}]'])
+def test_a_meta_json_of_something_else_does_not_hide_a_splat(tmp_path, content):
+    (tmp_path / "meta.json").write_text(content)
+    with pytest.raises(InputError, match="is a folder without a splat"):
+        load_splat(tmp_path)
+    save_ply(tmp_path / "splat.ply", random_gaussians(3))
+    assert len(load_splat(tmp_path)) == 3
+
+
+def test_a_damaged_meta_json_is_that_of_a_sog(tmp_path):
+    save_ply(tmp_path / "splat.ply", random_gaussians(3))
+    (tmp_path / "meta.json").write_text('{"version": 2, "mea')
+    with pytest.raises(InputError, match="cannot be read"):
+        load_splat(tmp_path)
+
+
+def test_a_folder_that_cannot_be_listed_is_not_called_empty(tmp_path, monkeypatch):
+    def refuse(path):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("os.listdir", refuse)
+    with pytest.raises(InputError, match="cannot be read: Permission denied"):
+        refuse_folder(tmp_path)
+
+
+def test_hidden_files_are_not_named(tmp_path):
+    for name in ("._a.ply", "b.ply", "._meta.lcc"):
+        (tmp_path / name).write_bytes(b"ply")
+    with pytest.raises(InputError, match=r"such as b\.ply"):
+        load_splat(tmp_path)
 
 
 def test_a_folder_of_a_streamed_scene_is_named(tmp_path):

@@ -130,6 +130,8 @@ def test_additions_to_surfels_keep_their_thickness(tmp_path):
         (["splat_30000.ply", "splat_7000.ply"], 0),
         (["export_5000.ply", "export_10000.ply"], 1),
         (["splat.ply"], 0),
+        (["export_30000_0.ply", "export_7000_1.ply"], 0),
+        (["ckpts/ckpt_29999_rank0.ply", "ckpts/x_v2.ply", "ckpts/._ckpt_39999.ply"], 0),
     ],
 )
 def test_a_trainers_folder_opens_its_newest_iteration(tmp_path, names, newest):

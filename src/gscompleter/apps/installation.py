@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
-from collections.abc import Iterator, Sequence
+import shlex
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 from urllib.request import url2pathname
@@ -15,10 +16,11 @@ from packaging.requirements import Requirement
 from gscompleter.apps.viewer.packages import BUILT_LIBRARIES, LOCK_FILE, get_archive_path, read_lock
 from gscompleter.apps.warmup import PARTS
 from gscompleter.models.weights.fetching import find_cached
-from gscompleter.models.weights.published import PUBLISHED
+from gscompleter.models.weights.published import PUBLISHED, PublishedWeights
 from gscompleter.numerics.kernels.cache import CACHE
 from gscompleter.numerics.kernels.compiled import get_cache_folder, is_compiled
 from gscompleter.render.device import choose_device
+from gscompleter.render.gsplat_kernels import explain_missing_gpu
 from gscompleter.render.loading import load_renderer
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.writing import get_download_folder
@@ -31,7 +33,7 @@ PURPOSES = {
     "evaluation": "the plots of evaluate and tables, FLIP, LPIPS, ST-LPIPS and FID",
     "models": "downloading published weights from the Hugging Face hub",
     "diffusion": "--generator pe-field and diffusers-inpaint",
-    "onnx": "--generator migan and lama",
+    "onnx": "--generator migan and lama, and --depth moge-2",
     "poses": "photographs whose cameras are not known",
     "features": "cameras of photographs too far apart for SIFT",
     "browser": "the picture of the viewer in the documentation",
@@ -46,7 +48,15 @@ PURPOSES = {
 """Purpose of each extra, without those for developers (`test-core`, `test`, `dev`, `docs`)."""
 
 CPU_BUILD = "--index-url https://download.pytorch.org/whl/cpu"
-"""Option of pip for the CPU build of torch; as a further index pip may pass over it in silence."""
+"""Option of pip for the CPU build of torch. Named as an extra index, beside the usual one, pip may
+pass over it in silence."""
+PACKAGE = "gscompleter"
+WEIGHT_USES: dict[str, Callable[[PublishedWeights], bool]] = {
+    "reconstructor": lambda published: published.is_reconstructor,
+    "depth": lambda published: published.gives == "monocular depth",
+    "generator": lambda published: published.gives == "image",
+}
+"""Options that take published weights, with those that they take."""
 TEST_SIZE = 16
 """Width and height, in pixels, of the picture that each renderer draws."""
 MIN_TEST_ALPHA = 0.5
@@ -60,6 +70,7 @@ class Found:
     kind: str
     name: str
     there: bool
+    """True for what is installed and works, and False for what is missing."""
     told: str
     """Versions and locations, or the purpose of a missing part."""
     install: str | None = None
@@ -81,11 +92,15 @@ def inspect_installation() -> Iterator[Found]:
     for name, value in describe_machine(choose_device()).items():
         yield Found("machine", name, True, str(value))
 
+    if not is_installed():
+        told = "it runs from a folder and is not installed, so that what it needs is not known"
+        yield Found("packages", PACKAGE, False, told)
     for requirement in list_requirements():
         version = find_installed_version(requirement)
         if version is None:
             told = "every command needs it"
-            yield Found("packages", requirement.name, False, told, f"pip install '{requirement}'")
+            install = f"pip install {shlex.quote(str(requirement))}"
+            yield Found("packages", requirement.name, False, told, install)
         else:
             yield Found("packages", requirement.name, True, describe_build(requirement, version))
     for extra, purpose in PURPOSES.items():
@@ -93,20 +108,9 @@ def inspect_installation() -> Iterator[Found]:
 
     for name in ("cpu", "cuda", "metal", "reference"):
         yield inspect_renderer(name)
-    compiled = all(is_compiled(part) for part in PARTS)
-    yield Found(
-        "renderers",
-        "kernels",
-        compiled,
-        "compiled" if compiled else "compiled by the first completion, or in advance",
-        None if compiled else "gscompleter warmup",
-    )
-
-    # One file of weights is enough to count as there: nobody needs all of them.
-    here = [name for name, published in PUBLISHED.items() if find_cached(published)]
-    weights = ", ".join(here) or f"all {len(PUBLISHED)} that `gscompleter models` lists"
-    command = None if here else "gscompleter models --download NAME"
-    yield Found("weights", "reconstructors", bool(here), f"{weights}, for --reconstructor", command)
+    yield inspect_kernels()
+    for option, takes in WEIGHT_USES.items():
+        yield inspect_weights(option, [p for p in PUBLISHED.values() if takes(p)])
 
     # A wheel contains the libraries in one file; a checkout downloads an archive of each.
     archives = [get_archive_path(package) for package in read_lock(LOCK_FILE)]
@@ -121,12 +125,13 @@ def inspect_installation() -> Iterator[Found]:
 
 
 def describe_build(requirement: Requirement, version: str) -> str:
-    """Describe an installed package; torch with the libraries of CUDA says so where no GPU is."""
-    if requirement.name != "torch" or not torch.version.cuda or torch.cuda.is_available():
+    """Describe an installed package; torch with the libraries of CUDA says if it sees no GPU."""
+    missing = explain_missing_gpu()
+    if requirement.name != "torch" or not torch.version.cuda or missing is None:
         return version
     return (
-        f"{version} (built for CUDA, and there is no GPU; gigabytes smaller is the CPU build: pip "
-        f"install --force-reinstall torch {CPU_BUILD})"
+        f"{version} (built for CUDA, and {missing}; where there is none, the CPU build is "
+        f"gigabytes smaller: pip install --force-reinstall torch {CPU_BUILD})"
     )
 
 
@@ -165,6 +170,25 @@ def make_test_scene(device: str) -> tuple[Gaussians, Camera]:
     return gaussian.to(device), camera.to(device)
 
 
+def inspect_kernels() -> Found:
+    """Inspect whether all kernels are compiled; without a cache they never stay so."""
+    if CACHE.folder is None:
+        return Found("renderers", "kernels", False, "compiled again in each run")
+    if all(is_compiled(part) for part in PARTS):
+        return Found("renderers", "kernels", True, "compiled")
+    told = "compiled by the first completion, or in advance"
+    return Found("renderers", "kernels", False, told, "gscompleter warmup")
+
+
+def inspect_weights(option: str, published: Sequence[PublishedWeights]) -> Found:
+    """Inspect the published weights that an option takes."""
+    # One file is enough to count as there: nobody needs all of them.
+    here = [weights.name for weights in published if find_cached(weights)]
+    names = ", ".join(here) or f"all {len(published)} that `gscompleter models` lists"
+    command = None if here else "gscompleter models --download NAME"
+    return Found("weights", f"{option}s", bool(here), f"{names}, for --{option}", command)
+
+
 def inspect_kernel_cache() -> Found:
     """Inspect the folder of compiled kernels; a note says why it is not the usual one."""
     if CACHE.note is not None:
@@ -173,48 +197,83 @@ def inspect_kernel_cache() -> Found:
 
 
 def inspect_extra(extra: str, purpose: str) -> Found:
-    """Inspect the packages of an extra."""
-    versions = {
-        requirement.name: find_installed_version(requirement)
-        for requirement in list_requirements(extra)
-    }
-    missing = [name for name, version in versions.items() if version is None]
+    """Inspect the packages of an extra, and what these need of their own extras."""
+    requirements = list_requirements(extra)
+    if not is_installed():
+        return Found("extras", extra, False, f"its packages are not known; for {purpose}")
     # No requirement at all: an older version of the package does not know the extra, or its markers
     # leave out this version of Python.
-    if not versions:
+    if not requirements:
         detail = f"the installed version or this Python is older than this extra; for {purpose}"
-    elif missing:
+        return Found("extras", extra, False, detail)
+    missing = list_missing(requirements)
+    if missing:
         detail = f"{', '.join(missing)}, for {purpose}"
         return Found("extras", extra, False, detail, make_install_command(extra))
-    else:
-        names = ", ".join(f"{name} {version}" for name, version in versions.items())
-        detail = f"{names}, for {purpose}"
-    return Found("extras", extra, bool(versions), detail)
+    versions = [f"{one.name} {find_installed_version(one)}" for one in requirements]
+    return Found("extras", extra, True, f"{', '.join(versions)}, for {purpose}")
+
+
+def list_missing(requirements: Sequence[Requirement]) -> list[str]:
+    """List the names of missing packages, those included that extras of others bring."""
+    missing: list[str] = []
+    waiting = [*requirements]
+    seen = set()
+    while waiting:
+        requirement = waiting.pop(0)
+        if str(requirement) in seen:
+            continue
+        # Extras may name each other.
+        seen.add(str(requirement))
+        if find_installed_version(requirement) is None:
+            missing.append(requirement.name)
+            continue
+        for extra in sorted(requirement.extras):
+            waiting += list_requirements(extra, requirement.name)
+    return list(dict.fromkeys(missing))
 
 
 def make_install_command(extra: str) -> str:
     """Make the command that adds an extra to the package as it was installed.
 
-    A checkout or a wheel was named by its place, and the package index need not have this version.
+    A checkout, a wheel or a repository was named by its place, and the package index need not have
+    this version.
     """
     try:
-        text = importlib.metadata.distribution("gscompleter").read_text("direct_url.json")
+        text = importlib.metadata.distribution(PACKAGE).read_text("direct_url.json")
     except importlib.metadata.PackageNotFoundError:
         text = None
     source = json.loads(text) if text else {}
-    url = source.get("url", "")
-    if not url.startswith("file:"):
-        return f"pip install 'gscompleter[{extra}]'"
-    if "dir_info" not in source:
-        return f"pip install 'gscompleter[{extra}] @ {url}'"
-    editable = "-e " if source["dir_info"].get("editable") else ""
-    folder = url2pathname(urlsplit(url).path)
-    return f"pip install {editable}'{folder}[{extra}]'"
+    url = source.get("url")
+    named = f"{PACKAGE}[{extra}]"
+    if url is None:
+        return f"pip install {shlex.quote(named)}"
+    if "dir_info" in source:
+        editable = "-e " if source["dir_info"].get("editable") else ""
+        folder = url2pathname(urlsplit(url).path)
+        return f"pip install {editable}{shlex.quote(f'{folder}[{extra}]')}"
+    if "vcs_info" in source:
+        url = f"{source['vcs_info']['vcs']}+{url}@{source['vcs_info']['commit_id']}"
+    if "subdirectory" in source:
+        url += f"#subdirectory={source['subdirectory']}"
+    return f"pip install {shlex.quote(f'{named} @ {url}')}"
 
 
-def list_requirements(extra: str = "") -> list[Requirement]:
-    """List the requirements of the package, or those that an extra adds."""
-    lines = importlib.metadata.requires("gscompleter") or []
+def is_installed() -> bool:
+    """Return True if the package is installed, so that its requirements are known."""
+    try:
+        importlib.metadata.distribution(PACKAGE)
+    except importlib.metadata.PackageNotFoundError:
+        return False
+    return True
+
+
+def list_requirements(extra: str = "", package: str = PACKAGE) -> list[Requirement]:
+    """List the requirements of a package, or those that an extra of it adds; none if unknown."""
+    try:
+        lines = importlib.metadata.requires(package) or []
+    except importlib.metadata.PackageNotFoundError:
+        return []
     requirements = [Requirement(line) for line in lines]
     return [requirement for requirement in requirements if is_required_by(extra, requirement)]
 

@@ -1,4 +1,4 @@
-"""Published weights as a table or JSON. Nothing here needs torch."""
+"""Published weights as a table or JSON. Listing them needs no torch; downloading does."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from rich.table import Table
 
 from gscompleter.models.weights.fetching import (
     INSTALL,
+    check_available,
     find_cached,
     get_cache_path,
     is_hub_installed,
@@ -32,6 +33,9 @@ WEIGHT_KINDS = {
 
 def list_weights(names: Sequence[str], as_json: bool) -> None:
     """Print the published weights and their location on this machine; download `names` first."""
+    # All of them before any download, which takes minutes.
+    for name in names:
+        check_downloadable(name)
     for name in names:
         download(name)
     cached = [(weights, find_cached(weights)) for weights in PUBLISHED.values()]
@@ -51,13 +55,18 @@ def list_weights(names: Sequence[str], as_json: bool) -> None:
     print(json.dumps(rows, indent=2))
 
 
-def download(name: str) -> None:
-    """Download a published file to the hub's cache, and verify it by its SHA-256."""
+def check_downloadable(name: str) -> None:
+    """Raise InputError for weights that do not exist, or that cannot be downloaded."""
     if name not in PUBLISHED:
         raise InputError(
             f"There are no weights '{quote_value(name)}'; choose one of {', '.join(PUBLISHED)}.",
             "download",
         )
+    check_available(PUBLISHED[name])
+
+
+def download(name: str) -> None:
+    """Get a file, downloaded unless it is here, and compare its SHA-256 if one is published."""
     from gscompleter.models.weights.reading import fetch_checked
 
     fetch_checked(PUBLISHED[name])

@@ -55,8 +55,8 @@ SPLAT_PART = "splat"
 COSTS = {RENDERER_PART: 58, RECONSTRUCTOR_PART: 41, GENERATOR_PART: 18, SPLAT_PART: 18}
 """Time to compile each part that has kernels, in that of `time_compilation` (decision 098)."""
 PARTS = tuple(COSTS)
-"""Renderer, models and part that have kernels."""
-COMPILED_PARTS = (RECONSTRUCTOR_PART, GENERATOR_PART)
+"""The parts that have kernels: the renderer, the models, and what input splats need."""
+PARTS_BESIDE = (RECONSTRUCTOR_PART, GENERATOR_PART)
 """Parts that are compiled in a process of their own, beside the others."""
 CHILD = "import sys; from gscompleter.apps.warmup import rehearse; rehearse(sys.argv[1:])"
 """Program of that process."""
@@ -74,7 +74,10 @@ def list_uncompiled(names: Collection[str]) -> list[str]:
 
 
 def compile_kernels(names: Collection[str]) -> float | None:
-    """Compile the missing kernels of these parts; return the seconds, or None if there are none."""
+    """Compile the missing kernels of these parts; return the seconds.
+
+    Return None if none is missing, or without a cache.
+    """
     # Without a cache each kernel is compiled when it is used, and a rehearsal gains nothing.
     if not list_uncompiled(names) or get_cache_folder() is None:
         return None
@@ -88,7 +91,8 @@ def compile_kernels(names: Collection[str]) -> float | None:
 def compile_beside(names: Collection[str]) -> Iterator[None]:
     """Compile the missing kernels of these parts, some of them beside the block, the rest after it.
 
-    Within the block only what needs no kernels should be done, such as reading photographs.
+    Within the block only what needs few kernels should be done, such as reading photographs and a
+    splat: they are compiled before the line that announces the others.
     """
     missing = list_uncompiled(names)
     # As in `compile_kernels`.
@@ -120,8 +124,8 @@ def compile_beside(names: Collection[str]) -> Iterator[None]:
 
 def split_work(missing: Sequence[str], threads: int) -> tuple[list[str], list[str]]:
     """Split missing parts into those for a process of their own, and the others."""
-    models = [name for name in missing if name in COMPILED_PARTS]
-    others = [name for name in missing if name not in COMPILED_PARTS]
+    models = [name for name in missing if name in PARTS_BESIDE]
+    others = [name for name in missing if name not in PARTS_BESIDE]
     # Models call the renderer at the end. By then this process has compiled its kernels, and if it
     # need not, one process is enough.
     if threads == 1 or RENDERER_PART not in others:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from typing import Any
 
 import torch
 
 from gscompleter.completer import GSCompleter
 from gscompleter.config import ABLATIONS, get_named_config
+from gscompleter.config.settings import COVERED
 from gscompleter.evaluation.baselines.optimization import OptimizationConfig, optimize
 from gscompleter.evaluation.baselines.reggs import RegGSConfig, register_by_similarity
 from gscompleter.generators import Generator
+from gscompleter.numerics.geometry import add_near_plane
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.render.protocols import Renderer
 from gscompleter.stages.lift import lift_pair
@@ -37,17 +39,19 @@ class Models:
     """Maximum number of iterations of the baselines; None keeps their own numbers."""
 
     def make_completer(self, config: str = "default") -> GSCompleter:
-        """Return our method with the named config.
+        """Make our completer with the named config.
 
-        Scenes that are handed on from target to target are what Ψ made of the photographs, so that
-        nothing is added to them but at targets.
+        It adds nothing but at targets: Ψ made the scene of the same photographs, which show nothing
+        that it lacks.
         """
         settings = replace(get_named_config(config), add_observed=False)
         return GSCompleter(self.reconstructor, self.generator, self.renderer, settings, self.seed)
 
     def limit_iterations(self, num_iterations: int) -> int:
         """Limit a number of iterations to `baseline_iterations`."""
-        return min(num_iterations, self.baseline_iterations or num_iterations)
+        if self.baseline_iterations is None:
+            return num_iterations
+        return min(num_iterations, self.baseline_iterations)
 
 
 @dataclass(frozen=True)
@@ -60,7 +64,7 @@ class Prediction:
     seconds: Mapping[str, float]
     """Wall time by stage, without the reconstruction of the context, and `total`."""
     anchor: int | None = None
-    """Index of the anchor view, or None for a method that lifts nothing."""
+    """Index of the anchor view, or None if nothing is lifted or a render is the anchor."""
     anchor_fallback: bool = False
     """True if all views were rotated too far and the least rotated one was chosen."""
     registered: Gaussians | None = None
@@ -104,16 +108,25 @@ def predict(done: Completion) -> Prediction:
 
 
 def complete_bare(state: Completion, target: Camera, models: Models) -> Prediction:
-    """Complete the scene without its photographs, from renders of it around the target."""
+    """Complete the scene without its photographs, from renders of it around the target.
+
+    Raise InputError if no camera around the target sees what is beside its hole.
+    """
     completer = replace(models.make_completer("bare"), keep_registered=True)
-    with record_seconds() as seconds, timed_stage("context"):
-        cameras = choose_cameras_around(state.scene, target, models.renderer)
-        views = render_views(state.scene, cameras, models.renderer)
-    # Nothing is to be seen around a target without a hole, which needs no completion either.
-    if not views:
-        return keep_scene(state, target, models)
     # The depth range of the photographs is not known without them.
     unranged = replace(target, near=None, far=None)
+    with record_seconds() as seconds, timed_stage("context"):
+        camera = add_near_plane(unranged, state.scene.means)
+        holes = models.renderer.render(state.scene, camera).alpha < COVERED
+        cameras = choose_cameras_around(state.scene, target, models.renderer, holes)
+        views = render_views(state.scene, cameras, models.renderer)
+    if not views and holes.any():
+        raise InputError(
+            "No camera around the target sees what is beside its hole, so that there is nothing to "
+            "complete it from; leave out the method bare, or choose another target."
+        )
+    if not views:
+        return Prediction(state.scene, state.scene[:0], seconds)
     done = completer.advance(completer.begin(views, state.scene), unranged)
     prediction = predict(done.plus_seconds(seconds))
     # The anchor is a render, and not one of the photographs of the state.
@@ -125,8 +138,7 @@ def make_steps_method(steps: int) -> Method:
     complete = make_completion_method("paper")
 
     def method(state: Completion, target: Camera, models: Models) -> Prediction:
-        if not hasattr(models.generator, "steps"):
-            raise InputError(f"steps-{steps} needs denoising steps; choose the generator pe-field.")
+        check_steps((f"steps-{steps}",), models.generator)
         generator: Any = models.generator
         return complete(state, target, replace(models, generator=replace(generator, steps=steps)))
 
@@ -190,6 +202,11 @@ SCENE_CHANGING: dict[str, Method] = {
 BASELINES: dict[str, Method] = {**SCENE_CHANGING, "reggs": complete_by_similarity}
 """Methods of others."""
 
+STEPS_METHODS: dict[str, Method] = {
+    f"steps-{steps}": make_steps_method(steps) for steps in (2, 4, 8, 16)
+}
+"""The paper's method with other numbers of denoising steps."""
+
 # Method name to config name. Three degrees of freedom are no ablation: the paper compares the ray
 # constraint with them.
 _ABLATIONS = {"unconstrained" if name == "3-dof" else name: name for name in ABLATIONS}
@@ -201,7 +218,7 @@ METHODS: dict[str, Method] = {
     "paper": make_completion_method("paper"),
     **{title: make_completion_method(name) for title, name in _ABLATIONS.items()},
     **{f"paper/{t}": make_completion_method(f"paper/{name}") for t, name in _ABLATIONS.items()},
-    **{f"steps-{steps}": make_steps_method(steps) for steps in (2, 4, 8, 16)},
+    **STEPS_METHODS,
     **BASELINES,
 }
 """All methods by name, in the order of the tables."""
@@ -224,9 +241,7 @@ def expand_methods(names: Sequence[str]) -> tuple[str, ...]:
 
 def check_methods(names: Sequence[str], num_targets: int = 1) -> None:
     """Raise InputError for no or unknown names, and methods that cannot do that many targets."""
-    known = ", ".join(
-        [*METHOD_GROUPS, *(name for name in METHODS if not name.startswith(("paper/", "steps-")))]
-    )
+    known = ", ".join([*METHOD_GROUPS, *(n for n in METHODS if not n.startswith("paper/"))])
     if not names:
         raise InputError(f"No method was named; choose one or more of {known}.")
     for name in names:
@@ -238,5 +253,20 @@ def check_methods(names: Sequence[str], num_targets: int = 1) -> None:
         if num_targets > 1 and name in SCENE_CHANGING:
             raise InputError(
                 f"The method {name!r} changes existing Gaussians, and a sequence can only add new "
-                "ones; choose one of context, full, paper, an ablation of these, and reggs."
+                "ones; choose one of context, full, bare, paper, an ablation of full or paper, "
+                f"{', '.join(STEPS_METHODS)}, and reggs."
+            )
+
+
+def check_steps(names: Sequence[str], generator: Generator) -> None:
+    """Raise InputError for a method that sets denoising steps which the generator does not have."""
+    # They are set in a copy, so that the generator has to be a dataclass with such a field.
+    has_steps = is_dataclass(generator) and any(
+        field.name == "steps" and field.init for field in fields(generator)
+    )
+    for name in names:
+        if name in STEPS_METHODS and not has_steps:
+            raise InputError(
+                f"The method {name} needs a generator with denoising steps; choose pe-field, or "
+                "leave the method out."
             )

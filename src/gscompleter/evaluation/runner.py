@@ -12,7 +12,7 @@ from typing import Any, Literal
 from gscompleter.config.generators import GeneratorSettings
 from gscompleter.evaluation import store
 from gscompleter.evaluation.measured_code import find_commit
-from gscompleter.evaluation.methods import Models, check_methods
+from gscompleter.evaluation.methods import Models, check_methods, check_steps
 from gscompleter.evaluation.protocols import Task, get_clip
 from gscompleter.evaluation.scene_poses import refine_scene
 from gscompleter.evaluation.steps import PreparedTask, attempt, complete_task
@@ -118,7 +118,7 @@ def evaluate(
     check_shard(*shard)
     check_tasks(tasks)
     # Once before all tasks: missing weights are then an error of the call, not of each task.
-    config.load_models(())
+    check_steps(methods, config.load_models(()).generator)
     store.claim(out, collect_settings(config))
     share = tasks[shard[0] :: shard[1]]
     runner = TaskRunner(out, tuple(dict.fromkeys(methods)), config)

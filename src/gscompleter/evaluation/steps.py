@@ -55,7 +55,7 @@ class SequenceStep:
     frame: int
     """Frame of the target."""
     anchor: int | None
-    """Anchor frame, or None for a method that lifts nothing."""
+    """Anchor frame, or None if nothing is lifted or a render is the anchor."""
     anchor_fallback: bool
     """True if every view was rotated too far, so that the least rotated one is the anchor."""
     scores: scoring.Scores

@@ -294,8 +294,10 @@ def select_spread_cameras(cameras: Sequence[Camera], count: int) -> list[int]:
 def embed_cameras(cameras: Sequence[Camera]) -> Float[Tensor, "n 6"]:
     """Embed cameras as centres, relative to their extent, and viewing directions."""
     centers = torch.stack([camera.center for camera in cameras])
-    extent = (centers - centers.mean(dim=0)).norm(dim=1).max().clamp_min(1e-30)
-    return torch.cat([centers / extent, torch.stack([c.forward for c in cameras])], dim=1)
+    # Relative to their middle: distances between them would cancel far from the origin.
+    offsets = centers - centers.mean(dim=0)
+    extent = offsets.norm(dim=1).max().clamp_min(1e-30)
+    return torch.cat([offsets / extent, torch.stack([c.forward for c in cameras])], dim=1)
 
 
 def compute_spacing(cameras: Sequence[Camera]) -> float:

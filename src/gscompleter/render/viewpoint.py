@@ -37,7 +37,10 @@ class Splats:
     """Factors on the opacities of antialiased Gaussians, or None for classic ones."""
 
     def move_to_depths(self, depths: Float32[ndarray, "n"], near: np.float32) -> Splats:
-        """Move the splats to other z-depths; those not beyond `near` get empty boxes."""
+        """Move the splats to other z-depths, along their rays and with constant footprints.
+
+        Those not beyond `near` get empty boxes.
+        """
         columns = self.columns.copy()
         columns[:, project.DEPTH] = depths
         # A box of zeros covers no tile.
@@ -83,7 +86,10 @@ class Viewpoint:
         return np.int16 if fits else np.int32
 
     def enter(self, splats: Splats, depth_limits: Float32[ndarray, "tiles"]) -> BinnedSplats:
-        """Enter splats into the lists of the tiles, and give those of each splat adjacent slots."""
+        """Enter splats into the lists of the tiles, and give those of each splat adjacent slots.
+
+        `depth_limits` are those of `fill_lists`.
+        """
         return bin_layer(self.fill_lists(splats, depth_limits))
 
     def project(self, gaussians: GaussianArrays, is_antialiased: bool) -> Splats:
@@ -103,7 +109,11 @@ class Viewpoint:
         return Splats(columns, opacities, boxes, factors)
 
     def fill_lists(self, splats: Splats, depth_limits: Float32[ndarray, "tiles"]) -> Layer:
-        """Enter splats into the lists of the tiles, and sort these."""
+        """Enter splats into the lists of the tiles, and sort these.
+
+        `depth_limits` are the z-depths behind which nothing is visible in a tile, since what was
+        rendered before is opaque there; infinity in others. Splats behind them are not entered.
+        """
         # A counting sort by tile: each thread counts the entries of its chunk of splats per tile,
         # the counts become offsets, and each thread fills its own places. Depth sorts each list.
         chunks = split_range(len(splats.columns), self.threads)

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import zlib
 from contextlib import suppress
 from pathlib import Path
 
@@ -17,12 +18,12 @@ from gscompleter.data.formats import find_format
 from gscompleter.data.frame import FOLDERS
 from gscompleter.data.sfm.poses import holds_packed_splat
 from gscompleter.splats.packing import ZIP_MAGIC
-from gscompleter.splats.sog import LOD_KEY, LOD_META, META
+from gscompleter.splats.sog import LOD_KEY, LOD_META, META, is_meta_of_others
 from gscompleter.splats.splat_format import list_zip
-from gscompleter.splats.spz import GZIP
+from gscompleter.splats.spz import GZIP, GZIP_BITS
 from gscompleter.splats.table import FILE_ENDINGS
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.reading import list_entries
+from gscompleter.system.files.reading import list_entries, make_read_error, read_bytes
 
 OF_STREAMED = (
     "in several levels of detail; write one of them to a .ply with `gscompleter convert`, and name "
@@ -30,6 +31,7 @@ OF_STREAMED = (
 )
 MAX_SEARCHED_JSON = 1 << 26
 """Largest JSON that is looked into, in bytes."""
+JSON_ENDINGS = (".json", ".gltf", ".lcc", ".lcc2")
 CHECKPOINTS = (".pt", ".pth", ".ckpt")
 POINT_CLOUDS = (".las", ".laz", ".e57", ".pcd", ".xyz", ".pts")
 POINT_CLOUD_STARTS = (b"LASF", b"ASTM-E57", b"# .PCD")
@@ -60,7 +62,9 @@ KINDS_BY_ENDING = {
     ".psht": "is a project of Postshot; open it there, export a .ply, and name that",
     ".ssproj": "is a project of SuperSplat; open it there, export a .ply, and name that",
 }
-"""Kinds of files by their endings, where the first bytes do not tell."""
+"""Kinds of files by their endings: their first bytes do not tell, or those of a .zip or of JSON."""
+MACOS_FOLDER = "__MACOSX/"
+"""Where macOS keeps, in a .zip, what its file system knows of each file."""
 
 SPLAT_NEIGHBOURS = (None, "cameras-json", "photograph")
 """Formats that a folder may have beside the splat that it stands for: a trainer keeps the cameras
@@ -83,17 +87,19 @@ _PATTERNS = (
 def find_newest_splat(folder: Path) -> Path | None:
     """Find the splat of the newest iteration in a trainer's model folder, or None.
 
-    The first pattern with a file decides; of several files, the largest number in the name.
+    The first pattern with a file decides; of several files, the largest number in the name, and
+    then the next largest ones.
     """
 
-    def get_iteration(path: Path) -> int:
+    def list_numbers(path: Path) -> list[int]:
+        # Beside the iteration a name may have smaller numbers: of a process, a copy or a version.
         numbers = re.findall(r"\d+", str(path.relative_to(folder)))
-        return int(numbers[-1][:18]) if numbers else -1
+        return sorted((int(digits) for digits in numbers), reverse=True)
 
     for pattern in _PATTERNS:
         paths = [path for path in list_entries(folder, pattern) if path.is_file()]
         if paths:
-            return max(paths, key=lambda path: (get_iteration(path), str(path)))
+            return max(paths, key=lambda path: (list_numbers(path), str(path)))
     return None
 
 
@@ -113,9 +119,14 @@ def holds_splat_alone(folder: Path) -> bool:
 
 def resolve_splat(path: Path) -> Path:
     """Return the newest splat of a trainer's model folder; other paths stay as they are."""
-    if not os.path.isdir(path) or os.path.isfile(path / META):
+    if not os.path.isdir(path) or is_packed_folder(path):
         return path
     return find_newest_splat(path) or path
+
+
+def is_packed_folder(folder: Path) -> bool:
+    """Check that a folder is an unpacked .sog, damaged ones included."""
+    return os.path.isfile(folder / META) and not is_meta_of_others(folder / META)
 
 
 def refuse_folder(path: Path) -> None:
@@ -123,26 +134,28 @@ def refuse_folder(path: Path) -> None:
     name = quote_value(path)
     if os.path.isfile(path / LOD_META):
         raise InputError(f"{name} is a streamed scene ({LOD_META}) {OF_STREAMED}.")
-    with suppress(OSError):
-        names = sorted(os.listdir(path))
-        indices = [n for n in names if n.lower().endswith((".lcc", ".lcc2"))]
-        if indices:
-            raise InputError(
-                f"{name} holds {quote_value(indices[0])}, which {KINDS_BY_ENDING['.lcc']}."
-            )
-        inside = [n for n in names if n.lower().endswith(FILE_ENDINGS)]
-        if inside:
-            raise InputError(
-                f"{name} is a folder; name one of the splats in it, such as "
-                f"{quote_value(inside[0])}."
-            )
+    try:
+        names = sorted(child for child in os.listdir(path) if not child.startswith("."))
+    except OSError as error:
+        raise make_read_error(path, error) from error
+    indices = [child for child in names if child.lower().endswith((".lcc", ".lcc2"))]
+    if indices:
+        raise InputError(
+            f"{name} holds {quote_value(indices[0])}, which {KINDS_BY_ENDING['.lcc']}."
+        )
+    inside = [child for child in names if child.lower().endswith(FILE_ENDINGS)]
+    if inside:
+        raise InputError(
+            f"{name} is a folder; name one of the splats in it, such as {quote_value(inside[0])}."
+        )
     raise InputError(f"{name} is a folder without a splat; name the file of a splat.")
 
 
 def refuse_foreign(path: Path, head: bytes) -> None:
     """Raise InputError for a file of a known kind that is no splat; `head` are its first bytes.
 
-    No format has recognised the file by its content.
+    No format has recognised the file by its content. Those without a header have any first bytes,
+    so that a few of them decide nothing.
     """
     kind = _describe_by_content(path, head) or _describe_by_name(path.suffix.lower())
     if kind is not None:
@@ -155,7 +168,7 @@ def _describe_by_content(path: Path, head: bytes) -> str | None:
         return "is a web page; download the file that it links to"
     if head.startswith(ZIP_MAGIC):
         return _describe_zip(path)
-    if head.startswith(GZIP):
+    if head.startswith(GZIP) and (path.suffix.lower() == ".gz" or can_unpack_start(head)):
         return "is packed with gzip; unpack it (gunzip), and name the file inside"
     if start.startswith((b"{", b"[")):
         return _describe_json(path)
@@ -165,6 +178,14 @@ def _describe_by_content(path: Path, head: bytes) -> str | None:
         if head.startswith(first):
             return kind
     return None
+
+
+def can_unpack_start(head: bytes) -> bool:
+    """Check that the first bytes of a file can be unpacked as those of gzip."""
+    with suppress(zlib.error):
+        zlib.decompressobj(GZIP_BITS).decompress(head)
+        return True
+    return False
 
 
 def _describe_by_name(ending: str) -> str | None:
@@ -192,8 +213,11 @@ def _describe_points() -> str:
 
 def _describe_zip(path: Path) -> str:
     """Describe a .zip that is none of a splat."""
-    names = list_zip(path)
-    if any(name.endswith("data.pkl") for name in names) or path.suffix.lower() in CHECKPOINTS:
+    ending = path.suffix.lower()
+    if ending in KINDS_BY_ENDING:
+        return KINDS_BY_ENDING[ending]
+    names = [name for name in list_zip(path) if not name.startswith(MACOS_FOLDER)]
+    if any(name.endswith("data.pkl") for name in names) or ending in CHECKPOINTS:
         return _describe_checkpoint()
     if any(Path(name).name == LOD_META for name in names):
         return f"is a streamed scene {OF_STREAMED}, once it is unpacked"
@@ -205,12 +229,16 @@ def _describe_zip(path: Path) -> str:
     return "is a .zip archive without a splat; name the file of a splat"
 
 
-def _describe_json(path: Path) -> str:
-    """Describe a JSON file that is none of a splat."""
+def _describe_json(path: Path) -> str | None:
+    """Describe a JSON file that is none of a splat; None if it is no JSON."""
     table: object = None
-    with suppress(OSError, ValueError, RecursionError):
-        if os.path.getsize(path) <= MAX_SEARCHED_JSON:
-            table = json.loads(path.read_bytes())
+    # By its name, one that is too large to look into, or damaged.
+    is_json = path.suffix.lower() in JSON_ENDINGS
+    with suppress(InputError, ValueError, RecursionError):
+        table = json.loads(read_bytes(path, MAX_SEARCHED_JSON))
+        is_json = True
+    if not is_json:
+        return None
     keys = set(table) if isinstance(table, dict) else set()
     ending = path.suffix.lower()
     if ending == ".gltf" or (keys >= {"asset"} and keys & {"meshes", "nodes", "scenes", "buffers"}):

@@ -26,7 +26,12 @@ from PIL import Image
 from torch import Tensor
 
 from gscompleter.numerics.value_checks import check_gaussians
-from gscompleter.splats.foreign import refuse_folder, refuse_foreign, resolve_splat
+from gscompleter.splats.foreign import (
+    is_packed_folder,
+    refuse_folder,
+    refuse_foreign,
+    resolve_splat,
+)
 from gscompleter.splats.morton import sort_along_morton
 from gscompleter.splats.origin import measure_distance
 from gscompleter.splats.packing import BandError, UnsupportedError
@@ -48,7 +53,7 @@ from gscompleter.splats.provenance import (
     Provenance,
     parse_provenance,
 )
-from gscompleter.splats.sog import META, SOG_FOLDER
+from gscompleter.splats.sog import SOG_FOLDER
 from gscompleter.splats.splat_format import SplatFormat
 from gscompleter.splats.table import SPLAT_FORMATS as SPLAT_FORMATS
 from gscompleter.splats.table import get_written_format, match_ending
@@ -262,7 +267,7 @@ def describe_rounding(path: Path, gaussians: Gaussians) -> str | None:
 def detect_splat_format(path: Path) -> str:
     """Detect the format of a file or folder, by name."""
     if path.is_dir():
-        if (path / META).is_file():
+        if is_packed_folder(path):
             return SOG_FOLDER.name
         refuse_folder(path)
     with open_file(path) as file:

@@ -357,18 +357,27 @@ def is_meta(path: Path, head: bytes) -> bool:
     """Check that a file of JSON is the `meta.json` of a scene, under whatever name."""
     if path.name.lower() == META:
         return True
-    table: object = None
-    with suppress(OSError, ValueError, RecursionError):
-        if path.stat().st_size <= MAX_META:
-            table = json.loads(path.read_bytes())
+    table = _read_json_or_none(path)
     return isinstance(table, dict) and "means" in table and LOD_KEY not in table
+
+
+def is_meta_of_others(path: Path) -> bool:
+    """Check that a `meta.json` is whole, and describes something else than Gaussians."""
+    table = _read_json_or_none(path)
+    return isinstance(table, (dict, list)) and "means" not in table
+
+
+def _read_json_or_none(path: Path) -> object:
+    """Read a JSON file, or return None for one that is damaged or too large."""
+    with suppress(InputError, ValueError, RecursionError):
+        table: object = json.loads(read_bytes(path, MAX_META))
+        return table
+    return None
 
 
 def refuse_pngs_of_gsplat(folder: Path) -> None:
     """Raise InputError for a folder of PNGs of gsplat, whose `meta.json` is none of a .sog."""
-    table: object = None
-    with suppress(OSError, ValueError, RecursionError):
-        table = json.loads((folder / META).read_bytes()[:MAX_META])
+    table = _read_json_or_none(folder / META)
     properties = list(table.values()) if isinstance(table, dict) else []
     are_described = [isinstance(entry, dict) and "dtype" in entry for entry in properties]
     if are_described and all(are_described) and not any("files" in entry for entry in properties):

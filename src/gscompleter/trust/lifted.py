@@ -14,6 +14,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
+from gscompleter.system.errors import InputError
 from gscompleter.types import Gaussians
 
 MAX_SPREAD = 0.4
@@ -25,10 +26,14 @@ MAX_SAMPLES = 8000
 """Gaussians that are compared."""
 MIN_COMPARED_OPACITY = 0.3
 """Least opacity of a Gaussian that is compared."""
+MIN_DECIDING = 8
+"""Fewest Gaussians that decide: three coordinates and a ratio can be chosen so that they fit the
+sizes of about four, whatever these are."""
 SEARCH_SEED = 0
 NUM_STARTS = 600
-"""Random centres that are tried first, within `START_REACH` radii of the splat's middle."""
+"""Random centres that are tried first, in a cube around the splat's middle."""
 START_REACH = 3.0
+"""Half of the side of that cube, in radii."""
 STEP_DEVIATIONS = (0.6, 0.3, 0.15, 0.08, 0.04, 0.02, 0.01)
 """Standard deviations of the steps of each further round, in radii."""
 NUM_KEPT = 8
@@ -37,6 +42,8 @@ NUM_RANDOM_STEPS = 40
 """Random steps from each of them."""
 CORE_QUANTILES = (0.03, 0.97)
 """Quantiles of the coordinates between which the core of a splat lies."""
+QUANTILE_SAMPLE = 100_000
+"""Gaussians, evenly taken from those of a splat, that are enough to find quantiles."""
 
 
 @dataclass(frozen=True)
@@ -54,10 +61,11 @@ class Core:
 
 
 def measure_core(means: Float[Tensor, "n 3"]) -> Core:
-    """Measure the core of a splat."""
-    low, high = torch.quantile(
-        means[:: max(1, len(means) // 100_000)], means.new_tensor(CORE_QUANTILES), 0
-    )
+    """Measure the core of a splat; raise InputError for one without Gaussians."""
+    if not len(means):
+        raise InputError("A splat without Gaussians has no size; name another one.")
+    sample = means[:: max(1, len(means) // QUANTILE_SAMPLE)]
+    low, high = torch.quantile(sample, means.new_tensor(CORE_QUANTILES), 0)
     return Core((low + high) / 2, (high - low) / 2)
 
 
@@ -70,7 +78,7 @@ def find_pixel_center(scene: Gaussians) -> Float[Tensor, "3"] | None:
     """Find the centre of the camera of a pixel-aligned splat; None for other splats."""
     generator = torch.Generator().manual_seed(SEARCH_SEED)
     opaque = torch.nonzero(scene.opacities > MIN_COMPARED_OPACITY)[:, 0].cpu()
-    if len(opaque) < NUM_KEPT:
+    if len(opaque) < MIN_DECIDING:
         return None
     chosen = opaque[torch.randperm(len(opaque), generator=generator)[:MAX_SAMPLES]]
     means = scene.means[chosen].cpu()
@@ -80,13 +88,15 @@ def find_pixel_center(scene: Gaussians) -> Float[Tensor, "3"] | None:
     if spread_alone == 0:
         return None
     core = measure_core(means)
+    # Relative to the middle: differences of squares would cancel far from the origin.
+    offsets = means - core.center
 
     def measure(centers: Float[Tensor, "c 3"]) -> Float[Tensor, "c"]:
-        distances = torch.cdist(centers, means).clamp_min(1e-3 * core.radius)
+        distances = torch.cdist(centers, offsets).clamp_min(1e-3 * core.radius)
         return measure_spread(sizes - distances.log())
 
     starts = 2 * torch.rand((NUM_STARTS, 3), generator=generator) - 1
-    centers = core.center + START_REACH * core.radius * starts
+    centers = START_REACH * core.radius * starts
     for step in STEP_DEVIATIONS:
         best = centers[measure(centers).topk(NUM_KEPT, largest=False).indices]
         steps = torch.randn((NUM_KEPT, NUM_RANDOM_STEPS, 3), generator=generator)
@@ -95,7 +105,7 @@ def find_pixel_center(scene: Gaussians) -> Float[Tensor, "3"] | None:
     spreads = measure(centers)
     if spreads.min().item() > MAX_SPREAD * spread_alone or math.isnan(spreads.min().item()):
         return None
-    return centers[spreads.argmin()].to(scene.means)
+    return (core.center + centers[spreads.argmin()]).to(scene.means)
 
 
 def measure_spread(values: Float[Tensor, "c n"]) -> Float[Tensor, "c"]:

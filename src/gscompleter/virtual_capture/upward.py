@@ -20,7 +20,7 @@ from gscompleter.numerics.geometry import estimate_up
 from gscompleter.render.protocols import Renderer
 from gscompleter.splats.upward import USUAL, Direction, read_upward
 from gscompleter.system.errors import InputError
-from gscompleter.trust.lifted import measure_core
+from gscompleter.trust.lifted import QUANTILE_SAMPLE, measure_core
 from gscompleter.types import Camera, Gaussians
 from gscompleter.virtual_capture.kind import is_object
 
@@ -153,7 +153,7 @@ def measure_floor(scene: Gaussians, up: Direction) -> Floor:
     middle_scale, largest_scale = scene.scales.sort(dim=1).values[:, 1:].unbind(1)
     weights = (middle_scale * largest_scale * scene.opacities).double()
     # A few huge Gaussians are sky or floaters.
-    sample = weights[:: max(1, len(weights) // 100_000)]
+    sample = weights[:: max(1, len(weights) // QUANTILE_SAMPLE)]
     weights = weights.clamp_max(sample.quantile(0.99))
     weights = weights / weights.sum()
 
@@ -186,7 +186,7 @@ def measure_filled(
     """Measure the share of the cells of the extent, seen from above, that a floor fills."""
     level = [axis for axis in range(3) if up[axis] == 0]
     points = scene.means[:, level]
-    sample = points[:: max(1, len(points) // 100_000)]
+    sample = points[:: max(1, len(points) // QUANTILE_SAMPLE)]
     low, high = sample.quantile(points.new_tensor([0.02, 0.98]), dim=0)
     cells = ((points - low) / (high - low).clamp_min(1e-12) * FLOOR_CELLS).floor().long()
     inside = is_floor & ((cells >= 0) & (cells < FLOOR_CELLS)).all(dim=1)

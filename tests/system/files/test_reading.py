@@ -7,6 +7,7 @@ import tracemalloc
 import zipfile
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from gscompleter import InputError, load_splat
@@ -53,9 +54,9 @@ def test_files_and_lines_that_are_too_long_are_refused(tmp_path):
     path = tmp_path / "a.txt"
     path.write_bytes(b"\xef\xbb\xbfab\ncdef\n")
     assert list(read_lines(path)) == ["ab\n", "cdef\n"]
-    assert list(read_lines(path, max_length=5)) == ["ab\n", "cdef\n"]
-    with pytest.raises(InputError, match="a line of more than 4 characters"):
-        list(read_lines(path, max_length=4))
+    assert list(read_lines(path, max_length=4)) == ["ab\n", "cdef\n"]
+    with pytest.raises(InputError, match="a line of more than 3 characters"):
+        list(read_lines(path, max_length=3))
     with pytest.raises(InputError, match="has 11 bytes, and at most 10 are read"):
         list(read_lines(path, max_bytes=10))
     with pytest.raises(InputError, match="has 11 bytes, and at most 10 are read"):
@@ -64,12 +65,25 @@ def test_files_and_lines_that_are_too_long_are_refused(tmp_path):
 
 def test_values_are_plain_up_to_a_depth_and_a_number(tmp_path):
     nested: list = []
-    for _ in range(63):
+    for _ in range(30):
         nested = [nested]
+    # numpy 1 makes arrays of up to 32 dimensions.
+    assert np.array([nested]).ndim == 32
     check_plain({"a": [1, (2, 3)], "b": nested}, tmp_path, 100)
+    check_plain([nested], tmp_path, 100)
     for value in ([[nested]], [[1] * 50] * 2 + [1]):
         with pytest.raises(InputError, match="nested too deeply or without end"):
             check_plain(value, tmp_path, 100)
+
+
+@pytest.mark.linux
+def test_a_file_that_states_no_size_is_read_up_to_the_limit():
+    path = Path("/proc/self/maps")
+    assert path.stat().st_size == 0
+    assert len(read_bytes(path)) > 100
+    for reader in (read_bytes, lambda path, most: list(read_lines(path, max_bytes=most))):
+        with pytest.raises(InputError, match="and at most 10 are read"):
+            reader(path, 10)
 
 
 @pytest.mark.linux

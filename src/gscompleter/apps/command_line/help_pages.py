@@ -53,6 +53,7 @@ HELP_GROUPS = (
         "scene", "cameras", "up", "photos", "geometry", "context", "format", "frames",
         "resolution", "near", "far", "no_given_depth", "no_refine_poses", "no_masks", "ignore",
         "invert_masks", "large_masks", "ignore_moving", "no_ego_mask", "drop_nonfinite",
+        "ignore_properties",
     )),
     Group("computing", "Models, settings, and where they run.", (
         "reconstructor", "weights", "depth", "depth_weights", "config", "device",
@@ -153,6 +154,7 @@ def make_plain_type(kind: Any) -> Any:
     inner, *marks = get_args(kind) if get_origin(kind) is Annotated else (kind,)
     if get_origin(inner) not in (UnionType, Union, tuple):
         return kind
+    # The one mark of those that `call_tyro` sets for all options that changes how a type is shown.
     info = PrimitiveTypeInfo.make(kind, {tyro.conf.DisallowNone})
     spec = ConstructorRegistry.get_primitive_spec(info)
     assert isinstance(spec, PrimitiveConstructorSpec)

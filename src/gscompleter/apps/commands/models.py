@@ -12,11 +12,12 @@ from gscompleter.system.process import import_without_collection
 class ModelsOptions(Settings):
     """List published model weights with their licences, and show which are downloaded.
 
-    Example: gscompleter models --download mvsplat-re10k
+    Example: gscompleter models --download da3-small
     """
 
     download: tuple[str, ...] = ()
-    """Names of the list, whose files are downloaded and verified first."""
+    """Names of the list, whose files are downloaded first unless they are here, and compared with
+    their SHA-256 if one is published."""
     json: bool = False
     """Print the result as JSON."""
 

@@ -43,15 +43,17 @@ def fetch(weights: PublishedWeights, local: Path | None = None, offline: bool = 
                 f"folder, from {weights.source}."
             )
         return path
-    cached = find_cached(weights)
-    if cached is not None:
-        return cached
-    if weights.repository is None:
+    check_available(weights)
+    return find_cached(weights) or _download(weights, offline)
+
+
+def check_available(weights: PublishedWeights) -> None:
+    """Raise WeightsNotAvailable if a file is not on this machine and has no automatic download."""
+    if weights.repository is None and find_cached(weights) is None:
         raise WeightsNotAvailable(
             f"The weights {weights.name} are not on this machine and have no automatic download; "
             f"{_describe_manual_download(weights)}."
         )
-    return _download(weights, offline)
 
 
 def get_cache_path(weights: PublishedWeights) -> Path:

@@ -22,13 +22,16 @@ MAX_BYTES = 1 << 33
 MAX_TEXT = 1 << 23
 """Largest text file, in bytes."""
 MAX_LINE = 4096
-"""Longest line, in characters."""
+"""Longest line, in characters, without its line break."""
 MAX_JSON = 1 << 29
 """Largest JSON file, in bytes."""
 MAX_DIGITS = 20
 """Longest integer in JSON: 64 bits have no more digits."""
-MAX_DEPTH = 64
-"""Deepest nesting of lists and dictionaries, the most dimensions that numpy supports."""
+MAX_DEPTH = 32
+"""Most lists and dictionaries within each other. Lists become arrays, and numpy 1 ends with an
+error of its own beyond 32 dimensions, numpy 2 beyond 64."""
+BLOCK_BYTES = 1 << 20
+"""Bytes that are read at a time from a file of unknown size."""
 
 _HOLDERS = (list, tuple, dict, set, frozenset)
 
@@ -65,7 +68,7 @@ def hash_file(path: Path) -> str:
     """Compute the SHA-256 of a file, in hexadecimal; files of gigabytes are not held in memory."""
     digest = hashlib.sha256()
     with open_file(path) as file:
-        while block := file.read(1 << 20):
+        while block := file.read(BLOCK_BYTES):
             digest.update(block)
     return digest.hexdigest()
 
@@ -73,8 +76,14 @@ def hash_file(path: Path) -> str:
 def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
     """Read a file of at most `max_bytes` bytes; raise InputError if that fails."""
     with open_file(path) as file:
-        _check_size(path, file, max_bytes)
-        return file.read()
+        size = os.fstat(file.fileno()).st_size
+        _check_size(path, size, max_bytes)
+        data = file.read(size + 1)
+        # Files of /proc state no size, and others may grow.
+        while len(data) <= max_bytes and (more := file.read(BLOCK_BYTES)):
+            data += more
+        _check_size(path, len(data), max_bytes)
+        return data
 
 
 def read_zip_entry(archive: zipfile.ZipFile, name: str, max_bytes: int) -> bytes:
@@ -98,10 +107,12 @@ def read_lines(
 ) -> Iterator[str]:
     """Read the lines of a UTF-8 text file one by one; raise InputError if it is too long."""
     with open_file(path) as file:
-        _check_size(path, file, max_bytes)
+        _check_size(path, os.fstat(file.fileno()).st_size, max_bytes)
         text = TextIOWrapper(file, encoding="utf-8-sig", errors=errors)
         while line := text.readline(max_length + 1):
-            if len(line) > max_length:
+            # The size may be unknown, as in `read_bytes`.
+            _check_size(path, file.tell(), max_bytes)
+            if len(line.removesuffix("\n")) > max_length:
                 raise InputError(
                     f"{quote_value(path)} has a line of more than {max_length:,} characters, "
                     "which its format does not allow; copy the file again."
@@ -163,15 +174,14 @@ def check_plain(value: Any, name: Path | str, max_values: int) -> None:
             continue
         parts = holder.values() if isinstance(holder, dict) else holder
         count += len(parts)
-        if depth > MAX_DEPTH or count > max_values:
+        if depth >= MAX_DEPTH or count > max_values:
             raise InputError(
                 f"{quote_value(name)} is nested too deeply or without end; write it again."
             )
         waiting += [(part, depth + 1) for part in parts if isinstance(part, _HOLDERS)]
 
 
-def _check_size(path: Path, file: BinaryIO, max_bytes: int) -> None:
-    size = os.fstat(file.fileno()).st_size
+def _check_size(path: Path, size: int, max_bytes: int) -> None:
     if size > max_bytes:
         raise InputError(
             f"{quote_value(path)} has {size:,} bytes, and at most {max_bytes:,} are read; name a "
