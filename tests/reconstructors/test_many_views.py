@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from gscompleter import View, load_renderer
+from gscompleter import View, load_renderer, load_views
 from gscompleter.evaluation.metrics.image import compute_masked_psnr, psnr
 from gscompleter.numerics.geometry import compute_sparse_depth, find_at_depth, look_up, project
 from gscompleter.numerics.kernels import stereo
@@ -23,6 +23,11 @@ from gscompleter.reconstructors.features.stereo_image import (
 )
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.reconstructors.plane_sweep.fit import STEPS_PER_VIEW, fit_jointly, shuffle_views
+from gscompleter.reconstructors.plane_sweep.free_space import (
+    Surfaces,
+    find_seen_through,
+    leave_free_space,
+)
 from gscompleter.reconstructors.plane_sweep.fusion import (
     DepthLayer,
     find_finest_pixels,
@@ -266,6 +271,55 @@ def test_large_images_are_matched_at_half_their_size_first(monkeypatch, count, s
     depths = PlaneSweep().estimate_depths(row_of_views(count, size=size))
     assert matched == expected
     assert {tuple(depth.depth.shape) for depth in depths} == {(size, size)}
+
+
+def test_what_stands_before_the_surfaces_of_others_moves_behind_them():
+    layers, transforms = true_layers(row_of_views(3))
+    block = (slice(20, 40), slice(24, 40))
+    wrong = layers[0].inverse.copy()
+    wrong[block] *= 3
+    confidence = layers[0].confidence.copy()
+    confidence[block] = 0.0
+    changed = replace(layers[0], inverse=wrong, confidence=confidence)
+    open_pixels = [np.zeros_like(wrong, dtype=bool) for _ in layers]
+    open_pixels[0][block] = True
+    open_pixels[0][22] = False
+
+    layers = [changed, *layers[1:]]
+    first, *others = leave_free_space(layers, open_pixels, transforms)
+    assert all(after is before for after, before in zip(others, layers[1:], strict=True))
+    surfaces = [Surfaces.measured_in(layer) for layer in layers]
+    was_before = find_seen_through(0, wrong, surfaces, transforms) & open_pixels[0]
+    assert was_before.sum() > 200
+    assert not (find_seen_through(0, first.inverse, surfaces, transforms) & open_pixels[0]).any()
+    assert (first.inverse < wrong)[was_before].all()
+    # Nothing else moved: neither what is measured nor what something else covers.
+    assert np.array_equal(first.inverse[~was_before], wrong[~was_before])
+    # Not farther behind the surface than one step.
+    true = true_layers(row_of_views(3))[0][0].inverse
+    inner = (slice(24, 38), slice(26, 38))
+    assert (first.inverse > 0.95 * true)[inner].all()
+
+
+def test_what_is_measured_or_has_no_place_behind_stays():
+    layers, transforms = true_layers(row_of_views(3))
+    near = replace(layers[0], inverse=1.5 * layers[0].inverse)
+    everywhere = [np.ones_like(near.inverse, dtype=bool) for _ in layers]
+    (first, *_) = leave_free_space([near, *layers[1:]], everywhere, transforms)
+    assert first is near
+    # Even twice its farthest depth is before what the others see.
+    flat = np.full_like(near.inverse, 4 * near.inverse.max())
+    unknown = replace(near, inverse=flat, confidence=np.zeros_like(flat))
+    (first, *_) = leave_free_space([unknown, *layers[1:]], everywhere, transforms)
+    assert first is unknown
+
+
+def test_what_one_of_four_photographs_shows_is_no_fog_before_it(shared):
+    """The last one shows a courtyard that no other does; it had 22 dB, and the others lost 3."""
+    views = load_views(shared / "data" / "fountain_p11", [1, 4, 7, 10], 96)
+    scene = PlaneSweep()(views).gaussians
+    scores = [psnr(RENDERER.render(scene, view.camera).image, view.image) for view in views]
+    assert min(scores) > 31
 
 
 def test_a_part_is_built_alone_and_as_in_the_whole(found):

@@ -81,6 +81,22 @@ def test_a_completion_names_its_folder_and_photographs_as_they_are(tmp_path, cap
     assert f"Report: {out / 'report.html'}" in said
 
 
+def test_a_narrow_terminal_breaks_cameras_and_no_numbers(tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "60")
+    out = Path(shutil.copytree(TESTS / "fixtures/results/before-formats", tmp_path / "out"))
+    summary = json.loads((out / "summary.json").read_text())
+    target = summary["targets"][0]
+    target["derived_from"] = target["frame"]
+    target["offset"] = "turned right by 15° and moved down by 1.6"
+    target["added"] = 1_234_567
+    (out / "summary.json").write_text(json.dumps(summary))
+    print_completion(ResultsRequest(out=out))
+    said = capsys.readouterr().out
+    assert "…" not in said
+    assert "1,234,567" in said
+    assert f"{summary['context'][0]['psnr_before']:.2f}" in said
+
+
 @pytest.mark.slow
 def test_a_dry_run_names_its_folder_as_it_is(tmp_path, capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "300")

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from rich.table import Column, Table
+from rich.table import Table
 
 from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.completing.keeping import describe_size
@@ -65,22 +65,21 @@ def print_completion(results: ResultsRequest) -> None:
 def make_score_table(summary: CompletionSummary) -> Table:
     """Make the table of PSNR before and after at each camera."""
     has_fitted = any(target.fitted is not None for target in summary.targets)
-    columns = ["hole", "PSNR before", "PSNR after"]
+    columns = ["camera", "hole", "PSNR before", "PSNR after"]
     # After one pose and one gain of the target's camera were fitted to its photograph.
     columns += ["camera fitted", "added"] if has_fitted else ["added"]
-    # Headers are broken in a narrow terminal, and names of files are not.
-    table = Table(Column("camera", no_wrap=True), *columns, box=None)
     kind = "context" if summary.scene.renders_from is None else "render"
+    rows: list[list[str]] = []
     # Photographs of the context have neither a hole nor Gaussians of their own.
-    for row in summary.context:
-        before = format_number(row.psnr_before)
-        after = format_number(row.psnr_after)
-        table.add_row(f"{kind} {row.photograph}", "", before, after, "")
+    for given in summary.context:
+        before = format_number(given.psnr_before)
+        after = format_number(given.psnr_after)
+        rows.append([f"{kind} {given.photograph}", "", before, after])
     # Without targets, the photographs that were not used test the result.
     for held_out in () if summary.targets else summary.held_out:
         before = format_number(held_out.psnr_before)
         after = format_number(held_out.psnr_after)
-        table.add_row(f"not used: {held_out.photograph}", "", before, after, "")
+        rows.append([f"not used: {held_out.photograph}", "", before, after])
     for target in summary.targets:
         before = format_number(target.psnr_before)
         after = format_number(target.psnr_after)
@@ -88,7 +87,16 @@ def make_score_table(summary: CompletionSummary) -> Table:
         cells = [f"target: {target.name}", hole, before, after]
         if has_fitted:
             cells.append(format_number(None if target.fitted is None else target.fitted.psnr))
-        table.add_row(*cells, f"{target.added:,}")
+        rows.append([*cells, f"{target.added:,}"])
+
+    # In a narrow terminal headers and cameras are broken between words, and numbers are not.
+    table = Table(box=None)
+    for number, header in enumerate(columns):
+        lengths = [len(row[number]) for row in rows if number < len(row)]
+        width = max(lengths, default=0) if number else None
+        table.add_column(header, min_width=width, overflow="fold")
+    for row in rows:
+        table.add_row(*row)
     return table
 
 

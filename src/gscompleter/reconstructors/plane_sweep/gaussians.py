@@ -19,6 +19,7 @@ from gscompleter.numerics.image_ops import dilate
 from gscompleter.numerics.sky import extend_sky, is_sky, restore_sky_colors
 from gscompleter.reconstructors.plane_sweep.directional_colors import fit_directional_colors
 from gscompleter.reconstructors.plane_sweep.fit import fit_jointly, fit_opacities
+from gscompleter.reconstructors.plane_sweep.free_space import leave_free_space
 from gscompleter.reconstructors.plane_sweep.fusion import (
     DepthLayer,
     estimate_gains,
@@ -89,14 +90,13 @@ class Splatter:
             for view, gain in zip(views, gains.to(device), strict=True)
         ]
 
-        # A disc for every pixel of every view, of which those that form the scene are kept.
-        parts = [self.splat(view, depth) for view, depth in zip(normalized, depths, strict=True)]
         if masks is not None and not any(bool(mask.any()) for mask in masks):
+            empty = self.splat(normalized[0], depths[0])[:0]
             none = torch.zeros(0, dtype=torch.long, device=device)
-            return Reconstruction(parts[0][:0], tuple(depths), none, none)
-        candidates = merge(parts).to("cpu")
+            return Reconstruction(empty, tuple(depths), none, none)
+
         on_cpu = [view.to("cpu") for view in views]
-        kept = self.select_pixels(candidates, on_cpu, layers, transforms)
+        candidates, kept, depths = self.fuse(normalized, depths, layers, transforms)
         # Nothing is reconstructed from masked pixels.
         kept &= flatten_masks([view.valid_mask for view in on_cpu])
         if masks is not None:
@@ -113,8 +113,9 @@ class Splatter:
         fitted = restore_sky_colors(scene, fitted, on_cpu[0].camera)
 
         # View and pixel of each Gaussian, in the order of the scene.
-        pixels = torch.cat([torch.arange(len(part)) for part in parts])[kept]
-        numbers = torch.cat([torch.full((len(part),), i) for i, part in enumerate(parts)])[kept]
+        sizes = [view.valid_mask.numel() for view in views]
+        pixels = torch.cat([torch.arange(size) for size in sizes])[kept]
+        numbers = torch.cat([torch.full((size,), i) for i, size in enumerate(sizes)])[kept]
         sky_numbers = [torch.full((len(sky_pixels),), i) for i, _, sky_pixels in skies]
         return Reconstruction(
             fitted.to(device),
@@ -163,6 +164,50 @@ class Splatter:
             start += gap.numel()
         return kept
 
+    def fuse(
+        self,
+        views: Sequence[View],
+        depths: Sequence[DepthMap],
+        layers: Sequence[DepthLayer],
+        transforms: Transforms,
+    ) -> tuple[Gaussians, Bool[Tensor, "n"], Sequence[DepthMap]]:
+        """Create a disc for every pixel of every view, and mark those that form the scene.
+
+        Return them on the CPU, with the depths that they stand at: what only one of several
+        photographs shows leaves the free space of the others.
+        """
+        on_cpu = [view.to("cpu") for view in views]
+        candidates = self.splat_all(views, depths)
+        kept = self.select_pixels(candidates, on_cpu, layers, transforms)
+        if len(views) <= 2:
+            return candidates, kept, depths
+        moved = leave_free_space(
+            layers, self.find_open_pixels(candidates[kept], on_cpu), transforms
+        )
+        if all(after is before for after, before in zip(moved, layers, strict=True)):
+            return candidates, kept, depths
+        depths = [
+            move_depths(depth, before, after)
+            for depth, before, after in zip(depths, layers, moved, strict=True)
+        ]
+        candidates = self.splat_all(views, depths)
+        return candidates, self.select_pixels(candidates, on_cpu, moved, transforms), depths
+
+    def find_open_pixels(self, gaussians: Gaussians, views: Sequence[View]) -> list[Mask]:
+        """Find the pixels of each view that Gaussians do not cover, apart from ignored ones."""
+        return [
+            (
+                (self.renderer.render(gaussians, view.camera).alpha < CLOSED_ALPHA)
+                & view.valid_mask
+            ).numpy()
+            for view in views
+        ]
+
+    def splat_all(self, views: Sequence[View], depths: Sequence[DepthMap]) -> Gaussians:
+        """Create the discs of all pixels of all views in turn, on the CPU."""
+        parts = [self.splat(view, depth) for view, depth in zip(views, depths, strict=True)]
+        return merge(parts).to("cpu")
+
     def replace_ignored(self, scene: Gaussians, view: View, gain: Float[Tensor, "3"]) -> View:
         """Replace ignored pixels by the render, so that nothing is fitted to them."""
         if view.ignore_mask is None:
@@ -202,6 +247,14 @@ class Splatter:
                 gaussians, pixels = extend_sky(view, sky, self.disc_sigma)
                 extended.append((number, gaussians, pixels))
         return extended
+
+
+def move_depths(depth: DepthMap, before: DepthLayer, after: DepthLayer) -> DepthMap:
+    """Move the depths of a view, in scene units, as its layer was moved."""
+    if after is before:
+        return depth
+    factor = torch.from_numpy(before.inverse / after.inverse)
+    return replace(depth, depth=depth.depth * factor.to(depth.depth))
 
 
 def ignore_elsewhere(
