@@ -312,9 +312,9 @@ def test_the_terminal_has_no_facts_and_the_page_folds_them(
     print_completion(ResultsRequest(out=out))
     said = capsys.readouterr().out.splitlines()
     assert said[0] == summary["outcome"]["headline"]
-    # The headline, the head of the table and its three rows, and the results.
+    # The headline, the head of the table in two lines, its three rows, and the results.
     assert [line.split()[0] for line in said[-3:]] == ["Added", "The", "Report:"]
-    assert len(said) == 8
+    assert len(said) == 9
 
     page = render_completion_page(out)
     header = page[page.index("<header>") : page.index("</header>")]

@@ -8,7 +8,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
-from rich.table import Table
+from rich.table import Column, Table
 
 from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.completing.keeping import describe_size
@@ -65,9 +65,9 @@ def print_completion(results: ResultsRequest) -> None:
 def make_score_table(summary: CompletionSummary) -> Table:
     """Make the table of PSNR before and after at each camera."""
     has_fitted = any(target.fitted is not None for target in summary.targets)
-    columns = ["camera", "hole", "PSNR before", "PSNR after"]
+    columns = ["camera", "hole", "PSNR\nbefore", "PSNR\nafter"]
     # After one pose and one gain of the target's camera were fitted to its photograph.
-    columns += ["camera fitted", "added"] if has_fitted else ["added"]
+    columns += ["camera\nfitted", "added"] if has_fitted else ["added"]
     kind = "context" if summary.scene.renders_from is None else "render"
     rows: list[list[str]] = []
     # Photographs of the context have neither a hole nor Gaussians of their own.
@@ -89,12 +89,10 @@ def make_score_table(summary: CompletionSummary) -> Table:
             cells.append(format_number(None if target.fitted is None else target.fitted.psnr))
         rows.append([*cells, f"{target.added:,}"])
 
-    # In a narrow terminal headers and cameras are broken between words, and numbers are not.
-    table = Table(box=None)
-    for number, header in enumerate(columns):
-        lengths = [len(row[number]) for row in rows if number < len(row)]
-        width = max(lengths, default=0) if number else None
-        table.add_column(header, min_width=width, overflow="fold")
+    # In a narrow terminal cameras are broken between words, and numbers are not.
+    table = Table(Column(columns[0], overflow="fold"), box=None)
+    for header in columns[1:]:
+        table.add_column(header, no_wrap=True)
     for row in rows:
         table.add_row(*row)
     return table
