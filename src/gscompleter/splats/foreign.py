@@ -64,7 +64,7 @@ KINDS_BY_ENDING = {
 }
 """Kinds of files by their endings: their first bytes do not tell, or those of a .zip or of JSON."""
 MACOS_FOLDER = "__MACOSX/"
-"""Where macOS keeps, in a .zip, what its file system knows of each file."""
+"""Folder of a .zip in which macOS keeps what its file system knows of each file."""
 
 SPLAT_NEIGHBOURS = (None, "cameras-json", "photograph")
 """Formats that a folder may have beside the splat that it stands for: a trainer keeps the cameras

@@ -28,6 +28,8 @@ CHECKED_OPTIONS = (
 )
 """Options that only photographs can follow."""
 
+NEEDS_PHOTOGRAPHS = "There are no photographs to apply this to; name their SCENE."
+
 Strength = Annotated[float, Interval(ge=0.1, le=10)]
 
 
@@ -71,9 +73,7 @@ def decide_cleaning(options: CleanOptions) -> CleaningRequest:
         defaults = {field.name: field.default for field in fields(options)}
         for name in CHECKED_OPTIONS:
             if getattr(options, name) != defaults[name]:
-                raise InputError(
-                    "There are no photographs to apply this to; name their SCENE.", name
-                )
+                raise InputError(NEEDS_PHOTOGRAPHS, name)
     refuse_unused_settings(options.config, options.folder is not None)
     photographs = None
     if options.folder is not None:
@@ -104,10 +104,7 @@ def refuse_unused_settings(config: CleaningConfig, has_photographs: bool) -> Non
     for field in fields(CleaningConfig):
         name = field.name
         if name != "floaters" and getattr(config, name) != getattr(usual, name):
-            raise InputError(
-                "There are no photographs to apply this to; name their SCENE.",
-                f"config.{name.replace('_', '-')}",
-            )
+            raise InputError(NEEDS_PHOTOGRAPHS, f"config.{name.replace('_', '-')}")
 
 
 def run_clean(options: CleanOptions) -> None:

@@ -75,14 +75,13 @@ def leave_free_space(
         layer = layers[number]
         inverse = layer.inverse
         waiting = open_pixels[number] & ~layer.measured_mask
-        waiting = waiting & find_seen_through(number, inverse, surfaces, transforms)
         lowest = inverse.min() / FARTHEST
         while waiting.any():
+            waiting = waiting & find_seen_through(number, inverse, surfaces, transforms)
             inverse = np.where(waiting, inverse / STEP, inverse)
             is_too_far = waiting & (inverse < lowest)
             inverse = np.where(is_too_far, layer.inverse, inverse)
             waiting = waiting & ~is_too_far
-            waiting = waiting & find_seen_through(number, inverse, surfaces, transforms)
         return layer if np.array_equal(inverse, layer.inverse) else replace(layer, inverse=inverse)
 
     return map_in_parallel(move, range(len(layers)))

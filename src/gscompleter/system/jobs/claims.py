@@ -18,7 +18,7 @@ from gscompleter.system.files.unfinished import (
 from gscompleter.system.files.writing import convert_write_errors
 
 CLAIM = "jobs in this folder"
-"""What the unfinished entries of claims are named after."""
+"""Name for the unfinished entries of all claims in a folder."""
 
 
 @contextmanager
