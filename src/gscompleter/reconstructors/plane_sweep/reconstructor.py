@@ -32,6 +32,7 @@ from gscompleter.reconstructors.plane_sweep.given_depth import (
     is_dense,
     measure_nothing,
 )
+from gscompleter.reconstructors.plane_sweep.ground import hold_to_ground
 from gscompleter.reconstructors.plane_sweep.near_plane import find_near_plane
 from gscompleter.reconstructors.plane_sweep.predicted_depth import (
     Supported,
@@ -256,13 +257,14 @@ def find_contradicted(rig: Rig, views: Sequence[View]) -> list[bool]:
 def measure_views(rig: Rig, views: Sequence[View]) -> tuple[list[Measurement], list[Mask]]:
     """Measure the depth of each view, by stereo or as it is given, and find its sky.
 
-    The sky is judged by measurements alone, before predictions fill its pixels.
+    The sky is judged by measurements alone, before the ground and predictions fill its pixels.
     """
     measured = [
         add_given(measurement, image)
         for measurement, image in zip(match_views(rig, views), rig.images, strict=True)
     ]
-    return measured, find_skies(rig, measured)
+    skies = find_skies(rig, measured)
+    return hold_to_ground(rig, measured, skies), skies
 
 
 def complete_layers(

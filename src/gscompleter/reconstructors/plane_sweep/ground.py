@@ -1,0 +1,296 @@
+"""The ground below the cameras of a drive or a walk, where stereo cannot measure it.
+
+From one photograph of a drive to the next the near road leaves the image. Its even asphalt then
+matches itself at the same pixel, as if it stood at infinity, and is built hundreds of metres away.
+But cameras that keep one height move over ground: the plane below all of them on which most of
+what is measured lies. A pixel is held to it only if the other photographs show the same there.
+Lengths are in widest baselines.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32
+
+from gscompleter.numerics.kernels.parallel import map_in_parallel
+from gscompleter.reconstructors.features.stereo_image import StereoImage
+from gscompleter.reconstructors.plane_sweep.rig import Rig, Transform
+from gscompleter.reconstructors.plane_sweep.sweep import (
+    BACKGROUND_WEIGHT,
+    Map,
+    Mask,
+    Measurement,
+    compute_plane_index,
+)
+
+MIN_VIEWS = 3
+"""Fewest photographs. Two that are good for stereo show the near ground with parallax."""
+
+NUM_HYPOTHESES = 500
+"""Number of planes that are tried, each through three measured points."""
+POINTS_PER_VIEW = 1500
+"""Most measured points of a photograph that propose planes and count for them."""
+MIN_CONFIDENCE = 0.2
+"""Confidence above which a measured depth is such a point."""
+MIN_POINTS = 100
+"""Fewest points below the horizon."""
+MIN_UPWARDS = 0.8
+"""Smallest cosine between the normal of the ground and the mean upward axis of the cameras."""
+MAX_HEIGHT_RATIO = 1.4
+"""Largest height of a camera above the ground, relative to the smallest one."""
+MAX_MISS = 0.03
+"""Largest relative error of inverse depth on the ground, beside one plane of the sweep."""
+REFITS = 5
+"""Number of least-squares fits to the inliers, each to those of the last one."""
+
+MIN_GROUND_INDEX = 4.0
+"""Smallest inverse depth of ground that is judged, in planes of the sweep. Nearer to the horizon
+all that is far lies on it."""
+REACH = 5.0
+"""Distance from the place below a camera up to which there is ground, in heights of the cameras."""
+BEYOND = 0.85
+"""Inverse depth relative to that of the ground below which a surface is clearly beyond it."""
+BEYOND_PLANES = 1.5
+"""Distance of such a surface from the ground, in planes of the sweep."""
+MAX_DIFFERENCE = 0.06
+"""Largest colour difference from another photograph at the depth of the ground."""
+WINDOW = 9
+"""Side of the window over which differences are averaged, in pixels."""
+MIN_AGREEING = 0.6
+"""Smallest share of the ground in view of others that has to agree with them, for what no other
+photograph shows to be held, too."""
+MIN_COMPARED = 0.02
+"""Smallest share of the photograph that is compared for that."""
+
+Rows = Float[np.ndarray, "n 3"]
+
+
+@dataclass(frozen=True)
+class MeasuredPoints:
+    """Points that were measured below the horizon, by the rays of their pixels."""
+
+    rays: Rows
+    """Rays with z-depth 1, in world axes."""
+    centers: Rows
+    """Centre of the camera of each ray."""
+    inverse: Float[np.ndarray, "n"]
+    """Measured inverse depth."""
+    step: Float[np.ndarray, "n"]
+    """Distance of two planes of the sweep that measured it, in inverse depth."""
+
+    @cached_property
+    def places(self) -> Rows:
+        """Positions in world axes."""
+        return self.centers + self.rays / self.inverse[:, None]
+
+
+@dataclass(frozen=True)
+class Ground:
+    """The plane of points x with normal · x = offset; the normal points upwards."""
+
+    normal: Float[np.ndarray, "3"]
+    offset: float
+
+    def measure_heights(self, centers: Rows) -> Float[np.ndarray, "n"]:
+        """Measure how high points are above the ground."""
+        return centers @ self.normal - self.offset
+
+    def find_inliers(self, points: MeasuredPoints) -> Bool[np.ndarray, "n"]:
+        """Find the points on the ground, apart from those near the horizon."""
+        inverse = -(points.rays @ self.normal) / self.measure_heights(points.centers)
+        is_judged = inverse > MIN_GROUND_INDEX * points.step
+        is_near = np.abs(points.inverse - inverse) < points.step + MAX_MISS * inverse
+        found: Bool[np.ndarray, "n"] = is_judged & is_near
+        return found
+
+
+def hold_to_ground(
+    rig: Rig, measured: Sequence[Measurement], skies: Sequence[Mask]
+) -> list[Measurement]:
+    """Put on the ground what is not measured there, or was measured beyond it.
+
+    What is put there weighs as little as the background of occluded pixels. `measured` are at full
+    size, and stay as they are without a ground that the cameras moved over.
+    """
+    if len(rig.images) < MIN_VIEWS:
+        return list(measured)
+    ground = find_ground(rig.images, measured, skies)
+    if ground is None:
+        return list(measured)
+    hold = partial(hold_view, rig, ground)
+    return map_in_parallel(hold, range(len(measured)), measured, skies)
+
+
+def find_ground(
+    images: Sequence[StereoImage], measured: Sequence[Measurement], skies: Sequence[Mask]
+) -> Ground | None:
+    """Find the plane below all cameras with the most measured points, by RANSAC.
+
+    None if no plane has points and all cameras at about one height above it.
+    """
+    centers = np.stack([image.center for image in images])
+    upwards = -np.mean([image.rotation[:, 1] for image in images], axis=0)
+    upwards /= max(float(np.linalg.norm(upwards)), 1e-9)
+    generator = np.random.default_rng(0)
+    points = sample_points(images, measured, skies, upwards, generator)
+    if len(points.inverse) < MIN_POINTS:
+        return None
+
+    best = None
+    most = 0
+    for _ in range(NUM_HYPOTHESES):
+        corners = points.places[generator.choice(len(points.inverse), 3, replace=False)]
+        normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
+        ground = make_ground(normal, corners[0], upwards)
+        if lies_below(ground, centers, upwards):
+            count = int(ground.find_inliers(points).sum())
+            if count > most:
+                best, most = ground, count
+    for _ in range(REFITS):
+        if best is None:
+            break
+        refitted = refit_ground(best, points, upwards)
+        if not lies_below(refitted, centers, upwards):
+            break
+        best = refitted
+    return best
+
+
+def sample_points(
+    images: Sequence[StereoImage],
+    measured: Sequence[Measurement],
+    skies: Sequence[Mask],
+    upwards: Float[np.ndarray, "3"],
+    generator: np.random.Generator,
+) -> MeasuredPoints:
+    """Sample measured points of all photographs, below the horizon and not in the sky."""
+    parts = []
+    for image, measurement, sky in zip(images, measured, skies, strict=True):
+        rays = compute_rays(image)
+        candidates = (measurement.confidence > MIN_CONFIDENCE) & ~sky & (rays @ upwards < 0)
+        pixels = generator.permutation(np.flatnonzero(candidates))[:POINTS_PER_VIEW]
+        step = float(measurement.planes[1] - measurement.planes[0])
+        parts.append(
+            (
+                rays.reshape(-1, 3)[pixels],
+                np.tile(image.center, (len(pixels), 1)),
+                measurement.inverse.reshape(-1)[pixels].astype(np.float64),
+                np.full(len(pixels), step),
+            )
+        )
+    return MeasuredPoints(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+
+
+def compute_rays(image: StereoImage) -> Float[np.ndarray, "h w 3"]:
+    """Compute the ray of each pixel, with z-depth 1, in world axes."""
+    height, width = image.size
+    x, y = np.meshgrid(np.arange(width) + 0.5, np.arange(height) + 0.5)
+    pixels = np.stack([x, y, np.ones_like(x)], axis=-1)
+    rays: Float[np.ndarray, "h w 3"] = pixels @ (image.rotation @ np.linalg.inv(image.K)).T
+    return rays
+
+
+def make_ground(
+    normal: Float[np.ndarray, "3"], place: Float[np.ndarray, "3"], upwards: Float[np.ndarray, "3"]
+) -> Ground:
+    """Make the plane through `place` whose normal, of any length and sign, is turned upwards."""
+    length = max(float(np.linalg.norm(normal)), 1e-30)
+    unit = normal / (length if normal @ upwards > 0 else -length)
+    return Ground(unit, float(unit @ place))
+
+
+def lies_below(ground: Ground, centers: Rows, upwards: Float[np.ndarray, "3"]) -> bool:
+    """Check whether a plane is level, and below all cameras at about the same height."""
+    heights = ground.measure_heights(centers)
+    lowest = float(heights.min())
+    is_level = float(ground.normal @ upwards) > MIN_UPWARDS
+    return is_level and lowest > 0 and float(heights.max()) < MAX_HEIGHT_RATIO * lowest
+
+
+def refit_ground(ground: Ground, points: MeasuredPoints, upwards: Float[np.ndarray, "3"]) -> Ground:
+    """Fit the plane to its inliers by least squares of their heights above it."""
+    found = ground.find_inliers(points)
+    places = points.places[found]
+    # A step of the sweep moves a point along its ray by step / inverse², and so in height by its
+    # share of the height of the camera.
+    heights = ground.measure_heights(points.centers[found])
+    weight = (points.inverse[found] / (points.step[found] * heights)) ** 2
+    middle = weight @ places / weight.sum()
+    # The direction in which they spread least is the normal.
+    scaled = (places - middle) * np.sqrt(weight)[:, None]
+    normal = np.linalg.svd(scaled, full_matrices=False)[2][-1]
+    return make_ground(normal, middle, upwards)
+
+
+def hold_view(
+    rig: Rig, ground: Ground, number: int, measured: Measurement, sky: Mask
+) -> Measurement:
+    """Hold the pixels of a view to the ground where other photographs agree with it."""
+    image = rig.images[number]
+    centers = np.stack([other.center for other in rig.images])
+    heights = ground.measure_heights(centers)
+    rays = compute_rays(image)
+    inverse = (-(rays @ ground.normal) / heights[number]).astype(np.float32)
+    index = compute_plane_index(measured.planes, inverse)
+    step = measured.planes[1] - measured.planes[0]
+    is_ground = (inverse > MIN_GROUND_INDEX * step) & ~sky & (image.given == 0)
+
+    # Ground is known where cameras passed: within reach of the places below them.
+    hits = image.center + rays / np.maximum(inverse, step)[..., None]
+    feet = centers - heights[:, None] * ground.normal
+    distances = [np.linalg.norm(hits - foot, axis=-1) for foot in feet]
+    is_ground &= np.min(distances, axis=0) < REACH * float(np.median(heights))
+
+    difference = measure_difference(rig, number, inverse)
+    is_compared = is_ground & np.isfinite(difference)
+    agrees = is_ground & (difference < MAX_DIFFERENCE)
+    # Where no other photograph looks, the ground goes on if the rest of it proved right.
+    is_right = agrees.sum() >= MIN_AGREEING * is_compared.sum()
+    if is_right and is_compared.mean() >= MIN_COMPARED:
+        agrees |= is_ground & ~is_compared
+
+    is_beyond = (measured.inverse < BEYOND * inverse) & (measured.index < index - BEYOND_PLANES)
+    held = agrees & (is_beyond | (measured.weight == 0))
+    return replace(
+        measured,
+        index=np.where(held, index, measured.index),
+        weight=np.where(held, BACKGROUND_WEIGHT, measured.weight),
+        confidence=np.where(held, np.float32(0), measured.confidence),
+    )
+
+
+def measure_difference(rig: Rig, number: int, inverse: Map) -> Float32[np.ndarray, "h w"]:
+    """Measure how much a view differs from the most similar other one at some inverse depths.
+
+    Colour differences are averaged over a window, since an edge may be a pixel off. Infinite where
+    no other photograph shows the place.
+    """
+    own = rig.images[number].image
+    least = np.full(inverse.shape, np.inf, np.float32)
+    for other, image in enumerate(rig.images):
+        if other != number:
+            seen, is_inside = sample_at(image.image, inverse, rig.transforms[number, other])
+            difference = cv2.blur(np.abs(seen - own).mean(axis=-1), (WINDOW, WINDOW))
+            least = np.where(is_inside, np.minimum(least, difference), least)
+    return least
+
+
+def sample_at(
+    image: Float32[np.ndarray, "H W 3"], inverse: Map, transform: Transform
+) -> tuple[Float32[np.ndarray, "h w 3"], Mask]:
+    """Sample another image at the inverse depths of a view, and mark what lies inside of it."""
+    height, width = inverse.shape
+    x = np.arange(width, dtype=np.float32) + np.float32(0.5)
+    y = np.arange(height, dtype=np.float32)[:, None] + np.float32(0.5)
+    u, v, z = (a * x + b * y + c + d * inverse for a, b, c, d in transform)
+    in_front = z > 1e-3
+    # Pixel centres are at whole numbers for OpenCV; -1 is outside.
+    u = np.where(in_front, u / np.where(in_front, z, 1) - np.float32(0.5), np.float32(-1))
+    v = np.where(in_front, v / np.where(in_front, z, 1) - np.float32(0.5), np.float32(-1))
+    is_inside = (u >= 0) & (v >= 0) & (u <= image.shape[1] - 1) & (v <= image.shape[0] - 1)
+    return cv2.remap(image, u, v, cv2.INTER_LINEAR), is_inside
