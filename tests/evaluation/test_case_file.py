@@ -68,6 +68,10 @@ def test_a_case_is_read(tmp_path, monkeypatch):
         (with_case(ignore=[[[0, 0], [1, 0], [1, 20]]]), "in shares of width and height"),
         (with_case(ignore=True), "has ignore true"),
         (with_case(ignore="none.png"), 'has ignore "none.png", and there is no such file'),
+        (
+            {"cases": [CASE, {**CASE, "scene": "./there/../room/"}]},
+            "case 2 has the scene, context and target of case 1",
+        ),
         ({"cases": [CASE, CASE]}, "case 2 has the scene, context and target of case 1"),
     ],
 )

@@ -86,8 +86,8 @@ def map_in_parallel(function, *arguments):
 def map_small_tasks(function, *arguments):
     """Map `function` over small tasks, each with its kernels on a single thread; yield in order.
 
-    `arguments` are sequences of equal length. Fewer tasks than threads run one after the other, with
-    their kernels on all threads.
+    `arguments` are sequences of equal length. Fewer tasks than threads run one after the other,
+    with their kernels on all threads.
     """
     threads = numba.config.NUMBA_NUM_THREADS
     if threads == 1 or len(arguments[0]) < threads:
