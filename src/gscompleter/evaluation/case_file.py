@@ -244,8 +244,8 @@ def parse_ignored(value: Any, name: str, file: Path) -> IgnoredRegions | None:
     if not isinstance(value, list) or not value or not all(map(is_polygon, value)):
         raise InputError(
             f"{name} has ignore {quote_json(value)}, and a list of polygons is needed, each of "
-            "three corners [x, y] or more in shares of width and height from 0 to 1, or the path of a "
-            "mask."
+            "three corners [x, y] or more in shares of width and height from 0 to 1, or the path "
+            "of a mask."
         )
     return IgnoredRegions(tuple(tuple((float(x), float(y)) for x, y in one) for one in value))
 
