@@ -361,3 +361,14 @@ def test_what_is_left_in_a_forced_hole_hides_nothing_that_fills_it(has_geometry)
     assert inside.sum() > 50
     ratio = z.reshape(SIZE, SIZE)[inside] / seen.render.depth[inside]
     assert ratio.max() <= IN_FRONT * 1.001
+
+
+def test_without_a_trusted_surface_the_depth_is_that_of_what_is_seen():
+    """With none at all, additions would collapse into the centre of the camera."""
+    reference, anchor_view = view_of(ROOM, TARGET), view_of(ROOM, ANCHOR)
+    config = CompleterConfig(registration=RegistrationConfig(hole_depth="scene"))
+    seen = observe(gaussians_of(anchor_view), [anchor_view], TARGET, config)
+    everywhere_open = torch.ones(SIZE, SIZE, dtype=torch.bool)
+    seen = replace(seen, masks=replace(seen.masks, holes=everywhere_open))
+    result = register(lifted(reference, anchor_view, 1.3), reference, seen)
+    assert depth_error(result, reference) < 0.05

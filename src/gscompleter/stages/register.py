@@ -75,26 +75,26 @@ def register_along_rays(
     # Geometry from elsewhere is a measurement, already bent to what the scene shows around the
     # hole. The losses of the registration know no depth of a hole, so it comes after them.
     given = bring_before_forced(reference.given_depth, view)
-    gaussians = place_at_given(
+    gaussians = place_at_depths(
         registered.gaussians, registered.pixel_index, reference.camera, given
     )
     return replace(registered, gaussians=gaussians)
 
 
-def place_at_given(
+def place_at_depths(
     gaussians: Gaussians,
     pixel_index: Int[Tensor, "n"] | None,
     camera: Camera,
-    given: Float[Tensor, "h w"],
+    depth: Float[Tensor, "h w"],
 ) -> Gaussians:
-    """Move Gaussians to the given z-depth of their pixel, or of the pixel that shows their mean.
+    """Move Gaussians to the z-depth of their pixel, or of the pixel that shows their mean.
 
-    Where `given` is 0 they stay.
+    Where `depth` is 0, which is unknown, they stay.
     """
     if pixel_index is None:
-        depths = look_up(given, gaussians, camera)
+        depths = look_up(depth, gaussians, camera)
     else:
-        depths = given.flatten()[pixel_index]
+        depths = depth.flatten()[pixel_index]
     z = compute_z_depths(gaussians.means, camera)
     return move_to_depths(gaussians, camera, depths.where(depths > 0, z))
 
@@ -131,8 +131,9 @@ def register_lifted(
     if config.hole_depth == "scene":
         # A trained splat has its depth from many photographs, which two-view stereo cannot better.
         # Nothing is left to optimize.
-        depth = continue_scene_depth(view, reference).flatten()[pixel_index]
-        return Registration(move_to_depths(coarse, camera, depth), pixel_index, ())
+        depth = continue_scene_depth(view, reference)
+        placed = place_at_depths(coarse, pixel_index, camera, depth)
+        return Registration(placed, pixel_index, ())
     if config.extrapolate_into_holes and config.degrees_of_freedom == 1:
         return register_beside_holes(coarse, pixel_index, reference, anchor, view)
     registered, losses = optimize_distances(coarse, reference, anchor, view)
@@ -143,7 +144,7 @@ def continue_scene_depth(view: TargetView, reference: View) -> Float[Tensor, "h 
     """Compute the z-depth of the scene at the padded target, continued smoothly into its holes.
 
     A given depth of the reference is continued like that of the scene. In a forced hole the depth
-    is before what is left there.
+    is before what is left there. It is 0 if the target sees no surface.
     """
     surface = view.render.depth_map(view.state.config.holes.max_alpha)
     # Beside an object there is neither a hole nor a depth.
@@ -153,6 +154,9 @@ def continue_scene_depth(view: TargetView, reference: View) -> Float[Tensor, "h 
         is_given = reference.given_depth > 0
         depth = torch.where(is_given, reference.given_depth, depth)
         known = known | is_given
+    # Where nothing is trusted, or all was marked as wrong, the depth of what is seen is still
+    # nearer to the truth than none.
+    known = known | (surface.valid & ~known.any())
     return bring_before_forced(fill_smoothly(depth, known), view)
 
 

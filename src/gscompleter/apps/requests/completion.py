@@ -34,8 +34,8 @@ class WorkRequest:
     """Mesh or points whose depth is used where photographs show none; None for none."""
     models: ModelRequest = ModelRequest()
     config: CompleterConfig = CompleterConfig()
-    """Settings. Those of a splat without photographs are completed when its Gaussians are read, which
-    tell what a hole of it is, and whether images are padded."""
+    """Settings. For a splat without photographs they are completed when its Gaussians are read,
+    which tell what a hole of it is, and whether images are padded."""
 
 
 @dataclass(frozen=True)
