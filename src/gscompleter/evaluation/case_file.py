@@ -89,7 +89,11 @@ def read_case_file(path: Path) -> CaseFile:
     name = f"{quote_value(path)} is no file of cases"
     if not isinstance(content, dict):
         raise InputError(f"{name}: it has to be an object with resolution and cases.")
-    refuse_unknown(content, FILE_KEYS, name)
+    if "scenes" in content:
+        raise InputError(
+            f"{name}: it names scenes, of which a protocol chooses the frames; give --protocol."
+        )
+    refuse_unknown(content, FILE_KEYS, f"{name}: it")
 
     size = content.get("resolution")
     sides = size if isinstance(size, list) else []
@@ -138,7 +142,7 @@ def read_scene_file(path: Path) -> tuple[SceneRow, ...]:
     name = f"{quote_value(path)} is no file of scenes"
     if not isinstance(content, dict):
         raise InputError(f"{name}: it has to be an object with scenes.")
-    refuse_unknown(content, SCENE_KEYS, name)
+    refuse_unknown(content, SCENE_KEYS, f"{name}: it")
     scenes = content.get("scenes")
     if not isinstance(scenes, list) or not scenes:
         raise InputError(
@@ -265,7 +269,7 @@ def is_corner(value: Any) -> bool:
 
 
 def refuse_unknown(content: Mapping[str, Any], known: Sequence[str], name: str) -> None:
-    """Refuse keys that nothing reads, such as misspelt ones."""
+    """Refuse keys that nothing reads, such as misspelt ones; `name` begins the sentence."""
     unknown = [key for key in content if key not in known]
     if unknown:
         raise InputError(
