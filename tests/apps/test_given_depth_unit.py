@@ -12,6 +12,9 @@ from command import run
 from exact_room import make_cameras, write_transforms
 from gscompleter import InputError
 from gscompleter.apps.inputs.given_depth import read_with_depth
+from gscompleter.apps.inputs.reading import read_task
+from gscompleter.apps.inputs.task import Opened
+from gscompleter.apps.requests.scene import SceneRequest
 from gscompleter.data.formats import open_photographs
 from gscompleter.reconstructors.features.depth_factor import DepthSamples, fit_depth_factor
 
@@ -72,6 +75,23 @@ def test_metres_that_are_read_as_millimetres_are_scaled(tmp_path, ending):
 def test_one_photograph_is_compared_with_the_next(tmp_path):
     scene = make_scene(tmp_path / "room", "png", lambda z, _: 2.5 * z)
     (note,) = check_exact(scene, (0,))
+    assert "2.5 times" in note
+
+
+def test_the_last_photograph_is_compared_with_the_one_before(tmp_path):
+    scene = make_scene(tmp_path / "room", "png", lambda z, _: 2.5 * z)
+    (note,) = check_exact(scene, (2,))
+    assert "2.5 times" in note
+
+
+@pytest.mark.parametrize("held_out", [(), (1,)], ids=["a target", "held out"])
+def test_a_photograph_that_scores_the_result_tells_no_unit(tmp_path, held_out):
+    """The unit decides where the result stands. Here the depth of photograph 1 has another one."""
+    scene = make_scene(tmp_path / "room", "png", lambda z, number: (2.5, 9, 2.5)[number] * z)
+    photographs = open_photographs(scene)
+    opened = Opened(SceneRequest(scene), photographs, "nerfstudio", len(photographs), held_out)
+    targets = () if held_out else ("1",)
+    (note,) = read_task(opened, (0,), targets, "cpu", has_splat=True).depth_notes
     assert "2.5 times" in note
 
 

@@ -104,7 +104,7 @@ def test_photographs_are_named_by_file_in_options_lines_and_results(tmp_path, mo
     captured = capsys.readouterr()
     assert "from photographs 0 (photo_000.png), 2 (photo_002.png) for photograph 3" in captured.err
     assert "context 2 (photo_002.png)" in captured.out
-    assert "target: photograph 3 (photo_003.png)" in captured.out
+    assert "target 1: photograph 3 (photo_003.png)" in captured.out
     summary = json.loads((tmp_path / "out/summary.json").read_text())
     assert [row["file"] for row in summary["context"]] == ["photo_000.png", "photo_002.png"]
     assert [row["file"] for row in summary["held_out"]] == ["photo_001.png"]

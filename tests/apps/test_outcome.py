@@ -17,7 +17,7 @@ from command import run
 from gscompleter.apps.batch.running import complete_job
 from gscompleter.apps.commands.batch_rows import decide_row
 from gscompleter.apps.completing import run_info
-from gscompleter.apps.completing.printing import print_completion
+from gscompleter.apps.completing.printing import print_completion, print_plan
 from gscompleter.apps.completing.run_info import read_held_out
 from gscompleter.apps.inputs.task import CompletionTask, Opened, Target
 from gscompleter.apps.report.page import render_completion_page
@@ -323,3 +323,29 @@ def test_the_terminal_has_no_facts_and_the_page_folds_them(
     for text in ("It rained.", "2 photographs are missing.", "depth, which decides"):
         assert page.count(text) == folded.count(text) == 1
     assert 'class="notes"' not in header
+
+
+def test_targets_have_the_numbers_that_sentences_name(completed_room, tmp_path, capsys):
+    out = Path(shutil.copytree(completed_room, tmp_path / "out"))
+    summary = json.loads((out / "summary.json").read_text())
+    given = {**summary["targets"][0], "frame": None, "file": None}
+    rows = [{**given, "warnings": [warning]} for warning in ("It rained.", "It was dark.")]
+    (out / "summary.json").write_text(json.dumps({**summary, "targets": rows}))
+    print_completion(ResultsRequest(out=out))
+    said = capsys.readouterr().out
+    assert said.index("target 1: a given camera") < said.index("target 2: a given camera")
+    assert "Target 1: It rained." in said
+    assert "Target 2: It was dark." in said
+
+
+@pytest.mark.parametrize("is_found", [False, True])
+def test_a_plan_names_a_photograph_beside_a_camera_that_was_found(tmp_path, capsys, is_found):
+    """That of a camera which the user named is not written."""
+    folder = photographed(tmp_path / "scene", [camera_at(x, size=16) for x in (0.0, 0.2)])
+    photographs = open_photographs(folder)
+    opened = Opened(SceneRequest(folder), photographs, "nerfstudio", 2)
+    target = Target(camera_at(0.5, size=16), derived_from=1 if is_found else None)
+    print_plan(tmp_path / "out", opened, [target], [0.25])
+    said = capsys.readouterr().out
+    assert "25.0 %" in said
+    assert ("the photograph beside it" in " ".join(said.split())) == is_found

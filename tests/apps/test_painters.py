@@ -284,6 +284,8 @@ def test_a_damaged_holes_file_is_refused(scene, holes, tmp_path, monkeypatch, ca
         (["--export-holes", "NEW", "--dry-run"], "completes nothing"),
         (["--export-holes", "NEW", "--video"], "completes nothing"),
         (["--export-holes", "NEW", "--save-as", ".spz"], "completes nothing"),
+        (["--export-holes", "NEW", "--generator", "oracle"], "generates nothing"),
+        (["--export-holes", "NEW", "--generator-retries", 2], "generates nothing"),
         (["--export-holes", "OUT"], "have to lie apart from each other"),
         (["--export-holes", "OUT/holes"], "have to lie apart from each other"),
         (["--export-holes", "SCENE"], "is the input"),

@@ -180,6 +180,9 @@ def test_a_row_of_a_batch_is_the_request_of_its_command_line(decide, tmp_path):
     [
         ("complete --out out", "Nothing is named that is to be completed"),
         ("complete SPLAT --scene SPLAT --out out", "Two splats are named"),
+        ("complete SPLAT --scene . --out out", "SCENE, and the splat with --scene"),
+        ("update SPLAT --scene SPLAT --out out", "Two splats are named"),
+        ("update SPLAT --scene . --out out", "SCENE, and the splat with --scene"),
         ("complete SCENE --up 0 1 0 --out out", "leave --up out"),
         ("complete SPLAT --frames 9 --out out", "There are no photographs to apply this to"),
         ("complete SCENE --mask m.png --out out", "there is nothing that masks could mark"),
@@ -190,6 +193,10 @@ def test_a_row_of_a_batch_is_the_request_of_its_command_line(decide, tmp_path):
         ("complete SCENE --painter me --out out", "--painter names who painted --images"),
         ("complete SCENE --path --out out", "--path is a video of what --export-holes writes"),
         ("complete SCENE --generator painted --out out", "needs painted images"),
+        (
+            "repair SPLAT --target c.json --mask m.png --generator painted --out out",
+            "which `complete --images` names",
+        ),
         ("complete SCENE --generator-steps 3 --out out", "has no setting steps"),
         ("complete SCENE --reconstructor none-such --out out", "no reconstructor"),
         ("complete SCENE --context 1 1 --out out", "--context names no frame, or one twice"),

@@ -1,4 +1,4 @@
-"""Without photographs, options that only photographs can follow are refused by their name."""
+"""Options that only photographs can follow, or only a splat, are refused by name without them."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import pytest
 from command import run
 from gscompleter import save_ply
 from gscompleter.apps.commands.clean import CleanOptions
+from gscompleter.apps.commands.shared_decisions import SPLAT_OPTIONS
 from gscompleter.apps.commands.shared_options import CompletingOptions, SceneOptions
 from scenes import Room, camera_at, gaussians_of, view_of
 
@@ -100,3 +101,14 @@ def test_commands_that_complete_refuse_what_renders_cannot_follow(
         command = (words[0], *given, *words[1:], "--out", tmp_path / "out")
         check_refusal(monkeypatch, capsys, name, *command)
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("name", SPLAT_OPTIONS)
+def test_what_only_a_splat_can_follow_is_refused_for_photographs(
+    tmp_path, monkeypatch, capsys, name
+):
+    option = f"--{name.replace('_', '-')}"
+    assert run(monkeypatch, "complete", tmp_path / "room", option, "--out", tmp_path / "out") == 2
+    said = capsys.readouterr().err
+    assert "There is no splat to apply this to" in said
+    assert option in said

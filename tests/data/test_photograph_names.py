@@ -20,6 +20,8 @@ def test_a_photograph_has_its_number_and_its_file():
 def test_a_render_in_place_of_a_photograph_has_one_number():
     """Its number among the frames, from 0, and that of its name, from 1, told nothing together."""
     assert name_photograph(0, name_render(1)) == "1"
+    assert name_target(0, name_render(1), None, None) == "render 1"
+    assert name_target(None, name_render(1), 0, None) == "near render 1"
 
 
 def test_targets_near_one_photograph_are_told_apart():

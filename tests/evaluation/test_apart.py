@@ -100,6 +100,7 @@ def test_a_misspelt_scene_is_refused_instead_of_used(tmp_path, content, sentence
     [
         ({"scenes": []}, "scenes has to be a list of folders, and is []."),
         ({"scenes": ["a", "a"]}, 'scene 2 is "a"; name different folders'),
+        ({"scenes": ["a", "./a/"]}, 'scene 2 is "./a/"; name different folders'),
         ({"scenes": [""]}, 'scene 1 is "";'),
         ({"scene": ["a"]}, "has the key 'scene', which is none of scenes, about, apart"),
         ([], "it has to be an object with scenes."),

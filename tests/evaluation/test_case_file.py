@@ -49,7 +49,8 @@ def test_a_case_is_read(tmp_path, monkeypatch):
         ({"cases": []}, "cases has to be a list of cases, and is []."),
         ({"cases": 3}, "and is 3."),
         ({"cases": ["room"]}, "case 1 has to be an object"),
-        ({"case": []}, "has the key 'case', which is none of resolution, cases"),
+        ({"case": []}, "cases: it has the key 'case', which is none of resolution, cases"),
+        ({"scenes": ["room"]}, "a protocol chooses the frames; give --protocol."),
         (with_case(neighbors=[1]), "case 1 has the key 'neighbors', which is none of scene"),
         (with_case(scene=""), 'needs scene, a folder relative to the file; it has "".'),
         (with_case(context=[0]), "a list of at least two frames"),
@@ -68,6 +69,10 @@ def test_a_case_is_read(tmp_path, monkeypatch):
         (with_case(ignore=[[[0, 0], [1, 0], [1, 20]]]), "in shares of width and height"),
         (with_case(ignore=True), "has ignore true"),
         (with_case(ignore="none.png"), 'has ignore "none.png", and there is no such file'),
+        (
+            {"cases": [CASE, {**CASE, "scene": "./there/../room/"}]},
+            "case 2 has the scene, context and target of case 1",
+        ),
         ({"cases": [CASE, CASE]}, "case 2 has the scene, context and target of case 1"),
     ],
 )

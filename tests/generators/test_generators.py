@@ -72,6 +72,14 @@ def test_photographs_that_share_nothing_keep_their_exposure():
     assert torch.equal(second, torch.ones(3))
 
 
+def test_a_photograph_is_matched_through_another_one():
+    colors = [torch.full((20, 20, 3), value) for value in (0.4, 0.6, 0.8)]
+    column = torch.arange(20).expand(20, 20)
+    visible = [column < 8, (column >= 2) & (column < 14), column >= 8]
+    gains = match_exposures(colors, visible, reference=0)
+    assert torch.allclose(torch.stack(gains)[:, 0], torch.tensor([1, 2 / 3, 1 / 2]), rtol=1e-5)
+
+
 def test_what_was_photographed_but_is_missing_in_the_scene_is_shown():
     """A ball of Gaussians is cut out of the wall that both photographs show."""
     target = camera_at(0.4, yaw=5, size=SIZE)

@@ -7,13 +7,19 @@ import pytest
 import torch
 
 import gscompleter as gsc
-from gscompleter.config import CompleterConfig
+from gscompleter.config import CompleterConfig, HoleConfig
 from gscompleter.config.settings import COVERED
-from gscompleter.numerics.geometry import add_near_plane, look_along, resize_camera, unproject
+from gscompleter.numerics.geometry import (
+    add_near_plane,
+    look_along,
+    pad_camera,
+    resize_camera,
+    unproject,
+)
 from gscompleter.numerics.image_ops import dilate, label_regions
 from gscompleter.render.loading import load_renderer
 from gscompleter.stages.enclosed_holes import keep_enclosed
-from gscompleter.stages.hole_masks import compute_hole_mask
+from gscompleter.stages.hole_masks import HoleEdits, compute_hole_mask, find_hole_masks
 from gscompleter.stages.synthesize import make_generator_input
 from gscompleter.types import Camera, Gaussians, make_observed, merge
 from paths import DATA
@@ -73,6 +79,23 @@ def test_a_hole_in_its_surface_is_one():
     assert label_regions(holes)[1] == 2
     assert (rows.float().mean() - SIZE / 2).abs() < 4
     assert (columns.float().mean() - SIZE / 2).abs() < 4
+
+
+def test_a_hole_stays_one_where_what_is_not_trusted_joins_it_to_the_space_around():
+    scene = cut(make_plate())
+    render = RENDERER.render(scene, CAMERA)
+    trusted = render.alpha.clone()
+    trusted[SIZE // 2 - 3 : SIZE // 2 + 3] = 0.0
+    masks = find_hole_masks(
+        render,
+        trusted,
+        pad_camera(CAMERA, 0.0),
+        HoleConfig(kind="enclosed"),
+        HoleEdits(),
+        lambda other: RENDERER.render(scene, other),
+    )
+    assert masks.empty.any()
+    assert masks.holes[masks.empty].all()
 
 
 def test_a_notch_in_its_edge_is_none():

@@ -14,10 +14,12 @@ from gscompleter.numerics.given_geometry import make_geometry
 from gscompleter.stages.given_geometry import (
     ContradictedError,
     check_geometry,
+    count_on_geometry,
     fit_to_surface,
     give_depth_before_scene,
     require_uncontradicted,
 )
+from gscompleter.target_result import GeometryUse
 from gscompleter.types import DepthMap
 from room_mesh import mesh_of, points_of, triangles_of
 from scenes import Room, camera_at, cast, gaussians_of, merge, view_of
@@ -146,3 +148,14 @@ def test_only_the_part_beside_a_contradiction_is_left_out():
     fit = fit_to_surface(drawn, surface)
     assert fit.contradicted[:26].all()
     torch.testing.assert_close(fit.depth[38:], torch.full((26, 64), 2.0))
+
+
+def test_a_gaussian_that_was_moved_away_does_not_stand_where_the_geometry_says():
+    view = view_of(ROOM, CAMERAS[0])
+    depth = view.depth
+    assert depth is not None
+    image = replace(view, depth=None, given_depth=depth)
+    use = GeometryUse("room.ply", share=1.0)
+    standing = count_on_geometry(use, gaussians_of(view), image).added
+    assert standing > 0.9 * SIZE**2
+    assert count_on_geometry(use, gaussians_of(view, 0.8 * depth), image).added == 0

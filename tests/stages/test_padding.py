@@ -9,7 +9,7 @@ from gscompleter import GSCompleter
 from gscompleter.config import LIFTED_MARGIN, CompleterConfig
 from gscompleter.numerics.geometry import pad_pixels
 from gscompleter.stages.context import choose_config
-from gscompleter.stages.hole_masks import beside_holes
+from gscompleter.stages.hole_masks import mark_beside_holes
 from gscompleter.target_result import TargetResult
 from gscompleter.types import Gaussians, Render
 from gscompleter.virtual_capture.render_views import render_views
@@ -47,7 +47,7 @@ def test_padding_follows_the_hole_that_touches_the_border():
     inside = camera.crop(holes)
     inside[:] = False
     inside[3, 7] = True
-    beside = beside_holes(holes, camera, 1)
+    beside = mark_beside_holes(holes, camera, 1)
     # The image itself stays open for whatever is a hole in it.
     assert camera.crop(beside).all()
     # To the right of the hole, with its seam, and nowhere else.

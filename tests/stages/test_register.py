@@ -15,7 +15,9 @@ from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
 from gscompleter.render.redraw import RedrawnScene
 from gscompleter.stages.align_depth import align_depth
+from gscompleter.stages.hole_masks import HoleEdits
 from gscompleter.stages.register import (
+    IN_FRONT,
     Objective,
     apply_affine,
     register_along_rays,
@@ -339,3 +341,34 @@ def test_the_loss_of_eq_11_has_the_weights_and_renders_of_the_paper():
     assert min(depth, stereo, 0.1 * color) > 0.005
     expected = depth + stereo + 0.1 * color
     assert register(lift, reference, seen).losses[0] == pytest.approx(expected, rel=1e-3)
+
+
+@pytest.mark.parametrize("has_geometry", [False, True])
+def test_what_is_left_in_a_forced_hole_hides_nothing_that_fills_it(has_geometry):
+    """Not even what geometry from elsewhere puts behind it."""
+    reference, anchor_view = view_of(ROOM, TARGET), view_of(ROOM, ANCHOR)
+    config = CompleterConfig(registration=RegistrationConfig(hole_depth="scene"))
+    seen = observe(gaussians_of(view_of(ROOM, TARGET)), [anchor_view], TARGET, config)
+    forced = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    forced[10:20, 10:20] = True
+    seen = replace(seen, masks=replace(seen.masks, edits=HoleEdits(forced=forced)))
+    if has_geometry:
+        behind = torch.where(forced, 1.2 * reference.depth, 0.0)
+        reference = replace(reference, depth=None, given_depth=behind)
+    registered = register(lifted(view_of(ROOM, TARGET), anchor_view, 1.0), reference, seen)
+    _, z = project(registered.gaussians.means, TARGET)
+    inside = forced & seen.render.depth_map().valid
+    assert inside.sum() > 50
+    ratio = z.reshape(SIZE, SIZE)[inside] / seen.render.depth[inside]
+    assert ratio.max() <= IN_FRONT * 1.001
+
+
+def test_without_a_trusted_surface_the_depth_is_that_of_what_is_seen():
+    """With none at all, additions would collapse into the centre of the camera."""
+    reference, anchor_view = view_of(ROOM, TARGET), view_of(ROOM, ANCHOR)
+    config = CompleterConfig(registration=RegistrationConfig(hole_depth="scene"))
+    seen = observe(gaussians_of(anchor_view), [anchor_view], TARGET, config)
+    everywhere_open = torch.ones(SIZE, SIZE, dtype=torch.bool)
+    seen = replace(seen, masks=replace(seen.masks, holes=everywhere_open))
+    result = register(lifted(reference, anchor_view, 1.3), reference, seen)
+    assert depth_error(result, reference) < 0.05

@@ -77,7 +77,7 @@ def test_a_completion_names_its_folder_and_photographs_as_they_are(tmp_path, cap
     print_completion(ResultsRequest(out=out))
     said = capsys.readouterr().out
     assert "context 0 (c [red] b].png)" in said
-    assert "(c [red] b].png)" in said.split("target: ")[1]
+    assert "(c [red] b].png)" in said.split("target 1: ")[1]
     assert f"Report: {out / 'report.html'}" in said
 
 

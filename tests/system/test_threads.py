@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 import threading
+import time
 
 import numba
 import pytest
@@ -194,6 +195,43 @@ def test_who_asks_works_where_others_keep_the_threads_busy(monkeypatch):
         assert not busy.done()
     finally:
         done.set()
+
+
+def test_an_error_of_one_thread_comes_when_the_others_have_ended():
+    """What goes on would write into arrays that the caller has given up."""
+    own = threading.get_ident()
+    # Which of the two helpers fails is chance, and an error of the second one waits for the first.
+    for _ in range(6):
+        together = threading.Barrier(3, timeout=60)
+        failing = threading.Lock()
+        ended = []
+
+        def call(number: int, together=together, failing=failing, ended=ended) -> None:
+            together.wait()
+            if threading.get_ident() != own:
+                if failing.acquire(blocking=False):
+                    raise ZeroDivisionError
+                time.sleep(0.1)
+            ended.append(number)
+
+        with pytest.raises(ZeroDivisionError):
+            run_calls(call, [(number,) for number in range(3)], threads=3)
+        assert len(ended) == 2
+
+
+def test_after_an_error_no_call_begins():
+    begun = []
+
+    def call(number: int) -> None:
+        begun.append(number)
+        if number == 0:
+            raise ZeroDivisionError
+        # Long enough for the first call to fail.
+        time.sleep(0.2)
+
+    with pytest.raises(ZeroDivisionError):
+        run_calls(call, [(number,) for number in range(20)], threads=2)
+    assert len(begun) <= 2
 
 
 def test_pieces_are_taken_by_all_threads_and_come_in_their_order(monkeypatch):

@@ -38,13 +38,14 @@ def name_target(
 ) -> str:
     """Name a target: a photograph, a camera near one, or a camera from elsewhere.
 
-    `file` is that of the photograph that it is or that it was derived from; `offset` tells targets
-    near one photograph apart.
+    `file` is that of the photograph that it is or that it was derived from, or the name of a render
+    in its place; `offset` tells targets near one photograph apart.
     """
+    kind = "render" if file is not None and file.startswith(RENDER) else "photograph"
     if derived_from is not None:
-        near = f"near photograph {name_photograph(derived_from, file)}"
+        near = f"near {kind} {name_photograph(derived_from, file)}"
         return near if offset is None else f"{near}, {offset}"
-    return "a given camera" if frame is None else f"photograph {name_photograph(frame, file)}"
+    return "a given camera" if frame is None else f"{kind} {name_photograph(frame, file)}"
 
 
 def describe_offset(camera: Camera, base: Camera) -> str:

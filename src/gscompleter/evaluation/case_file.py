@@ -1,10 +1,12 @@
 """The file of cases, `cases.json`: its keys, and one sentence for each mistake in it.
 
 {"resolution": [h, w], "cases": [{"scene", "context", "target", "near", "far", "neighbours"}, ...]}.
-Scenes are folders relative to the file, and may name variables of the environment. With "apart",
-true or a list of names of scenes, all cases or those of these scenes are kept apart (`apart.py`).
-"ignore" of a case is a list of polygons or the path of a mask: parts of its photographs that do not
-count.
+Scenes are folders, and frames are numbers of photographs from 0; near and far are z-depths in scene
+units. "ignore" of a case is a list of polygons or the path of a mask: parts of its photographs that
+do not count. Paths are relative to the file, and may name variables of the environment.
+
+With "apart", true or a list of names of scenes, all cases or those of these scenes are kept apart
+(`apart.py`). The name of a scene is the last part of its path.
 
 A file of scenes, {"scenes": [folder, ...], "apart": [name, ...]}, names those of a data set for the
 protocols, which choose frames themselves.
@@ -31,8 +33,11 @@ FILE_KEYS = ("resolution", "cases", "about", "apart")
 SCENE_KEYS = ("scenes", "about", "apart")
 """Keys of a file of scenes."""
 CASE_KEYS = ("scene", "context", "target", "neighbours", "near", "far", "ignore", "about")
+"""Keys of a case."""
 MAX_FRAME = 10**9
+"""Largest number of a frame; a time stamp is no frame."""
 MIN_CONTEXT = 2
+"""Fewest context frames: a single photograph has no stereo."""
 MIN_CORNERS = 3
 """Fewest corners of a polygon."""
 
@@ -42,10 +47,15 @@ class CaseRow:
     """A case as its file has it."""
 
     scene: str
+    """Path of the scene as the file has it; see `locate_named`."""
     context: tuple[int, ...]
+    """At least `MIN_CONTEXT` different frames."""
     target: int
+    """Frame that is completed, and none of the context."""
     neighbours: tuple[int, ...] = ()
+    """Further frames, beside the target, for scoring only."""
     near: float | None = None
+    """Smallest z-depth in scene units; None for that of the data, as of `far`."""
     far: float | None = None
     ignore: IgnoredRegions | None = None
     """What does not count in its photographs; None for nothing."""
@@ -58,7 +68,9 @@ class SceneRow:
     """A scene as a file of scenes has it."""
 
     scene: str
+    """Path of the scene as the file has it; see `locate_named`."""
     is_apart: bool = False
+    """True if the file keeps the scene apart."""
 
 
 @dataclass(frozen=True)
@@ -68,6 +80,7 @@ class CaseFile:
     resolution: tuple[int, int]
     """Height and width, in pixels."""
     rows: tuple[CaseRow, ...]
+    """At least one case."""
 
 
 def read_case_file(path: Path) -> CaseFile:
@@ -76,26 +89,30 @@ def read_case_file(path: Path) -> CaseFile:
     name = f"{quote_value(path)} is no file of cases"
     if not isinstance(content, dict):
         raise InputError(f"{name}: it has to be an object with resolution and cases.")
-    refuse_unknown(content, FILE_KEYS, name)
+    if "scenes" in content:
+        raise InputError(
+            f"{name}: it names scenes, of which a protocol chooses the frames; give --protocol."
+        )
+    refuse_unknown(content, FILE_KEYS, f"{name}: it")
 
     size = content.get("resolution")
     sides = size if isinstance(size, list) else []
     if len(sides) != 2 or not all(type(s) is int and 1 <= s <= MAX_IMAGE_SIDE for s in sides):
         raise InputError(
             f"{name}: resolution has to be height and width in pixels, as in [256, 256], and is "
-            f"{show(size)}."
+            f"{quote_json(size)}."
         )
     rows = content.get("cases")
     if not isinstance(rows, list) or not rows:
-        raise InputError(f"{name}: cases has to be a list of cases, and is {show(rows)}.")
-    parsed = [
-        parse_case_row(row, f"{name}: case {n}", path.parent) for n, row in enumerate(rows, start=1)
-    ]
+        raise InputError(f"{name}: cases has to be a list of cases, and is {quote_json(rows)}.")
+    parsed = [parse_case_row(row, f"{name}: case {n}", path) for n, row in enumerate(rows, start=1)]
 
-    # The scores of two cases of one name would overwrite each other.
-    names = [(row.scene, row.context, row.target) for row in parsed]
-    for number, row_name in enumerate(names, start=1):
-        first = names.index(row_name) + 1
+    # A run refuses two cases of one name as well, but can no longer say which rows they are. Two
+    # spellings of a path are one scene.
+    numbers: dict[tuple[str, tuple[int, ...], int], int] = {}
+    for number, row in enumerate(parsed, start=1):
+        place = os.path.abspath(locate_named(path, row.scene))
+        first = numbers.setdefault((place, row.context, row.target), number)
         if first < number:
             raise InputError(
                 f"{name}: case {number} has the scene, context and target of case {first}; leave "
@@ -125,58 +142,74 @@ def read_scene_file(path: Path) -> tuple[SceneRow, ...]:
     name = f"{quote_value(path)} is no file of scenes"
     if not isinstance(content, dict):
         raise InputError(f"{name}: it has to be an object with scenes.")
-    refuse_unknown(content, SCENE_KEYS, name)
+    refuse_unknown(content, SCENE_KEYS, f"{name}: it")
     scenes = content.get("scenes")
     if not isinstance(scenes, list) or not scenes:
-        raise InputError(f"{name}: scenes has to be a list of folders, and is {show(scenes)}.")
+        raise InputError(
+            f"{name}: scenes has to be a list of folders, and is {quote_json(scenes)}."
+        )
+    places: set[str] = set()
     for number, scene in enumerate(scenes, start=1):
-        if not isinstance(scene, str) or not scene or scene in scenes[: number - 1]:
+        is_path = isinstance(scene, str) and scene != ""
+        place = os.path.abspath(locate_named(path, scene)) if is_path else ""
+        if not is_path or place in places:
             raise InputError(
-                f"{name}: scene {number} is {show(scene)}; name different folders, relative to "
-                "the file."
+                f"{name}: scene {number} is {quote_json(scene)}; name different folders, relative "
+                "to the file."
             )
+        places.add(place)
     is_apart = parse_apart(content.get("apart"), scenes, name)
     return tuple(SceneRow(scene, apart) for scene, apart in zip(scenes, is_apart, strict=True))
 
 
+def locate_named(file: Path, path: str) -> Path:
+    """Locate what a file names by a path: relative to the file, with variables replaced."""
+    return file.parent / os.path.expandvars(path)
+
+
 def parse_apart(apart: Any, scenes: Sequence[str], name: str) -> list[bool]:
-    """Parse which of `scenes` are kept apart: all of them, or those that a list names."""
+    """Parse which of `scenes` are kept apart, in their order: all, or those that a list names.
+
+    `name` begins the sentences about mistakes.
+    """
     known = [PurePath(scene).name for scene in scenes]
     if isinstance(apart, bool) or apart is None:
         return [bool(apart)] * len(known)
     if not isinstance(apart, list) or not all(isinstance(scene, str) for scene in apart):
         raise InputError(
-            f"{name}: apart has to be true or a list of names of scenes, and is {show(apart)}."
+            f"{name}: apart has to be true or a list of names of scenes, and is "
+            f"{quote_json(apart)}."
         )
     # A misspelt name would leave its scene in every measurement.
     unknown = [scene for scene in apart if scene not in known]
     if unknown:
         raise InputError(
-            f"{name}: apart names {show(unknown[0])}, which is none of its scenes "
+            f"{name}: apart names {quote_json(unknown[0])}, which is none of its scenes "
             f"({', '.join(dict.fromkeys(known))}); correct or remove it."
         )
     return [scene in apart for scene in known]
 
 
-def parse_case_row(row: Any, name: str, home: Path) -> CaseRow:
-    """Parse a case of a file in the folder `home`; sentences begin with its name."""
+def parse_case_row(row: Any, name: str, file: Path) -> CaseRow:
+    """Parse a case of a file; sentences about mistakes begin with the `name` of the case."""
     if not isinstance(row, dict):
         raise InputError(f"{name} has to be an object with scene, context and target.")
     refuse_unknown(row, CASE_KEYS, name)
     scene = row.get("scene")
     if not isinstance(scene, str) or not scene:
         raise InputError(
-            f"{name} needs scene, a folder relative to the file; it has {show(scene)}."
+            f"{name} needs scene, a folder relative to the file; it has {quote_json(scene)}."
         )
     context = parse_frames(row.get("context"), "context", name)
     if len(context) < MIN_CONTEXT:
         raise InputError(
-            f"{name} needs context, a list of at least two frames; it has {show(context)}."
+            f"{name} needs context, a list of at least two frames; it has {quote_json(context)}."
         )
     target = row.get("target")
     if type(target) is not int or not is_frame(target):
         raise InputError(
-            f"{name} needs target, the number of a frame counted from 0; it has {show(target)}."
+            f"{name} needs target, the number of a frame counted from 0; it has "
+            f"{quote_json(target)}."
         )
     if target in context:
         raise InputError(
@@ -196,27 +229,27 @@ def parse_case_row(row: Any, name: str, home: Path) -> CaseRow:
         raise InputError(
             f"{name} has near {near:g}, which is not before far {far:g}; correct them."
         )
-    ignore = parse_ignored(row.get("ignore"), name, home)
+    ignore = parse_ignored(row.get("ignore"), name, file)
     return CaseRow(scene, context, target, neighbours, near, far, ignore)
 
 
-def parse_ignored(value: Any, name: str, home: Path) -> IgnoredRegions | None:
+def parse_ignored(value: Any, name: str, file: Path) -> IgnoredRegions | None:
     """Parse what does not count: polygons, or the path of a mask; None if it is not given."""
     if value is None:
         return None
     if isinstance(value, str) and value:
-        mask = home / os.path.expandvars(value)
+        mask = locate_named(file, value)
         if not os.path.isfile(mask):
             raise InputError(
-                f"{name} has ignore {show(value)}, and there is no such file; name a mask "
+                f"{name} has ignore {quote_json(value)}, and there is no such file; name a mask "
                 "relative to the file of cases."
             )
         return IgnoredRegions(mask=mask)
     if not isinstance(value, list) or not value or not all(map(is_polygon, value)):
         raise InputError(
-            f"{name} has ignore {show(value)}, and a list of polygons is needed, each of three "
-            "corners [x, y] or more in shares of width and height from 0 to 1, or the path of a "
-            "mask."
+            f"{name} has ignore {quote_json(value)}, and a list of polygons is needed, each of "
+            "three corners [x, y] or more in shares of width and height from 0 to 1, or the path "
+            "of a mask."
         )
     return IgnoredRegions(tuple(tuple((float(x), float(y)) for x, y in one) for one in value))
 
@@ -231,12 +264,12 @@ def is_corner(value: Any) -> bool:
     return (
         isinstance(value, list)
         and len(value) == 2
-        and all(not isinstance(v, bool) and is_number(v) and 0 <= v <= 1 for v in value)
+        and all(is_number(v) and 0 <= v <= 1 for v in value)
     )
 
 
 def refuse_unknown(content: Mapping[str, Any], known: Sequence[str], name: str) -> None:
-    """Refuse keys that nothing reads, such as misspelt ones."""
+    """Refuse keys that nothing reads, such as misspelt ones; `name` begins the sentence."""
     unknown = [key for key in content if key not in known]
     if unknown:
         raise InputError(
@@ -249,8 +282,8 @@ def parse_frames(frames: Any, key: str, name: str) -> tuple[int, ...]:
     """Parse a list of different frames."""
     if not isinstance(frames, list) or not all(is_frame(frame) for frame in frames):
         raise InputError(
-            f"{name} has {key} {show(frames)}, and a list of numbers of frames counted from 0 is "
-            "needed."
+            f"{name} has {key} {quote_json(frames)}, and a list of numbers of frames counted from "
+            "0 is needed."
         )
     twice = [frame for number, frame in enumerate(frames) if frame in frames[:number]]
     if twice:
@@ -267,18 +300,14 @@ def parse_plane(value: Any, key: str, name: str) -> float | None:
     """Parse a z-depth in scene units; None if it is not given."""
     if value is None:
         return None
-    if isinstance(value, bool) or not is_number(value) or not 0 < value < float("inf"):
+    if not is_number(value) or not 0 < value < float("inf"):
         raise InputError(
-            f"{name} has {key} {show(value)}, and a positive z-depth in scene units is needed."
+            f"{name} has {key} {quote_json(value)}, and a positive z-depth in scene units is "
+            "needed."
         )
     return float(value)
 
 
-def show(value: Any) -> str:
-    """Write a value of the file for a sentence; `nothing` for a key that is not there."""
-    if value is None:
-        return "nothing"
-    try:
-        return quote_value(json.dumps(value))
-    except (TypeError, ValueError):
-        return quote_value(value)
+def quote_json(value: Any) -> str:
+    """Write a value of the file for a sentence, as JSON; `nothing` for a key that is not there."""
+    return "nothing" if value is None else quote_value(json.dumps(value))

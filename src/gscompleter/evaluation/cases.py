@@ -20,6 +20,7 @@ from gscompleter.data.photographs import MAX_TRANSLATION, Photographs, Resolutio
 from gscompleter.evaluation.case_file import (
     CaseFile,
     is_scene_file,
+    locate_named,
     read_case_file,
     read_scene_file,
 )
@@ -83,7 +84,7 @@ def read_cases(path: Path) -> list[Case]:
     check_regions(content, path)
     return [
         Case(
-            path.parent / os.path.expandvars(row.scene),
+            locate_named(path, row.scene),
             row.context,
             row.target,
             row.neighbours,
@@ -133,7 +134,7 @@ def list_places(path: Path) -> list[ScenePlace]:
     if not is_scene_file(path):
         return [ScenePlace(path)]
     return [
-        ScenePlace(path.parent / os.path.expandvars(row.scene), path if row.is_apart else None)
+        ScenePlace(locate_named(path, row.scene), path if row.is_apart else None)
         for row in read_scene_file(path)
     ]
 

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import CompleterConfig
-from gscompleter.numerics.geometry import look_up
+from gscompleter.numerics.geometry import compute_z_depths, look_up
 from gscompleter.numerics.given_geometry import GivenGeometry
 from gscompleter.numerics.image_ops import fill_smoothly, smooth_masked
 from gscompleter.numerics.sky import mask_out_sky
@@ -188,8 +188,13 @@ def add_geometry_depth(image: GeneratedView, view: TargetView) -> tuple[Generate
 
 
 def count_on_geometry(use: GeometryUse, added: Gaussians, image: View) -> GeometryUse:
-    """Count the added Gaussians that stand at the depth of the geometry."""
+    """Count the added Gaussians that stand at the depth of the geometry.
+
+    Some are moved away from it: by guards, and before what is left in a forced hole.
+    """
     if image.given_depth is None:
         return use
-    is_given = look_up(image.given_depth > 0, added, image.camera)
-    return replace(use, added=int(is_given.sum()))
+    given = look_up(image.given_depth, added, image.camera)
+    z = compute_z_depths(added.means, image.camera)
+    stands_there = (given > 0) & ((z - given).abs() <= MAX_DEVIATION * given)
+    return replace(use, added=int(stands_there.sum()))

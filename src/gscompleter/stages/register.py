@@ -1,6 +1,7 @@
-"""Registration of the lifted Gaussians as we do it: Sec. III-E, with departures.
+"""Registration of the lifted Gaussians as we do it: Sec. III-E of the paper, with departures.
 
 `register_paper.py` is the paper's. Each departure is named where it is made, with its reason.
+Distances and depths are in scene units, and images are those of the padded target camera.
 """
 
 from __future__ import annotations
@@ -36,18 +37,18 @@ from gscompleter.types import (
 )
 
 MIN_RATIO = 0.1
-"""Smallest factor by which a distance may shrink: an affine with a negative shift would push near
+"""Smallest ratio of a new distance to the old one: an affine with a negative shift would push near
 Gaussians through the camera."""
 ADAM_BETAS = (0.0, 0.8)
-"""Adam's decay rates of gradients and of their squares. The usual 0.9 and 0.999 overshoot in so few
-steps (decision 003)."""
+"""Adam's decay rates of the mean of gradients and of that of their squares. The usual 0.9 and 0.999
+overshoot in so few steps (decision 003)."""
 OCCLUSION_TOLERANCE = 0.05
-"""Distance behind the context, relative to depth, that still counts as the same surface."""
+"""Depth behind the context, relative to its depth, that still counts as the same surface."""
 IN_FRONT = 0.98
-"""Depth of what fills a forced hole, relative to what is left in it."""
+"""Largest depth of what fills a forced hole, relative to that of what is left in it."""
 
 RenderAlone = Callable[[Gaussians], tuple[Render, Render]]
-"""Renders moved Gaussians at target and anchor, without the scene."""
+"""Renders Gaussians at the target and at the anchor, without the scene."""
 
 
 @timed_stage("register")
@@ -60,30 +61,55 @@ def register_along_rays(
     Args:
         lifted: Gaussians of the reference, each with its pixel if the model tells it.
         affine: Affine from their z-depths to those of the scene (Eq. 8).
-        reference: The synthesized image at the target camera.
+        reference: The synthesized image at the padded target camera.
         anchor: The photograph that depth is compared at, besides the target.
         view: The scene at the target.
+
+    Returns:
+        The same Gaussians in their order, moved along the rays of the target (with three degrees of
+        freedom, anywhere).
     """
     registered = register_lifted(lifted, affine, reference, anchor, view)
     if reference.given_depth is None:
         return registered
-    # Geometry from elsewhere is a measurement, bent to what the scene shows around the hole
-    # already; the losses above know nothing of a hole's depth.
-    gaussians = place_at_given(registered.gaussians, registered.pixel_index, reference)
+    # Geometry from elsewhere is a measurement, already bent to what the scene shows around the
+    # hole. The losses of the registration know no depth of a hole, so it comes after them.
+    given = bring_before_forced(reference.given_depth, view)
+    gaussians = place_at_depths(
+        registered.gaussians, registered.pixel_index, reference.camera, given
+    )
     return replace(registered, gaussians=gaussians)
 
 
-def place_at_given(
-    gaussians: Gaussians, pixel_index: Int[Tensor, "n"] | None, reference: View
+def place_at_depths(
+    gaussians: Gaussians,
+    pixel_index: Int[Tensor, "n"] | None,
+    camera: Camera,
+    depth: Float[Tensor, "h w"],
 ) -> Gaussians:
-    """Move Gaussians to the given depth of their pixel, or of the pixel that shows their mean."""
-    assert reference.given_depth is not None
+    """Move Gaussians to the z-depth of their pixel, or of the pixel that shows their mean.
+
+    Where `depth` is 0, which is unknown, they stay.
+    """
     if pixel_index is None:
-        depths = look_up(reference.given_depth, gaussians, reference.camera)
+        depths = look_up(depth, gaussians, camera)
     else:
-        depths = reference.given_depth.flatten()[pixel_index]
-    z = compute_z_depths(gaussians.means, reference.camera)
-    return move_to_depths(gaussians, reference.camera, depths.where(depths > 0, z))
+        depths = depth.flatten()[pixel_index]
+    z = compute_z_depths(gaussians.means, camera)
+    return move_to_depths(gaussians, camera, depths.where(depths > 0, z))
+
+
+def bring_before_forced(depth: Float[Tensor, "h w"], view: TargetView) -> Float[Tensor, "h w"]:
+    """Bring a z-depth at the padded target before what is left in forced holes.
+
+    What is left there is wrong, and must not hide what fills it.
+    """
+    forced = view.masks.edits.forced
+    if forced is None:
+        return depth
+    left = view.render.depth_map(view.state.config.holes.max_alpha)
+    in_front = torch.minimum(depth, IN_FRONT * left.depth)
+    return torch.where(forced & left.valid, in_front, depth)
 
 
 def register_lifted(
@@ -97,14 +123,17 @@ def register_lifted(
     if config.iterations == 0:
         return Registration(coarse, pixel_index, ())
     if pixel_index is None:
-        # Voxel-aligned models do not say which pixel a Gaussian belongs to, so that no depth map
-        # of corrections can be made.
+        # Voxel-aligned models do not say which pixel a Gaussian belongs to, so that neither a depth
+        # map of the scene nor one of corrections is that of a Gaussian. `hole_depth` and
+        # `extrapolate_into_holes` then have no effect.
         registered, losses = optimize_distances(coarse, reference, anchor, view)
         return Registration(registered, None, losses)
     if config.hole_depth == "scene":
         # A trained splat has its depth from many photographs, which two-view stereo cannot better.
-        depth = continue_scene_depth(view, reference).flatten()[pixel_index]
-        return Registration(move_to_depths(coarse, camera, depth), pixel_index, ())
+        # Nothing is left to optimize.
+        depth = continue_scene_depth(view, reference)
+        placed = place_at_depths(coarse, pixel_index, camera, depth)
+        return Registration(placed, pixel_index, ())
     if config.extrapolate_into_holes and config.degrees_of_freedom == 1:
         return register_beside_holes(coarse, pixel_index, reference, anchor, view)
     registered, losses = optimize_distances(coarse, reference, anchor, view)
@@ -114,7 +143,8 @@ def register_lifted(
 def continue_scene_depth(view: TargetView, reference: View) -> Float[Tensor, "h w"]:
     """Compute the z-depth of the scene at the padded target, continued smoothly into its holes.
 
-    A given depth of the reference is continued like that of the scene.
+    A given depth of the reference is continued like that of the scene. In a forced hole the depth
+    is before what is left there. It is 0 if the target sees no surface.
     """
     surface = view.render.depth_map(view.state.config.holes.max_alpha)
     # Beside an object there is neither a hole nor a depth.
@@ -124,13 +154,10 @@ def continue_scene_depth(view: TargetView, reference: View) -> Float[Tensor, "h 
         is_given = reference.given_depth > 0
         depth = torch.where(is_given, reference.given_depth, depth)
         known = known | is_given
-    depth = fill_smoothly(depth, known)
-    forced = view.masks.edits.forced
-    if forced is None:
-        return depth
-    # What is left in a forced hole is wrong, and must not hide what fills it.
-    in_front = torch.minimum(depth, IN_FRONT * surface.depth)
-    return torch.where(forced & surface.valid, in_front, depth)
+    # Where nothing is trusted, or all was marked as wrong, the depth of what is seen is still
+    # nearer to the truth than none.
+    known = known | (surface.valid & ~known.any())
+    return bring_before_forced(fill_smoothly(depth, known), view)
 
 
 def register_beside_holes(
@@ -140,10 +167,11 @@ def register_beside_holes(
     anchor: Anchor,
     view: TargetView,
 ) -> Registration:
-    """Register Gaussians that overlap the scene, and move those in holes like them.
+    """Register Gaussians that overlap the scene, and move those in holes like those around.
 
     No loss acts inside a hole. In the paper its pixels keep the affine while those around it move,
-    which leaves a step of depth at the border (decision 005).
+    which leaves a step of depth at the border (decision 005). `coarse` are the Gaussians after the
+    affine.
     """
     camera = reference.camera
     surface = view.render.depth_map(view.state.config.holes.max_alpha)
@@ -171,7 +199,11 @@ def apply_affine(gaussians: Gaussians, affine: DepthAffine, camera: Camera) -> G
 def optimize_distances(
     coarse: Gaussians, reference: View, anchor: Anchor, view: TargetView
 ) -> tuple[Gaussians, tuple[float, ...]]:
-    """Minimize Eq. 11 over one distance per Gaussian; also return the loss per iteration."""
+    """Minimize Eq. 11 over the distances of Gaussians; also return the loss before each step.
+
+    `coarse` are the Gaussians after the affine. With three degrees of freedom their positions are
+    optimized instead.
+    """
     if len(coarse) == 0:
         return coarse, ()
     config = view.state.config.registration
@@ -210,7 +242,7 @@ def move_along_rays(
     one learning rate then suits near and far Gaussians, and any unit of the scene.
     """
     distances = (coarse.means - camera.center).norm(dim=1, keepdim=True)
-    shifts = distances * parameters  # in scene units
+    shifts = distances * parameters  # in scene units, as in Eq. 10
     if degrees_of_freedom == 3:
         return replace(coarse, means=coarse.means + shifts, encoded=None)
     ratio = 1 + (shifts / distances)[:, 0]
@@ -224,10 +256,10 @@ def make_renderer_alone(
     renderer: Renderer,
     config: RegistrationConfig,
 ) -> RenderAlone:
-    """Return a renderer of moved Gaussians alone.
+    """Return a renderer of the moved Gaussians alone, at target and anchor.
 
-    With a constant footprint their image at the target does not change along rays, so only depth is
-    rendered again there. A GPU gains nothing by that, but by drawing for both cameras at once.
+    With a constant footprint their image at the target does not change along rays, so that a CPU
+    only renders its depth again. A GPU is no faster by that: it draws for both cameras at once.
     """
     nothing = renderer.freeze(coarse[:0], target)
     if isinstance(nothing, JointScene):
@@ -249,7 +281,9 @@ class Objective:
     """
 
     target_depth: DepthMap
+    """z-depth of the scene at the padded target, without the sky."""
     anchor_depth: DepthMap
+    """The same at the anchor."""
     unit: Float[Tensor, ""]
     """Divisor of depth residuals, in scene units."""
     config: RegistrationConfig
@@ -276,9 +310,9 @@ class Objective:
         return Objective(target_depth, anchor_depth, unit, config)
 
     def __call__(self, at_target: Render, at_anchor: Render) -> Float[Tensor, ""]:
-        """Compute the loss from renders of the candidates alone, at target and anchor.
+        """Compute the loss from renders of the lifted Gaussians alone, at target and anchor.
 
-        The paper renders L_depth of the composite scene, where a candidate behind a surface gets no
+        The paper renders L_depth of the composite scene, where a Gaussian behind a surface gets no
         gradient and stays there (decision 004).
         """
         l_depth = self.compute_depth_error(
@@ -297,7 +331,7 @@ class Objective:
         return torch.where(where, error, 0.0).mean()
 
     def find_comparable(self, at_anchor: Render) -> Bool[Tensor, "h w"]:
-        """Find anchor pixels that show the scene and candidates that it does not hide.
+        """Find anchor pixels that show the scene, and lifted Gaussians that it does not hide.
 
         The paper compares hidden ones too, which pulls them onto what hides them (decision 007).
         """

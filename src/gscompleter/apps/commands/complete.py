@@ -197,6 +197,11 @@ def check_ending(options: CompleteOptions) -> None:
             "--export-holes completes nothing; leave --dry-run, --video and --save-as out.",
             "export-holes",
         )
+    # The command with the painted images, which is the same otherwise, takes none either.
+    if is_export and options.synthesis != GeneratorOptions():
+        raise InputError(
+            "--export-holes generates nothing; leave --generator and its options out.", "generator"
+        )
 
 
 def check_painted(options: CompleteOptions) -> None:

@@ -47,7 +47,10 @@ PHOTOGRAPH_OPTIONS = {
     "ignore": None,
     "forget_edits": False,
 }
-"""Options that only photographs can follow, with their defaults."""
+"""Options that only photographs can follow, with their defaults. A default that is typed all the
+same cannot be told from one that is not."""
+SPLAT_OPTIONS = ("drop_nonfinite", "ignore_properties", "forget_edits")
+"""Switches that only a splat can follow."""
 
 Adapt = Callable[[CompleterConfig], CompleterConfig]
 """Changes a config for what a command does."""
@@ -65,11 +68,21 @@ def decide_filling(
 ) -> CompletionRequest:
     """Decide which holes of which scene are filled, and by what.
 
-    `context` and `synthesis` are those of the options, or of the painted images. `has_marks` is
-    True if the command is given masks of its own, such as of what goes: `--invert-masks` is then
-    for them. `adapt` changes the config for what a command does.
+    Args:
+        options: What the user gave. Those that exclude each other in one command alone were refused
+            before.
+        targets: Cameras at which holes are filled.
+        results: What is written, and where.
+        context: That of the options, or the one that the images were painted for.
+        synthesis: The generator of the options, or that of painted images.
+        has_marks: True if the command has masks of what goes. `--invert-masks` is then for them,
+            and not for masks of photographs.
+        adapt: Changes the config for what a command does.
+
+    Raises:
+        InputError: Options exclude each other, or a model, setting or device is not there.
     """
-    check_photograph_options(options, has_marks)
+    check_source_options(options, has_marks)
     models = decide_models(options, synthesis)
     lacks_photographs = has_splat_alone(options)
     # A splat without photographs may be SCENE itself.
@@ -109,9 +122,9 @@ def decide_results(options: SceneOptions) -> ResultsRequest:
 def decide_scene(
     options: SceneOptions, folder: Path, masks: MaskReading, has_splat: bool
 ) -> SceneRequest:
-    """Decide how the photographs in a folder are read.
+    """Decide how the photographs in a folder are read, or the splat in their place.
 
-    With a splat the default resolution is that of its training if smaller (`has_splat`).
+    With a splat (`has_splat`) the default resolution is that of its training, if that is smaller.
     """
     return SceneRequest(
         folder,
@@ -128,7 +141,7 @@ def decide_scene(
 
 
 def decide_photographs(options: SceneOptions, folder: Path) -> PhotographsRequest:
-    """Decide how the photographs of a splat are read, of which no target is named."""
+    """Decide how the photographs of a splat are read by a command that has no targets."""
     masks = MaskReading(options.invert_masks, options.large_masks, folder=options.ignore)
     poses = PosesRequest(options.out, options.overwrite, options.frames, options.context or ())
     return PhotographsRequest(
@@ -150,7 +163,12 @@ def decide_splat(options: SceneOptions, path: Path) -> SplatRequest:
 
 
 def decide_models(options: ReconstructorOptions, synthesis: GeneratorOptions) -> ModelRequest:
-    """Decide on models and their devices; refuse what is wrong with their names and settings."""
+    """Decide on models and their devices.
+
+    Raises:
+        InputError: A reconstructor, generator, setting or device is not there. What is wrong with a
+            monocular depth or with weights is found when they are loaded.
+    """
     from gscompleter.reconstructors import check_reconstructor
     from gscompleter.render.device import choose_devices
 
@@ -193,27 +211,28 @@ def names_splat(path: Path) -> bool:
     return has_splat_extension(path)
 
 
-def check_photograph_options(options: CompletingOptions, has_marks: bool) -> None:
-    """Refuse options of photographs without them, and with them those of a splat alone."""
-    if not has_splat_alone(options):
-        if options.cameras is not None:
-            raise InputError(
-                "The photographs of SCENE have cameras of their own; leave --cameras out, or name "
-                "the splat alone.",
-                "cameras",
-            )
-        if options.up is not None:
-            raise InputError(
-                "The photographs of SCENE tell what is up; leave --up out.",
-                "up",
-            )
+def check_source_options(options: CompletingOptions, has_marks: bool) -> None:
+    """Refuse options that photographs, or a splat, would have to be there for."""
+    if has_splat_alone(options):
+        check_options_alone(options, has_marks)
         return
-    if options.folder is not None and options.scene is not None:
+    if options.cameras is not None:
         raise InputError(
-            f"Two splats are named, {quote_value(options.folder, 80)} and "
-            f"{quote_value(options.scene, 80)}; name one, and as SCENE only its photographs.",
-            "scene",
+            "The photographs of SCENE have cameras of their own; leave --cameras out, or name the "
+            "splat alone.",
+            "cameras",
         )
+    if options.up is not None:
+        raise InputError("The photographs of SCENE tell what is up; leave --up out.", "up")
+    for name in SPLAT_OPTIONS:
+        if options.scene is None and getattr(options, name):
+            raise InputError("There is no splat to apply this to; name it with --scene.", name)
+
+
+def check_options_alone(options: CompletingOptions, has_marks: bool) -> None:
+    """Refuse two splats, none, and options of photographs where a splat is alone."""
+    if options.folder is not None and options.scene is not None:
+        raise make_two_splats_error(options.folder, options.scene)
     if options.folder is None and options.scene is None:
         raise InputError(
             "Nothing is named that is to be completed; name SCENE, the folder of photographs, or "
@@ -234,8 +253,25 @@ def check_photograph_options(options: CompletingOptions, has_marks: bool) -> Non
         raise InputError("There are no masks that could be too large; leave it out.", "large-masks")
 
 
+def make_two_splats_error(folder: Path, scene: Path) -> InputError:
+    """Make the error for a splat that is named as SCENE where `--scene` names something, too."""
+    from gscompleter.splats.foreign import resolve_splat
+
+    # The two are easily taken for each other.
+    if os.path.exists(scene) and not names_splat(resolve_splat(scene)):
+        return InputError(
+            f"SCENE, {quote_value(folder, 80)}, is a splat, and {quote_value(scene, 80)} does not "
+            "look like one; name the photographs as SCENE, and the splat with --scene."
+        )
+    return InputError(
+        f"Two splats are named, {quote_value(folder, 80)} and {quote_value(scene, 80)}; name one, "
+        "and as SCENE only its photographs.",
+        "scene",
+    )
+
+
 def check_context(context: Names | None) -> None:
-    """Refuse an empty context, and repeated frames."""
+    """Refuse an empty context, and photographs that it names twice by the same word."""
     if context is None:
         return
     if len(context) == 0 or len(set(context)) < len(context):
@@ -246,8 +282,10 @@ def check_context(context: Names | None) -> None:
 
 
 def check_generator(synthesis: GeneratorOptions) -> None:
-    """Refuse the generator of painted images where none are named."""
+    """Refuse the generator of painted images for a command that is given none."""
     if synthesis.generator == "painted":
         raise InputError(
-            "The generator 'painted' needs painted images; name their folder.", "images"
+            "The generator 'painted' needs painted images, which `complete --images` names; choose "
+            "another one where there are none.",
+            "generator",
         )

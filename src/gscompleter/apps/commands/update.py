@@ -16,6 +16,7 @@ from gscompleter.apps.commands.shared_decisions import (
     decide_photographs,
     decide_results,
     decide_splat,
+    make_two_splats_error,
     names_splat,
     stop_recoloring,
 )
@@ -26,7 +27,7 @@ from gscompleter.apps.commands.shared_options import (
 )
 from gscompleter.apps.requests.completion import UpdateRequest, WorkRequest
 from gscompleter.config.generators import GeneratorOptions
-from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.errors import InputError
 from gscompleter.system.process import import_without_collection
 
 
@@ -57,11 +58,7 @@ def decide_update(options: UpdateOptions) -> UpdateRequest:
     """Decide which splat is updated, by which photographs."""
     check_context(options.context)
     if names_splat(options.folder):
-        raise InputError(
-            f"Two splats are named, {quote_value(options.folder, 80)} and "
-            f"{quote_value(options.scene, 80)}; name one, and as SCENE only its photographs.",
-            "scene",
-        )
+        raise make_two_splats_error(options.folder, options.scene)
     config = options.config.decide(is_splat=True, has_photographs=True)
     if not config.add_observed:
         raise InputError(

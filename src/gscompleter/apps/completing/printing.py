@@ -34,7 +34,10 @@ from gscompleter.system.files.writing import SUMMARY_FILE, TARGETS_FILE
 def answer_completion(
     results: ResultsRequest, further: Mapping[str, Any] = MappingProxyType({})
 ) -> None:
-    """Print a completion for people, or its summary and `further` entries as JSON."""
+    """Print a completion for people, or its summary and `further` entries as JSON.
+
+    Both are read from the folder `results.out`, where the completion was written.
+    """
     if results.answer.json:
         summary = json.loads((results.out / SUMMARY_FILE).read_bytes())
         print_json({"out": str(results.out), **summary, **further})
@@ -43,30 +46,32 @@ def answer_completion(
 
 
 def print_completion(results: ResultsRequest) -> None:
-    """Print the scores per camera, the notes, and the location of the results."""
+    """Print the verdict, the scores per camera, the warnings, and where the results are."""
     console = make_console()
     summary = read_summary(results.out)
     console.print(summary.outcome.headline, soft_wrap=True)
     console.print(make_score_table(summary))
 
-    # What holds for several targets is said once, before the warnings of each. If nothing was
-    # gained, the headline gives the reason for all. The report has the facts.
+    # First what holds for several targets or for all, then what holds for one. If nothing was
+    # gained, the headline gives the reason for all. The facts are in the report alone.
     sentences = list(list_warnings(summary))
     if summary.outcome.status != "nothing-gained":
         for warnings, numbers in group_target_warnings(summary.targets).items():
             if len(numbers) == 1:
-                name = summary.targets[numbers[0] - 1].name
-                sentences.append(f"{name}: {' '.join(warnings)}")
+                sentences.append(f"Target {numbers[0]}: {' '.join(warnings)}")
     sentences += describe_completion(summary, results)
     for sentence in sentences:
         console.print(sentence, soft_wrap=True)
 
 
 def make_score_table(summary: CompletionSummary) -> Table:
-    """Make the table of PSNR before and after at each camera."""
+    """Make the table of PSNR (dB) before and after at each camera.
+
+    Targets are numbered from 1, as in sentences and in the names of their images.
+    """
     has_fitted = any(target.fitted is not None for target in summary.targets)
     columns = ["camera", "hole", "PSNR\nbefore", "PSNR\nafter"]
-    # After one pose and one gain of the target's camera were fitted to its photograph.
+    # PSNR after a pose and a gain of the target's camera were fitted to its photograph.
     columns += ["camera\nfitted", "added"] if has_fitted else ["added"]
     kind = "context" if summary.scene.renders_from is None else "render"
     rows: list[list[str]] = []
@@ -75,16 +80,17 @@ def make_score_table(summary: CompletionSummary) -> Table:
         before = format_number(given.psnr_before)
         after = format_number(given.psnr_after)
         rows.append([f"{kind} {given.photograph}", "", before, after])
-    # Without targets, the photographs that were not used test the result.
+    # Without targets, photographs that were not used tell how good the result is. With targets the
+    # headline has their mean.
     for held_out in () if summary.targets else summary.held_out:
         before = format_number(held_out.psnr_before)
         after = format_number(held_out.psnr_after)
         rows.append([f"not used: {held_out.photograph}", "", before, after])
-    for target in summary.targets:
+    for number, target in enumerate(summary.targets, start=1):
         before = format_number(target.psnr_before)
         after = format_number(target.psnr_after)
         hole = format_percent(target.hole_fraction)
-        cells = [f"target: {target.name}", hole, before, after]
+        cells = [f"target {number}: {target.name}", hole, before, after]
         if has_fitted:
             cells.append(format_number(None if target.fitted is None else target.fitted.psnr))
         rows.append([*cells, f"{target.added:,}"])
@@ -118,7 +124,7 @@ def describe_completion(summary: CompletionSummary, results: ResultsRequest) -> 
 
 
 def describe_geometry_use(summary: CompletionSummary) -> Iterator[str]:
-    """Write the sentence on the use of geometry from elsewhere, if there is any."""
+    """Write the sentence on the depth that `--geometry` gives, if it was asked at a target."""
     shares = [row.geometry.share for row in summary.targets if row.geometry is not None]
     if not shares:
         return
@@ -134,7 +140,7 @@ def describe_geometry_use(summary: CompletionSummary) -> Iterator[str]:
 def answer_plan(
     results: ResultsRequest, opened: Opened, targets: Sequence[Target], holes: Sequence[float]
 ) -> None:
-    """Print the targets and the share of holes in each image, for people or as JSON."""
+    """Print the targets and `holes`, the share of holes in each image, for people or as JSON."""
     if results.answer.json:
         print_json(describe_plan(results.out, opened, targets, holes))
     elif not results.answer.quiet:
@@ -144,7 +150,7 @@ def answer_plan(
 def describe_plan(
     out: Path, opened: Opened, targets: Sequence[Target], holes: Sequence[float]
 ) -> dict[str, Any]:
-    """Describe the targets and their holes as JSON."""
+    """Describe the targets and their holes as a JSON object; without targets no file has any."""
     rows = [
         {"name": opened.name_target(target), "frame": target.frame, "hole_fraction": hole}
         for target, hole in zip(targets, holes, strict=True)
@@ -169,16 +175,19 @@ def print_plan(
         table.add_row(f"{number}: {opened.name_target(target)}", format_percent(hole))
     console.print(table)
     console.print(f"Edit the cameras in {quote_value(out / TARGETS_FILE)}.", soft_wrap=True)
-    # New photographs from there are the best help, and `update` adds what they show.
-    console.print(
-        "What each camera sees now, and the photograph beside it: "
-        f"{quote_value(out / IMAGES_FOLDER)}",
-        soft_wrap=True,
-    )
+    # A camera that was searched for stands beside a photograph, which shows where that is: a new
+    # photograph from there is the best help, and `update` adds what it shows.
+    is_found = any(target.derived_from is not None for target in targets)
+    beside = f", and the {'photograph' if opened.renders_from is None else 'render'} beside it"
+    shown = f"What each camera sees now{beside if is_found else ''}"
+    console.print(f"{shown}: {quote_value(out / IMAGES_FOLDER)}", soft_wrap=True)
 
 
 def answer_export(request: ExportRequest, answer: AnswerRequest, lines: Sequence[str]) -> None:
-    """Print an export for people, or its `holes.json` and lines as JSON."""
+    """Print an export for people, or its `holes.json` as JSON.
+
+    `lines` are sentences about targets that are left out.
+    """
     if answer.json:
         content = json.loads((request.folder / HOLES_FILE).read_bytes())
         print_json({"out": str(request.folder), "notes": list(lines), "holes": content})
@@ -195,6 +204,7 @@ def print_export(request: ExportRequest, lines: Sequence[str]) -> None:
     for row in holes.frames:
         table.add_row(row.image_path, format_percent(row.hole_fraction))
     console.print(table)
+    # Options that the command with the painted images does not take.
     given = ["--export-holes"]
     given += ["--path"] if request.has_path else []
     given += ["--auto"] if request.names_number else []

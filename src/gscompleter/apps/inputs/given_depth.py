@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 
@@ -26,58 +26,28 @@ from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.types import View
 
 WAY_OUT = "--no-given-depth leaves it out"
+"""What a user can do about the depth, for sentences."""
 MAX_DEPTH_DEVIATION = 0.03
 """Largest median deviation of predicted depth from triangulated points that counts as measured.
 Stereo of photographs is about as exact, so that a worse map only helps where stereo measures
 nothing (decision 088)."""
 MAX_OFF_PHOTOGRAPHS = 3
 """Photographs that a sentence names."""
-
-
-@dataclass(frozen=True)
-class DepthReading:
-    """Photographs with the depth that the scene holds of them."""
-
-    views: Sequence[View]
-    notes: tuple[str, ...] = ()
-    """Sentences about its unit and its use."""
-    predicted: Mapping[int, Float[Tensor, "h w"]] = field(default_factory=dict)
-    """Predicted z-depth by frame, 0 where unknown, that only supports stereo."""
-
-
-def read_with_depth(
-    photographs: Photographs, frames: Sequence[int], resolution: Resolution = None
-) -> DepthReading:
-    """Load photographs with their given depth in scene units, and say how its unit was found.
-
-    Raises InputError if measured depth contradicts what the photographs and the points of the scene
-    measure. Depth that a network predicted counts as measured only where it agrees with these.
-    """
-    views = photographs.views(frames, resolution)
-    factor = 1.0
-    note = ""
-    if any(view.depth is not None for view in views):
-        factor, note = find_factor(photographs, frames, views, resolution)
-    predicted = sort_predicted(photographs, frames, views)
-
-    views_with_depth = []
-    for view, frame in zip(views, frames, strict=True):
-        if view.depth is not None and factor != 1.0:
-            view = replace(view, depth=view.depth * factor)
-        # Given depth takes the place of stereo in the reconstruction (decision 046).
-        view = replace(view, depth=predicted.agreeing.get(frame, view.depth))
-        view = give_depth(view, photographs.frame(frame), photographs.origin)
-        views_with_depth.append(view)
-    notes = (*((note,) if note else ()), *predicted.describe(photographs))
-    return DepthReading(views_with_depth, notes, predicted.others)
+RANGE_QUANTILES = (0.02, 0.98)
+"""Quantiles of depths that a sentence names as their range: single matches are false."""
 
 
 @dataclass(frozen=True)
 class PredictedDepth:
-    """Predicted depth of photographs by frame, apart by how it agrees with points and matches."""
+    """Predicted depth of photographs by frame, sorted by how it agrees with points and matches.
+
+    It is z-depth in scene units as far as its file tells, 0 where unknown.
+    """
 
     agreeing: Mapping[int, Float[Tensor, "h w"]]
+    """Depth that is used as if it were measured."""
     others: Mapping[int, Float[Tensor, "h w"]]
+    """Depth that only supports stereo."""
     deviations: Mapping[int, float]
     """Median relative deviation; photographs with too few points to tell have none."""
 
@@ -111,10 +81,60 @@ class PredictedDepth:
         return tuple(notes)
 
 
+@dataclass(frozen=True)
+class DepthReading:
+    """Photographs with the depth that the scene holds of them."""
+
+    views: Sequence[View]
+    """Photographs of the context, whose `given_depth` has the measured depth in scene units."""
+    notes: tuple[str, ...] = ()
+    """Sentences about the unit of the depth and its use."""
+    predicted: Mapping[int, Float[Tensor, "h w"]] = field(default_factory=dict)
+    """Predicted z-depth in scene units by frame, 0 where unknown, that only supports stereo."""
+
+
+def read_with_depth(
+    photographs: Photographs,
+    frames: Sequence[int],
+    resolution: Resolution = None,
+    scoring: Collection[int | None] = (),
+) -> DepthReading:
+    """Load the photographs of `frames` with their given depth, and say how its unit was found.
+
+    Depth that a network predicted counts as measured only in photographs where it agrees with what
+    they measure. The frames of `scoring` are never read: their photographs score the result.
+
+    Raises:
+        InputError: A photograph cannot be read, or no factor from measured depth to scene units
+            explains what the photographs and the points of the scene measure.
+    """
+    views = photographs.views(frames, resolution)
+    factor = 1.0
+    note = ""
+    if any(view.depth is not None for view in views):
+        factor, note = find_factor(photographs, frames, views, resolution, scoring)
+    predicted = sort_predicted(photographs, frames, views)
+
+    views_with_depth = []
+    for view, frame in zip(views, frames, strict=True):
+        if view.depth is not None and factor != 1.0:
+            view = replace(view, depth=view.depth * factor)
+        # Given depth takes the place of stereo in the reconstruction (decision 046). Predicted
+        # depth is there for photographs without a measured one.
+        view = replace(view, depth=predicted.agreeing.get(frame, view.depth))
+        view = give_depth(view, photographs.frame(frame), photographs.origin)
+        views_with_depth.append(view)
+    notes = (*((note,) if note else ()), *predicted.describe(photographs))
+    return DepthReading(views_with_depth, notes, predicted.others)
+
+
 def sort_predicted(
     photographs: Photographs, frames: Sequence[int], views: Sequence[View]
 ) -> PredictedDepth:
-    """Load predicted depth of photographs without measured depth, and compare it with points."""
+    """Load predicted depth of photographs without measured depth, and compare it.
+
+    It is compared with what tracks, points and matches measure in the same photograph.
+    """
     maps = {}
     for frame, view in zip(frames, views, strict=True):
         depth = None if view.depth is not None else photographs.load_predicted_depth(view)
@@ -147,18 +167,18 @@ def find_factor(
     frames: Sequence[int],
     views: Sequence[View],
     resolution: Resolution,
+    scoring: Collection[int | None],
 ) -> tuple[float, str]:
-    """Find the factor from the measured depth to scene units, and the sentence about it, or none.
+    """Find the factor from measured depth to scene units, and the sentence about it.
 
-    The photographs after those of the context take part if these alone tell too little: if they are
-    far apart, or if there is only one.
+    The sentence is empty if the depth is in scene units already. Photographs beside those of the
+    context take part if these alone tell too little: if they are far apart, or if there is only
+    one. Raises InputError if no factor explains what is compared.
     """
     samples = compare_given_depth(photographs, frames, views)
     if len(samples) < MIN_SAMPLES:
-        last = len(photographs) - 1
-        next_frames = {min(frame + 1, last) for frame in frames} - set(frames)
         more: dict[int, View] = {}
-        for frame in sorted(next_frames):
+        for frame in list_frames_beside(frames, len(photographs), scoring):
             # One that cannot be read is left out: it is only wanted for this comparison.
             with suppress(InputError):
                 (more[frame],) = photographs.views([frame], resolution)
@@ -183,15 +203,34 @@ def find_factor(
     )
 
 
+def list_frames_beside(
+    frames: Sequence[int], count: int, scoring: Collection[int | None]
+) -> list[int]:
+    """List the nearest other frame of each of `frames` that is not followed by one of them.
+
+    Frames are numbered from 0 to `count` - 1; of two that are equally near it is the later one.
+    Those of `scoring` are left out even here: the factor decides where the result stands, so it
+    must not depend on the photographs that score it.
+    """
+    free = [frame for frame in range(count) if frame not in {*frames, *scoring}]
+    ends = [frame for frame in frames if frame + 1 not in frames]
+    if not free:
+        return []
+    return sorted({min(free, key=lambda one: (abs(one - end), one < end)) for end in ends})
+
+
 def compare_given_depth(
     photographs: Photographs, frames: Sequence[int], views: Sequence[View]
 ) -> DepthSamples:
-    """Compare the measured depths of photographs with their tracks or points, and with matches."""
+    """Compare the depths of photographs with their tracks or points, and with their matches.
+
+    Compared is `depth` of each of `views`, which are the photographs of `frames`.
+    """
     points = photographs.points()
     samples = []
     depths = []
-    for number, view in enumerate(views):
-        frame = photographs.frame(frames[number])
+    for number, (frame_number, view) in enumerate(zip(frames, views, strict=True)):
+        frame = photographs.frame(frame_number)
 
         # 0 where nothing is measured, and at edges, where the sensor and the photograph may see
         # two surfaces.
@@ -222,5 +261,5 @@ def describe_contradiction(samples: DepthSamples) -> str:
 
 def describe_range(depths: Float[np.ndarray, "n"]) -> str:
     """Write the range of depths without the outermost 2 % on both sides."""
-    low, high = np.quantile(depths, [0.02, 0.98])
+    low, high = np.quantile(depths, RANGE_QUANTILES)
     return f"{low:.3g} to {high:.3g}"

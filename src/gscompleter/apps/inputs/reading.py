@@ -92,7 +92,8 @@ def make_task(
     check_sizes([*cameras, *(target.camera for target in targets)])
 
     if request.uses_given_depth:
-        read = read_with_depth(bounded, frames, resolution)
+        scoring = {*opened.held_out, *(target.frame for target in targets)}
+        read = read_with_depth(bounded, frames, resolution, scoring)
     else:
         read = DepthReading(bounded.views(frames, resolution))
     views = [view.to(device) for view in read.views]

@@ -2,6 +2,9 @@
 
 `complete`, `remove` and `repair` fill holes at targets; what `remove` and `repair` take out before
 is theirs alone. `update` adds what photographs show, and has no targets.
+
+Requests hold what was decided, and check nothing: `apps/commands` refuses options that exclude each
+other, and what is opened is checked where it is opened.
 """
 
 from __future__ import annotations
@@ -18,7 +21,7 @@ from gscompleter.config import CompleterConfig
 from gscompleter.data.mask_reading import MaskReading
 
 DEFAULT_NUM_TARGETS = 4
-"""Most targets that are searched for, unless a number is given."""
+"""Most cameras that are searched for as targets, unless a number is given."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,8 +34,8 @@ class WorkRequest:
     """Mesh or points whose depth is used where photographs show none; None for none."""
     models: ModelRequest = ModelRequest()
     config: CompleterConfig = CompleterConfig()
-    """Settings. For a splat without photographs, its Gaussians tell later what a hole of it is, and
-    whether images are padded."""
+    """Settings. For a splat without photographs they are completed when its Gaussians are read,
+    which tell what a hole of it is, and whether images are padded."""
 
 
 @dataclass(frozen=True)
@@ -40,11 +43,11 @@ class TargetRequest:
     """Cameras at which holes are filled."""
 
     named: tuple[str, ...] = ()
-    """Files of cameras, and numbers and names of photographs, in order."""
+    """Files of cameras, and numbers (from 0) and names of photographs, in order."""
     max_found: int = DEFAULT_NUM_TARGETS
     """Most cameras to search for if none is named."""
     images: Path | None = None
-    """Folder of images that were painted for them, in place of a generator."""
+    """Folder of images that were painted for them; the generator is then `painted`."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -57,7 +60,7 @@ class ResultsRequest:
     suffix: Literal[".ply", ".spz", ".sog"] | None = None
     """Format in which results are kept small; None to write all files as .ply."""
     has_video: bool = False
-    """True to write a flight through the holes."""
+    """True to write a video, a flight through the holes."""
     answer: AnswerRequest = AnswerRequest()
 
 
@@ -65,6 +68,7 @@ class ResultsRequest:
 class CompletionRequest:
     """Fill holes at targets."""
 
+    # The name of the command, for the record of edits; so in the classes below.
     command: ClassVar[str] = "complete"
     source: PhotographsRequest | AloneRequest
     work: WorkRequest
@@ -76,7 +80,7 @@ class CompletionRequest:
 class RepairRequest:
     """Take what masks mark at the targets, or a selection, out of a splat, and fill its place.
 
-    The place is a hole whatever stands behind it.
+    The place is a hole whatever stands behind it. Either `masks` or `selection` is given.
     """
 
     command: ClassVar[str] = "repair"
@@ -86,12 +90,12 @@ class RepairRequest:
     reading: MaskReading = MaskReading()
     """How these masks are read."""
     selection: Selection | None = None
-    """What goes in place of what masks mark."""
+    """What goes if there are no masks; None with masks."""
 
 
 @dataclass(frozen=True)
 class RemovalRequest:
-    """Take a selection out of a splat, and fill its place."""
+    """Take a selection out of a splat, and fill the holes that this opens."""
 
     command: ClassVar[str] = "remove"
     completion: CompletionRequest
@@ -118,14 +122,18 @@ class UpdateRequest:
 
 @dataclass(frozen=True)
 class ExportRequest:
-    """Write the holes of a completion for whoever paints them, in place of completing it."""
+    """Write the holes of a completion for whoever paints them, in place of completing it.
+
+    The folder of its results gets no more than cameras that had to be found.
+    """
 
     filling: FillingRequest
     folder: Path
     has_path: bool = False
     """True to write a video along the targets, too."""
     names_number: bool = False
-    """True if `--auto` was given, which the command with the painted images does not take."""
+    """True if `--auto` was given, which the command with the painted images does not take: the
+    sentence on how to go on then says so."""
 
 
 @dataclass(frozen=True)
@@ -136,9 +144,9 @@ class PlanRequest:
 
 
 Request = FillingRequest | UpdateRequest | ExportRequest | PlanRequest
-"""All that can be asked of `apps/completing`."""
+"""All that `apps/completing` can be asked for."""
 
 
 def get_completion(request: FillingRequest) -> CompletionRequest:
-    """Return the completion that a request is, or that follows what it takes out."""
+    """Return the request itself, or that of the completion which follows what it takes out."""
     return request if isinstance(request, CompletionRequest) else request.completion

@@ -1,4 +1,8 @@
-"""MVSplat (Chen et al., ECCV 2024): Gaussians from cost volumes, in a single pass."""
+"""MVSplat (Chen et al., ECCV 2024): Gaussians from cost volumes, in a single pass.
+
+Modules and their order are those of the published weights, whose keys name them. Shapes: b scenes
+of v views are n = b v images, s source views help each of them, and p x q is a quarter of h x w.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +34,7 @@ from gscompleter.models.feed_forward.unet import (
 NUM_CANDIDATES = 128
 """Number of candidate inverse depths."""
 DOWNSCALE = 4
-"""Full resolution divided by the resolution of the cost volumes."""
+"""Full resolution divided by the resolution of features and cost volumes, p x q."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +48,10 @@ class MVSplatConfig:
 
     @property
     def patch(self) -> int:
-        """Side lengths of the images must be multiples of this, in pixels."""
+        """Side lengths of the images must be multiples of this, in pixels.
+
+        Both U-Nets halve to a sixteenth of the image: that of the cost volume from a quarter.
+        """
         return 16
 
 
@@ -59,7 +66,10 @@ class Backbone(nn.Module):
     def forward(
         self, images: Float[Tensor, "n 3 h w"], sources: Int[Tensor, "b v s"]
     ) -> tuple[Float[Tensor, "n 128 p q"], Float[Tensor, "n 128 p q"]]:
-        """Encode images in [0, 1] into features with and without attention to the sources."""
+        """Encode images in [0, 1] into features with and without attention to the `sources`.
+
+        The sources of a view are the indices of other views of its scene.
+        """
         alone = self.backbone(normalize_images(images))[-1]
         return self.transformer(alone, sources), alone
 
@@ -70,6 +80,7 @@ class MVSplatDepth(nn.Module):
     def __init__(self, depth_chunk: int) -> None:
         super().__init__()
         self.depth_chunk = depth_chunk
+        # 256 channels are 128 of the cost volume, or of other features, and 128 of features.
         coarse = UNet(128, levels=3, attention_level=2, pre_norm=False)
         self.corr_refine_net = create_refiner(256, 128, coarse)
         self.regressor_residual = nn.Conv2d(256, 128, 1)
@@ -80,8 +91,10 @@ class MVSplatDepth(nn.Module):
             nn.GELU(),
         )
         self.proj_feature = create_conv3x3(128, 32)
+        # 37 channels: the image, projected features, coarse inverse depth and its certainty.
         fine = UNet(32, levels=5, attention_level=4, pre_norm=False)
         self.refine_unet = Steps([create_conv3x3(37, 32), nn.GroupNorm(4, 32), nn.GELU(), fine])
+        # 163 channels: refined features, the image and features.
         self.to_gaussians = create_conv_block(163, 168, MVSPLAT_CHANNELS)
         self.to_disparity = create_conv_block(32, 64, 2)
 
@@ -93,10 +106,14 @@ class MVSplatDepth(nn.Module):
         cameras: Cameras,
         sources: Int[Tensor, "b v s"],
     ) -> tuple[Float[Tensor, "n 1 h w"], Float[Tensor, "n 1 h w"], Float[Tensor, "n channels h w"]]:
-        """Predict depth in scene units, opacity, and the raw channels of the Gaussians."""
+        """Predict depth, opacity in [0, 1], and the raw channels of the Gaussians.
+
+        The images are in [0, 1], and the depth is in scene units, between near and far. The cost
+        volume takes it for z-depth.
+        """
         views = sources.shape[1]
-        # Coarse depth at a quarter of the resolution, enlarged; then a U-Net at full resolution
-        # corrects it, in inverse depth.
+        # The cost volume gives a coarse inverse depth, which is enlarged. A U-Net at full
+        # resolution then corrects it.
         coarse, certainty = self.estimate_coarse_disparity(cross_view, cameras, sources)
         features = self.upsampler(torch.cat([cross_view, single_view], 1))
         joined = torch.cat([images, self.proj_feature(features), coarse, certainty], 1)
@@ -109,7 +126,10 @@ class MVSplatDepth(nn.Module):
     def estimate_coarse_disparity(
         self, features: Float[Tensor, "n 128 p q"], cameras: Cameras, sources: Int[Tensor, "b v s"]
     ) -> tuple[Float[Tensor, "n 1 h w"], Float[Tensor, "n 1 h w"]]:
-        """Estimate inverse depth and the probability of the best candidate, at full resolution."""
+        """Estimate inverse depth and the probability of the best candidate, at full resolution.
+
+        The inverse depth is in 1 / scene units; `features` are those with attention.
+        """
         candidates = space_evenly(*cameras.compute_inverse_range(), NUM_CANDIDATES)
         costs = compute_cost_volume(features, cameras, sources, candidates, self.depth_chunk)
         joined = torch.cat([costs, features], 1)
@@ -118,6 +138,7 @@ class MVSplatDepth(nn.Module):
         # The expectation over the candidates is finer than their spacing.
         expected = (probability * candidates).sum(1, keepdim=True)
         certainty = probability.amax(1, keepdim=True)
+        # The authors enlarge the certainty without interpolation.
         return enlarge(expected, DOWNSCALE), F.interpolate(certainty, scale_factor=DOWNSCALE)
 
 
@@ -131,10 +152,16 @@ class MVSplat(nn.Module):
         self.depth_predictor = MVSplatDepth(config.depth_chunk)
 
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> PixelGaussians:
-        """Predict a Gaussian for each pixel of at least two views with sides divisible by 16."""
+        """Predict a Gaussian for each pixel of at least two views.
+
+        Colours are in [0, 1], and sides are multiples of `config.patch`. `create_batch`
+        (`inputs.py`) crops views to such sides, and refuses what cannot be a batch.
+        """
         b, v = images.shape[:2]
         sources = list_other_views(b, v, images.device)
         flat = images.flatten(0, 1)
         informed, alone = self.backbone(flat, sources)
-        distance, opacity, raw = self.depth_predictor(flat, informed, alone, cameras, sources)
-        return create_mvsplat_gaussians(raw, distance, opacity, cameras)
+        depth, opacity, raw = self.depth_predictor(flat, informed, alone, cameras, sources)
+        # The authors place Gaussians at this depth along unit rays, though the cost volume took it
+        # for z-depth. Their weights were trained so, and the difference is learned.
+        return create_mvsplat_gaussians(raw, depth, opacity, cameras)
