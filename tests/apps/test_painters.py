@@ -15,7 +15,7 @@ from gscompleter.apps.commands.batch_rows import parse_batch_row
 from gscompleter.apps.completing.path_video import plan_path
 from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.system.errors import InputError
-from gscompleter.system.files.image import read_depth, read_image, read_pixels
+from gscompleter.system.files.image import read_depth, read_image, read_pixels, write_depth
 from gscompleter.system.files.video import read_video, write_video
 from scenes import Room, camera_at, cast, photographed, view_of
 
@@ -304,11 +304,21 @@ def test_options_that_exclude_each_other_are_refused(
 def test_what_was_painted_is_not_exported_over(scene, holes, tmp_path, monkeypatch, capsys):
     named = ("--target", TARGETS[0], "--export-holes", holes)
     command = words(scene, tmp_path / "out", *named, "--overwrite")
+    # Beside the exported image, as that of the new target 2 it would be in the wrong place.
+    paint(holes, 2, MAGENTA, "target2.webp")
+    assert "target2.webp was painted" in refused(monkeypatch, capsys, *command)
+    (holes / "target2.webp").unlink()
     paint(holes, 2, MAGENTA)
     assert "target2.png was painted" in refused(monkeypatch, capsys, *command)
     (holes / "target2.png").unlink()
     assert run(monkeypatch, *command) == 0
     assert not (holes / "target2_mask.png").exists()
+
+
+def test_a_surface_near_the_camera_stays_known_before_a_far_one(tmp_path):
+    """The farthest depth decides the unit, of which the nearest may be less than half of one."""
+    write_depth(tmp_path / "depth.png", torch.tensor([[0.0, 0.1, 1e5]]), 1e5 / 65535)
+    assert (read_depth(tmp_path / "depth.png", 1.0) > 0).tolist() == [[False, True, True]]
 
 
 def test_a_batch_exports_no_holes(tmp_path):
