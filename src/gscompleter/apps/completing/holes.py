@@ -18,7 +18,7 @@ from torch import Tensor
 
 from gscompleter import __version__
 from gscompleter.apps.completing.path_video import PATH_MASK, PATH_VIDEO, plan_path, write_path
-from gscompleter.apps.completing.preparation import Prepared
+from gscompleter.apps.completing.prepared import Prepared
 from gscompleter.apps.inputs.holes_file import HOLES_FILE, HoleRow, read_holes
 from gscompleter.apps.inputs.paintings import PAINTING_ENDINGS, VIDEO_ENDINGS, list_by_stem
 from gscompleter.apps.inputs.task import Target

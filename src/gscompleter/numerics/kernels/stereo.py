@@ -342,7 +342,7 @@ def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, t
     for width in (bands.high - bands.low).flat:
         widest = max(widest, width + 2)
     # Costs of the row before and of this one, which take turns, and the lowest cost of each pixel,
-    # for the three paths that come from the row before. `along` has those of the path along the row.
+    # for the three paths that come from the row before; `along` is for the path along the row.
     rows = np.zeros((2, 3, w, widest), np.int16)
     lows = np.zeros((2, 3, w), np.int16)
     along = np.zeros((2, widest), np.int16)
