@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,11 @@ from command import run
 from gscompleter import load_cameras, load_splat, load_views
 from gscompleter.apps.commands.batch_rows import parse_batch_row
 from gscompleter.apps.completing.path_video import plan_path
+from gscompleter.apps.inputs.holes_file import HoleRow
+from gscompleter.apps.inputs.paintings import add_exported_photograph
+from gscompleter.apps.inputs.task import Target
+from gscompleter.data.formats import open_photographs
+from gscompleter.data.photograph_names import name_target
 from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.image import read_depth, read_image, read_pixels, write_depth
@@ -319,6 +325,19 @@ def test_a_surface_near_the_camera_stays_known_before_a_far_one(tmp_path):
     """The farthest depth decides the unit, of which the nearest may be less than half of one."""
     write_depth(tmp_path / "depth.png", torch.tensor([[0.0, 0.1, 1e5]]), 1e5 / 65535)
     assert (read_depth(tmp_path / "depth.png", 1.0) > 0).tolist() == [[False, True, True]]
+
+
+def test_a_camera_keeps_the_photograph_that_it_was_derived_from(scene):
+    """Photographs that were added since the export give others this number."""
+    photographs = open_photographs(scene)
+    target = Target(camera_at(0.9, size=SIZE))
+    file = photographs.frame(1).file_name
+    row = HoleRow("a.png", "", "b.png", SIZE, SIZE, 0.1, derived_from=1, offset="turned left by 3°")
+    for name, base in ((file, 1), ("other.png", None)):
+        title = name_target(None, name, 1, row.offset)
+        found = add_exported_photograph(target, replace(row, title=title), photographs, None)
+        assert found.derived_from == base
+        assert (found.offset is None) == (base is None)
 
 
 def test_a_batch_exports_no_holes(tmp_path):

@@ -205,7 +205,8 @@ def write_hole(folder: Path, hole: ExportedHole, unit: float, ready: Prepared) -
     write_depth(folder / f"{name}_depth.png", hole.depth, unit)
 
     target = hole.target
-    files = ready.opened.files
+    opened = ready.opened
+    is_numbered = opened.has_numbered_frames
     row = HoleRow(
         image_path=f"{name}.png",
         sha256=hash_file(folder / f"{name}.png"),
@@ -214,16 +215,17 @@ def write_hole(folder: Path, hole: ExportedHole, unit: float, ready: Prepared) -
         h=hole.camera.height,
         hole_fraction=hole.hole_fraction,
         frame=target.frame,
-        derived_from=target.derived_from,
-        offset=target.offset,
+        # Renders at cameras that were found are others in the next command.
+        derived_from=target.derived_from if is_numbered else None,
+        offset=target.offset if is_numbered else None,
+        title=opened.name_target(target),
     )
     return {
         **asdict(row),
-        "title": ready.opened.name_target(target),
         "depth_file_path": f"{name}_depth.png",
         "warped_path": f"{name}_warped.png",
         "reference_path": f"{name}_reference.png",
         "reference_frame": shown.reference.frame,
-        "reference_file": files.get(shown.reference.frame),
+        "reference_file": opened.files.get(shown.reference.frame),
         **describe_camera(hole.camera),
     }

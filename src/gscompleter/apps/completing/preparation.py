@@ -136,17 +136,17 @@ def make_prepared(
     """
     source = request.source
     return Prepared(
-        request.command,
-        source,
-        request.work,
-        targets,
-        request.results,
-        loaded.opened,
-        loaded.task,
-        ViewPlanner(loaded.completer),
-        loaded.cameras,
-        loaded.seconds,
-        source.scene.masks.is_inverted,
+        command=request.command,
+        source=source,
+        work=request.work,
+        targets=targets,
+        results=request.results,
+        opened=loaded.opened,
+        task=loaded.task,
+        explorer=ViewPlanner(loaded.completer),
+        cameras=loaded.cameras,
+        seconds=loaded.seconds,
+        inverts_masks=source.scene.masks.is_inverted,
         settings=settings,
     )
 

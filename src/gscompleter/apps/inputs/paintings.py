@@ -20,6 +20,7 @@ from gscompleter.apps.inputs.holes_file import (
 )
 from gscompleter.apps.inputs.named_photographs import add_photograph
 from gscompleter.apps.inputs.task import Target
+from gscompleter.data.photograph_names import name_target
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.data.scene import load_cameras
 from gscompleter.generators.painted import Painting, fit_mask, fit_painting
@@ -160,7 +161,10 @@ def add_exported_photograph(
             return add_photograph(replace(target, frame=frame), photographs, resolution)
     base = row.derived_from
     if base is not None and base in range(len(photographs)):
-        return replace(target, derived_from=base, offset=row.offset)
+        # Here the name tells it, in which the file is.
+        file = photographs.frame(base).file_name
+        if name_target(None, file, base, row.offset) == row.title:
+            return replace(target, derived_from=base, offset=row.offset)
     return target
 
 
