@@ -383,6 +383,13 @@ def test_a_splat_in_place_of_the_photographs_is_sent_to_its_option(tmp_path, mon
     refused(monkeypatch, capsys, out, words, told)
 
 
+def test_a_splat_that_is_not_there_is_told_as_missing(tmp_path, monkeypatch, capsys):
+    out = tmp_path / "out"
+    refused(
+        monkeypatch, capsys, out, ("complete", "none.ply", "--out", out), "There is no none.ply"
+    )
+
+
 def config_of(scene, tmp_path, monkeypatch, *more) -> CompleterConfig:
     """Return the settings of a command."""
     words = [str(word) for word in complete(scene, tmp_path / "out", *more)]

@@ -454,6 +454,8 @@ def test_nothing_that_is_given_is_ignored(splat_begun):
         SessionStep("fill", camera, SPOT, box=CRATE),
         SessionStep("remove", camera, SPOT, box=CRATE),
         SessionStep("complete", camera, SPOT),
+        SessionStep("complete", camera, box_rotation=(float("nan"), 0.0, 0.0, 0.0)),
+        SessionStep("remove", camera, SPOT, box_rotation=(0.0, 1.0, 0.0, 0.0)),
     ):
         with pytest.raises(InputError, match=r"leave it out|takes no mask"):
             apply_step(splat_begun, step)
@@ -677,7 +679,8 @@ def test_a_request_that_is_none_is_refused(server, body, said):
 
 def test_what_a_request_lacks_is_said(page):
     assert "no camera" in do(page, b'{"action": "complete"}')["text"]
-    assert "no base64" in do(page, request_for("fill", mask="*"))["text"]
+    for mask in ("*", "a", "é"):
+        assert "no base64" in do(page, request_for("fill", mask=mask))["text"]
     empty = parse_request(b'{"action": "complete", "camera": {"frames": []}}', ("complete",))
     with pytest.raises(InputError, match="0 cameras"):
         empty.read_camera()

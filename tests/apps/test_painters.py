@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,14 @@ from command import run
 from gscompleter import load_cameras, load_splat, load_views
 from gscompleter.apps.commands.batch_rows import parse_batch_row
 from gscompleter.apps.completing.path_video import plan_path
+from gscompleter.apps.inputs.holes_file import HoleRow
+from gscompleter.apps.inputs.paintings import add_exported_photograph
+from gscompleter.apps.inputs.task import Target
+from gscompleter.data.formats import open_photographs
+from gscompleter.data.photograph_names import name_target
 from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.system.errors import InputError
-from gscompleter.system.files.image import read_depth, read_image, read_pixels
+from gscompleter.system.files.image import read_depth, read_image, read_pixels, write_depth
 from gscompleter.system.files.video import read_video, write_video
 from scenes import Room, camera_at, cast, photographed, view_of
 
@@ -306,11 +312,34 @@ def test_options_that_exclude_each_other_are_refused(
 def test_what_was_painted_is_not_exported_over(scene, holes, tmp_path, monkeypatch, capsys):
     named = ("--target", TARGETS[0], "--export-holes", holes)
     command = words(scene, tmp_path / "out", *named, "--overwrite")
+    # Beside the exported image, as that of the new target 2 it would be in the wrong place.
+    paint(holes, 2, MAGENTA, "target2.webp")
+    assert "target2.webp was painted" in refused(monkeypatch, capsys, *command)
+    (holes / "target2.webp").unlink()
     paint(holes, 2, MAGENTA)
     assert "target2.png was painted" in refused(monkeypatch, capsys, *command)
     (holes / "target2.png").unlink()
     assert run(monkeypatch, *command) == 0
     assert not (holes / "target2_mask.png").exists()
+
+
+def test_a_surface_near_the_camera_stays_known_before_a_far_one(tmp_path):
+    """The farthest depth decides the unit, of which the nearest may be less than half of one."""
+    write_depth(tmp_path / "depth.png", torch.tensor([[0.0, 0.1, 1e5]]), 1e5 / 65535)
+    assert (read_depth(tmp_path / "depth.png", 1.0) > 0).tolist() == [[False, True, True]]
+
+
+def test_a_camera_keeps_the_photograph_that_it_was_derived_from(scene):
+    """Photographs that were added since the export give others this number."""
+    photographs = open_photographs(scene)
+    target = Target(camera_at(0.9, size=SIZE))
+    file = photographs.frame(1).file_name
+    row = HoleRow("a.png", "", "b.png", SIZE, SIZE, 0.1, derived_from=1, offset="turned left by 3°")
+    for name, base in ((file, 1), ("other.png", None)):
+        title = name_target(None, name, 1, row.offset)
+        found = add_exported_photograph(target, replace(row, title=title), photographs, None)
+        assert found.derived_from == base
+        assert (found.offset is None) == (base is None)
 
 
 def test_a_batch_exports_no_holes(tmp_path):

@@ -57,8 +57,12 @@ def splat(tmp_path_factory) -> Path:
 
 @pytest.fixture
 def decide(splat, tmp_path, monkeypatch):
-    """Return a function from a command line, in which SPLAT is a file, to its request."""
+    """Return a function from a command line, in which SPLAT is a file, to its request.
+
+    SCENE is an empty folder.
+    """
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "SCENE").mkdir()
 
     def decide(line: str) -> object:
         words = [str(splat) if word == "SPLAT" else word for word in line.split()]
@@ -185,7 +189,10 @@ def test_a_row_of_a_batch_is_the_request_of_its_command_line(decide, tmp_path):
         ("update SPLAT --scene . --out out", "SCENE, and the splat with --scene"),
         ("complete SCENE --up 0 1 0 --out out", "leave --up out"),
         ("complete SPLAT --frames 9 --out out", "There are no photographs to apply this to"),
-        ("complete SCENE --mask m.png --out out", "there is nothing that masks could mark"),
+        ("complete SCENE --mask m.png --out out", "there is nothing that could be marked"),
+        ("repair SCENE --target 1 --mask m.png --out out", "there is nothing that could be marked"),
+        ("repair none.ply --target 1 --mask m.png --out out", "There is no none.ply"),
+        ("remove none.ply --sphere 0 0 0 1 --out out", "There is no none.ply"),
         ("complete SPLAT --mask m.png --out out", "name the camera of each with --target"),
         ("remove SCENE --sphere 0 0 0 1 --out out", "there is nothing that could be removed"),
         ("remove --sphere 0 0 0 1 --out out", "Nothing is named that is to be completed"),

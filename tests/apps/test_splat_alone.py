@@ -236,6 +236,17 @@ def test_a_painted_hole_of_a_splat_alone_is_completed(folder, tmp_path, monkeypa
 
 
 @pytest.mark.slow
+def test_an_export_does_not_number_renders_that_the_next_command_does_not_have(
+    folder, tmp_path, monkeypatch
+):
+    words = ("complete", folder / "splat.ply", "--auto", 1, "--out", tmp_path / "out", "--quiet")
+    assert run(monkeypatch, *words, "--export-holes", tmp_path / "holes") == 0
+    (row,) = json.loads((tmp_path / "holes" / "holes.json").read_text())["frames"]
+    assert (row["derived_from"], row["offset"]) == (None, None)
+    assert row["title"].startswith("near photograph")
+
+
+@pytest.mark.slow
 def test_with_nothing_named_the_camera_of_a_pixel_aligned_splat_is_found(
     folder, tmp_path, monkeypatch, capsys
 ):

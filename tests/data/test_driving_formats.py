@@ -14,8 +14,9 @@ import torch
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from driving_files import infos, write_infos
 from gscompleter import InputError
-from gscompleter.data.driving.mmdet3d import load_plain
+from gscompleter.data.driving.mmdet3d import load_plain, open_infos
 from gscompleter.data.driving.vehicle import read_sweep
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.json_fields import get_number
@@ -98,6 +99,26 @@ def test_waymo_infos_project_as_their_own_matrix_does(shared):
     homogeneous = np.c_[points, np.ones(3)] @ np.array(sample["images"]["CAM_FRONT"]["lidar2img"]).T
     assert depths.numpy() == pytest.approx(homogeneous[:, 2], rel=1e-4)
     assert pixels.numpy() == pytest.approx(homogeneous[:, :2] / homogeneous[:, 2:3], abs=0.1)
+
+
+def test_samples_of_which_nothing_names_the_drive_make_one_scene(tmp_path):
+    content = infos()
+    for sample in content["data_list"]:
+        del sample["context_name"]
+    content["data_list"][-1]["timestamp"] += 60
+    scenes = list(open_infos(write_infos(tmp_path, content)))
+    assert [(scene.name, len(scene)) for scene in scenes] == [
+        ("infos_0.000", 4),
+        ("infos_62.000", 1),
+    ]
+
+
+def test_infos_that_mix_up_left_and_right_cameras_are_refused(tmp_path):
+    content = infos()
+    image = content["data_list"][0]["images"]["CAM_FRONT"]
+    image["cam2img"] = [[*row, 0.0] for row in (*image["cam2img"], [0.0, 0.0, 0.0])]
+    with pytest.raises(InputError, match="before mmdetection3d 1.4, which take left cameras"):
+        open_photographs(write_infos(tmp_path, content))
 
 
 class Evil:

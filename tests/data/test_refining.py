@@ -128,7 +128,20 @@ def test_each_camera_is_paired_with_near_ones_of_its_direction():
     assert (0, 1) not in pair_near([camera_at(), camera_at(yaw=5), camera_at(x=1), camera_at(x=2)])
 
 
-@pytest.mark.parametrize(("refined", "is_accepted"), [(0.1, True), (0.19, False), (0.3, False)])
-def test_poses_are_refined_only_where_kept_back_matches_agree_better(refined, is_accepted):
-    done = PoseRefinement(9, given_error=0.2, refined_error=refined, moved=0.1)
+@pytest.mark.parametrize(
+    ("given", "refined", "is_accepted"),
+    [(0.2, 0.1, True), (0.2, 0.19, False), (0.2, 0.3, False), (0.0, 0.0, False)],
+)
+def test_poses_are_refined_only_where_kept_back_matches_agree_better(given, refined, is_accepted):
+    done = PoseRefinement(9, given_error=given, refined_error=refined, moved=0.1)
     assert done.is_accepted == is_accepted
+
+
+def test_poses_that_no_kept_back_match_compares_are_left(tmp_path, monkeypatch):
+    """As COLMAP's process answers if it kept no match back: then nothing is known of the errors."""
+    scene = open_photographs(photographed(tmp_path / "scene", CAMERAS[:4]))
+    moved = [np.linalg.inv(camera.c2w.double().numpy())[:3] + 0.01 for camera in CAMERAS[:4]]
+    answer = {"viewmats": np.array(moved).tolist(), "given_error": None, "refined_error": None}
+    monkeypatch.setattr("gscompleter.data.sfm.refining.run_colmap", lambda *_: answer)
+    monkeypatch.setattr("gscompleter.data.sfm.refining.require_pycolmap", lambda: None)
+    assert refine_poses(scene) == (scene, None)

@@ -12,7 +12,7 @@ import torch
 from command import run
 from copies import watch_copies
 from gscompleter.apps.cleaning import describe_cleaning
-from gscompleter.apps.completing import preparation
+from gscompleter.apps.inputs import splat as splat_reading
 from gscompleter.config import CleaningConfig
 from gscompleter.editing.cleaning import find_removable, find_superfluous
 from gscompleter.evaluation.metrics.image import psnr
@@ -203,9 +203,9 @@ def test_colours_of_a_large_splat_lie_in_a_file_and_nothing_else_changes(
         mapped.append(is_mapped(moved))
         return moved
 
-    monkeypatch.setattr(preparation, "move_to_file", move)
+    monkeypatch.setattr(splat_reading, "move_to_file", move)
     for worth in (len(SCENE) + 1, len(SCENE)):
-        monkeypatch.setattr(preparation, "MIN_PROXY_GAUSSIANS", worth)
+        monkeypatch.setattr(splat_reading, "MIN_PROXY_GAUSSIANS", worth)
         out = tmp_path / str(worth)
         words = clean(scene, splat, out)
         assert run(monkeypatch, *(words if has_photographs else ["clean", *words[2:]])) == 0

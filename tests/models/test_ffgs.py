@@ -67,7 +67,7 @@ class Pipeline:
 
     @classmethod
     def from_pretrained(cls, place, *, device):
-        if place not in (VARIANT, "folder"):
+        if place != VARIANT and not place.endswith("folder"):
             raise KeyError(f"no zoo entry {place!r}")
         return cls()
 
@@ -107,8 +107,9 @@ def test_the_model_gets_images_and_cameras_and_gives_a_scene(package):
         assert error.median() < 0.05
 
 
-def test_a_scene_is_completed_with_it(package):
-    psi = load_reconstructor(f"ffgs:{VARIANT}", "folder")
+def test_a_scene_is_completed_with_it(package, tmp_path):
+    (tmp_path / "folder").mkdir()
+    psi = load_reconstructor(f"ffgs:{VARIANT}", tmp_path / "folder")
     done = GSCompleter(reconstructor=psi)(VIEWS, camera_at(0.7, yaw=12, size=SIZE))
     assert len(done.added) > 0
 
@@ -131,11 +132,12 @@ def test_what_the_package_refuses_is_one_sentence(package):
         psi(VIEWS[:1])
     with pytest.raises(InputError, match="did not load none/such"):
         load_reconstructor("ffgs:none/such")
+    with pytest.raises(InputError, match="There are no weights at some/where"):
+        load_reconstructor(f"ffgs:{VARIANT}", "some/where")
 
 
 def test_without_the_package_its_command_is_named(monkeypatch, capsys, room, tmp_path):
     monkeypatch.setitem(sys.modules, "ffgs", None)
-    monkeypatch.setattr("gscompleter.models.ffgs.find_spec", lambda name: None)
     words = ("complete", room, "--out", tmp_path / "o", "--reconstructor", f"ffgs:{VARIANT}")
     assert run(monkeypatch, *words) == 2
     assert "pip install --pre ffgs" in capsys.readouterr().err

@@ -6,6 +6,7 @@ import math
 import sys
 from dataclasses import replace
 from importlib.machinery import ModuleSpec
+from pathlib import Path
 from types import ModuleType
 
 import pytest
@@ -30,7 +31,7 @@ class StandIn:
     """Knows the true depth; above the middle there is no surface."""
 
     def __init__(self, place: str) -> None:
-        if place not in ("Ruicheng/moge-3-vitl", "model.pt"):
+        if place != "Ruicheng/moge-3-vitl" and not place.endswith("model.pt"):
             raise OSError("nothing there")
 
     from_pretrained = classmethod(lambda kind, place: kind(place))
@@ -66,8 +67,10 @@ def test_moge3_gets_the_field_of_view_and_gives_metres(package):
     assert depth.depth.isfinite().all()
 
 
-def test_moge3_serves_a_single_photograph(package):
-    psi = load_reconstructor("plane-sweep", depth="moge-3-large", depth_weights="model.pt")
+def test_moge3_serves_a_single_photograph(package, tmp_path):
+    file = tmp_path / "model.pt"
+    file.touch()
+    psi = load_reconstructor("plane-sweep", depth="moge-3-large", depth_weights=file)
     (view,) = prepare_single(psi, [replace(VIEW, depth=None)])
     assert view.given_depth is not None
     assert torch.equal(view.given_depth > 0, psi.predict_depth(VIEW).valid)
@@ -76,7 +79,9 @@ def test_moge3_serves_a_single_photograph(package):
 def test_moge3_without_its_package_or_weights(package, monkeypatch):
     with pytest.raises(InputError, match="was not loaded from Ruicheng/moge-3-vitg"):
         load_depth_predictor("moge-3-giant")
-    monkeypatch.setattr("gscompleter.models.moge3.find_spec", lambda name: None)
+    with pytest.raises(InputError, match="There are no weights at some/where"):
+        load_depth_predictor("moge-3-large", Path("some/where"))
+    monkeypatch.setitem(sys.modules, "moge.model.v3", None)
     with pytest.raises(InputError, match="pip install git"):
         load_depth_predictor("moge-3-large")
 

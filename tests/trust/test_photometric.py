@@ -202,7 +202,7 @@ def complete(scene, splat, out, *more):
 )
 def test_the_command_recolours_and_strip_puts_back(tmp_path, monkeypatch, worth):
     """Restored to the byte, with further columns and whether or not the scene was sorted before."""
-    monkeypatch.setattr("gscompleter.apps.completing.preparation.MIN_PROXY_GAUSSIANS", worth)
+    monkeypatch.setattr("gscompleter.apps.inputs.splat.MIN_PROXY_GAUSSIANS", worth)
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
     splat, out = labelled(tmp_path / "splat.ply", SCENE), tmp_path / "out"
     assert run(monkeypatch, *complete(scene, splat, out)) == 0
@@ -216,7 +216,7 @@ def test_the_command_recolours_and_strip_puts_back(tmp_path, monkeypatch, worth)
 
 @pytest.mark.linux
 def test_colours_of_a_large_scene_lie_in_a_file_and_nothing_else_changes(tmp_path, monkeypatch):
-    monkeypatch.setattr("gscompleter.apps.completing.preparation.MIN_PROXY_GAUSSIANS", 0)
+    monkeypatch.setattr("gscompleter.apps.inputs.splat.MIN_PROXY_GAUSSIANS", 0)
     scene = photographed(tmp_path / "scene", [*PHOTOGRAPHS, TARGET])
     splat = labelled(tmp_path / "splat.ply", SCENE)
     files = []
@@ -228,7 +228,7 @@ def test_colours_of_a_large_scene_lie_in_a_file_and_nothing_else_changes(tmp_pat
             mapped.append(is_mapped(moved))
             return moved
 
-        monkeypatch.setattr("gscompleter.apps.completing.preparation.move_to_file", move)
+        monkeypatch.setattr("gscompleter.apps.inputs.splat.move_to_file", move)
         out = tmp_path / name
         assert run(monkeypatch, *complete(scene, splat, out)) == 0
         assert set(mapped) == {name == "in-file"}

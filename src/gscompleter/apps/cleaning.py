@@ -16,13 +16,18 @@ from torch import Tensor
 
 from gscompleter import __version__
 from gscompleter.apps.command_line.answers import print_answer
-from gscompleter.apps.completing.preparation import file_harmonics, open_input, read_splat
+from gscompleter.apps.completing.preparation import open_input
 from gscompleter.apps.completing.run_info import describe_run_values
 from gscompleter.apps.inputs.depth_range import apply_splat_range
 from gscompleter.apps.inputs.describing import describe_opening, print_lines
 from gscompleter.apps.inputs.reading import read_photographs
 from gscompleter.apps.inputs.refined_poses import read_at_refined_poses, write_refined_poses
-from gscompleter.apps.inputs.splat import locate_splat, move_to_splat
+from gscompleter.apps.inputs.splat import (
+    file_harmonics,
+    locate_splat,
+    move_to_splat,
+    read_splat,
+)
 from gscompleter.apps.inputs.taken_out import take_over_edits
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened
 from gscompleter.apps.report.cleaning_picture import (

@@ -13,9 +13,9 @@ from gscompleter.evaluation.steps import compute_scale_drift
 from gscompleter.system.timing import STAGES
 
 RunRow = dict[str, Any]
-"""Output of `evaluate` for a task and a method."""
+"""Result of a method on a task as JSON, with its `steps`."""
 StepRow = dict[str, Any]
-"""A `steps.Step` as JSON."""
+"""A `SequenceStep` as JSON, whose `scores` are `Scores`."""
 
 Reduction = Callable[[Sequence[float]], Any]
 """Reduces several numbers to one, or to None."""
@@ -29,19 +29,25 @@ class Column:
     """A column of a table: a number of each step, reduced over steps and then over tasks."""
 
     key: str
+    """Name in files and claims."""
     title: str
+    """Heading in tables."""
     digits: int
+    """Decimals that are shown."""
     path: str
-    """Place of the number in a step or its scores, with dots; a list of views is reduced too."""
+    """Place of the number in a step or its scores (`find_number`)."""
     minus: str | None = None
-    """Place of a number that is subtracted."""
+    """Place of a number that is subtracted, in the same way; None for none."""
     reduce_steps: Reduction = statistics.fmean
+    """Reduces the numbers of the views of a step, and those of the steps of a task."""
     reduce_tasks: Reduction = statistics.fmean
+    """Reduces the numbers of all tasks."""
     pixels: str | None = None
-    """Place of the number of pixels, of which `MIN_GEOMETRY_PIXELS` are needed."""
+    """Place of the number of pixels that the score is of, at least `MIN_GEOMETRY_PIXELS`; None for
+    a score that counts however many they are."""
 
     def get_value(self, step: StepRow) -> float | None:
-        """Return the number of a step; None without ground truth."""
+        """Return the number of a step; None if nothing was measured, or at too few pixels."""
         # A score of few pixels says more about them than about the method.
         if self.pixels is not None and (find_number(step, self.pixels) or 0) < MIN_GEOMETRY_PIXELS:
             return None
@@ -61,7 +67,12 @@ class Column:
 
 
 def find_number(step: StepRow, path: str) -> Any:
-    """Return the number at a place in a step or its scores, one per view, or None."""
+    """Return the number at a place in a step or its scores; None if nothing was measured there.
+
+    Keys of a place are joined by dots. Where a list of views lies on the way, numbers are one for
+    each view.
+    """
+    # By the whole place: `added` is a number of a step, and `added.pixels` one of its scores.
     is_direct = path in step or path.startswith("seconds.")
     value: Any = step if is_direct else step["scores"]
     for key in path.split("."):
@@ -73,20 +84,20 @@ def find_number(step: StepRow, path: str) -> Any:
 
 
 def _make_median(key: str, title: str, digits: int, path: str) -> Column:
-    """Make a column of medians over the tasks."""
+    """Make a column of medians over the tasks; steps are averaged."""
     return Column(key, title, digits, path, reduce_tasks=statistics.median)
 
 
 def _make_geometry(
     key: str, title: str, path: str, digits: int = 3, reduce: Reduction = statistics.median
 ) -> Column:
-    """Make a column of a number of an `Agreement`."""
+    """Make a column of a number of a `SurfaceAgreement`, which has its pixels beside it."""
     pixels = f"{path.split('.')[0]}.pixels"
     return Column(key, title, digits, path, reduce_tasks=reduce, pixels=pixels)
 
 
 def _make_agreements(path: str, title: str, key: str = "registered") -> tuple[Column, ...]:
-    """Make the columns of an `Agreement` with the context."""
+    """Make the columns of a `SurfaceAgreement` with the context: medians over the tasks."""
     numbers = (("abs_rel", "AbsRel", 4), ("chamfer", "Chamfer", 4), ("f_score", "F-score", 3))
     return tuple(
         _make_geometry(f"{key}_{name}_median", f"{of} {title} (median)", f"{path}.{name}", digits)
@@ -169,7 +180,7 @@ COLUMN_GROUPS = {
         Column("scale_drift", "scale drift", 3, "depth_scale", reduce_steps=compute_scale_drift),
     ),
 }
-"""Columns by the title of their table; PSNR is in dB."""
+"""Columns of the tables of every run by the title of their table; PSNR is in dB."""
 
 PAPER = (
     *(
@@ -182,8 +193,8 @@ PAPER = (
     Column("seconds", "total (s)", 2, "seconds.total"),
     *(Column(f"seconds_{s}", f"{s} (s)", 2, f"seconds.{s}") for s in STAGES),
 )
-"""Further columns of the paper's tables, which are means over cases; all lifted Gaussians are
-compared with the context, at the rim only those that are added."""
+"""Further columns of the paper's tables. All are means over cases but the sum of fallbacks. All
+lifted Gaussians are compared with the context, and with "(rim)" those that are added."""
 
 BY_KEY = {column.key: column for group in (*COLUMN_GROUPS.values(), PAPER) for column in group}
 """All columns by their key."""

@@ -1,4 +1,9 @@
-"""Comparison of synthesized images with the photographs, and correction of colour shifts."""
+"""Comparison of synthesized images with the photographs, and correction of colour shifts.
+
+A network may paint the scene in other colours, or another scene. The colours that it gave to pixels
+which the photographs show tell both: an affine shift of each channel is fitted to them and undone,
+and what still differs decides whether the image shows the scene. All colours are in [0, 1].
+"""
 
 from __future__ import annotations
 
@@ -16,17 +21,17 @@ from gscompleter.numerics.robust import fit_robust_affine
 from gscompleter.system.errors import InputError
 
 COMPARED_BLUR = 2
-"""Blur in pixels before colours are compared; edges may be a pixel off."""
+"""Radius in pixels of the mean before colours are compared; edges may be a pixel off."""
 MAX_SHARE = 0.6
 """Largest residual of a consistent image, relative to that of an image of one colour."""
 RESIDUAL_QUANTILE = 0.7
 """Quantile of the residuals; higher than the median, which may be a blank wall."""
 MIN_LIMIT = 0.03
-"""Residual that is always accepted, for colours in [0, 1]."""
+"""Residual that is always accepted."""
 MAX_SHIFT_GAIN = 1.6
 """Largest gain of a colour shift; its inverse is the smallest."""
 MAX_OFFSET = 0.25
-"""Largest offset of a colour shift, either way, for colours in [0, 1]."""
+"""Largest offset of a colour shift, either way."""
 MIN_OBSERVED_PIXELS = 200
 """Fewest observed pixels for a comparison."""
 
@@ -36,19 +41,21 @@ class Agreement:
     """Comparison of an image with the photographs: `photographed = gain * image + offset`."""
 
     gain: Float[Tensor, "3"]
+    """Of each channel; 1 if a consistent image is not to be corrected, or was not compared."""
     offset: Float[Tensor, "3"]
+    """Of each channel; likewise 0."""
     residual: float
-    """Quantile of the colour difference after the correction."""
+    """Quantile of the colour differences that are left by the best shift, corrected or not."""
     limit: float
     """Largest residual of a consistent image."""
     is_consistent: bool
     """True if the image is consistent with the photographs, or cannot be compared."""
     image: Float[Tensor, "h w 3"]
-    """The image; if it is consistent and correction is asked for, with the shift corrected."""
+    """The image; with the shift corrected if it is consistent and correction is asked for."""
 
     @property
     def is_finite(self) -> bool:
-        """False if the image has NaN or infinity, and was not compared."""
+        """False if the image has NaN or infinity; it was not compared then."""
         return self.residual != float("inf")
 
     def describe_difference(self) -> str:
@@ -76,8 +83,11 @@ def paint_consistently(
     """Paint an image from a seed, compare it with the photographs and correct its colours.
 
     `paint` makes the image of a seed; `observed` are the photographs warped to its camera. While it
-    is inconsistent, up to `retries` further seeds are tried and the best image is kept. Raise
-    InputError if no seed gives finite colours.
+    is inconsistent, up to `retries` further seeds are tried, those after `seed`. The best image is
+    kept, and a note tells if that is inconsistent, too.
+
+    Raises:
+        InputError: No seed gives finite colours.
     """
     attempts: list[Agreement] = []
     for attempt in range(retries + 1):
@@ -114,8 +124,9 @@ def compare_with_observed(
 ) -> Agreement:
     """Fit the colour shift of `image` to the `known` pixels, and correct a consistent image.
 
-    With `correct_color` off, a consistent image stays as it is, with a gain of 1. An image that the
-    photographs show too little of is consistent, and one with NaN or infinity never.
+    `observed` is what the photographs show there; its other pixels do not count. With
+    `correct_color` off, a consistent image is not shifted. An image that the photographs show too
+    little of is consistent, and one with NaN or infinity never.
     """
     ones = torch.ones(3).to(image)
     zeros = torch.zeros(3).to(image)
@@ -130,13 +141,13 @@ def compare_with_observed(
     differences = (gain * painted + offset - photographed).abs().mean(dim=-1)
     residual = compute_quantile(differences, RESIDUAL_QUANTILE)
 
-    # A single colour would match photographs of a blank wall as well, so the residual of one is
-    # the scale that an image has to be better than.
+    # How well an image has to agree depends on the contrast of the photographs: it has to be
+    # clearly better than an image of their median colour alone.
     median = photographed.median(dim=0).values
     contrast = compute_quantile((photographed - median).abs().mean(dim=-1), RESIDUAL_QUANTILE)
     limit = max(MIN_LIMIT, MAX_SHARE * contrast)
 
-    # With any gain and offset an image of another scene could be fitted, too.
+    # With any gain and offset, an image of another scene could be fitted, too.
     is_gain_plausible = bool(((gain >= 1 / MAX_SHIFT_GAIN) & (gain <= MAX_SHIFT_GAIN)).all())
     is_offset_plausible = bool((offset.abs() <= MAX_OFFSET).all())
     agrees = is_gain_plausible and is_offset_plausible and residual <= limit
@@ -148,5 +159,6 @@ def compare_with_observed(
 
 
 def compute_quantile(values: Float[Tensor, "n"], share: float) -> float:
-    """Return the value below which a fraction `share` of the values lies."""
+    """Return the value below which a fraction `share` of the values lies; there is at least one."""
+    # `torch.quantile` refuses more than 16 million values.
     return values.kthvalue(1 + int(share * (len(values) - 1))).values.item()

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ from torch.nn.functional import normalize
 
 from gscompleter.models.feed_forward.inputs import compute_central_crops
 from gscompleter.models.feed_forward.reconstructor import MAX_COEFFICIENTS
+from gscompleter.models.packages import choose_weights, import_authors_module
 from gscompleter.render.loading import load_renderer
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.types import Gaussians, Reconstruction, View, make_observed
@@ -95,14 +95,9 @@ def load_ffgs(variant: str, weights: Path | None = None, device: str = "cpu") ->
     Raises:
         InputError: The package is missing, or the model cannot be loaded.
     """
-    if find_spec("ffgs") is None:
-        raise InputError(
-            f"The reconstructor '{PREFIX}{quote_value(variant)}' needs its package: {INSTALL}.",
-            "reconstructor",
-        )
-    import ffgs
-
-    place = variant if weights is None else str(weights)
+    place = choose_weights(weights, variant, "weights")
+    title = f"The reconstructor '{PREFIX}{quote_value(variant)}'"
+    ffgs = import_authors_module("ffgs", title, INSTALL, "reconstructor")
     try:
         pipeline = ffgs.GSPipeline.from_pretrained(place, device=device)
     except Exception as error:  # the hub, safetensors and the package have errors of their own

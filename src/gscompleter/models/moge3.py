@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from gscompleter.models.packages import choose_weights, import_authors_module
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.types import DepthMap, View
 
@@ -62,13 +62,10 @@ class MoGe3:
 
 def load_moge3(name: str, weights: Path | None = None, device: str = "cpu") -> MoGe3:
     """Load a published size, or a file `model.pt`; raise InputError if it cannot be loaded."""
-    if find_spec("moge") is None:
-        raise InputError(f"The depth '{name}' needs its package: {INSTALL}.", "depth")
-    from moge.model.v3 import MoGeModel
-
-    place = REPOSITORIES[name] if weights is None else str(weights)
+    place = choose_weights(weights, REPOSITORIES[name], "depth_weights")
+    moge = import_authors_module("moge.model.v3", f"The depth '{name}'", INSTALL, "depth")
     try:
-        model = MoGeModel.from_pretrained(place)
+        model = moge.MoGeModel.from_pretrained(place)
     except Exception as error:  # the hub, torch and the package have errors of their own
         raise InputError(
             f"MoGe-3 was not loaded from {quote_value(place)} ({type(error).__name__}); name its "

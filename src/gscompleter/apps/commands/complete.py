@@ -12,9 +12,9 @@ from gscompleter.apps.commands.shared_decisions import (
     Adapt,
     check_context,
     check_generator,
+    check_splat_named,
     decide_filling,
     decide_results,
-    has_splat_alone,
 )
 from gscompleter.apps.commands.shared_options import CompletingOptions, list_inputs
 from gscompleter.apps.requests.completion import (
@@ -96,10 +96,7 @@ def decide_completion(options: CompleteOptions) -> Request:
     marks = options.mask
     if not marks:
         return choose_ending(options, decide_holes(options, has_marks=False))
-    if options.scene is None and not has_splat_alone(options):
-        raise InputError(
-            "Without a splat there is nothing that masks could mark; name it with --scene.", "mask"
-        )
+    check_splat_named(options, "marked")
     if not options.target:
         raise InputError(
             "A mask is painted on the image of a target; name the camera of each with --target.",

@@ -9,12 +9,11 @@ from typing import Annotated
 import tyro
 
 from gscompleter.apps.commands.complete import CompleteOptions, choose_ending, decide_holes
-from gscompleter.apps.commands.shared_decisions import has_splat_alone
+from gscompleter.apps.commands.shared_decisions import check_splat_named
 from gscompleter.apps.requests.completion import RemovalRequest, Request
 from gscompleter.apps.requests.splat import Selection
 from gscompleter.config import CompleterConfig
 from gscompleter.data.mask_reading import MaskReading
-from gscompleter.system.errors import InputError
 from gscompleter.system.process import import_without_collection
 
 
@@ -46,10 +45,7 @@ class RemoveOptions(CompleteOptions):
 
 def decide_removal(options: RemoveOptions) -> Request:
     """Decide what is removed, and how its hole is filled."""
-    if options.scene is None and not has_splat_alone(options):
-        raise InputError(
-            "Without a splat there is nothing that could be removed; name it with --scene.", "scene"
-        )
+    check_splat_named(options, "removed")
     reading = MaskReading(options.invert_masks, options.large_masks)
     # With masks of what goes, `--invert-masks` is for them instead of for masks of photographs.
     has_marks = options.mask is not None

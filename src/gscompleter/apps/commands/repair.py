@@ -1,4 +1,8 @@
-"""The command `repair`: take what is wrong out of a splat, and fill its place."""
+"""The command `repair`: take what is wrong out of a splat, and fill its place.
+
+What is wrong is named in one of three ways: by masks at cameras, by a selection of Gaussians, or by
+the strokes of a session of `live`.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +15,9 @@ import tyro
 from gscompleter.apps.commands.shared_decisions import (
     check_context,
     check_generator,
+    check_splat_named,
     decide_filling,
     decide_results,
-    has_splat_alone,
 )
 from gscompleter.apps.commands.shared_options import CompletingOptions
 from gscompleter.apps.requests.completion import RepairRequest, TargetRequest
@@ -58,13 +62,9 @@ class RepairOptions(CompletingOptions):
 
 
 def decide_repair(options: RepairOptions) -> RepairRequest:
-    """Decide what is repaired at the cameras of masks."""
+    """Decide what is repaired at the target cameras: what masks mark there, or a selection."""
     has_masks = options.select is None
-    if options.scene is None and not has_splat_alone(options):
-        raise InputError(
-            "Without a splat there is nothing that could be marked; name it with --scene.",
-            "mask" if has_masks else "select",
-        )
+    check_splat_named(options, "marked")
     check_context(options.context)
     check_generator(options.synthesis)
     completion = decide_filling(
@@ -85,8 +85,8 @@ def decide_repair(options: RepairOptions) -> RepairRequest:
 
 def run_repair(options: RepairOptions) -> int:
     """Repair the splat, and print a summary; exit codes as of `complete`."""
-    # Imported here, so that help pages do not wait for torch.
     check_marks_named(options)
+    # Imported here, so that help pages do not wait for torch.
     if options.strokes is not None:
         with import_without_collection():
             from gscompleter.apps.commands.sessions import decide_replay

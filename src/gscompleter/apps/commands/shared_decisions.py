@@ -211,6 +211,21 @@ def names_splat(path: Path) -> bool:
     return has_splat_extension(path)
 
 
+def check_splat_named(options: CompletingOptions, what: str) -> None:
+    """Refuse a command that takes something out of a splat where none is named.
+
+    `what` happens to it, such as "removed".
+    """
+    if options.scene is not None or has_splat_alone(options):
+        return
+    # A splat that is not there is no folder of photographs.
+    if options.folder is not None and not os.path.exists(options.folder):
+        raise InputError(f"There is no {quote_value(options.folder)}; correct the path.")
+    raise InputError(
+        f"Without a splat there is nothing that could be {what}; name it with --scene.", "scene"
+    )
+
+
 def check_source_options(options: CompletingOptions, has_marks: bool) -> None:
     """Refuse options that photographs, or a splat, would have to be there for."""
     if has_splat_alone(options):

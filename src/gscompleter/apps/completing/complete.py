@@ -15,11 +15,8 @@ from gscompleter.apps.completing.holes import EXPORTED, refuse_painted, write_ho
 from gscompleter.apps.completing.keeping import save_compactly
 from gscompleter.apps.completing.maker import describe_maker
 from gscompleter.apps.completing.marking import prepare_repair
-from gscompleter.apps.completing.preparation import (
-    Prepared,
-    describe_settings,
-    prepare_completion,
-)
+from gscompleter.apps.completing.preparation import describe_settings, prepare_completion
+from gscompleter.apps.completing.prepared import Prepared
 from gscompleter.apps.completing.printing import (
     answer_completion,
     answer_export,

@@ -1,4 +1,7 @@
-"""Export of the holes of targets, for whoever paints them."""
+"""Export of the holes of targets, for whoever paints them.
+
+`holes.json` lists the targets; `apps/inputs/paintings.py` reads it back, with what was painted.
+"""
 
 from __future__ import annotations
 
@@ -15,9 +18,9 @@ from torch import Tensor
 
 from gscompleter import __version__
 from gscompleter.apps.completing.path_video import PATH_MASK, PATH_VIDEO, plan_path, write_path
-from gscompleter.apps.completing.preparation import Prepared
+from gscompleter.apps.completing.prepared import Prepared
 from gscompleter.apps.inputs.holes_file import HOLES_FILE, HoleRow, read_holes
-from gscompleter.apps.inputs.paintings import is_exported
+from gscompleter.apps.inputs.paintings import PAINTING_ENDINGS, VIDEO_ENDINGS, list_by_stem
 from gscompleter.apps.inputs.task import Target
 from gscompleter.apps.report.hole_pictures import HolePictures, draw_hole
 from gscompleter.config.settings import COVERED
@@ -36,7 +39,7 @@ from gscompleter.system.progress import track
 from gscompleter.types import Camera
 
 VISIBLE_FIELD = "visible_field.npz"
-"""File of the distance field that the cameras see, for programs that complete geometry."""
+"""File of a `VisibleField`, for programs that complete geometry."""
 EXPORTED = ("target*.png", PATH_VIDEO, PATH_MASK, VISIBLE_FIELD, HOLES_FILE)
 """Globs of the files that an export may write."""
 DEPTH_STEPS = 65535
@@ -56,6 +59,7 @@ class ExportedHole:
     depth: Float[Tensor, "h w"]
     """z-depth in the unit of `camera`, 0 in holes."""
     hole_fraction: float
+    """Share of the image that is a hole; the mask to paint is somewhat larger."""
 
     @property
     def name(self) -> str:
@@ -64,17 +68,20 @@ class ExportedHole:
 
 
 def refuse_painted(folder: Path) -> None:
-    """Refuse to replace the images of an earlier export that were painted."""
-    exported: dict[str, str] = {}
+    """Refuse to export to a folder where images or the video of an earlier export were painted.
+
+    A painted image may have another ending than the exported one. It would stay, and be taken for
+    that of the new target of its number.
+    """
+    exported: list[tuple[str, str, Sequence[str]]] = []
     # A damaged file says nothing of its images, and is replaced.
     with suppress(InputError):
         holes = read_holes(folder)
-        exported = {row.image_path: row.sha256 for row in holes.frames}
+        exported += [(row.image_path, row.sha256, PAINTING_ENDINGS) for row in holes.frames]
         if holes.path is not None:
-            exported[holes.path.video_path] = holes.path.sha256
-    for name, sha256 in exported.items():
-        path = folder / name
-        if path.is_file() and not is_exported(path, sha256):
+            exported.append((holes.path.video_path, holes.path.sha256, VIDEO_ENDINGS))
+    for name, sha256, endings in exported:
+        for path in list_by_stem(folder, name, endings, sha256):
             raise InputError(
                 f"{quote_value(path)} was painted; name another folder for the export.",
                 "export-holes",
@@ -82,11 +89,14 @@ def refuse_painted(folder: Path) -> None:
 
 
 def write_holes(folder: Path, ready: Prepared, begun: Completion, has_path: bool) -> list[str]:
-    """Write the files of an export; return the lines about targets that have no hole.
+    """Write the files of an export; return a line about each target that is left out.
 
     All targets are seen in the scene as it is, so that a hole which several of them see is exported
-    with each. `has_path` is True for a video along the targets. Raise InputError if no
-    target has a hole.
+    with each. `has_path` is True for a video along the targets. `begun` is the scene before
+    anything is filled.
+
+    Raises:
+        InputError: No target has a hole.
     """
     exported = []
     skipped = []
@@ -97,10 +107,11 @@ def write_holes(folder: Path, ready: Prepared, begun: Completion, has_path: bool
         else:
             exported.append(make_export(number, target, view, ready.task.frame))
     if not exported:
+        # Without targets the planner was asked for some, and found none.
         reason = skipped[0].partition(": ")[2] if skipped else "No camera has much to gain."
         raise InputError(f"There is nothing to paint: {reason}", "target")
 
-    # One unit for all depth maps, as in a transforms.json.
+    # One unit for all depth maps, as in a transforms.json: the farthest depth is `DEPTH_STEPS`.
     farthest = max(hole.depth.max().item() for hole in exported)
     unit = (farthest or 1.0) / DEPTH_STEPS
     rows = [write_hole(folder, hole, unit, ready) for hole in exported]
@@ -112,7 +123,8 @@ def write_holes(folder: Path, ready: Prepared, begun: Completion, has_path: bool
         path = write_path(folder, ready, begun, planned)
         for row, frame in zip(rows, planned.target_frames, strict=True):
             row["path_frame"] = frame
-    # Cameras that were found around the targets are found again.
+    # Renders at cameras that were found have no numbers that a later command could be given; they
+    # are found again.
     frames = ready.task.context_frames if ready.opened.has_numbered_frames else ()
     content = {
         **RESULT_MARK,
@@ -131,21 +143,22 @@ def write_holes(folder: Path, ready: Prepared, begun: Completion, has_path: bool
 def write_visible_field(
     folder: Path, ready: Prepared, begun: Completion, exported: Sequence[ExportedHole]
 ) -> str | None:
-    """Write the distance field that photographs and targets see, in the frame of the photographs.
+    """Write the distance field of what context and exported targets see of the scene.
 
-    Return the name of its file, or None if they see nothing.
+    It is in the frame and unit of the photographs. Return the name of its file, or None if they see
+    nothing.
     """
-    back = np.linalg.inv(ready.task.frame)
-    cameras = [view.camera for view in begun.views]
-    frozen = ready.completer.scenes.freeze_at(begun.parts, cameras)
-    seen = [transform_camera_exactly(camera.to("cpu"), back) for camera in cameras]
+    to_photographs = np.linalg.inv(ready.task.frame)
+    context = [view.camera for view in begun.views]
+    renders = [view.render for view in ready.completer.scenes.freeze_at(begun.parts, context)]
+    cameras = [transform_camera_exactly(camera.to("cpu"), to_photographs) for camera in context]
     depths = [
-        scene.render.depth.where(scene.render.alpha >= COVERED, 0.0).cpu() * get_scale(back)
-        for scene in frozen
+        render.depth.where(render.alpha >= COVERED, 0.0).cpu() * get_scale(to_photographs)
+        for render in renders
     ]
-    seen += [hole.camera.to("cpu") for hole in exported]
+    cameras += [hole.camera.to("cpu") for hole in exported]
     depths += [hole.depth.cpu() for hole in exported]
-    field = compute_visible_field(seen, depths)
+    field = compute_visible_field(cameras, depths)
     if field is None:
         return None
     np.savez_compressed(folder / VISIBLE_FIELD, **vars(field))
@@ -162,20 +175,23 @@ def make_export(
     number: int, target: Target, view: TargetView, frame: Float[np.ndarray, "4 4"]
 ) -> ExportedHole:
     """Collect what a target shows; `frame` leads from the photographs to the result."""
-    back = np.linalg.inv(frame)
+    to_photographs = np.linalg.inv(frame)
     pictures = draw_hole(view)
     return ExportedHole(
         number,
         target,
-        transform_camera_exactly(view.camera.target, back),
-        pictures,
-        pictures.depth * get_scale(back),
-        view.holes.float().mean().item(),
+        camera=transform_camera_exactly(view.camera.target, to_photographs),
+        pictures=pictures,
+        depth=pictures.depth * get_scale(to_photographs),
+        hole_fraction=view.holes.float().mean().item(),
     )
 
 
 def write_hole(folder: Path, hole: ExportedHole, unit: float, ready: Prepared) -> dict[str, Any]:
-    """Write the pictures of a target, and return its entry in `holes.json`."""
+    """Write the pictures of a target, and return its entry in `holes.json`.
+
+    `unit` is the depth of one step of its depth map, in the unit of the photographs.
+    """
     name = hole.name
     shown = hole.pictures
     pictures = {
@@ -189,7 +205,8 @@ def write_hole(folder: Path, hole: ExportedHole, unit: float, ready: Prepared) -
     write_depth(folder / f"{name}_depth.png", hole.depth, unit)
 
     target = hole.target
-    files = ready.opened.files
+    opened = ready.opened
+    is_numbered = opened.has_numbered_frames
     row = HoleRow(
         image_path=f"{name}.png",
         sha256=hash_file(folder / f"{name}.png"),
@@ -198,16 +215,17 @@ def write_hole(folder: Path, hole: ExportedHole, unit: float, ready: Prepared) -
         h=hole.camera.height,
         hole_fraction=hole.hole_fraction,
         frame=target.frame,
-        derived_from=target.derived_from,
-        offset=target.offset,
+        # Renders at cameras that were found are others in the next command.
+        derived_from=target.derived_from if is_numbered else None,
+        offset=target.offset if is_numbered else None,
+        title=opened.name_target(target),
     )
     return {
         **asdict(row),
-        "title": ready.opened.name_target(target),
         "depth_file_path": f"{name}_depth.png",
         "warped_path": f"{name}_warped.png",
         "reference_path": f"{name}_reference.png",
         "reference_frame": shown.reference.frame,
-        "reference_file": files.get(shown.reference.frame),
+        "reference_file": opened.files.get(shown.reference.frame),
         **describe_camera(hole.camera),
     }

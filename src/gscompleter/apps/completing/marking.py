@@ -7,7 +7,8 @@ from functools import partial
 
 from rich.console import Console
 
-from gscompleter.apps.completing.preparation import Gone, Marks, Prepared, prepare_completion
+from gscompleter.apps.completing.preparation import Marks, prepare_completion
+from gscompleter.apps.completing.prepared import Gone, Prepared
 from gscompleter.apps.completing.remove import choose_selected
 from gscompleter.apps.inputs.hole_kinds import pair_masks, read_marks
 from gscompleter.apps.inputs.removal import check_selection

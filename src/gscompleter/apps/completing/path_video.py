@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from jaxtyping import UInt8
 
-from gscompleter.apps.completing.preparation import Prepared
+from gscompleter.apps.completing.prepared import Prepared
 from gscompleter.apps.inputs.holes_file import PathRow
 from gscompleter.apps.report.film import (
     FRAMES_PER_SECOND,

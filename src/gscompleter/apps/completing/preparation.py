@@ -1,26 +1,30 @@
-"""Everything that is opened and loaded before a completion."""
+"""Everything that is opened and loaded before a completion.
+
+In this order: what can be refused at once, the photographs, the splat, the kernels, the models, and
+the depth range. A splat without photographs takes a way of its own up to the models, with renders
+in their place (`read_splat_alone`).
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, is_dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from rich.console import Console
-from torch import Tensor
 
+from gscompleter.apps.completing.prepared import Prepared
 from gscompleter.apps.inputs.captures import RenderRequest
 from gscompleter.apps.inputs.depth_range import (
     apply_scene_range,
     apply_splat_range,
 )
-from gscompleter.apps.inputs.describing import list_missing_photographs as list_missing_photographs
-from gscompleter.apps.inputs.describing import print_lines
+from gscompleter.apps.inputs.describing import list_missing_photographs, print_lines
 from gscompleter.apps.inputs.earlier_work import mark_earlier_work
 from gscompleter.apps.inputs.memory import check_gpu, check_scene
 from gscompleter.apps.inputs.named_photographs import check_target_files
@@ -30,12 +34,11 @@ from gscompleter.apps.inputs.reading import read_task
 from gscompleter.apps.inputs.refined_poses import read_at_refined_poses, take_over_poses
 from gscompleter.apps.inputs.renders import open_renders
 from gscompleter.apps.inputs.selection import collect_usable_cameras
-from gscompleter.apps.inputs.splat import add_check_views, locate_splat, move_to_splat
+from gscompleter.apps.inputs.splat import add_check_views, move_to_splat, read_splat, sort_splat
 from gscompleter.apps.inputs.taken_out import take_over_edits
-from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened, Target
+from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.apps.requests.completion import (
     CompletionRequest,
-    ResultsRequest,
     TargetRequest,
     UpdateRequest,
     WorkRequest,
@@ -48,110 +51,21 @@ from gscompleter.completer import GSCompleter
 from gscompleter.config import CompleterConfig
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.mask_reading import MaskReading
-from gscompleter.data.photograph_names import describe_offset
-from gscompleter.editing.cutting import Region
-from gscompleter.editing.removal import remove_gaussians
 from gscompleter.generators import load_generator
 from gscompleter.generators.painted import Painting
 from gscompleter.numerics.given_geometry import GivenGeometry
-from gscompleter.planning.planner import Choice, ViewPlanner
+from gscompleter.planning.planner import ViewPlanner
 from gscompleter.reconstructors import DepthAware, load_reconstructor
 from gscompleter.reconstructors.depth_predictors import StoredDepth
 from gscompleter.render.loading import load_renderer
-from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.alignment.similarity import transform_camera
-from gscompleter.splats.formats import find_origin, load_splat
+from gscompleter.splats.formats import find_origin
 from gscompleter.splats.geometry_files import load_geometry
-from gscompleter.splats.morton import sort_nearby
 from gscompleter.stages.context import prepare_single
-from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.mapping import move_to_file
-from gscompleter.system.process import give_large_arrays_own_pages
-from gscompleter.system.progress import show_preparation, stage
+from gscompleter.system.progress import show_preparation
 from gscompleter.system.timing import record_seconds, timed_stage
-from gscompleter.types import Camera, Gaussians, View
-
-
-@dataclass(frozen=True)
-class Gone:
-    """Gaussians that a command takes out of the splat before anything is completed."""
-
-    chosen: Bool[Tensor, "n"]
-    contains: Region
-    """Tells points of its place, at whose border Gaussians are cut."""
-
-
-@dataclass(frozen=True)
-class Prepared:
-    """Everything that is loaded before the first completion."""
-
-    command: str
-    """The command, for the record of edits."""
-    source: PhotographsRequest | AloneRequest
-    work: WorkRequest
-    targets: TargetRequest | None
-    """Cameras at which holes are filled; None where nothing is invented, as in an update."""
-    results: ResultsRequest
-    opened: Opened
-    task: CompletionTask
-    explorer: ViewPlanner
-    cameras: Mapping[int, Camera]
-    """Cameras of all usable photographs by frame, in the frame of the result."""
-    seconds: Mapping[str, float]
-    inverts_masks: bool = False
-    """True if masks are read the other way round: those of what goes, or else of photographs."""
-    choose_gone: Callable[[Prepared], Gone] | None = None
-    """Chooses what goes before anything is completed; None for nothing."""
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    """Settings of this command alone, for `summary.json`."""
-
-    @property
-    def completer(self) -> GSCompleter:
-        """The completer with its models."""
-        return self.explorer.completer
-
-    @property
-    def max_targets(self) -> int:
-        """Most cameras to search for."""
-        return 0 if self.targets is None else self.targets.max_found
-
-    def begin(self) -> Completion:
-        """Initialize the context, and take out what goes first."""
-        gone = None
-        if self.choose_gone is not None:
-            # Before the context, so that a wrong selection is refused without waiting for it.
-            with stage("removing"):
-                gone = self.choose_gone(self)
-        task = self.task
-        begun = self.completer.begin(
-            task.views,
-            task.scene,
-            task.check_views,
-            task.target_cameras,
-            invented=task.invented,
-            lifted=task.lifted,
-            geometry=task.geometry,
-        )
-        guarding = tuple(begun.with_depth_range(camera) for camera in task.witnesses.guarding)
-        begun = replace(begun, free_space_cameras=guarding)
-        if gone is None:
-            return begun
-        with stage("removing"):
-            return remove_gaussians(begun, gone.chosen, gone.contains, self.completer.scenes)
-
-    def with_choices(self, choices: Iterable[Choice]) -> Prepared:
-        """Return a copy with chosen candidates as targets."""
-        # A candidate counts its photograph among the usable ones, where a target names its frame.
-        frames = list(self.cameras)
-        targets = []
-        for choice in choices:
-            frame = frames[choice.candidate.base]
-            offset = describe_offset(choice.camera, self.cameras[frame])
-            targets.append(
-                Target(choice.camera, derived_from=frame, offset=offset, reason=choice.describe())
-            )
-        return replace(self, task=replace(self.task, targets=targets))
+from gscompleter.types import Camera, View
 
 
 @dataclass(frozen=True)
@@ -161,6 +75,7 @@ class Loaded:
     opened: Opened
     task: CompletionTask
     completer: GSCompleter
+    """With the models and the settings of the request."""
     cameras: Mapping[int, Camera]
     """Cameras of all usable photographs by frame, in the frame of the result."""
     seconds: Mapping[str, float]
@@ -172,8 +87,11 @@ class Marks:
     """What is marked as wrong: by masks at the targets, or by a selection of Gaussians."""
 
     masks: tuple[Path, ...] = ()
+    """An image for each target, in their order; none with a selection."""
     reading: MaskReading = MaskReading()
+    """How these masks are read."""
     selection: Selection | None = None
+    """Gaussians that are marked; None without a selection."""
 
 
 def prepare_completion(
@@ -184,18 +102,21 @@ def prepare_completion(
 ) -> Prepared:
     """Open the scene and load the models.
 
-    `marks` and `place` say what will go. Around a place cameras are found if there are no
-    photographs; what is marked is the hole.
+    `marks` or `place` say what will go, and matter only without photographs: cameras are then found
+    around the place, and what is marked counts as the hole.
+
+    Raises:
+        InputError: Something that is given is missing, damaged, or does not fit the rest.
     """
     source = request.source
     work = request.work
     targets = request.targets
-    check_models(work)
     geometry = read_geometry(work)
     if isinstance(source, AloneRequest):
         opened, task, config = read_splat_alone(work, source, targets, marks, place)
         print_lines(console, *opened.photographs.notes)
     else:
+        check_models(work)
         config = work.config if work.splat is None else work.config.for_photographs()
         opened = open_for_completion(work, source, targets, console)
         opened, task = read_opened(work, source, targets, opened, console)
@@ -215,33 +136,33 @@ def make_prepared(
     """
     source = request.source
     return Prepared(
-        request.command,
-        source,
-        request.work,
-        targets,
-        request.results,
-        loaded.opened,
-        loaded.task,
-        ViewPlanner(loaded.completer),
-        loaded.cameras,
-        loaded.seconds,
-        source.scene.masks.is_inverted,
+        command=request.command,
+        source=source,
+        work=request.work,
+        targets=targets,
+        results=request.results,
+        opened=loaded.opened,
+        task=loaded.task,
+        explorer=ViewPlanner(loaded.completer),
+        cameras=loaded.cameras,
+        seconds=loaded.seconds,
+        inverts_masks=source.scene.masks.is_inverted,
         settings=settings,
     )
 
 
 def check_models(work: WorkRequest) -> None:
     """Refuse what is wrong with a model before kernels are compiled, which takes minutes."""
-    # Where there are kernels, it is told soon enough when the photographs are read.
+    # With compiled kernels, `load_models` tells it within seconds.
     if list_uncompiled(list_parts(work)):
         load_completer(work.models, work.config, ())
 
 
 def list_parts(work: WorkRequest) -> list[str]:
-    """List the parts whose kernels a completion needs."""
+    """List the parts whose kernels a completion needs; names without kernels do no harm."""
     models = work.models
     parts = [models.device, models.reconstructor, models.generator]
-    return [*parts, SPLAT_PART] if work.splat is not None and "cpu" in parts else parts
+    return [*parts, SPLAT_PART] if work.splat is not None and models.device == "cpu" else parts
 
 
 def open_for_completion(
@@ -284,7 +205,10 @@ def read_inputs(
     targets: TargetRequest,
     opened: Opened,
 ) -> CompletionTask:
-    """Read the context and the targets, and add the input splat; compile the kernels."""
+    """Read the context and the targets, and add the input splat; compile the kernels.
+
+    With a splat everything is in its frame from here on, and else in that of the photographs.
+    """
     device = work.models.device
     splat = work.splat
     given = None
@@ -301,7 +225,7 @@ def read_inputs(
                 # Harmonics that lie in a file take no memory.
                 if device == "cpu":
                     check_scene(task, given)
-    if given is None or splat_file is None:
+    if given is None or splat_file is None:  # both without a splat
         return task
     with show_preparation("aligning the scene"):
         task = move_to_splat(task, given, splat_file, opened)
@@ -360,7 +284,7 @@ def load_models(
     # The depth range is counted as a part of the context stage, whose seconds it is added to.
     with show_preparation("depth range"), record_seconds() as seconds, timed_stage("context"):
         notes: tuple[str, ...] = ()
-        if work.splat is None or task.scene is None:
+        if work.splat is None or task.scene is None:  # both or none
             task, notes = apply_scene_range(task, reconstructor)
         else:
             task = apply_splat_range(task, task.scene, completer.renderer)
@@ -382,8 +306,8 @@ def read_geometry(work: WorkRequest) -> GivenGeometry | None:
 
 
 def add_geometry(task: CompletionTask, geometry: GivenGeometry) -> CompletionTask:
-    """Add geometry, which was given in the frame of the splat's file, or of the photographs."""
-    # Both are read relative to an origin.
+    """Add geometry that was given in the frame of the splat's file, or else of the photographs."""
+    # The task is relative to an origin in that frame.
     origin = task.origin if task.splat_file is None else task.splat_file.origin
     return replace(task, geometry=geometry.move(-origin))
 
@@ -416,9 +340,9 @@ def open_input(
     console: Console,
     check: Callable[[], object],
 ) -> Opened:
-    """Open the photographs, and choose their working size unless it is given.
+    """Open the photographs; with a splat, at its poses and origin and in the size of its training.
 
-    `check` is that of `open_scene`.
+    The size is only chosen if the user gave none. `check` is that of `open_scene`.
     """
     opened = open_scene(photographs.scene, photographs.poses, console, check)
     if splat is None:
@@ -447,38 +371,6 @@ def check_completion_inputs(
         read_splat(work.splat)
 
 
-def read_splat(splat: SplatRequest) -> Gaussians:
-    """Read the Gaussians of a splat."""
-    gaussians = load_splat(splat.path, splat.drop_nonfinite, splat.ignore_properties)
-    if len(gaussians) >= MIN_PROXY_GAUSSIANS:
-        give_large_arrays_own_pages()
-    return gaussians
-
-
-def sort_splat(
-    gaussians: Gaussians, splat: SplatRequest, device: str
-) -> tuple[Gaussians, InputSplatFile]:
-    """Sort a large splat along a Morton curve, in place, and keep the order of its file."""
-    # Gaussians of a file lie in random order, and each tile of an image would read memory all over
-    # (decision 025). Files are written in the order of the given file, which `file_order` leads
-    # back to.
-    splat_file = locate_splat(splat.path, splat.drop_nonfinite)
-    if len(gaussians) < MIN_PROXY_GAUSSIANS:
-        return gaussians, splat_file
-    order = sort_nearby(gaussians)
-    return file_harmonics(gaussians, splat, device), replace(splat_file, file_order=order)
-
-
-def file_harmonics(gaussians: Gaussians, splat: SplatRequest, device: str) -> Gaussians:
-    """Move the harmonics of a large splat to a temporary file.
-
-    They are three quarters of it, and seldom read.
-    """
-    if len(gaussians) < MIN_PROXY_GAUSSIANS or splat.beside is None or device != "cpu":
-        return gaussians
-    return replace(gaussians, sh=move_to_file(gaussians.sh, splat.beside))
-
-
 def read_splat_alone(
     work: WorkRequest,
     source: AloneRequest,
@@ -491,9 +383,10 @@ def read_splat_alone(
     Also returns the config with what a hole of this splat is, and with its padding.
     """
     splat = work.splat
-    assert splat is not None
+    assert splat is not None  # that of an `AloneRequest`
     device = work.models.device
-    # What can be wrong is read before anything that takes time.
+    # What is wrong with the models is told before anything that takes time. They are loaded again
+    # when the cameras are known, of which the oracle needs the photographs.
     load_completer(work.models, work.config, ())
     with show_preparation("reading the scene"):
         gaussians, splat_file = sort_splat(read_splat(splat), splat, device)

@@ -8,7 +8,8 @@ from typing import Any
 
 from rich.console import Console
 
-from gscompleter.apps.completing.preparation import Gone, Prepared, prepare_completion
+from gscompleter.apps.completing.preparation import prepare_completion
+from gscompleter.apps.completing.prepared import Gone, Prepared
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.inputs.removal import (
     check_removal_masks,

@@ -10,7 +10,6 @@ from rich.console import Console
 
 from gscompleter.apps.completing.preparation import (
     Loaded,
-    Prepared,
     check_models,
     collect_cameras,
     compute_view_transform,
@@ -21,6 +20,7 @@ from gscompleter.apps.completing.preparation import (
     read_opened,
     use_predicted_depth,
 )
+from gscompleter.apps.completing.prepared import Prepared
 from gscompleter.apps.inputs.depth_range import apply_splat_range
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.inputs.named_photographs import find_context

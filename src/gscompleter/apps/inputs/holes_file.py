@@ -37,11 +37,14 @@ class HoleRow:
     frame: int | None = None
     """Frame of the photograph that the target is; None for another camera."""
     derived_from: int | None = None
-    """Frame that a planned camera was derived from."""
+    """Frame that a planned camera was derived from; None for another camera, and for a render whose
+    camera was found, since that has another number in the next command."""
     offset: str | None = None
     """Move and turn from that frame, in words."""
     path_frame: int | None = None
     """Frame of the video at which the camera stands here, from 0; None if it never does."""
+    title: str = ""
+    """Name of the target for people (`name_target`)."""
 
 
 @dataclass(frozen=True)

@@ -55,8 +55,9 @@ def open_scene(
     """
     folder = request.folder
     is_folder = os.path.isdir(folder)
-    if holds_splat_alone(folder) if is_folder else has_splat_extension(folder):
-        kind = "folder" if is_folder else "file"
+    is_splat_file = os.path.isfile(folder) and has_splat_extension(folder)
+    if is_splat_file or (is_folder and holds_splat_alone(folder)):
+        kind = "file" if is_splat_file else "folder"
         raise InputError(
             f"{quote_value(folder, 80)} is a {kind} of Gaussians, which goes to --scene; SCENE has "
             "to be the folder of its photographs, with or without cameras, or a video."

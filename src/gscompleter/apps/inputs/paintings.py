@@ -20,6 +20,7 @@ from gscompleter.apps.inputs.holes_file import (
 )
 from gscompleter.apps.inputs.named_photographs import add_photograph
 from gscompleter.apps.inputs.task import Target
+from gscompleter.data.photograph_names import name_target
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.data.scene import load_cameras
 from gscompleter.generators.painted import Painting, fit_mask, fit_painting
@@ -160,7 +161,10 @@ def add_exported_photograph(
             return add_photograph(replace(target, frame=frame), photographs, resolution)
     base = row.derived_from
     if base is not None and base in range(len(photographs)):
-        return replace(target, derived_from=base, offset=row.offset)
+        # Here the name tells it, in which the file is.
+        file = photographs.frame(base).file_name
+        if name_target(None, file, base, row.offset) == row.title:
+            return replace(target, derived_from=base, offset=row.offset)
     return target
 
 
@@ -200,13 +204,7 @@ def find_by_stem(
 
     `exported` is the checksum of that; without it every file counts. Raise InputError for several.
     """
-    found = sorted(
-        path
-        for path in folder.iterdir()
-        if path.stem == Path(name).stem and path.suffix.lower() in endings and path.is_file()
-    )
-    if exported is not None:
-        found = [path for path in found if not is_exported(path, exported)]
+    found = list_by_stem(folder, name, endings, exported)
     if len(found) > 1:
         names = join_names([path.name for path in found], len(endings))
         raise InputError(
@@ -216,9 +214,19 @@ def find_by_stem(
     return found[0] if found else None
 
 
-def is_exported(path: Path, sha256: str) -> bool:
-    """Check whether a file has the bytes that were exported."""
-    return hash_file(path) == sha256
+def list_by_stem(
+    folder: Path, name: str, endings: Sequence[str], exported: str | None = None
+) -> list[Path]:
+    """List the files that are named like `name` with any of the endings, but not the exported one.
+
+    `exported` is that of `find_by_stem`.
+    """
+    found = sorted(
+        path
+        for path in folder.iterdir()
+        if path.stem == Path(name).stem and path.suffix.lower() in endings and path.is_file()
+    )
+    return [path for path in found if exported is None or hash_file(path) != exported]
 
 
 def read_painting(

@@ -1,4 +1,4 @@
-"""The input splat: its file, its frame, and the photographs that check it."""
+"""The input splat: how it is read, its file, its frame, and the photographs that check it."""
 
 from __future__ import annotations
 
@@ -17,18 +17,23 @@ from gscompleter.apps.inputs.selection import (
 )
 from gscompleter.apps.inputs.taken_out import load_taken_out
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened
+from gscompleter.apps.requests.splat import SplatRequest
 from gscompleter.data.local_origin import (
     choose_scene_origin,
     compute_frame_from_photographs,
     shift_to_origin,
 )
 from gscompleter.render.loading import load_renderer
+from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.alignment.estimate import align_splat
 from gscompleter.splats.alignment.similarity import transform_camera, transform_view
 from gscompleter.splats.alignment.trainer_frames import InputSplat
-from gscompleter.splats.formats import detect_splat_format
+from gscompleter.splats.formats import detect_splat_format, load_splat
+from gscompleter.splats.morton import sort_nearby
 from gscompleter.splats.ply import find_finite_rows
 from gscompleter.system.errors import InputError
+from gscompleter.system.files.mapping import move_to_file
+from gscompleter.system.process import give_large_arrays_own_pages
 from gscompleter.types import Camera, Gaussians, merge
 
 MAX_CHECK_VIEWS = 40
@@ -41,6 +46,40 @@ def locate_splat(path: Path, drop_nonfinite: bool) -> InputSplatFile:
     if drop_nonfinite and detect_splat_format(path) == "ply":
         return InputSplatFile(path, find_finite_rows(path))
     return InputSplatFile(path)
+
+
+def read_splat(splat: SplatRequest) -> Gaussians:
+    """Read the Gaussians of a splat, in the order of its file."""
+    gaussians = load_splat(splat.path, splat.drop_nonfinite, splat.ignore_properties)
+    if len(gaussians) >= MIN_PROXY_GAUSSIANS:
+        give_large_arrays_own_pages()
+    return gaussians
+
+
+def sort_splat(
+    gaussians: Gaussians, splat: SplatRequest, device: str
+) -> tuple[Gaussians, InputSplatFile]:
+    """Sort a large splat along a Morton curve, in place, and keep the order of its file.
+
+    Also moves its harmonics to a temporary file (`file_harmonics`).
+    """
+    splat_file = locate_splat(splat.path, splat.drop_nonfinite)
+    # Gaussians of a file lie in random order, and each tile of an image would read memory all over
+    # (decision 025). Files are written in the order of the given file, which `file_order` leads
+    # back to.
+    if len(gaussians) >= MIN_PROXY_GAUSSIANS:
+        splat_file = replace(splat_file, file_order=sort_nearby(gaussians))
+    return file_harmonics(gaussians, splat, device), splat_file
+
+
+def file_harmonics(gaussians: Gaussians, splat: SplatRequest, device: str) -> Gaussians:
+    """Move the harmonics of a large splat to a temporary file; return it with these mapped.
+
+    They are three quarters of it, and seldom read. A GPU holds them in its own memory.
+    """
+    if len(gaussians) < MIN_PROXY_GAUSSIANS or splat.beside is None or device != "cpu":
+        return gaussians
+    return replace(gaussians, sh=move_to_file(gaussians.sh, splat.beside))
 
 
 def place_scene(

@@ -9,7 +9,8 @@ from typing import Any
 from rich.console import Console
 
 from gscompleter.apps.completing.complete import write_done
-from gscompleter.apps.completing.preparation import Prepared, prepare_completion
+from gscompleter.apps.completing.preparation import prepare_completion
+from gscompleter.apps.completing.prepared import Prepared
 from gscompleter.apps.inputs.describing import describe_opening, print_lines
 from gscompleter.apps.inputs.task import Target
 from gscompleter.apps.live.opening import SessionRequest

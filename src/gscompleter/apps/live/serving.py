@@ -10,7 +10,7 @@ from PIL import Image
 from rich.console import Console
 
 from gscompleter.apps.command_line.answers import print_json
-from gscompleter.apps.completing.preparation import Prepared
+from gscompleter.apps.completing.prepared import Prepared
 from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.live.addresses import check_bindable, resolve_host
 from gscompleter.apps.live.difference import PageScene

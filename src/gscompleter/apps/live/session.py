@@ -136,9 +136,11 @@ def apply_step(session: Session, step: SessionStep) -> tuple[Session, str]:
 
 
 def check_step(step: SessionStep) -> None:
-    """Refuse a box or a mask that the action would ignore."""
+    """Refuse a box, its rotation or a mask that the action would ignore."""
     if step.box is not None and step.action != "remove":
         raise InputError(f"Only Remove takes a box, and {step.action} has one; leave it out.")
+    if step.box is None and tuple(step.box_rotation) != UPRIGHT:
+        raise InputError("A step without a box has a rotation of one; leave it out.")
     if step.mask is not None and (step.action == "complete" or step.box is not None):
         raise InputError("A step with a box, or that completes all holes, takes no mask.")
 

@@ -1,9 +1,10 @@
 """Refined cameras of photographs whose given ones contradict the features that they share.
 
 Poses of phones, SLAM and drives are off by a fraction of a pixel or more, which blurs whatever is
-made from several photographs. All photographs are refined together (`refining_process`), those of
-targets too: refining one pair alone moves the scene against the frame of everything else. A bundle
-adjustment leaves the frame of the scene free, so a similarity moves the result into the given one.
+made from several photographs. The photographs are refined together (`refining_process`), those of
+targets too: refining one pair alone moves the scene against the frame of everything else. Of very
+many, `choose_known` takes some far apart, and the others keep their poses. A bundle adjustment
+leaves the frame of the scene free, so a similarity moves the result into the given one.
 """
 
 from __future__ import annotations
@@ -19,14 +20,16 @@ import torch
 from jaxtyping import Float
 
 from gscompleter.data.cameras import Poses
+from gscompleter.data.frame import MASKS
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.sfm.placing import write_known_copies
-from gscompleter.data.sfm.poses import require_pycolmap, run_colmap
+from gscompleter.data.sfm.poses import COPIES_FOLDER, require_pycolmap, run_colmap
 from gscompleter.numerics.geometry import compute_spacing
 from gscompleter.numerics.two_views import ERROR_SIDE, find_near_pairs
 from gscompleter.types import Camera
 
 REFINING_PROCESS = "gscompleter.data.sfm.refining_process"
+"""Module that is run as a process of its own, as COLMAP aborts its process on some errors."""
 MIN_REFINED = 3
 """Fewest photographs that are refined: two cannot hold the frame of the scene."""
 NUM_MATCHED = 8
@@ -34,7 +37,7 @@ NUM_MATCHED = 8
 POSITION_SIGMA = 0.1
 """Standard deviation of a given camera centre, in steps between cameras."""
 MAX_ERROR_SHARE = 0.8
-"""Largest error of refined poses that is accepted, as a share of the error of given ones."""
+"""Refined poses are accepted if their error is below this share of the error of given ones."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +50,7 @@ class PoseRefinement:
     """
 
     photographs: int
-    """Photographs that were refined together."""
+    """Number of photographs that were refined together."""
     given_error: float
     refined_error: float
     moved: float
@@ -68,7 +71,7 @@ class PoseRefinement:
     @property
     def is_accepted(self) -> bool:
         """True if matches that were kept back agree clearly better, and a given splat no worse."""
-        agrees = self.refined_error <= MAX_ERROR_SHARE * self.given_error
+        agrees = self.refined_error < MAX_ERROR_SHARE * self.given_error
         return agrees and not self.is_contradicted_by_splat
 
     def describe(self) -> str:
@@ -94,21 +97,28 @@ class PoseRefinement:
 def refine_poses(photographs: Photographs) -> tuple[Photographs, PoseRefinement | None]:
     """Refine the poses of photographs together; keep all unless matches agree clearly better.
 
-    Returns the photographs in the given frame and scale, and what was done: None if fewer than
-    `MIN_REFINED` photographs can be refined, or if most cameras share their place with another.
+    Returns the photographs in the given frame and scale, and what was done. That is None, and all
+    poses are kept, if fewer than `MIN_REFINED` photographs can be refined, if most cameras share
+    their place with another, or if no match was kept back that could compare the poses.
+
+    Raises:
+        InputError: pycolmap is missing, or COLMAP gave up.
     """
     require_pycolmap()
     with tempfile.TemporaryDirectory() as work:
         home = Path(work)
         copies, _ = write_known_copies(photographs, home)
+        if len(copies) < MIN_REFINED:
+            return photographs, None
+        # Copies are named by the numbers of their photographs.
         numbers = [int(Path(copy.name).stem) for copy in copies]
         cameras = [photographs.camera(number) for number in numbers]
         step = compute_spacing(cameras)
-        if len(copies) < MIN_REFINED or step == 0:
+        if step == 0:
             return photographs, None
         job = {
-            "images": str(home / "images"),
-            "masks": str(home / "masks"),
+            "images": str(home / COPIES_FOLDER),
+            "masks": str(home / MASKS),
             "model": str(home / "model"),
             "copies": [asdict(copy) for copy in copies],
             "pairs": pair_near(cameras),
@@ -118,7 +128,7 @@ def refine_poses(photographs: Photographs) -> tuple[Photographs, PoseRefinement 
 
     given = np.stack([invert_pose_rows(copy.viewmat) for copy in copies])
     found = [row is not None for row in result["viewmats"]]
-    if sum(found) < MIN_REFINED:
+    if sum(found) < MIN_REFINED or result["given_error"] is None:
         return photographs, None
     # Photographs that COLMAP could not refine keep their poses.
     refined = given.copy()
@@ -150,7 +160,7 @@ def has_pycolmap() -> bool:
 
 
 def pair_near(cameras: Sequence[Camera]) -> list[tuple[int, int]]:
-    """Pair each camera with those that are nearest in place and direction."""
+    """Pair each camera with the `NUM_MATCHED` nearest in place and direction; i < j, sorted."""
     centers = torch.stack([camera.center for camera in cameras]).double().numpy()
     forward = torch.stack([camera.forward for camera in cameras]).double().numpy()
     return find_near_pairs(centers, forward, NUM_MATCHED)
@@ -167,6 +177,7 @@ def move_to_given_frame(refined: Poses, given: Poses) -> Poses:
     The rotation is fitted to their rotations, since the centres of a straight drive determine none
     about its own line; scale and shift are fitted to the centres. All are least squares and not the
     medians of `fit_pose_similarity`, as the poses of one bundle adjustment agree with each other.
+    Both are camera-to-world, in the same order; two centres at least have to be apart.
     """
     # Orthogonal Procrustes: the rotation R with the largest sum of trace(givenᵀ R refined).
     covariance = np.einsum("nij,nkj->ik", given[:, :3, :3], refined[:, :3, :3])

@@ -76,10 +76,11 @@ def main() -> None:
     refined = {number: model.images[number].cam_from_world() for number in seen}
     rows = [refined[n].matrix().tolist() if n in refined else None for n in numbers]
     intrinsics = {n: copy.pinhole for n, copy in zip(numbers, job.copies, strict=True)}
-    errors = {}
+    errors: dict[str, float | None] = {}
     for title, poses in (("given_error", given), ("refined_error", {**given, **refined})):
         distances = measure_epipolar_distances(kept_back, keypoints, poses, intrinsics)
-        errors[title] = float(np.median(distances)) if len(distances) else 0.0
+        # Without a match that was kept back, nothing tells which poses agree better.
+        errors[title] = float(np.median(distances)) if len(distances) else None
     print(json.dumps({"viewmats": rows, **errors}))
 
 

@@ -35,8 +35,10 @@ class Similarity:
 def fit_center_similarity(source: Points, destination: Points) -> Similarity:
     """Fit the similarity from `source` to `destination` by least squares.
 
+    The destination is what a model predicts.
+
     Raises:
-        InputError: All points of `source` are equal.
+        InputError: All points of one side are equal, or the model predicts none.
     """
     # Umeyama's closed form: centre both sets, and take the singular values of their covariance.
     x = source.astype(np.float64)
@@ -51,6 +53,13 @@ def fit_center_similarity(source: Points, destination: Points) -> Similarity:
             f"All {len(x)} cameras stand in one place, so the scale is unknown; give photographs "
             "taken from different positions."
         )
+    predicted_spread = (y**2).sum(1).mean()
+    # NaN is not above 0 either.
+    if not 0 < predicted_spread < np.inf:
+        raise InputError(
+            f"The model tells no distances between the {len(y)} cameras, so the scale of its "
+            "depths is unknown; give photographs taken from farther apart."
+        )
     u, values, v = np.linalg.svd(y.T @ x / len(x))
     # The sign keeps the rotation from becoming a reflection.
     signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(v))])
@@ -63,7 +72,8 @@ def fit_robust_similarity(source: Points, destination: Points) -> Similarity:
     """Fit a similarity, with RANSAC from ten points on.
 
     It follows the authors' code to its samples, so that their results are met; the fits of our own
-    (`fit_pose_similarity`, `move_to_given_frame`) also use the rotations of the cameras.
+    (`fit_pose_similarity`, `move_to_given_frame`) also use the rotations of the cameras. Errors as
+    in `fit_center_similarity`.
     """
     every = fit_center_similarity(source, destination)
     if len(source) < MIN_RANSAC_CAMERAS:
@@ -79,10 +89,10 @@ def fit_robust_similarity(source: Points, destination: Points) -> Similarity:
     best = None
     least = (0, np.inf)
     for half in halves:
-        # Cameras in one place determine no scale.
-        if np.ptp(source[half], axis=0).max() == 0:
+        try:
+            fit = fit_center_similarity(source[half], destination[half])
+        except InputError:  # cameras in one place determine no scale
             continue
-        fit = fit_center_similarity(source[half], destination[half])
         error = np.linalg.norm(fit(source) - destination, axis=1)
         inliers = error <= threshold
         count = int(inliers.sum())

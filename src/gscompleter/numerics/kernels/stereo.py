@@ -1,7 +1,10 @@
 """Plane-sweep stereo: matching costs, semi-global aggregation, and consistency checks.
 
 Pixel centres are at +0.5. A 3 x 4 `transform` [A | b] maps pixel (x, y, 1) of one view at inverse
-depth w to the homogeneous pixel A (x, y, 1) + b w of another; its third entry is the depth ratio.
+depth w to the homogeneous pixel A (x, y, 1) + b w of another; its third entry is the z-depth there
+over that in the first view. A plane is one inverse depth, parallel to the image of the reference
+view, and planes are numbered from far to near. Images have three colours in [0, 1] and at least
+2 x 2 pixels. Arrays are float32 unless their dtype is told.
 """
 
 from typing import NamedTuple
@@ -15,9 +18,9 @@ UNSEEN = 255
 """Cost of a plane at which the pixel falls outside the other image."""
 TILE_ROWS = 16
 TILE_COLUMNS = 64
-"""Size of a tile, which is matched at once, within the cache."""
+"""Size of a tile in pixels: what is matched at once stays in the cache."""
 INFEASIBLE = np.int16(16000)
-"""Infeasible cost, half of the largest int16."""
+"""Cost of what cannot be, above all sums of costs. Penalties on top of it do not overflow int16."""
 AGGREGATION_PATHS = 8
 """Number of paths of semi-global aggregation."""
 
@@ -25,7 +28,9 @@ AGGREGATION_PATHS = 8
 class Bands(NamedTuple):
     """The planes that each tile of an image is matched at.
 
-    Costs are ordered by tile, then row, pixel and plane.
+    They are narrow where a half-size sweep has found the likely ones. Costs [n] of all pixels at
+    the planes of their tiles are in one array, ordered by tile, then row, pixel and plane. Tiles at
+    the right and lower border may be incomplete.
     """
 
     low: np.ndarray
@@ -33,16 +38,16 @@ class Bands(NamedTuple):
     high: np.ndarray
     """One past the last plane of each tile [rows, columns] int32."""
     start: np.ndarray
-    """Offset of the costs of each tile, row by row, and the end [tiles + 1] int64."""
+    """Offset of the costs of each tile, row by row, and at last n [tiles + 1] int64."""
 
 
 @njit(inline="always")
 def _get_first_cost(bands, y, x, width):
-    """Return the place of a pixel's first cost: tiles come first, then rows, pixels and planes."""
+    """Return the index of a pixel's first cost, in an image that is `width` pixels wide."""
     row, column = y // TILE_ROWS, x // TILE_COLUMNS
     left = column * TILE_COLUMNS
-    wide = min(TILE_COLUMNS, width - left)
-    within = (y - row * TILE_ROWS) * wide + x - left
+    tile_width = min(TILE_COLUMNS, width - left)
+    within = (y - row * TILE_ROWS) * tile_width + x - left
     planes = bands.high[row, column] - bands.low[row, column]
     return bands.start[row * bands.low.shape[1] + column] + within * planes
 
@@ -56,7 +61,11 @@ def _clip(value, low, high):
 
 @njit(fastmath={"contract"})
 def _sum_boxes(values, sums, column, rows, width, radius):
-    """Sum `values` over (2 radius + 1)^2 windows."""
+    """Sum `values` over windows of (2 radius + 1)^2 pixels into `sums`.
+
+    values [rows + 2 radius, width + 2 radius], sums [rows, width]. column [at least as wide as
+    values] is scratch: running sums of 2 radius + 1 rows.
+    """
     for x in range(width + 2 * radius):
         column[x] = np.float32(0)
     for y in range(2 * radius):
@@ -78,24 +87,31 @@ def _sum_boxes(values, sums, column, rows, width, radius):
 def compute_matching_costs(
     reference, source, transform, inverse_depths, bands, radius, noise, detail
 ):
-    """Compute matching costs 0..254 of the reference pixels at the planes of their tiles.
+    """Compute matching costs [n] uint8, 0 to 254, of the reference pixels at the planes of `bands`.
 
     Normalised cross-correlation of windows over all colours, which ignores exposure, is mixed with
     the difference of the two pixels from their windows' means, which is sharper at edges. Planes
     outside the source cost UNSEEN.
 
-    transform [3, 4]: from reference to source. radius: of the windows, in pixels. noise: standard
-    deviation of image noise; weaker texture does not correlate. detail: share of the second term.
+    reference [h, w, 3] and source [H, W, 3]: images. transform [3, 4]: from reference to source.
+    inverse_depths [d]: those of all planes. radius: of the windows, in pixels. noise: standard
+    deviation of image noise, above 0; weaker texture does not correlate. detail: share of the
+    second term.
     """
     costs = np.empty(bands.start[-1], np.uint8)
-    images = (reference, source, transform, inverse_depths, bands)
-    share(_match_tiles, bands.low.size, *images, radius, noise, detail, costs)
+    given = (reference, source, transform, inverse_depths, bands)
+    share(_match_tiles, bands.low.size, *given, radius, noise, detail, costs)
     return costs
 
 
 @njit(fastmath={"contract"}, error_model="numpy", inline="always")
 def _compare(y, own, own_mean, other, other_mean, other_square, cross, line):
-    """Turn window sums into deviations and products in place; line[0] gets pixel differences."""
+    """Turn the window sums of row y into deviations and products, in place.
+
+    `other_mean` has sums before, and means after. `other_square` and `cross` have sums of squares
+    and products before, and of those of deviations from the means after. line[0] gets the
+    differences of the two pixels from their windows' means, summed over the colours.
+    """
     cols = cross.shape[1]
     radius = (own.shape[2] - cols) // 2
     area = np.float32((2 * radius + 1) ** 2)
@@ -139,6 +155,8 @@ def _match_tiles(
         cross = np.empty((rows, cols), np.float32)
         seen = np.empty((tall, wide), np.bool_)
         column = np.empty(wide, np.float32)
+        # Values of one row at a time: where its pixels are in the source, then differences, then
+        # costs.
         line = np.empty((2, wide), np.float32)
         # The reference window sums are the same at all planes: computed once, with a border of
         # `radius` pixels around the tile.
@@ -161,6 +179,7 @@ def _match_tiles(
                     own_mean[c, y, x] /= area
                     own_square[y, x] -= area * own_mean[c, y, x] * own_mean[c, y, x]
 
+        # Each plane: the source is warped to the tile, its windows are summed and compared.
         first = bands.start[tile]
         for plane in range(count):
             # Warp: A (x, y, 1) + b w, of which the part without x is constant along the row.
@@ -187,7 +206,8 @@ def _match_tiles(
                     line[1, x] = _clip(sy, np.float32(0), np.float32(H - 1))
                 for x in range(wide):
                     sx, sy = line[0, x], line[1, x]
-                    # `_clip` ensures 0..W - 1 and 0..H - 1 for any input.
+                    # `_clip` ensures 0..W - 1 and 0..H - 1 for any input. The last pixel is read
+                    # as the second of a pair, with weight 1.
                     ix = np.uint32(min(np.int32(sx), W - 2))
                     iy = np.uint32(min(np.int32(sy), H - 2))
                     ax, ay = sx - np.float32(ix), sy - np.float32(iy)
@@ -244,8 +264,8 @@ def _match_tiles(
 def prefer_given(costs, bands, given, weight, step):
     """Make planes beside given depths cost more, in place; within half a plane matching decides.
 
-    given [h, w]: plane of each pixel, or less than 0 if unknown. weight: of the matching cost
-    there. step: cost of each further plane.
+    costs [n] uint8, none of them UNSEEN. given [h, w]: plane of each pixel with its fraction, or
+    less than 0 if unknown. weight: of the matching cost there. step: cost of each further plane.
     """
     share(_prefer_given, len(given), costs, bands, given, weight, step)
 
@@ -270,7 +290,13 @@ def _prefer_given(begin, end, costs, bands, given, weight, step):
 
 @njit(fastmath={"contract"}, inline="always")
 def _advance_path(cost, before, lowest, after, total, small, large):
-    """Advance a path by one pixel and return its lowest cost there."""
+    """Advance a path by one pixel and return its lowest cost there.
+
+    cost [planes] uint8: of this pixel. before, after [at least planes + 2] int16: costs of the path
+    at the pixel before and at this one, with a border of one plane on either side. lowest: least of
+    those before. total [planes] int16: sum of all paths, to which this one is added. small, large:
+    penalties of one plane and of a jump.
+    """
     # Hirschmüller's recursion: L(p, d) = C(p, d) + min(L(q, d), L(q, d ± 1) + small,
     # min L(q) + large) - min L(q), with q the pixel before p on the path. Subtracting the lowest
     # cost before bounds L, so that it fits into 16 bits.
@@ -278,7 +304,6 @@ def _advance_path(cost, before, lowest, after, total, small, large):
     ceiling = np.int16(lowest + large)
     best = INFEASIBLE
     for k in range(planes):
-        # `before` has a border of one plane on either side.
         beside = np.int16(min(before[k], before[k + 2]) + small)
         reached = min(beside, min(before[k + 1], ceiling))
         value = np.int16(np.int16(cost[k]) + np.int16(reached - lowest))
@@ -292,7 +317,11 @@ def _advance_path(cost, before, lowest, after, total, small, large):
 
 @njit(inline="always")
 def _align_bands(before, band_before, band, scratch):
-    """Realign the costs of another tile's band to the planes of this one; others are INFEASIBLE."""
+    """Align the costs of a path in another tile to the planes of this one.
+
+    `band_before` and `band` are the first plane and the end of both. Planes that the other tile
+    does not have are INFEASIBLE. Returns `before` itself for the same band, or else `scratch`.
+    """
     if band_before[0] == band[0] and band_before[1] == band[1]:
         return before
     for plane in range(band[0] - 1, band[1] + 1):
@@ -303,12 +332,17 @@ def _align_bands(before, band_before, band, scratch):
 
 @njit(nogil=True, fastmath={"contract"})
 def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, total):
-    """Aggregate four of the eight paths: along the row, and from the row before."""
+    """Aggregate four of the eight paths: along the row, and three from the row before.
+
+    `down` is True for those that lead right and down, and False for their reverse: left and up.
+    `total` [n] int16 is the sum of the four.
+    """
     h, w = large_y.shape[0] + 1, large_x.shape[1] + 1
     widest = 2
     for width in (bands.high - bands.low).flat:
         widest = max(widest, width + 2)
-    # States of the row before and of this one, for the three paths that come from the row before.
+    # Costs of the row before and of this one, which take turns, and the lowest cost of each pixel,
+    # for the three paths that come from the row before; `along` is for the path along the row.
     rows = np.zeros((2, 3, w, widest), np.int16)
     lows = np.zeros((2, 3, w), np.int16)
     along = np.zeros((2, widest), np.int16)
@@ -361,12 +395,13 @@ def _sweep_half(costs, bands, large_x, large_y, large_d, large_u, small, down, t
 
 
 def aggregate_semi_globally(costs, bands, large_x, large_y, large_d, large_u, small):
-    """Aggregate costs along eight paths (Hirschmüller 2008), in the order of `bands`.
+    """Sum costs [n] uint8 along eight paths (Hirschmüller 2008) to totals [n] int16.
 
-    Planes missing in the previous tile are reached by a jump. small: penalty of one plane.
+    Planes missing in the previous tile are reached by a jump. small: penalty of one plane, int16.
     large_x [h, w - 1], large_y [h - 1, w], large_d and large_u [h - 1, w - 1]: penalties of a jump
     between a pixel and its right, lower and lower right neighbour, and along the other diagonal;
-    int16, at most 3000, so that sums do not overflow.
+    int16, at most 1700. A path costs a matching cost and a jump at most, so that the sum of eight
+    stays below INFEASIBLE.
     """
     # Each half has its own sum, so that two threads can work and order does not matter.
     totals = np.zeros((2, len(costs)), np.int16)
@@ -380,8 +415,9 @@ def aggregate_semi_globally(costs, bands, large_x, large_y, large_d, large_u, sm
 def select_planes(totals, bands, h, w):
     """Select the best plane [h, w] of every pixel, with fraction, and its margin over another one.
 
-    Margins are the difference to the best total more than two planes away, per path and so in units
-    of a matching cost.
+    Margins [h, w] are the difference to the best of the `totals` more than two planes away, per
+    path and so in units of a matching cost. In a band without such a plane they are about
+    INFEASIBLE / AGGREGATION_PATHS.
     """
     index = np.empty((h, w), np.float32)
     margin = np.empty((h, w), np.float32)
@@ -422,9 +458,10 @@ def _select_planes(begin, end, totals, bands, index, margin):
 def reproject(inverse, other, b_from_a, a_from_b):
     """Project every pixel of view a to view b and back, by inverse depths.
 
-    inverse, other [h, w]: inverse depths of a and b. b_from_a, a_from_b [3, 4]: the transforms.
-    Returns the distance between each pixel and its image, in pixels, or -1 if it falls outside b,
-    and its z-depth in b relative to b's own; both [h, w].
+    inverse [h, w], other [H, W]: inverse depths of a and b. b_from_a, a_from_b [3, 4]: the
+    transforms. Returns the distance between each pixel and where it comes back to, in pixels, or -1
+    if it falls outside b or behind a camera; and its z-depth in b relative to b's own, 1 where the
+    distance is -1. Both are [h, w].
     """
     error = np.full(inverse.shape, np.float32(-1), np.float32)
     ratio = np.ones(inverse.shape, np.float32)
@@ -475,9 +512,11 @@ def _reproject(begin, end, inverse, other, b_from_a, a_from_b, error, ratio):
 
 
 def fill_background(values, known):
-    """Fill unknown pixels with the second lowest known value in eight directions.
+    """Return `values` [h, w] with unknown pixels filled from known ones in eight directions.
 
-    Low inverse depths are far away, and one ray may miss a thin object in front.
+    Each takes the second lowest of the nearest known values, which are planes or inverse depths.
+    Low ones are far away, and the lowest may be that of the one ray that misses an object in
+    between. With fewer than two known, the pixel keeps its value.
     """
     filled = values.copy()
     share(_fill_background, len(values), values, known, filled)

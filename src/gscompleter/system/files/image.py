@@ -71,9 +71,11 @@ def write_pixels(
 def write_depth(path: Path | str, depth: Float[Tensor, "h w"], unit: float) -> None:
     """Write z-depth as a 16-bit PNG in multiples of `unit`, 0 where it is unknown.
 
-    `read_depth` reads it back. Depths beyond 65535 units are clamped.
+    `read_depth` reads it back. Depths beyond 65535 units are clamped, and so are those below one,
+    which are known.
     """
-    values = (depth.detach().cpu().double() / unit + 0.5).floor().clamp(0, 65535)
+    steps = (depth.detach().cpu().double() / unit + 0.5).floor().clamp(1, 65535)
+    values = steps.where(depth.detach().cpu() > 0, 0.0)
     with replace_file(path) as file:
         Image.fromarray(values.numpy().astype(np.uint16)).save(
             file, format="PNG", compress_level=PNG_COMPRESSION
