@@ -158,7 +158,9 @@ class GSCompleter:
             scene: Gaussians to complete, in the frame and unit of the cameras. If None, Ψ
                 reconstructs the context from `views`.
             check_views: Further photographs of `scene` that must not get worse. With them the scene
-                is trusted only as far as the photographs confirm it.
+                is trusted only as far as the photographs confirm it. Without `scene`, photographs
+                to which a Ψ such as plane-sweep fits the scene besides `views`, from three of these
+                on.
             geometry: A scan or mesh (`load_geometry`), in the frame and unit of the cameras or in
                 one of its own, from which it is moved to where the scene shows the same. It gives
                 depth where photographs show none, as far as it agrees with what they show.

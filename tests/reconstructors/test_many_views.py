@@ -8,7 +8,13 @@ import torch
 
 from gscompleter import View, load_renderer, load_views
 from gscompleter.evaluation.metrics.image import compute_masked_psnr, psnr
-from gscompleter.numerics.geometry import compute_sparse_depth, find_at_depth, look_up, project
+from gscompleter.numerics.geometry import (
+    compute_sparse_depth,
+    find_at_depth,
+    is_inside,
+    look_up,
+    project,
+)
 from gscompleter.numerics.kernels import stereo
 from gscompleter.reconstructors.features.neighbours import (
     NUM_COMPARED,
@@ -22,7 +28,12 @@ from gscompleter.reconstructors.features.stereo_image import (
     make_stereo_images,
 )
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.reconstructors.plane_sweep.fit import STEPS_PER_VIEW, fit_jointly, shuffle_views
+from gscompleter.reconstructors.plane_sweep.fit import (
+    STEPS_PER_CHECK,
+    STEPS_PER_VIEW,
+    fit_jointly,
+    shuffle_views,
+)
 from gscompleter.reconstructors.plane_sweep.free_space import (
     Surfaces,
     find_seen_through,
@@ -35,6 +46,7 @@ from gscompleter.reconstructors.plane_sweep.fusion import (
 )
 from gscompleter.reconstructors.plane_sweep.rig import build_rig, halve_image, halve_transform
 from gscompleter.reconstructors.plane_sweep.sweep import UNSEEN_COST, compute_costs, make_bands
+from gscompleter.types import merge
 from scenes import Room, camera_at, gaussians_of, view_of
 
 SIZE = 64
@@ -351,3 +363,76 @@ def test_a_part_is_built_alone_and_as_in_the_whole(found):
         images = [RENDERER.render(scene.gaussians, view.camera).image for scene in (part, whole)]
         alone, among_all = (compute_masked_psnr(image, view.image, mask) for image in images)
         assert alone > among_all - 0.2
+
+
+def test_check_views_fade_what_is_wrong_in_them_alone():
+    views = row_of_views(4, size=32)
+    given, check = views[:3], views[3]
+    scene = gaussians_of(views[1])
+    # A shard before the check view, in a place that no other photograph shows.
+    shard = scene[:1]
+    place = torch.tensor([[0.76, 0.0, 1.0]])
+    shard = replace(
+        shard,
+        means=place,
+        scales=torch.full_like(shard.scales, 0.03),
+        opacities=torch.full_like(shard.opacities, 0.95),
+        sh=torch.full_like(shard.sh, 1.5),
+    )
+    assert not any(bool(is_inside(*project(place, v.camera), v.camera)) for v in given)
+    assert bool(is_inside(*project(place, check.camera), check.camera))
+    start = merge([scene, shard])
+    gains = torch.ones(3, 3)
+    without = fit_jointly(start, given, gains, RENDERER)
+    fitted = fit_jointly(start, given, gains, RENDERER, [check])
+    assert without.opacities[-1] > 0.9
+    assert fitted.opacities[-1] < 0.7
+    before, after = (
+        psnr(RENDERER.render(s, check.camera).image, check.image) for s in (without, fitted)
+    )
+    assert after > before + 1
+
+
+def test_without_check_views_nothing_changes_and_they_have_turns_of_their_own():
+    views = row_of_views(3, size=32)
+    start = gaussians_of(views[1])
+    alone, empty = (
+        fit_jointly(start, views, torch.ones(3, 3), RENDERER, *rest) for rest in ((), ([],))
+    )
+    assert torch.equal(alone.means, empty.means)
+    turns = torch.bincount(torch.tensor(shuffle_views(4, 2))).tolist()
+    assert turns == [STEPS_PER_VIEW] * 4 + [STEPS_PER_CHECK] * 2
+
+
+def test_a_check_view_is_compared_in_the_exposure_of_the_scene_where_that_covers_it():
+    (view,) = row_of_views(1, size=32)
+    scene = gaussians_of(view)
+    half = scene[project(scene.means, view.camera)[0][:, 0] < 16]
+    bright = replace(view, image=0.5 * view.image)
+    sweep = PlaneSweep()
+    gains = torch.tensor([[1.2, 1.2, 1.2], [0.8, 0.8, 0.8]])
+    prepared = sweep.prepare_check(half, bright, gains)
+    render = RENDERER.render(half, view.camera)
+    is_open = render.alpha < 0.5
+    assert 0.3 < is_open.float().mean() < 0.7
+    assert torch.equal(prepared.image[is_open], render.image[is_open])
+    shown = ~is_open
+    error = (prepared.image - view.image)[shown].abs().mean() / view.image[shown].mean()
+    assert error < 0.05
+    # Of one exposure it is taken as it is.
+    plain = sweep.prepare_check(half, bright, torch.ones(2, 3))
+    assert torch.equal(plain.image[shown], bright.image[shown])
+
+
+def test_check_views_improve_what_lies_between_the_photographs():
+    views = row_of_views(7)
+    given, checks, unused = views[::3], [views[1], views[5]], [views[2], views[4]]
+    alone = PlaneSweep()(given).gaussians
+    made = PlaneSweep().reconstruct_and_fit(given, checks)
+    assert len(made.depths) == len(given)
+
+    def score(gaussians):
+        renders = [RENDERER.render(gaussians, view.camera).image for view in unused]
+        return sum(psnr(r, v.image) for r, v in zip(renders, unused, strict=True)) / len(unused)
+
+    assert score(made.gaussians) > score(alone)

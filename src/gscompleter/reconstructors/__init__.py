@@ -58,6 +58,16 @@ class PartReconstructor(Protocol):
 
 
 @runtime_checkable
+class FittingReconstructor(Protocol):
+    """Interface of a Ψ that can fit its scene to photographs that it makes no Gaussians of."""
+
+    def reconstruct_and_fit(
+        self, views: Sequence[View], check_views: Sequence[View]
+    ) -> Reconstruction:
+        """Reconstruct a scene from `views`, and fit it to `check_views`, too."""
+
+
+@runtime_checkable
 class NearPlaneFinder(Protocol):
     """Interface of a Ψ that tells from its matches that surfaces stand before the near plane."""
 
@@ -97,6 +107,23 @@ def run_part_reconstructor(
     if isinstance(reconstructor, PartReconstructor):
         return accept_reconstruction(reconstructor.reconstruct_part(views, choose_masks), views)
     return accept_reconstruction(reconstructor(views), views)
+
+
+def run_fitting_reconstructor(
+    reconstructor: Reconstructor, views: Sequence[View], check_views: Sequence[View]
+) -> Reconstruction:
+    """Run Ψ on `views`, and let it fit the scene to `check_views`, too; there may be none.
+
+    Raises InputError as `run_reconstructor`, and for check views that Ψ cannot use.
+    """
+    if not check_views:
+        return run_reconstructor(reconstructor, views)
+    if not isinstance(reconstructor, FittingReconstructor):
+        raise InputError(
+            "Check views need a scene that they check, or a reconstructor that fits its own to "
+            "them, such as plane-sweep; leave them out."
+        )
+    return accept_reconstruction(reconstructor.reconstruct_and_fit(views, check_views), views)
 
 
 def accept_reconstruction(reconstruction: Reconstruction, views: Sequence[View]) -> Reconstruction:

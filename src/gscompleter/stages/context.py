@@ -21,7 +21,7 @@ from gscompleter.reconstructors import (
     Reconstructor,
     get_trained_range,
     keeps_given_range,
-    run_reconstructor,
+    run_fitting_reconstructor,
 )
 from gscompleter.reconstructors.depth_predictors import give_prediction
 from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
@@ -43,7 +43,7 @@ class InitialContext:
 
     source: ContextScene
     views: tuple[View, ...]
-    """Context photographs, then check photographs, in the exposure of the context."""
+    """Context photographs, then those that check a given scene, in the exposure of the context."""
     exposure_gains: Float[Tensor, "v 3"] | None = None
     """Exposure gain per channel of each original photograph relative to the context, or None."""
     notes: tuple[str, ...] = ()
@@ -89,7 +89,7 @@ def init_context(
     if not views:
         raise InputError("No context view was given; name at least one frame.")
     if scene is None:
-        return reconstruct_context(reconstructor, views)
+        return reconstruct_context(reconstructor, views, check_views)
 
     photos = [*views, *check_views]
     source = build_proxy(scene.detach(), [*targets, *(view.camera for view in photos)])
@@ -110,14 +110,20 @@ def prepare_single(reconstructor: Reconstructor, views: Sequence[View]) -> list[
     return list(views)
 
 
-def reconstruct_context(reconstructor: Reconstructor, views: Sequence[View]) -> InitialContext:
-    """Reconstruct `G_ctx = Ψ(V_in)` from posed photographs (paper, Eq. 5)."""
+def reconstruct_context(
+    reconstructor: Reconstructor, views: Sequence[View], check_views: Sequence[View] = ()
+) -> InitialContext:
+    """Reconstruct `G_ctx = Ψ(V_in)` from posed photographs (paper, Eq. 5).
+
+    Ψ fits the scene to `check_views`, too, which are no photographs of the context.
+    """
     check_texture(views)
     found = find_scene_range(reconstructor, views)
     for note in found.notes:
         logging.getLogger("gscompleter").warning("gscompleter: %s", note)
     views = set_depth_range(views, found.near, found.far)
-    reconstruction = run_reconstructor(reconstructor, views)
+    checks = set_depth_range(check_views, found.near, found.far)
+    reconstruction = run_fitting_reconstructor(reconstructor, views, checks)
     source = ContextScene.whole(drop_ignored(reconstruction, views))
     # The scene has one exposure, which the photographs have to share from here on.
     gains = reconstruction.exposure_gains

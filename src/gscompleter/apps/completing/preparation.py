@@ -30,7 +30,7 @@ from gscompleter.apps.inputs.memory import check_gpu, check_scene
 from gscompleter.apps.inputs.named_photographs import check_target_files
 from gscompleter.apps.inputs.opening import choose_working_size, open_scene
 from gscompleter.apps.inputs.paintings import read_paintings
-from gscompleter.apps.inputs.reading import read_task
+from gscompleter.apps.inputs.reading import add_fit_views, read_task
 from gscompleter.apps.inputs.refined_poses import read_at_refined_poses, take_over_poses
 from gscompleter.apps.inputs.renders import open_renders
 from gscompleter.apps.inputs.selection import collect_usable_cameras
@@ -55,7 +55,7 @@ from gscompleter.generators import load_generator
 from gscompleter.generators.painted import Painting
 from gscompleter.numerics.given_geometry import GivenGeometry
 from gscompleter.planning.planner import ViewPlanner
-from gscompleter.reconstructors import DepthAware, load_reconstructor
+from gscompleter.reconstructors import DepthAware, FittingReconstructor, load_reconstructor
 from gscompleter.reconstructors.depth_predictors import StoredDepth
 from gscompleter.render.loading import load_renderer
 from gscompleter.splats.alignment.similarity import transform_camera
@@ -193,10 +193,14 @@ def read_opened(
     """
     read = partial(read_inputs, work, photographs, targets)
     # The paper takes poses as they are.
-    follows_paper = work.config.registration_method == "paper"
-    if follows_paper or not photographs.scene.refines_poses:
+    if follows_paper(work) or not photographs.scene.refines_poses:
         return opened, read(opened)
     return read_at_refined_poses(opened, read, console, num_known)
+
+
+def follows_paper(work: WorkRequest) -> bool:
+    """Return True if scenes are made as in the paper."""
+    return work.config.registration_method == "paper"
 
 
 def read_inputs(
@@ -207,6 +211,7 @@ def read_inputs(
 ) -> CompletionTask:
     """Read the context and the targets, and add the input splat; compile the kernels.
 
+    A context that is not named is fitted to further photographs.
     With a splat everything is in its frame from here on, and else in that of the photographs.
     """
     device = work.models.device
@@ -218,6 +223,8 @@ def read_inputs(
             has_splat = splat is not None
             task = read_task(opened, photographs.context, targets.named, device, has_splat)
             task = add_paintings(task, targets, opened)
+            if splat is None and photographs.context is None and not follows_paper(work):
+                task = add_fit_views(task, opened)
         if splat is not None:
             with show_preparation("reading the scene"):
                 task = add_check_views(task, opened)
@@ -266,6 +273,8 @@ def load_models(
     if geometry is not None:
         task = add_geometry(task, geometry)
     reconstructor = completer.reconstructor
+    if work.splat is None and not isinstance(reconstructor, FittingReconstructor):
+        task = replace(task, check_views=None)
 
     # A single photograph has no stereo, so a network predicts its depth; a splat needs neither.
     if work.splat is None:

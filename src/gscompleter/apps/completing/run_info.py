@@ -77,6 +77,7 @@ def describe_run_values(
             "format": opened.format,
             "photographs": opened.num_photographs,
             "used": len(task.views),
+            "fitted": 0 if task.scene is not None else len(task.check_views or ()),
             "splat": splat,
             "renders_from": opened.renders_from,
             "refined_poses": opened.refinement and asdict(opened.refinement),

@@ -38,6 +38,8 @@ def describe_task(
     context = [name_photograph(frame, files.get(frame)) for frame in task.context_frames]
     images = "photographs" if opened.renders_from is None else "renders"
     goal = f"{doing} from {images} {join_names(context, MAX_LISTED_PHOTOGRAPHS)}"
+    if task.scene is None and task.check_views:
+        goal += f", fitted to {len(task.check_views)} more,"
     targets = join_names(
         [opened.name_target(target) for target in task.targets], MAX_LISTED_PHOTOGRAPHS
     )

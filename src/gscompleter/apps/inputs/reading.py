@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 
 from gscompleter.apps.inputs.given_depth import DepthReading, read_with_depth
@@ -12,17 +13,26 @@ from gscompleter.apps.inputs.named_photographs import (
     find_context,
     read_targets,
 )
-from gscompleter.apps.inputs.selection import choose_context, collect_usable_cameras
+from gscompleter.apps.inputs.selection import (
+    choose_context,
+    collect_usable_cameras,
+    select_closest,
+)
 from gscompleter.apps.inputs.task import CompletionTask, Opened, Target
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.points import add_depth_range
+from gscompleter.numerics.geometry import select_spread_cameras
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.memory import check_memory
 from gscompleter.types import Camera
 
 MIN_IMAGE_SIZE = 16
 """Smallest side of an image, in pixels."""
+MAX_FIT_VIEWS = 8
+"""Most photographs to which a scene is fitted besides its context."""
+MIN_FITTED_CONTEXT = 3
+"""Fewest photographs of a context that is fitted jointly."""
 
 
 def read_task(
@@ -48,6 +58,34 @@ def read_task(
     cameras += [target.camera for target in targets]
     check_memory(max(camera.width * camera.height for camera in cameras), len(cameras))
     return make_task(opened, frames, targets, device, has_splat)
+
+
+def add_fit_views(task: CompletionTask, opened: Opened) -> CompletionTask:
+    """Add photographs to which the reconstructed scene is fitted besides the context.
+
+    They are nearest to the targets, or spread over the scene, and as many photographs stay unused
+    and score the result. What looks right from the context alone, such as shards before a wall, is
+    wrong in others (decision 139).
+    """
+    photographs = opened.photographs
+    resolution = opened.request.resolution
+    known = task.used_frames | set(opened.held_out)
+    others = [frame for frame in range(len(photographs)) if frame not in known]
+    cameras = collect_usable_cameras(photographs, others, resolution)
+    count = min(MAX_FIT_VIEWS, len(cameras) // 2)
+    if len(task.views) < MIN_FITTED_CONTEXT or count == 0:
+        return task
+    if task.targets:
+        chosen = select_closest(task.goals, cameras, count)
+    else:
+        frames = list(cameras)
+        chosen = [frames[index] for index in select_spread_cameras(list(cameras.values()), count)]
+    views = []
+    for frame in chosen:
+        # One that a mask hides tells nothing, and others do.
+        with suppress(InputError):
+            views += photographs.views([frame], resolution)
+    return replace(task, check_views=[view.to(task.device) for view in views])
 
 
 def read_photographs(

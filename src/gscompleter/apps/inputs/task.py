@@ -136,7 +136,8 @@ class CompletionTask:
     method: str = "given"
     frame_description: str = "the frame of the photographs"
     check_views: Sequence[View] | None = None
-    """Check views of the input splat, at low resolution."""
+    """Photographs that check the input splat, at low resolution; without one, those to which the
+    reconstructed scene is fitted besides the context."""
     depth_notes: tuple[str, ...] = ()
     """Sentences about the unit of the given depth."""
     predicted_depths: Mapping[int, Float[Tensor, "h w"]] = field(default_factory=dict)
@@ -190,5 +191,7 @@ class CompletionTask:
 
     @property
     def used_frames(self) -> set[int | None]:
-        """Frame numbers of the context and of the targets."""
-        return {*self.context_frames, *(target.frame for target in self.targets)}
+        """Frame numbers of the context, of the targets, and of what a context is fitted to."""
+        fitted = () if self.scene is not None else self.check_views or ()
+        frames = (*(target.frame for target in self.targets), *(view.frame for view in fitted))
+        return {*self.context_frames, *frames}

@@ -138,7 +138,8 @@ def list_notes(summary: CompletionSummary) -> Iterator[Note]:
     if summary.placed_geometry is not None:
         yield Note("depth", summary.placed_geometry.describe())
     if scene.renders_from is None and summary.settings.get("context") is None:
-        text = f"{scene.used} of {scene.photographs} photographs were chosen as the context."
+        text = f"{scene.used} of {scene.photographs} photographs were chosen as the context"
+        text += f", and the scene was fitted to {scene.fitted} more." if scene.fitted else "."
         yield Note("context", text)
     if summary.settings.get("uses_target_photographs"):
         yield Note("generator", ORACLE_NOTE, is_warning=True)

@@ -244,6 +244,8 @@ class OpenedSceneRow:
     """Number of photographs in the scene."""
     used: int
     """Number of photographs of the context."""
+    fitted: int = 0
+    """Number of further photographs to which a reconstructed scene was fitted."""
     splat: str | None = None
     """Path of the input splat; None if the scene was reconstructed."""
     context: str | None = None

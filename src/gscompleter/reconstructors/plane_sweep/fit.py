@@ -32,6 +32,8 @@ REMOVAL_PENALTY = 0.01
 
 STEPS_PER_VIEW = 7
 """Number of steps of the joint fit per photograph."""
+STEPS_PER_CHECK = 3
+"""Number of its steps per check view, between those of the photographs."""
 FIT_RATES = {"moved": 0.2, "quats": 0.0375, "grown": 0.1875, "logits": 0.75, "sh": 0.1125}
 """Initial Adam step sizes; positions are in units of the Gaussian's size."""
 FINAL_RATE = 0.5
@@ -73,15 +75,19 @@ def fit_jointly(
     views: Sequence[View],
     gains: Float[Tensor, "views 3"],
     renderer: Renderer,
+    check_views: Sequence[View] = (),
 ) -> Gaussians:
     """Minimize the squared image error, with renders scaled by each view's exposure gain.
 
     The images are linear in the colours, so that these are then fitted alone, by direction, to all
-    views at once and without gradients.
+    views at once and without gradients. `check_views`, in the exposure of the scene, are
+    photographs that no Gaussian comes from: what looks right to `views` alone is wrong there.
     """
+    order = shuffle_views(len(views), len(check_views))
+    views = [*views, *check_views]
+    gains = torch.cat([gains, torch.ones(len(check_views), 3)])
     unknown = init_parameters(gaussians)
     optimizer = Adam([(unknown[name], rate) for name, rate in FIT_RATES.items()], BETAS)
-    order = shuffle_views(len(views))
     for step, number in enumerate(order):
         view = views[number]
         fitted = apply_parameters(gaussians, unknown)
@@ -125,8 +131,14 @@ def apply_parameters(gaussians: Gaussians, unknown: dict[str, Tensor]) -> Gaussi
     )
 
 
-def shuffle_views(count: int) -> list[int]:
-    """Create a random order in which each of `count` views occurs `STEPS_PER_VIEW` times."""
+def shuffle_views(count: int, num_checks: int = 0) -> list[int]:
+    """Create a random order of `count` views, `STEPS_PER_VIEW` times each, and of check views.
+
+    These are numbered after the views, and occur `STEPS_PER_CHECK` times each, in the first rounds.
+    """
     generator = torch.Generator().manual_seed(0)
-    rounds = [torch.randperm(count, generator=generator) for _ in range(STEPS_PER_VIEW)]
+    rounds = []
+    for number in range(STEPS_PER_VIEW):
+        size = count + num_checks if number < STEPS_PER_CHECK else count
+        rounds.append(torch.randperm(size, generator=generator))
     return torch.cat(rounds).tolist()

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from gscompleter.config.settings import COVERED
 from gscompleter.numerics.geometry import (
     compute_sparse_depth,
     find_at_depth,
@@ -25,6 +26,7 @@ from gscompleter.reconstructors.plane_sweep.fusion import (
     estimate_gains,
     find_finest_pixels,
     find_free_pixels,
+    measure_ratio,
 )
 from gscompleter.reconstructors.plane_sweep.rig import Transforms
 from gscompleter.reconstructors.plane_sweep.sweep import Mask
@@ -73,6 +75,7 @@ class Splatter:
         layers: Sequence[DepthLayer],
         transforms: Transforms,
         masks: Sequence[Bool[Tensor, "_ _"]] | None = None,
+        check_views: Sequence[View] = (),
     ) -> Reconstruction:
         """Build the Gaussians of `views` and fit them to the photographs.
 
@@ -81,7 +84,8 @@ class Splatter:
         each other (decision 031). Clearly different exposures are normalized to their mean.
         `depths` are in scene units. `layers` hold the inverse depths, with the widest baseline as
         unit of length, and `transforms` relate the views of these layers. With `masks`, only what
-        any view shows in its mask is built and fitted.
+        any view shows in its mask is built and fitted. Of three views or more, the scene is fitted
+        to `check_views`, too, where it covers them.
         """
         gains = torch.from_numpy(estimate_gains(layers, transforms)).float()
         device = views[0].image.device
@@ -109,7 +113,8 @@ class Splatter:
             self.replace_ignored(scene, view, gain)
             for view, gain in zip(on_cpu, gains, strict=True)
         ]
-        fitted = self.fit_gaussians(scene, photographs, gains)
+        checks = [self.prepare_check(scene, view.to("cpu"), gains) for view in check_views]
+        fitted = self.fit_gaussians(scene, photographs, gains, checks)
         fitted = restore_sky_colors(scene, fitted, on_cpu[0].camera)
 
         # View and pixel of each Gaussian, in the order of the scene.
@@ -215,9 +220,28 @@ class Splatter:
         image = self.renderer.render(scene, view.camera).image * gain
         return replace(view, image=torch.where(view.ignore_mask[..., None], image, view.image))
 
+    def prepare_check(self, scene: Gaussians, view: View, gains: Float[Tensor, "views 3"]) -> View:
+        """Bring a check view to the exposure of the scene, and fit nothing where that is open."""
+        render = self.renderer.render(scene, view.camera)
+        is_open = (render.alpha < COVERED) | ~view.valid_mask
+        # Exposures that are all alike, or hardly differ, are not told apart (decision 018).
+        if (gains != 1).any() and not is_open.all():
+            shown = ~is_open
+            log, _ = measure_ratio(
+                view.image[shown].numpy(), render.image[shown].numpy(), is_open.numel()
+            )
+            view = view.normalize_exposure(torch.from_numpy(log).exp().to(view.image))
+        return self.replace_ignored(
+            scene, replace(view, ignore_mask=is_open), torch.ones_like(gains[0])
+        )
+
     @use_one_torch_thread()
     def fit_gaussians(
-        self, gaussians: Gaussians, views: Sequence[View], gains: Float[Tensor, "views 3"]
+        self,
+        gaussians: Gaussians,
+        views: Sequence[View],
+        gains: Float[Tensor, "views 3"],
+        check_views: Sequence[View] = (),
     ) -> Gaussians:
         """Fit the Gaussians to views whose colours are `gains` times those of the scene.
 
@@ -230,7 +254,7 @@ class Splatter:
         if len(views) == 2:
             faded, depths = fit_opacities(gaussians, views, self.renderer)
             return fit_directional_colors(faded, views, depths, self.renderer)
-        return fit_jointly(gaussians, views, gains, self.renderer)
+        return fit_jointly(gaussians, views, gains, self.renderer, check_views)
 
     def splat(self, view: View, depth: DepthMap) -> Gaussians:
         """Create one disc per pixel of `view`."""

@@ -28,55 +28,63 @@ from gscompleter.reconstructors.plane_sweep.sweep import (
     compute_plane_index,
 )
 
-MIN_VIEWS = 3
+MIN_GROUND_VIEWS = 3
 """Fewest photographs. Two that are good for stereo show the near ground with parallax."""
+MIN_FORWARD = 0.8
+"""Smallest cosine between viewing axes and the ways to the nearest cameras. Cameras that move to a
+side see the ground with parallax, and may look at a table."""
 
-NUM_HYPOTHESES = 500
+NUM_GROUNDS = 500
 """Number of planes that are tried, each through three measured points."""
 POINTS_PER_VIEW = 1500
 """Most measured points of a photograph that propose planes and count for them."""
-MIN_CONFIDENCE = 0.2
+MIN_GROUND_CONFIDENCE = 0.2
 """Confidence above which a measured depth is such a point."""
-MIN_POINTS = 100
+MIN_GROUND_POINTS = 100
 """Fewest points below the horizon."""
 MIN_UPWARDS = 0.8
-"""Smallest cosine between the normal of the ground and the mean upward axis of the cameras."""
+"""Smallest cosine between the normal of the ground and the mean upward axis of the cameras, which
+may look down."""
+MAX_SIDEWAYS = 0.2
+"""Largest sine of the angle by which it leans to a side, since people keep horizons level."""
+MIN_GROUND_SHARE = 0.1
+"""Smallest share of the points that lies on the ground."""
 MAX_HEIGHT_RATIO = 1.4
 """Largest height of a camera above the ground, relative to the smallest one."""
-MAX_MISS = 0.03
+MAX_GROUND_MISS = 0.03
 """Largest relative error of inverse depth on the ground, beside one plane of the sweep."""
-REFITS = 5
+GROUND_REFITS = 5
 """Number of least-squares fits to the inliers, each to those of the last one."""
 
 MIN_GROUND_INDEX = 4.0
 """Smallest inverse depth of ground that is judged, in planes of the sweep. Nearer to the horizon
 all that is far lies on it."""
-REACH = 5.0
+GROUND_REACH = 5.0
 """Distance from the place below a camera up to which there is ground, in heights of the cameras."""
 BEYOND = 0.85
 """Inverse depth relative to that of the ground below which a surface is clearly beyond it."""
 BEYOND_PLANES = 1.5
 """Distance of such a surface from the ground, in planes of the sweep."""
-MAX_DIFFERENCE = 0.06
+MAX_GROUND_DIFFERENCE = 0.06
 """Largest colour difference from another photograph at the depth of the ground."""
-WINDOW = 9
+GROUND_WINDOW = 9
 """Side of the window over which differences are averaged, in pixels."""
-MIN_AGREEING = 0.6
+MIN_AGREEING_GROUND = 0.6
 """Smallest share of the ground in view of others that has to agree with them, for what no other
 photograph shows to be held, too."""
-MIN_COMPARED = 0.02
+MIN_COMPARED_GROUND = 0.02
 """Smallest share of the photograph that is compared for that."""
 
-Rows = Float[np.ndarray, "n 3"]
+Places = Float[np.ndarray, "n 3"]
 
 
 @dataclass(frozen=True)
 class MeasuredPoints:
     """Points that were measured below the horizon, by the rays of their pixels."""
 
-    rays: Rows
+    rays: Places
     """Rays with z-depth 1, in world axes."""
-    centers: Rows
+    centers: Places
     """Centre of the camera of each ray."""
     inverse: Float[np.ndarray, "n"]
     """Measured inverse depth."""
@@ -84,7 +92,7 @@ class MeasuredPoints:
     """Distance of two planes of the sweep that measured it, in inverse depth."""
 
     @cached_property
-    def places(self) -> Rows:
+    def places(self) -> Places:
         """Positions in world axes."""
         return self.centers + self.rays / self.inverse[:, None]
 
@@ -96,7 +104,7 @@ class Ground:
     normal: Float[np.ndarray, "3"]
     offset: float
 
-    def measure_heights(self, centers: Rows) -> Float[np.ndarray, "n"]:
+    def measure_heights(self, centers: Places) -> Float[np.ndarray, "n"]:
         """Measure how high points are above the ground."""
         return centers @ self.normal - self.offset
 
@@ -104,7 +112,7 @@ class Ground:
         """Find the points on the ground, apart from those near the horizon."""
         inverse = -(points.rays @ self.normal) / self.measure_heights(points.centers)
         is_judged = inverse > MIN_GROUND_INDEX * points.step
-        is_near = np.abs(points.inverse - inverse) < points.step + MAX_MISS * inverse
+        is_near = np.abs(points.inverse - inverse) < points.step + MAX_GROUND_MISS * inverse
         found: Bool[np.ndarray, "n"] = is_judged & is_near
         return found
 
@@ -117,13 +125,27 @@ def hold_to_ground(
     What is put there weighs as little as the background of occluded pixels. `measured` are at full
     size, and stay as they are without a ground that the cameras moved over.
     """
-    if len(rig.images) < MIN_VIEWS:
+    if len(rig.images) < MIN_GROUND_VIEWS or not moves_forward(rig.images):
         return list(measured)
     ground = find_ground(rig.images, measured, skies)
     if ground is None:
         return list(measured)
     hold = partial(hold_view, rig, ground)
     return map_in_parallel(hold, range(len(measured)), measured, skies)
+
+
+def moves_forward(images: Sequence[StereoImage]) -> bool:
+    """Check whether most cameras look along the way to the nearest other one, or back along it."""
+    centers = np.stack([image.center for image in images])
+    cosines = []
+    for image in images:
+        ways = centers - image.center
+        distances = np.linalg.norm(ways, axis=1)
+        # Cameras in one place are no way.
+        nearest = np.where(distances > 0, distances, np.inf).argmin()
+        way = ways[nearest] / max(float(distances[nearest]), 1e-9)
+        cosines.append(abs(float(way @ image.rotation[:, 2])))
+    return float(np.median(cosines)) > MIN_FORWARD
 
 
 def find_ground(
@@ -134,28 +156,39 @@ def find_ground(
     None if no plane has points and all cameras at about one height above it.
     """
     centers = np.stack([image.center for image in images])
-    upwards = -np.mean([image.rotation[:, 1] for image in images], axis=0)
-    upwards /= max(float(np.linalg.norm(upwards)), 1e-9)
+    # Rotations are from camera to world axes, and y points down in a camera.
+    sideways, downwards, _ = np.mean([image.rotation for image in images], axis=0).T
+    upwards = -downwards / max(float(np.linalg.norm(downwards)), 1e-9)
     generator = np.random.default_rng(0)
     points = sample_points(images, measured, skies, upwards, generator)
-    if len(points.inverse) < MIN_POINTS:
+    if len(points.inverse) < MIN_GROUND_POINTS:
         return None
 
+    def is_possible(ground: Ground) -> bool:
+        """Check that a plane is level, and below all cameras at about the same height."""
+        heights = ground.measure_heights(centers)
+        lowest = float(heights.min())
+        return (
+            float(ground.normal @ upwards) > MIN_UPWARDS
+            and abs(float(ground.normal @ sideways)) < MAX_SIDEWAYS
+            and 0 < float(heights.max()) < MAX_HEIGHT_RATIO * lowest
+        )
+
     best = None
-    most = 0
-    for _ in range(NUM_HYPOTHESES):
+    most = MIN_GROUND_SHARE * len(points.inverse)
+    for _ in range(NUM_GROUNDS):
         corners = points.places[generator.choice(len(points.inverse), 3, replace=False)]
         normal = np.cross(corners[1] - corners[0], corners[2] - corners[0])
         ground = make_ground(normal, corners[0], upwards)
-        if lies_below(ground, centers, upwards):
-            count = int(ground.find_inliers(points).sum())
+        if is_possible(ground):
+            count = float(ground.find_inliers(points).sum())
             if count > most:
                 best, most = ground, count
-    for _ in range(REFITS):
+    for _ in range(GROUND_REFITS):
         if best is None:
             break
         refitted = refit_ground(best, points, upwards)
-        if not lies_below(refitted, centers, upwards):
+        if not is_possible(refitted):
             break
         best = refitted
     return best
@@ -172,7 +205,7 @@ def sample_points(
     parts = []
     for image, measurement, sky in zip(images, measured, skies, strict=True):
         rays = compute_rays(image)
-        candidates = (measurement.confidence > MIN_CONFIDENCE) & ~sky & (rays @ upwards < 0)
+        candidates = (measurement.confidence > MIN_GROUND_CONFIDENCE) & ~sky & (rays @ upwards < 0)
         pixels = generator.permutation(np.flatnonzero(candidates))[:POINTS_PER_VIEW]
         step = float(measurement.planes[1] - measurement.planes[0])
         parts.append(
@@ -202,14 +235,6 @@ def make_ground(
     length = max(float(np.linalg.norm(normal)), 1e-30)
     unit = normal / (length if normal @ upwards > 0 else -length)
     return Ground(unit, float(unit @ place))
-
-
-def lies_below(ground: Ground, centers: Rows, upwards: Float[np.ndarray, "3"]) -> bool:
-    """Check whether a plane is level, and below all cameras at about the same height."""
-    heights = ground.measure_heights(centers)
-    lowest = float(heights.min())
-    is_level = float(ground.normal @ upwards) > MIN_UPWARDS
-    return is_level and lowest > 0 and float(heights.max()) < MAX_HEIGHT_RATIO * lowest
 
 
 def refit_ground(ground: Ground, points: MeasuredPoints, upwards: Float[np.ndarray, "3"]) -> Ground:
@@ -244,14 +269,14 @@ def hold_view(
     hits = image.center + rays / np.maximum(inverse, step)[..., None]
     feet = centers - heights[:, None] * ground.normal
     distances = [np.linalg.norm(hits - foot, axis=-1) for foot in feet]
-    is_ground &= np.min(distances, axis=0) < REACH * float(np.median(heights))
+    is_ground &= np.min(distances, axis=0) < GROUND_REACH * float(np.median(heights))
 
     difference = measure_difference(rig, number, inverse)
     is_compared = is_ground & np.isfinite(difference)
-    agrees = is_ground & (difference < MAX_DIFFERENCE)
+    agrees = is_ground & (difference < MAX_GROUND_DIFFERENCE)
     # Where no other photograph looks, the ground goes on if the rest of it proved right.
-    is_right = agrees.sum() >= MIN_AGREEING * is_compared.sum()
-    if is_right and is_compared.mean() >= MIN_COMPARED:
+    is_right = agrees.sum() >= MIN_AGREEING_GROUND * is_compared.sum()
+    if is_right and is_compared.mean() >= MIN_COMPARED_GROUND:
         agrees |= is_ground & ~is_compared
 
     is_beyond = (measured.inverse < BEYOND * inverse) & (measured.index < index - BEYOND_PLANES)
@@ -275,7 +300,7 @@ def measure_difference(rig: Rig, number: int, inverse: Map) -> Float32[np.ndarra
     for other, image in enumerate(rig.images):
         if other != number:
             seen, is_inside = sample_at(image.image, inverse, rig.transforms[number, other])
-            difference = cv2.blur(np.abs(seen - own).mean(axis=-1), (WINDOW, WINDOW))
+            difference = cv2.blur(np.abs(seen - own).mean(axis=-1), (GROUND_WINDOW, GROUND_WINDOW))
             least = np.where(is_inside, np.minimum(least, difference), least)
     return least
 
@@ -293,4 +318,6 @@ def sample_at(
     u = np.where(in_front, u / np.where(in_front, z, 1) - np.float32(0.5), np.float32(-1))
     v = np.where(in_front, v / np.where(in_front, z, 1) - np.float32(0.5), np.float32(-1))
     is_inside = (u >= 0) & (v >= 0) & (u <= image.shape[1] - 1) & (v <= image.shape[0] - 1)
-    return cv2.remap(image, u, v, cv2.INTER_LINEAR), is_inside
+    # Beside the image its border goes on, so that it blurs into no foreign colour.
+    sampled = cv2.remap(image, u, v, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return sampled, is_inside

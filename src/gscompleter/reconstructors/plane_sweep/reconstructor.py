@@ -75,16 +75,30 @@ class PlaneSweep(Splatter):
     @run_in_plain_torch
     def __call__(self, views: Sequence[View]) -> Reconstruction:
         """Reconstruct the scene and the depth of every pixel."""
-        return self.reconstruct_part(views, None)
+        return self.reconstruct(views)
 
     @run_in_plain_torch
-    def reconstruct_part(
-        self, views: Sequence[View], choose_masks: ChooseMasks | None
-    ) -> Reconstruction:
-        """Reconstruct the depth of every pixel, and what any view shows in its mask; None for all.
+    def reconstruct_part(self, views: Sequence[View], choose_masks: ChooseMasks) -> Reconstruction:
+        """Reconstruct the depth of every pixel, and what any view shows in its mask.
 
         Half of the time is that of the fit to the photographs, which grows with what is fitted.
         """
+        return self.reconstruct(views, choose_masks)
+
+    @run_in_plain_torch
+    def reconstruct_and_fit(
+        self, views: Sequence[View], check_views: Sequence[View]
+    ) -> Reconstruction:
+        """Reconstruct the scene of `views`, from three of them on fitted to `check_views`, too."""
+        return self.reconstruct(views, None, check_views)
+
+    def reconstruct(
+        self,
+        views: Sequence[View],
+        choose_masks: ChooseMasks | None = None,
+        check_views: Sequence[View] = (),
+    ) -> Reconstruction:
+        """Reconstruct everything, or what any view shows in its mask, and fit it to all views."""
         check_given_views(views)
         views = set_depth_range(views, *get_depth_range(views))
         rig = build_rig(views)
@@ -105,9 +119,9 @@ class PlaneSweep(Splatter):
             kinds = [by_stereo] if by_prediction is None else [by_stereo, by_prediction]
             chosen = [choose_masks(make_depth_maps(kind, rig.unit, views)) for kind in kinds]
             masks = [torch.stack(of_view).any(dim=0) for of_view in zip(*chosen, strict=True)]
-        scene = self.build(rig, views, by_stereo, masks)
+        scene = self.build(rig, views, by_stereo, masks, check_views)
         if by_prediction is not None:
-            supported = self.build(rig, views, by_prediction, masks)
+            supported = self.build(rig, views, by_prediction, masks, check_views)
             # Surfaces that are right do not hide what another photograph shows.
             judged = views if masks is None else ignore_outside(views, masks)
             losses = self.measure_losses(judged, scene, supported)
@@ -209,10 +223,11 @@ class PlaneSweep(Splatter):
         views: Sequence[View],
         layers: Sequence[DepthLayer],
         masks: Sequence[Bool[Tensor, "_ _"]] | None,
+        check_views: Sequence[View],
     ) -> Reconstruction:
         """Build the Gaussians of completed depths, and fit them to the photographs."""
         depths = make_depth_maps(layers, rig.unit, views)
-        return self.build_scene(views, depths, layers, rig.transforms, masks)
+        return self.build_scene(views, depths, layers, rig.transforms, masks, check_views)
 
     def measure_losses(
         self, views: Sequence[View], before: Reconstruction, after: Reconstruction

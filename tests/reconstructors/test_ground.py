@@ -1,0 +1,186 @@
+"""The ground below the cameras of a drive, where stereo measures nothing or infinity."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from gscompleter.reconstructors.features.neighbours import Neighbours
+from gscompleter.reconstructors.features.stereo_image import (
+    StereoImage,
+    compute_source_from_reference,
+)
+from gscompleter.reconstructors.plane_sweep.ground import (
+    BACKGROUND_WEIGHT,
+    find_ground,
+    hold_to_ground,
+    measure_difference,
+    moves_forward,
+)
+from gscompleter.reconstructors.plane_sweep.rig import Rig
+from gscompleter.reconstructors.plane_sweep.sweep import Measurement, compute_plane_index
+
+SIZE = 96
+HEIGHT = 1.5
+"""Height of the cameras above the road, in widest baselines, as the other lengths."""
+PLANES = np.linspace(0.002, 0.5, 128, dtype=np.float32)
+NEAR_ROAD = 70
+"""First row of the near road, which stereo takes for something far away."""
+
+
+def paint_road(x: np.ndarray, z: np.ndarray) -> np.ndarray:
+    """Paint even asphalt, with bright and dark stretches along the road."""
+    gray = 0.4 + 0.02 * np.sin(2 * x) + 0.1 * np.sin(0.7 * z)
+    return np.repeat(gray[..., None], 3, axis=-1)
+
+
+def see_road(z: float, height: float = HEIGHT) -> tuple[StereoImage, np.ndarray]:
+    """Photograph a road forward from (0, 0, z); also return its inverse depth, 0 in the sky."""
+    K = np.array([[SIZE, 0, SIZE / 2], [0, SIZE, SIZE / 2], [0, 0, 1.0]])
+    x, y = np.meshgrid(np.arange(SIZE) + 0.5, np.arange(SIZE) + 0.5)
+    # y points down, so that rows below the middle see the road.
+    inverse = np.maximum((y - SIZE / 2) / SIZE / height, 0)
+    depth = 1 / np.maximum(inverse, 1e-3)
+    road = paint_road((x - SIZE / 2) / SIZE * depth, z + depth)
+    image = np.where(inverse[..., None] > 0, road, 0.9).astype(np.float32)
+    center = np.array([0.0, HEIGHT - height, z])
+    given = np.zeros((SIZE, SIZE), np.float32)
+    return StereoImage(image, K, np.eye(3), center, given), inverse.astype(np.float32)
+
+
+def make_rig(images: list[StereoImage]) -> Rig:
+    """Relate images by their exact cameras."""
+    pairs = [(i, j) for i in range(len(images)) for j in range(len(images)) if i != j]
+    transforms = {(i, j): compute_source_from_reference(images[i], images[j]) for i, j in pairs}
+    return Rig(images, 1.0, Neighbours(((),) * len(images), {}), transforms)
+
+
+def measure_road(inverse: np.ndarray) -> Measurement:
+    """Measure the far road, nothing in every second row of the near one, and infinity between."""
+    index = compute_plane_index(PLANES, inverse)
+    confidence = (inverse > 0).astype(np.float32)
+    near = np.arange(SIZE)[:, None] >= NEAR_ROAD
+    index = np.where(near, np.float32(1), index)
+    confidence[NEAR_ROAD::2] = 0
+    return Measurement(PLANES, index, confidence, confidence)
+
+
+@pytest.fixture
+def drive():
+    """Three photographs of a drive, what is measured in them, and the true inverse depths."""
+    seen = [see_road(z) for z in (0.0, 0.5, 1.0)]
+    images = [image for image, _ in seen]
+    inverses = [inverse for _, inverse in seen]
+    return make_rig(images), [measure_road(inverse) for inverse in inverses], inverses
+
+
+def skies_of(inverses: list[np.ndarray]) -> list[np.ndarray]:
+    return [inverse == 0 for inverse in inverses]
+
+
+def test_the_ground_is_found_below_the_cameras_though_a_third_is_measured_wrong(drive):
+    rig, measured, inverses = drive
+    ground = find_ground(rig.images, measured, skies_of(inverses))
+    assert ground is not None
+    heights = ground.measure_heights(np.stack([image.center for image in rig.images]))
+    np.testing.assert_allclose(heights, HEIGHT, rtol=0.01)
+    # y points down.
+    np.testing.assert_allclose(ground.normal, [0, -1, 0], atol=0.01)
+
+
+def test_the_near_road_lies_on_the_ground(drive):
+    rig, measured, inverses = drive
+    held = hold_to_ground(rig, measured, skies_of(inverses))
+    for before, after, inverse in zip(measured, held, inverses, strict=True):
+        near = np.zeros((SIZE, SIZE), bool)
+        near[NEAR_ROAD:] = True
+        assert (after.weight[near] == BACKGROUND_WEIGHT).all()
+        assert (after.confidence[near] == 0).all()
+        np.testing.assert_allclose(after.inverse[near], inverse[near], rtol=0.02)
+        np.testing.assert_array_equal(after.index[~near], before.index[~near])
+        np.testing.assert_array_equal(after.weight[~near], before.weight[~near])
+
+
+def test_what_stands_on_the_road_stays(drive):
+    rig, measured, inverses = drive
+    block = np.s_[75:85, 30:60]
+    before = measured[1]
+    index, weight = before.index.copy(), before.weight.copy()
+    index[block] = compute_plane_index(PLANES, 1.2 * inverses[1][block])
+    weight[block] = 1
+    measured[1] = replace(before, index=index, weight=weight, confidence=weight)
+    held = hold_to_ground(rig, measured, skies_of(inverses))[1]
+    np.testing.assert_array_equal(held.index[block], index[block])
+    np.testing.assert_array_equal(held.confidence[block], weight[block])
+
+
+def test_what_other_photographs_show_otherwise_is_not_held(drive):
+    rig, measured, inverses = drive
+    # A red thing on the road in the middle photograph, of which nothing is measured. The others
+    # show asphalt where the ground would be.
+    image = rig.images[1].image.copy()
+    image[72:92, 30:60] = 0.9, 0.1, 0.1
+    images = list(rig.images)
+    images[1] = replace(images[1], image=image)
+    held = hold_to_ground(make_rig(images), measured, skies_of(inverses))[1]
+    inner = np.s_[78:86, 36:54]
+    np.testing.assert_array_equal(held.index[inner], measured[1].index[inner])
+    np.testing.assert_array_equal(held.weight[inner], measured[1].weight[inner])
+
+
+def test_given_depth_is_left(drive):
+    rig, measured, inverses = drive
+    given = np.zeros((SIZE, SIZE), np.float32)
+    given[80:90] = 0.01
+    images = [replace(image, given=given) for image in rig.images]
+    held = hold_to_ground(make_rig(images), measured, skies_of(inverses))
+    for before, after in zip(measured, held, strict=True):
+        np.testing.assert_array_equal(after.index[80:90], before.index[80:90])
+        np.testing.assert_array_equal(after.weight[80:90], before.weight[80:90])
+
+
+def test_cameras_at_different_heights_have_no_ground_below_them():
+    seen = [see_road(0.0), see_road(0.5, 1.5 * HEIGHT), see_road(1.0, 2 * HEIGHT)]
+    images = [image for image, _ in seen]
+    inverses = [inverse for _, inverse in seen]
+    measured = [measure_road(inverse) for inverse in inverses]
+    assert find_ground(images, measured, skies_of(inverses)) is None
+    held = hold_to_ground(make_rig(images), measured, skies_of(inverses))
+    assert all(after is before for before, after in zip(measured, held, strict=True))
+
+
+def test_cameras_that_move_to_a_side_are_left_alone(drive):
+    rig, measured, inverses = drive
+    # The same cameras turned by 90 degrees look at what passes beside them.
+    turned = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    assert moves_forward(rig.images)
+    images = [replace(image, rotation=turned) for image in rig.images]
+    assert not moves_forward(images)
+    held = hold_to_ground(make_rig(images), measured, skies_of(inverses))
+    assert all(after is before for before, after in zip(measured, held, strict=True))
+
+
+def test_two_photographs_stay_as_they_are(drive):
+    rig, measured, inverses = drive
+    pair = make_rig(rig.images[:2])
+    held = hold_to_ground(pair, measured[:2], skies_of(inverses)[:2])
+    assert all(after is before for before, after in zip(measured[:2], held, strict=True))
+
+
+def test_too_few_measured_points_give_no_ground(drive):
+    rig, measured, inverses = drive
+    none = [replace(m, confidence=np.zeros_like(m.confidence)) for m in measured]
+    assert find_ground(rig.images, none, skies_of(inverses)) is None
+
+
+def test_differences_are_those_from_the_most_similar_photograph_in_view(drive):
+    rig, _, inverses = drive
+    difference = measure_difference(rig, 2, inverses[2])
+    # The last photograph sees ahead what those behind it see, too, farther away.
+    road = inverses[2] > 0.05
+    assert np.isfinite(difference[road]).all()
+    assert difference[road].max() < 0.05
+    # The first one looks from farther behind, so that the lower rows of its road are in nobody's
+    # view behind them.
+    first = measure_difference(rig, 0, inverses[0])
+    assert np.isinf(first[-5:]).all()
