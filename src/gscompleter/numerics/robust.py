@@ -63,8 +63,8 @@ def fit_line_ransac(
         design = torch.stack([x[agree], torch.ones_like(x[agree])], dim=-1) * weight[:, None]
         # Unlike lstsq, the normal equations are solved in closed form on any device.
         normal = design.T @ design
-        # The second column is in inverse depths; scaling makes the condition independent of units.
-        even = torch.stack([torch.ones_like(x[0]), y.median()])
+        # Columns of length 1 make the condition independent of the units of x and y.
+        even = normal.diagonal().clamp_min(torch.finfo(normal.dtype).tiny).rsqrt()
         if torch.linalg.cond(normal * even * even[:, None]) > 1e12:
             break
         scale, shift = torch.linalg.solve(normal, design.T @ (y[agree] * weight)).tolist()
@@ -93,8 +93,11 @@ def fit_robust_affine(
     """Fit `y = gain * x + offset` per channel by trimmed least squares, starting at gain 1.
 
     Residuals above 2.5 standard deviations are dropped; a constant channel keeps about gain 1.
+    Without samples it is the identity.
     """
-    gain = torch.ones_like(x[0])
+    gain = x.new_ones(x.shape[1])
+    if len(x) == 0:
+        return gain, torch.zeros_like(gain)
     offset = (y - x).median(dim=0).values
     for _ in range(TRIMMED_ROUNDS):
         error = (gain * x + offset - y).abs()
