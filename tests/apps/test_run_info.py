@@ -53,7 +53,7 @@ def describe(tmp_path_factory):
         ("drop_nonfinite", True, {"splat": replace(SPLAT, drop_nonfinite=True)}),
         ("forget_edits", True, {"splat": replace(SPLAT, forget_edits=True)}),
         ("cameras", "some.json", {"alone": {"cameras": Path("some.json")}}),
-        ("up", [0, 0, 1], {"alone": {"up": (0, 0, 1)}}),
+        ("up", [0, 0, 1], {"alone": {"up": (0.0, 0.0, 1.0)}}),
     ],
 )
 def test_an_option_that_changes_the_result_is_written_down(describe, name, value, given):

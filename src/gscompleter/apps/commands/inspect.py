@@ -15,7 +15,7 @@ from gscompleter.system.process import import_without_collection
 
 @dataclass(frozen=True, kw_only=True)
 class InspectOptions(DeviceOptions):
-    """Print what is in a splat, what of it is invented, by what, and how much of pictures that is.
+    """Print what is in a splat, what of it is invented, by whom, and its share of pictures.
 
     Pictures are at `--cameras`, or at the cameras of the completion in whose folder FILE lies.
 
@@ -28,7 +28,7 @@ class InspectOptions(DeviceOptions):
     cameras: Path | None = None
     """Cameras to look at the splat from: a file as in `complete --target`. Or a folder with a
     transforms.json or a COLMAP model. Their pictures are measured. They are in the coordinates of
-    the photographs if FILE lies in an output folder, else of FILE."""
+    the photographs if FILE lies in an output folder of `complete`, else of FILE."""
     resolution: tuple[int, int] | None = None
     """Size of images in pixels. Height and width, at `--cameras`; those of its file if not
     given."""
