@@ -1,4 +1,4 @@
-"""Entry point of the command line: options in, a command called, exit codes out."""
+"""Entry point of the command line: parse the options, run the command, choose the exit code."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ COMMANDS = (
 )
 """Names of all commands, in the order of the help page.
 
-The command `complete` is the file `apps/commands/complete.py` with the class `CompleteOptions` and
-the function `run_complete`, and so are all others.
+Each is a file: `complete` is `apps/commands/complete.py`, with its options in `CompleteOptions` and
+the function `run_complete` that gets them and returns an exit code, or None for 0.
 """
 
 
 class OptionClasses(Mapping[str, type]):
-    """Class of the options of each command, imported when it is asked for."""
+    """Class of the options of each command by its name, imported when it is asked for."""
 
     def __getitem__(self, name: str) -> type:
         if name not in COMMANDS:
@@ -59,10 +59,14 @@ class OptionClasses(Mapping[str, type]):
 
 
 def run() -> None:
-    """Run `main` as the command `gscompleter`, whose output may be closed, full or left."""
+    """Run `main` as the command `gscompleter`.
+
+    Its standard output may be closed, on a full disk, or a pipe whose reader has left.
+    """
     replace_closed_outputs()
 
-    # Windows writes no UTF-8 into pipes, and file names may have no characters in any encoding.
+    # An encoding may lack characters: that of pipes on Windows is not UTF-8, and bytes of a file
+    # name may be no characters in any.
     for output in (sys.stdout, sys.stderr):
         if isinstance(output, io.TextIOWrapper):
             output.reconfigure(errors="backslashreplace")
@@ -77,7 +81,7 @@ def run() -> None:
         leave_output()
         sys.exit(ERROR)
     except OSError as error:
-        # `main` explains a full disk with a file; without one it is that of the standard output.
+        # `main` explains a full disk if the error names a file. The standard output has no name.
         if error.errno not in FULL_DISK_ERRORS:
             raise
         leave_output()
@@ -100,13 +104,19 @@ def replace_closed_outputs() -> None:
 
 
 def leave_output() -> None:
-    """Let what is still written to the standard output vanish, also when Python ends."""
+    """Send all that is still written to the standard output to the null device.
+
+    Python writes what is buffered when it ends, and would print another error.
+    """
     with suppress(OSError, ValueError):
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 def main() -> None:
-    """Run a command and exit with one of the codes of `exit_codes`."""
+    """Run the command that `sys.argv` names, or exit with one of the codes of `exit_codes`.
+
+    It prints one sentence on the standard error. A defect raises its own exception.
+    """
     # Before anything imports torch, which reads this setting once.
     let_idle_threads_sleep()
     words = sys.argv[1:]
@@ -124,21 +134,21 @@ def main() -> None:
         command_options = validate(parse_command(words))
         if isinstance(command_options, Options):
             command_options.check_overlap()
-        if getattr(command_options, "quiet", False):
-            logging.getLogger("gscompleter").setLevel(logging.ERROR)
+            if command_options.quiet:
+                logging.getLogger("gscompleter").setLevel(logging.ERROR)
 
-        # Numba reads the number of threads when it is imported, with the command.
+        # Numba reads the number of threads when it is imported, which the command does.
         if isinstance(command_options, ComputeOptions):
             limit_threads(command_options.threads)
         run_command = getattr(import_command(words[0]), f"run_{words[0]}")
         code = run_command(command_options)
     except InputError as error:
-        # All three are InputErrors for their sentences alone: no other input would help.
         print_error(format_error(error))
-        is_input = not isinstance(error, (FullDiskError, NoCaseError, WorkerError))
-        sys.exit(WRONG_INPUT if is_input else ERROR)
+        # These three are InputErrors for their sentences alone: no other input would help.
+        is_failure = isinstance(error, (FullDiskError, NoCaseError, WorkerError))
+        sys.exit(ERROR if is_failure else WRONG_INPUT)
     except KeyboardInterrupt as stop:
-        # Whoever writes results says if they were complete when the signal came.
+        # `defer_interrupts` gives the reason where results were complete when the signal came.
         reason = str(stop) or "no unfinished result was written"
         print_error(f"interrupted; {reason}.")
         sys.exit(INTERRUPTED)
@@ -154,7 +164,7 @@ def main() -> None:
 
 
 def check_working_folder() -> None:
-    """Refuse to run in a folder that was deleted, in which libraries end the process."""
+    """Raise InputError in a working folder that was deleted: libraries end the process there."""
     try:
         os.getcwd()
     except OSError as error:
@@ -164,7 +174,7 @@ def check_working_folder() -> None:
 
 
 def parse_command(words: Sequence[str]) -> Any:
-    """Parse the options of the command; raises as `parse_words`."""
+    """Parse the words into the options of their command; raise the errors of `parse_words`."""
     return parse_words(words, OptionClasses())
 
 

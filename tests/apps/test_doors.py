@@ -256,6 +256,8 @@ def test_a_closed_or_full_output_is_no_traceback(splat, tmp_path):
     assert full.stderr == (
         "gscompleter: the standard output cannot be written: No space left on device.\n"
     )
+    # The sentence is lost there, and the code is not.
+    assert run_apart("nonsense", shell="{} 2> /dev/full").returncode == 2
 
 
 @pytest.mark.linux

@@ -11,6 +11,7 @@ import torch
 import gscompleter as gsc
 from command import run
 from gscompleter import load_ply, save_ply, save_splat
+from gscompleter.apps.completing.keeping import save_compactly
 from gscompleter.apps.completing.maker import record_model
 from gscompleter.data.scene import write_cameras
 from gscompleter.splats.formats import read_provenance
@@ -191,3 +192,37 @@ def test_the_folder_of_the_demo_is_that_of_its_completion(
     found = inspected(monkeypatch, capsys, tmp_path / "demo")
     assert found["file"] == str(tmp_path / "demo" / "completion" / "completed.ply")
     assert found["pictures"]
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".sog"])
+def test_a_folder_whose_scene_has_another_ending_is_inspected_as_a_completion(
+    completed_room, tmp_path, monkeypatch, capsys, suffix
+):
+    folder = tmp_path / "completion"
+    shutil.copytree(completed_room, folder)
+    save_compactly(folder, suffix, json.loads((folder / "summary.json").read_bytes()), None)
+    found = inspected(monkeypatch, capsys, completed_room)
+    for path in (folder, folder / f"completed{suffix}", tmp_path):
+        small = inspected(monkeypatch, capsys, path)
+        assert small["file"] == str(folder / f"completed{suffix}")
+        assert [row["camera"] for row in small["pictures"]] == [
+            row["camera"] for row in found["pictures"]
+        ]
+
+
+def test_a_cleaned_splat_is_inspected_without_cameras(tmp_path, monkeypatch, capsys):
+    save_ply(tmp_path / "splat.ply", plausible(300, 0))
+    out = tmp_path / "cleaned"
+    assert run(monkeypatch, "clean", "--scene", tmp_path / "splat.ply", "--out", out) == 0
+    for path in (out, out / "completed.ply"):
+        found = inspected(monkeypatch, capsys, path)
+        assert found["file"] == str(out / "completed.ply")
+        assert not found["pictures"]
+
+
+@pytest.mark.parametrize("command", ["inspect", "view"])
+def test_a_size_of_images_needs_cameras(tmp_path, monkeypatch, capsys, command):
+    save_ply(tmp_path / "splat.ply", walls([0], [0.0]))
+    words = (command, tmp_path / "splat.ply", "--resolution", 8, 8)
+    assert run(monkeypatch, *words) == 2
+    assert "--resolution is the size of images at --cameras" in capsys.readouterr().err

@@ -263,6 +263,15 @@ def test_the_nearest_views_are_the_closest_others():
     assert find_nearest_views(cameras, 2)[0].tolist() == expected
 
 
+def test_no_view_is_its_own_source_among_others_at_its_position():
+    """As of a panorama, whose images share a centre."""
+    c2w = torch.eye(4).repeat(1, 6, 1, 1)
+    c2w[0, 3:, 0, 3] = 1
+    ones = torch.ones(1, 6)
+    sources = find_nearest_views(Cameras(c2w, c2w[..., :3, :3], ones, ones), 2)[0].tolist()
+    assert [sorted(row) for row in sources] == [[1, 2], [0, 2], [0, 1], [4, 5], [3, 5], [3, 4]]
+
+
 def test_the_nearest_views_are_found_far_from_the_origin():
     c2w = torch.eye(4).repeat(1, 30, 1, 1)
     c2w[0, :, :3, 3] = torch.tensor([8000.0, 8000.0, 0.0])

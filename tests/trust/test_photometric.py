@@ -116,6 +116,19 @@ def test_a_photograph_of_something_else_contradicts():
     assert evidence.agreement[1, shown & right].mean() > 0.6
 
 
+def test_a_photograph_that_masks_hide_altogether_says_nothing():
+    """As one that shows nothing but what an earlier command removed."""
+    hidden = replace(VIEWS[1], ignore_mask=torch.ones(SIZE, SIZE, dtype=torch.bool))
+    sums = sum_weights(AT_TARGET)
+    found, expected = (
+        compute_trust(
+            gather_observations(SCENE, views, frozen_at(views), TrustConfig()), sums, TARGET
+        )
+        for views in ([VIEWS[0], hidden, VIEWS[2]], [VIEWS[0], VIEWS[2]])
+    )
+    assert torch.equal(found, expected)
+
+
 def test_sums_of_weights_make_up_the_alpha():
     sums = sum_weights(AT_TARGET)
     alpha = RENDERER.render(SCENE, TARGET).alpha.sum()

@@ -227,6 +227,7 @@ def clean_alone(request: CleaningRequest) -> Cleaning:
     run_info = {
         "settings": {
             "scene": str(splat.path),
+            "drop_nonfinite": splat.drop_nonfinite,
             "strength": request.strength,
             "device": device,
             "config": {"floaters": asdict(floaters)},

@@ -13,7 +13,7 @@ from jaxtyping import Float, UInt8
 from rich.table import Table
 from torch import Tensor
 
-from gscompleter.apps.report.schema import read_summary
+from gscompleter.apps.report.schema import find_completed, holds_completion, read_summary
 from gscompleter.apps.requests.viewing import InspectionRequest
 from gscompleter.apps.viewer.exhibit import (
     ViewerContent,
@@ -44,7 +44,7 @@ from gscompleter.splats.provenance import ModelRecord, RunRecord
 from gscompleter.splats.row_kinds import count_row_kinds
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.writing import COMPLETED_FILE, SUMMARY_FILE
+from gscompleter.system.files.writing import SUMMARY_FILE
 from gscompleter.types import Camera, Gaussians, Origin, sh_from_rgb
 
 ORIGINS = {
@@ -161,14 +161,13 @@ def inspect_splat(request: InspectionRequest) -> Inspection:
 
 def locate_inspected(file: Path) -> tuple[Path, Path | None]:
     """Find the splat, and the folder of the completion that it lies in, or None."""
+    path = resolve_splat(file)
     # The folder of `demo` holds that of its completion.
     for folder in (file, file / "completion"):
-        if (folder / SUMMARY_FILE).is_file() and (folder / COMPLETED_FILE).is_file():
-            return folder / COMPLETED_FILE, folder
-    path = resolve_splat(file)
-    beside = path.parent
-    is_result = (beside / SUMMARY_FILE).is_file() and (beside / COMPLETED_FILE).is_file()
-    return path, beside if is_result else None
+        if (folder / SUMMARY_FILE).is_file() and find_completed(folder).is_file():
+            path = find_completed(folder)
+            break
+    return path, path.parent if holds_completion(path.parent) else None
 
 
 def make_bounds(

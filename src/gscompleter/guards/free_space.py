@@ -82,7 +82,7 @@ class FreeSpace(Guard):
         cameras = [photo.camera for photo in state.views]
         renders = [
             replace(frozen.render, alpha=state.trust.compute_alpha(frozen, camera))
-            for frozen, camera in zip(view.at(state.views), cameras, strict=True)
+            for frozen, camera in zip(view.freeze_views(state.views), cameras, strict=True)
         ]
 
         # Completed targets count, or else a later target hangs its additions before those of an

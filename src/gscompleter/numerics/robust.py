@@ -1,4 +1,7 @@
-"""Robust fits: RANSAC (Fischler and Bolles 1981) for depths and planes, trimming for colours."""
+"""Robust fits: RANSAC (Fischler and Bolles 1981) for depths, trimmed least squares for colours.
+
+Depths are in any unit, and may be inverse depths; they are positive unless a function says more.
+"""
 
 from __future__ import annotations
 
@@ -7,23 +10,33 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 MAX_HYPOTHESES = 512
-"""Two-point hypotheses."""
+"""Lines that are tried, each through two points."""
 HYPOTHESES_PER_BATCH = 32
 """Hypotheses that are scored together, so few that their residuals stay in the cache."""
 RESIDUAL_THRESHOLD = 0.05
-"""Largest residual of an inlier, relative to `y`."""
+"""Largest residual of an inlier, relative to `y`: far pixels do not dominate."""
+MAX_CONDITION = 1e12
+"""Largest condition of normal equations in float64 that leaves some digits of the solution."""
+REFIT_ROUNDS = 3
+"""Rounds in which a line or a scale is fitted to its inliers, whose set changes with it."""
 NUM_RATIOS = 100
 """Quantiles of the ratios of depths that are tried as their scale."""
-SCALE_ROUNDS = 3
-"""Rounds in which a scale is fitted to its inliers, whose set changes with it."""
 TRIMMED_ROUNDS = 5
 """Number of trimmed fits; each one leaves out the outliers of the previous one."""
+MAX_DEVIATIONS = 2.5
+"""Largest residual of a trimmed fit, in standard deviations."""
+MAD_TO_SIGMA = 1.4826
+"""Standard deviation of normal errors over the median of their absolute values."""
+MIN_DEVIATION = 1e-3
+"""Smallest standard deviation, of colours in [0, 1]: of equal colours all are kept."""
+GAIN_VARIANCE = 1e-4
+"""Variance of colours in [0, 1] at which a gain is halfway between 1 and that of the samples."""
 
 
 def find_affine_inliers(
     x: Float[Tensor, "n"], y: Float[Tensor, "n"], scale: float, shift: float
 ) -> Bool[Tensor, "n"]:
-    """Find pixels with a small residual, relative to `y`."""
+    """Mark samples at which `scale * x + shift` is `y` up to `RESIDUAL_THRESHOLD` of it."""
     return (scale * x + shift - y).abs() < RESIDUAL_THRESHOLD * y
 
 
@@ -33,10 +46,17 @@ def fit_line_ransac(
     rng: torch.Generator,
     device: torch.device | None = None,
 ) -> tuple[float, float]:
-    """Fit scale and shift to the most inliers of two-point hypotheses, then refit them.
+    """Fit `y = scale * x + shift` by RANSAC, and refit it to its inliers.
 
-    Residuals are relative to depth, so that distant pixels do not dominate. Returns (0, 0) if no
-    hypothesis has a positive scale. Hypotheses are scored on `device`, by default that of `x`.
+    Args:
+        x: Samples in float64, at least one; inverse depths may be 0.
+        y: Positive values of the line, in float64.
+        rng: Generator on the CPU that draws the hypotheses.
+        device: Where hypotheses are scored; None for the device of `x`.
+
+    Returns:
+        Scale and shift. (0, 0) if no hypothesis has a positive scale. The refit may end at a
+        negative scale where `y` hardly depends on `x`, which is for the caller to refuse.
     """
     device = device or x.device
     # A line through two points each. Equal x give a scale of 0, which no hypothesis may have.
@@ -54,25 +74,26 @@ def fit_line_ransac(
     if scales[best] <= 0:
         return 0.0, 0.0
 
-    # Least squares on the inliers, whose set changes with the line.
+    # Least squares on the inliers, of residuals relative to y.
     scale = scales[best].item()
     shift = shifts[best].item()
-    for _ in range(3):
+    for _ in range(REFIT_ROUNDS):
         agree = find_affine_inliers(x, y, scale, shift)
         weight = 1 / y[agree]
         design = torch.stack([x[agree], torch.ones_like(x[agree])], dim=-1) * weight[:, None]
         # Unlike lstsq, the normal equations are solved in closed form on any device.
         normal = design.T @ design
-        # The second column is in inverse depths; scaling makes the condition independent of units.
-        even = torch.stack([torch.ones_like(x[0]), y.median()])
-        if torch.linalg.cond(normal * even * even[:, None]) > 1e12:
+        # Columns of length 1 make the condition independent of the units of x and y.
+        even = normal.diagonal().clamp_min(torch.finfo(normal.dtype).tiny).rsqrt()
+        # Equal x leave scale and shift open: the line stays as it was.
+        if torch.linalg.cond(normal * even * even[:, None]) > MAX_CONDITION:
             break
         scale, shift = torch.linalg.solve(normal, design.T @ (y[agree] * weight)).tolist()
     return scale, shift
 
 
 def fit_scale(x: Float[Tensor, "n"], y: Float[Tensor, "n"]) -> float:
-    """Fit the scale of `y = scale * x` with the most inliers, both being positive.
+    """Fit the scale of `y = scale * x` with the most inliers, from at least one sample.
 
     It is the median ratio of its inliers. The median of all ratios would be off where many pixels
     show different surfaces.
@@ -82,7 +103,7 @@ def fit_scale(x: Float[Tensor, "n"], y: Float[Tensor, "n"]) -> float:
     scales = ratios.quantile(levels)
     counts = torch.stack([find_affine_inliers(x, y, scale, 0.0).sum() for scale in scales.tolist()])
     scale = scales[counts.argmax()].item()
-    for _ in range(SCALE_ROUNDS):
+    for _ in range(REFIT_ROUNDS):
         scale = ratios[find_affine_inliers(x, y, scale, 0.0)].median().item()
     return scale
 
@@ -92,14 +113,18 @@ def fit_robust_affine(
 ) -> tuple[Float[Tensor, "c"], Float[Tensor, "c"]]:
     """Fit `y = gain * x + offset` per channel by trimmed least squares, starting at gain 1.
 
-    Residuals above 2.5 standard deviations are dropped; a constant channel keeps about gain 1.
+    Values are colours in [0, 1], or have a spread like theirs. Samples far off are left out,
+    channel by channel. A constant channel keeps about gain 1. Without samples, as of a photograph
+    that masks hide altogether, it is the identity.
     """
-    gain = torch.ones_like(x[0])
+    gain = x.new_ones(x.shape[1])
+    if len(x) == 0:
+        return gain, torch.zeros_like(gain)
     offset = (y - x).median(dim=0).values
     for _ in range(TRIMMED_ROUNDS):
         error = (gain * x + offset - y).abs()
-        sigma = 1.4826 * error.median(dim=0).values
-        weight = (error <= 2.5 * sigma.clamp_min(1e-3)).to(x)
+        sigma = MAD_TO_SIGMA * error.median(dim=0).values
+        weight = (error <= MAX_DEVIATIONS * sigma.clamp_min(MIN_DEVIATION)).to(x)
         total = weight.sum(dim=0).clamp_min(1.0)
         mean_x = (weight * x).sum(dim=0) / total
         mean_y = (weight * y).sum(dim=0) / total
@@ -107,7 +132,7 @@ def fit_robust_affine(
         centred_y = y - mean_y
         variance = (weight * centred_x * centred_x).sum(dim=0) / total
         covariance = (weight * centred_x * centred_y).sum(dim=0) / total
-        # The two constants pull the gain towards 1 where the channel hardly varies.
-        gain = (covariance + 1e-4) / (variance + 1e-4)
+        # The constant pulls the gain towards 1 where the channel hardly varies.
+        gain = (covariance + GAIN_VARIANCE) / (variance + GAIN_VARIANCE)
         offset = mean_y - gain * mean_x
     return gain, offset

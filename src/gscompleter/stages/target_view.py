@@ -25,27 +25,30 @@ from gscompleter.state import Completion
 from gscompleter.types import Camera, ErrorBudget, PaddedCamera, Render, View, merge
 
 FULL_TRUST = 1.0
-"""Mean trust of what a pixel shows from which on it is not recoloured."""
+"""Mean trust of what a pixel shows at which it keeps its colour."""
 NO_TRUST = 0.6
-"""Mean trust up to which a pixel takes the synthesized colour."""
+"""Mean trust up to which a pixel takes the synthesized colour alone; above, it is mixed."""
 DISTRUST_BLUR = 2 / 320
-"""Standard deviation of the blur of that weight, relative to the longer side of the image."""
+"""Standard deviation of the blur of the weight of synthesized colours, relative to the longer side
+of the padded image: no seam where trust ends."""
 
 
 @dataclass(frozen=True)
 class TargetView:
-    """The scene as the padded target camera sees it."""
+    """The scene as the padded target camera sees it; h and w are those of the padded image."""
 
     state: Completion
+    """The scene so far, with its photographs and settings."""
     scenes: SceneRenderer
     """Freezes the scene at further cameras, and remembers what it froze."""
     camera: PaddedCamera
+    """The target, and the same camera with padding around its image."""
     frozen: FrozenScene
     """The scene frozen at the padded camera."""
     alpha: Float[Tensor, "h w"]
-    """Accumulated opacity at the padded camera, weighted by trust."""
+    """Accumulated opacity at the padded camera, weighted by trust, in [0, 1]."""
     masks: HoleMasks
-    """The holes there."""
+    """The holes at the padded camera."""
 
     @property
     def render(self) -> Render:
@@ -64,11 +67,11 @@ class TargetView:
 
     @cached_property
     def distrust(self) -> Float[Tensor, "h w"]:
-        """Weight in [0, 1] with which covered pixels take the synthesized colour."""
+        """Weight in [0, 1] with which covered pixels take the synthesized colour; 0 elsewhere."""
         weight = compute_distrust(self.alpha, self.render.alpha)
         # Empty pixels get Gaussians of their own, and are no reason to recolour what is beside
-        # them: they are left out before the blur, and again after it.
-        # So is what is empty around an object, and is no hole.
+        # them: they are left out before the blur, and again after it. Beside `empty` that holds for
+        # what is empty around an object, which is no hole.
         covered = ~self.empty & ~compute_hole_mask(self.render.alpha, self.state.config.holes)
         sigma = DISTRUST_BLUR * max(weight.shape)
         weight = blur_gaussian(weight.where(covered, 0.0), sigma)
@@ -76,44 +79,54 @@ class TargetView:
 
     @property
     def candidate_mask(self) -> Bool[Tensor, "h w"] | None:
-        """Pixels that are lifted: near empty pixels, or None for all of the pair (paper)."""
+        """Pixels of the target that are lifted: empty ones and what is near them.
+
+        None for all pixels of target and anchor, as in the paper.
+        """
         radius = self.state.config.holes.candidate_radius
         return None if radius is None else dilate(self.empty, radius)
 
     @cached_property
     def view_renders(self) -> tuple[Render, ...]:
         """Renders of the scene at the context views."""
-        return tuple(frozen.render for frozen in self.at(self.state.views))
+        return tuple(frozen.render for frozen in self.freeze_views(self.state.views))
 
     @cached_property
     def frozen_photos(self) -> tuple[FrozenScene, ...]:
-        """The same scene frozen at all photographs."""
-        return self.at([photo.view for photo in self.state.photos])
+        """The scene frozen at all photographs: the context, then the check views."""
+        return self.freeze_views([photo.view for photo in self.state.photos])
 
     @cached_property
     def budgets(self) -> tuple[tuple[ErrorBudget, ...], ...]:
-        """Largest errors of each photograph that additions for this target may cause."""
+        """Largest errors of each of `frozen_photos` that additions for this target may cause.
+
+        That is the share of this target in the budgets for all targets.
+        """
         guard = self.state.config.psnr_guard
         return tuple(
             share_budgets(photo.budgets, frozen.render.image, guard)
             for photo, frozen in zip(self.state.photos, self.frozen_photos, strict=True)
         )
 
-    def at(self, views: Sequence[View]) -> tuple[FrozenScene, ...]:
-        """Freeze the same scene at photographs."""
+    def freeze_views(self, views: Sequence[View]) -> tuple[FrozenScene, ...]:
+        """Freeze the scene at the cameras of views."""
         return self.scenes.freeze_at(self.state.parts, [view.camera for view in views])
 
 
 def compute_distrust(
     trusted_alpha: Float[Tensor, "h w"], alpha: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w"]:
-    """Compute a weight in [0, 1] that falls with the mean trust of what a pixel shows."""
+    """Compute the weight of synthesized colours, in [0, 1].
+
+    It falls from 1 to 0 as the mean trust of what a pixel shows, which is the ratio of both alphas,
+    rises from `NO_TRUST` to `FULL_TRUST`. Where nothing is shown it means nothing.
+    """
     trust = trusted_alpha / alpha.clamp_min(1e-6)
     return ((FULL_TRUST - trust) / (FULL_TRUST - NO_TRUST)).clamp(0, 1)
 
 
 def render_target(state: Completion, camera: PaddedCamera, scenes: SceneRenderer) -> TargetView:
-    """Render the scene at a padded target, and find its holes."""
+    """Render the scene at a padded target, and find its holes before anything is added for it."""
 
     def render_at(other: Camera) -> Render:
         return scenes.freeze(state.parts, other).render
@@ -128,7 +141,10 @@ def render_target(state: Completion, camera: PaddedCamera, scenes: SceneRenderer
 def find_hole_edits(
     state: Completion, camera: PaddedCamera, frozen: FrozenScene, scenes: SceneRenderer
 ) -> HoleEdits:
-    """Find where a removal may have opened holes, and where the user marked the scene as wrong."""
+    """Find where a removal may have opened holes, and where the user marked the scene as wrong.
+
+    Both are masks of the padded image. `frozen` is the scene at the padded camera.
+    """
     config = state.config
     if len(state.source.removed) == 0:
         return HoleEdits()
@@ -141,7 +157,7 @@ def find_hole_edits(
     if state.confirmation is not None:
         trusted_alpha = state.confirmation.compute_alpha(frozen, camera.padded)
         is_covered = ~compute_hole_mask(frozen.render.alpha, config.holes)
-        # A surface beside what was removed, which photographs confirm.
+        # A surface that photographs confirm shows the place as it is: there is nothing to fill.
         removed = removed & ~(is_covered & (trusted_alpha >= COVERED))
     # What an earlier target filled is no hole any more.
     filled = [part.gaussians for part in state.added_parts if part.origin.is_invented]

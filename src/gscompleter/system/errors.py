@@ -61,11 +61,16 @@ class WorkerError(InputError):
 
 
 def print_error(sentence: str) -> None:
-    """Print a sentence as one line of the standard error, shortened to `MAX_MESSAGE_LENGTH`."""
-    print(
-        f"{MESSAGE_PREFIX}{shorten_message(sentence, MAX_MESSAGE_LENGTH - len(MESSAGE_PREFIX))}",
-        file=sys.stderr,
-    )
+    """Print a sentence as one line of the standard error, shortened to `MAX_MESSAGE_LENGTH`.
+
+    If that is full or its reader has left, nothing is printed, and the exit code still says what
+    went wrong.
+    """
+    with suppress(OSError):
+        print(
+            MESSAGE_PREFIX + shorten_message(sentence, MAX_MESSAGE_LENGTH - len(MESSAGE_PREFIX)),
+            file=sys.stderr,
+        )
 
 
 def quote_value(value: object, length: int | None = None) -> str:

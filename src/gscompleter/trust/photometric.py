@@ -192,13 +192,14 @@ def compute_color_differences(
 ) -> tuple[list[Float[Tensor, "_ _"]], float]:
     """Compute the colour difference at each photograph, and the one that is usual in the scene.
 
-    That is the median of the medians of all photographs.
+    That is the median of the medians of all photographs; masks may hide one, but not all of them.
     """
     with use_one_torch_thread():
         differences = map_in_parallel(compute_color_difference, renders, views)
     medians = [
         difference[view.valid_mask].median()
         for difference, view in zip(differences, views, strict=True)
+        if view.valid_mask.any()
     ]
     return differences, torch.stack(medians).median().item()
 

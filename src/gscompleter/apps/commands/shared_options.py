@@ -15,6 +15,7 @@ from gscompleter.apps.requests.answer import AnswerRequest
 from gscompleter.apps.requests.scene import FRAME_NUMBER, NUM_VIDEO_FRAMES, Names, Size
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Device, Seed, Settings
+from gscompleter.system.errors import InputError
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.jobs.engine_names import EngineName
 
@@ -259,6 +260,15 @@ def list_inputs(options: Settings) -> list[Path]:
         elif name not in OUTPUTS:
             inputs += [path for path in values if isinstance(path, Path)]
     return inputs
+
+
+def refuse_size_alone(resolution: tuple[int, int] | None, cameras: Path | None) -> None:
+    """Raise InputError for a size of images without `--cameras`, whose images it is."""
+    if resolution is not None and cameras is None:
+        raise InputError(
+            "--resolution is the size of images at --cameras; name their file, or leave it out.",
+            "cameras",
+        )
 
 
 def replace_by_scenes(inputs: Sequence[Path], folders: Sequence[Path]) -> list[Path]:

@@ -8,7 +8,12 @@ from typing import Annotated
 
 import tyro
 
-from gscompleter.apps.commands.shared_options import Port, WritingOptions, list_inputs
+from gscompleter.apps.commands.shared_options import (
+    Port,
+    WritingOptions,
+    list_inputs,
+    refuse_size_alone,
+)
 from gscompleter.apps.requests.viewing import ViewRequest
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.overlap import refuse_input_file
@@ -33,7 +38,8 @@ class ViewOptions(WritingOptions):
     transforms.json or a COLMAP model. The page jumps to them. They are in the coordinates of the
     photographs if A is an output folder, else of A."""
     resolution: tuple[int, int] | None = None
-    """Size of images in pixels. Height and width, of cameras whose file has none."""
+    """Size of images in pixels. Height and width, at `--cameras`; those of its file if not
+    given."""
     up: tuple[float, float, float] | None = None
     """Upward direction of the splat: x, y and z in its file (in the axes of a .ply). That of A,
     which the page takes. If not given, that of most cameras; without any, what the file says, else
@@ -59,6 +65,7 @@ def decide_view(options: ViewOptions) -> ViewRequest:
     """Decide what is shown, and where."""
     if options.save is not None and options.save.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{quote_value(options.save)} is no .html file; name it *.html.", "save")
+    refuse_size_alone(options.resolution, options.cameras)
     return ViewRequest(
         scene=options.scene,
         other=options.other,

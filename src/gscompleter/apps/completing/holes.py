@@ -57,7 +57,7 @@ class ExportedHole:
     """In the frame of the photographs, in float64."""
     pictures: HolePictures
     depth: Float[Tensor, "h w"]
-    """z-depth in the unit of `camera`, 0 in holes."""
+    """z-depth in the unit of `camera`, 0 where the scene is empty."""
     hole_fraction: float
     """Share of the image that is a hole; the mask to paint is somewhat larger."""
 

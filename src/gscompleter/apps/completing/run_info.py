@@ -1,4 +1,4 @@
-"""The input of a run: its description for `summary.json`, and photographs that test the result."""
+"""What a run was given: values for `summary.json`, and photographs that test its result."""
 
 from __future__ import annotations
 
@@ -39,28 +39,45 @@ def describe_run_values(
     settings: Mapping[str, Any] = MappingProxyType({}),
     inverts_masks: bool = False,
 ) -> dict[str, Any]:
-    """Describe the input and all settings that determine the result, with further `settings`.
+    """Describe the input and all settings that determine the result, as values of JSON.
 
-    `given` is the input splat. `inverts_masks` is True if masks were read the other way round,
-    whichever they are.
+    They are the entries of `summary.json` that docs/contracts.md lists from `settings` to
+    `depth_range`.
+
+    Args:
+        source: What the command was given: photographs, or a splat alone.
+        given: The input splat, if there is one, and how it was read.
+        opened: The scene after it was opened.
+        task: What was read of it. Its views share one depth range.
+        config: Settings of the method.
+        settings: Those of the command alone, such as its models.
+        inverts_masks: True if masks were read the other way round: those of what goes, or else
+            those of photographs.
     """
-    camera = task.views[0].camera  # all have one depth range
+    camera = task.views[0].camera
+    # The request before it was opened: opening may change the resolution, and nothing else here.
+    reading = source.scene
     resolution = opened.request.resolution
     splat = None if given is None else str(given.path)
-    reading = source.scene
-    # Of a splat alone the folder is its file, which is named below, and there is no video.
-    folder: str | None = None
-    num_frames = NUM_VIDEO_FRAMES
+    of_source: dict[str, Any]
     if isinstance(source, PhotographsRequest):
-        folder = str(reading.folder)
-        num_frames = source.poses.num_frames
+        of_source = {"folder": str(reading.folder), "frames": source.poses.num_frames}
+    else:
+        # The folder of its reading is the splat itself, and there is no video.
+        of_source = {
+            "folder": None,
+            "frames": NUM_VIDEO_FRAMES,
+            "cameras": None if source.cameras is None else str(source.cameras),
+            "up": source.up,
+        }
     return {
         "settings": {
-            "folder": folder,
+            **of_source,
             "format": reading.format,
-            "frames": num_frames,
             "context": None if source.context is None else list(source.context),
             "scene": splat,
+            "drop_nonfinite": given is not None and given.drop_nonfinite,
+            "forget_edits": given is not None and given.forget_edits,
             **settings,
             "resolution": "full" if resolution is None else resolution,
             "near": reading.near,
@@ -68,6 +85,7 @@ def describe_run_values(
             "no_given_depth": not reading.uses_given_depth,
             "no_refine_poses": not reading.refines_poses,
             "masks": reading.uses_masks,
+            "ignore": None if reading.masks.folder is None else str(reading.masks.folder),
             "invert_masks": inverts_masks,
             "large_masks": reading.masks.may_be_large,
             "config": asdict(config),
@@ -97,8 +115,8 @@ def describe_run_values(
 
 
 def compute_frame_of_file(task: CompletionTask) -> Float[np.ndarray, "4 4"]:
-    """Compute the similarity from the frame of the photographs to that of the written files."""
-    # A splat with an origin is written in the coordinates of its file again.
+    """Compute the similarity from the coordinates of the photographs to those of written files."""
+    # The result is relative to the origin of the splat, which is added when it is written.
     origin = None if task.scene is None else task.scene.origin
     if origin is None:
         return task.frame

@@ -1,4 +1,4 @@
-"""Pictures of a target before its hole is painted."""
+"""Pictures of a target before its hole is painted, for painters outside of the program."""
 
 from __future__ import annotations
 
@@ -18,28 +18,30 @@ from gscompleter.types import View
 
 @dataclass(frozen=True)
 class HolePictures:
-    """Pictures of one target for whoever paints its hole, at the size of its camera."""
+    """Pictures of one target for whoever paints its hole; colours are in [0, 1]."""
 
     image: Float[Tensor, "h w 3"]
-    """As the scene shows it, over black."""
+    """The render of the scene, over black."""
     mask: Bool[Tensor, "h w"]
-    """True where to paint: the hole with its dark rim."""
+    """True where to paint: the hole and `BORDER_WIDTH` pixels around it."""
     warped: Float[Tensor, "h w 3"]
     """Photographs warped to the target, with tone and lines continued into the hole."""
     depth: Float[Tensor, "h w"]
-    """z-depth of the scene in its unit, 0 in holes."""
+    """z-depth of the scene in its unit. 0 where the scene is empty; holes that it covers, and that
+    are not trusted, have the depth of what covers them."""
     reference: View
-    """The nearest photograph of the context."""
+    """The view of the context that is nearest to the target, of its own size."""
 
 
 def draw_hole(view: TargetView) -> HolePictures:
-    """Collect the pictures of a target that is not padded."""
+    """Draw the pictures of a target, whose camera must not be padded: they have its size."""
     camera = view.camera.target
     context = make_generator_input(view)
     nearest = context.views[find_nearest_view(camera, context.views)]
     depth = view.render.depth_map()
     return HolePictures(
         image=view.render.image,
+        # Pixels at the rim of a hole are a blend with the black behind it.
         mask=dilate(view.holes, BORDER_WIDTH),
         warped=complete_warp(nearest, camera, context).image,
         depth=torch.where(depth.valid, depth.depth, 0.0),

@@ -27,6 +27,9 @@ from gscompleter.system.files.writing import COMPLETED_FILES, SUMMARY_FILE
 RECORD_FILE = "report.json"
 SUMMARY_ADVICE = "complete the scene again"
 """Advice about a damaged file, for errors."""
+COMPLETION_COMMANDS = (None, "complete")
+"""Commands that write completions, as `summary.json` names them. None is a folder of unknown
+origin, which is refused by what its files lack."""
 MAX_FRAME_NUMBER = 1e12
 """Largest absolute number of the transform and the origin of a `ResultFrame`: the determinant and
 what is computed in float32 stay finite."""
@@ -329,6 +332,13 @@ def find_completed(folder: Path) -> Path:
     return next((path for path in paths if os.path.lexists(path)), paths[0])
 
 
+def holds_completion(folder: Path) -> bool:
+    """Return True for an output folder with a completed scene, but not for one of `clean`."""
+    if not ((folder / SUMMARY_FILE).is_file() and find_completed(folder).is_file()):
+        return False
+    return read_command(folder) in COMPLETION_COMMANDS
+
+
 def refuse_completed(out: Path) -> None:
     """Refuse the output folder of a dry run if it holds a completed scene."""
     if os.path.lexists(find_completed(out)):
@@ -343,12 +353,11 @@ def read_summary(folder: Path) -> CompletionSummary:
     """
     refuse_later_results(folder)
     command = read_command(folder)
-    if command not in (None, "complete"):
+    if command not in COMPLETION_COMMANDS:
         raise InputError(
             f"{quote_value(folder)} holds a result of `{quote_value(command)}`, which is no "
             "completion; name the output folder of a completion."
         )
-    # A folder without a command is of unknown origin, and is refused by what its files lack.
     if command and not os.path.lexists(find_completed(folder)):
         raise InputError(
             f"{quote_value(folder)} holds no completed scene, but perhaps the plan of a dry run; "

@@ -2,7 +2,7 @@
 
 Scale, rotation and translation of all lifted Gaussians are fitted to colour, depth and the entropic
 Mixture-2-Wasserstein distance (Delon and Desolneux, 2020). RegGS also estimates the poses, which
-are known here.
+are known here. Positions are in the frame and unit of the scene, unless a function says more.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ EPSILON = 0.1
 MAX_ITERATIONS = 100
 """Largest number of updates of both potentials."""
 POTENTIAL_TOLERANCE = 1e-5
-"""Largest change of a converged potential."""
+"""Largest change of a converged potential, which is the logarithm of a factor."""
 REGGS_RATES = (1e-3, 2e-4, 2e-3)
-"""Step sizes of scale, rotation, and translation (in scene units), as in RegGS."""
+"""Step sizes of Adam for scale, quaternion and translation (in scene units), as in RegGS."""
 DEPTH_WEIGHT = 0.1
-"""Weight of the depths in the loss, relative to the colours."""
+"""Weight of the summed errors of depth, in scene units, relative to those of colours in [0, 1]."""
 PATIENCE = 10
 """The mixture distance is dropped once it is no less than all of this many steps before."""
 MAX_BATCH = 2**14
@@ -44,17 +44,22 @@ class RegGSConfig:
 
     iterations: int = 400
     mixture_weight: float = 0.1
+    """Weight of the mixture distance in the loss; 0 leaves it out."""
     components: int = 1000
-    """Clusters per set of Gaussians."""
+    """Most clusters of each set of Gaussians, between which that distance is measured."""
 
 
 @dataclass(frozen=True)
 class Similarity:
-    """Similarity of the lifted Gaussians: x -> R^T (scale-about-camera(x) - t)."""
+    """Similarity that moves lifted Gaussians into the scene, with the camera centre c.
+
+    x -> R^T (c + scale (x - c) - t). The other way the scene is only turned and moved, by R x + t;
+    it is compared with lifted Gaussians that are scaled about the camera.
+    """
 
     scale: Float[Tensor, ""]
     quaternion: Float[Tensor, "4"]
-    """Rotation R (wxyz) from the scene to the lifted Gaussians."""
+    """Rotation R (wxyz, of any length) from the scene to the lifted Gaussians."""
     translation: Float[Tensor, "3"]
     """Translation t, in scene units."""
 
@@ -72,7 +77,19 @@ def register_by_similarity(
     seed: int = 42,
     config: RegGSConfig = RegGSConfig(),
 ) -> Gaussians:
-    """Fit one similarity between `lifted` and `scene` at the camera of `reference`."""
+    """Move `lifted` into the scene by the one similarity that fits best.
+
+    Args:
+        lifted: Gaussians of the reference, at a scale of their own; at least one.
+        scene: The scene, at least one Gaussian.
+        reference: The image that was lifted, with its camera, about which the scale is.
+        renderer: Renders both, with gradients.
+        seed: Seed of the clusters.
+        config: Settings of the fit.
+
+    Returns:
+        The lifted Gaussians after the best of all steps. Their colours by direction are not turned.
+    """
     camera = reference.camera
     own = renderer.render(lifted, camera)
     theirs = renderer.render(scene, camera)
@@ -93,13 +110,13 @@ def register_by_similarity(
     groups = [{"params": [p], "lr": rate} for p, rate in zip(parameters, REGGS_RATES, strict=True)]
     optimizer = torch.optim.Adam(groups, amsgrad=True)
 
-    # The distance of mixtures takes time and memory of n × m 3×3 matrices: clusters instead of all.
+    # The mixture distance takes time and memory of n × m 3×3 matrices, so it is one of clusters.
     small_lifted = cluster_gaussians(lifted, camera, config.components, seed)
     small_scene = cluster_gaussians(scene, camera, config.components, seed)
     best = None
     best_loss = np.inf
     distances: list[float] = []
-    compare_mixtures = config.mixture_weight > 0
+    uses_mixtures = config.mixture_weight > 0
     for _ in track(range(config.iterations), "Registering"):
         # The scene is moved to the lifted Gaussians, whose camera stays in place.
         fit = Similarity(scale, quaternion, translation)
@@ -109,20 +126,20 @@ def register_by_similarity(
         depth = (moved.depth - scale * own.depth.detach())[overlap].abs().sum()
         loss = colour + DEPTH_WEIGHT * depth
 
-        if compare_mixtures:
+        if uses_mixtures:
             means = scale * small_lifted.means
             covariances = scale**2 * small_lifted.covariances
             scaled = Mixture(means, covariances, small_lifted.weights)
             distance = compute_mixture_wasserstein(scaled, move_mixture(small_scene, fit, camera))
             recent = distances[-PATIENCE:]
             if len(distances) >= PATIENCE and distance.item() >= max(recent):
-                compare_mixtures = False
+                uses_mixtures = False
             else:
                 loss = loss + config.mixture_weight * distance
             distances.append(distance.item())
 
-        # The best of all steps, since the loss is not monotonous. Without the distance of mixtures
-        # it is smaller, so that a later step wins once that is dropped.
+        # The best of all steps, since the loss is not monotonous. Once the mixture distance is
+        # dropped the loss lacks one summand, so that a step after that wins.
         if loss.item() < best_loss:
             best_loss = loss.item()
             best = Similarity(*(p.detach().clone() for p in parameters))
@@ -134,7 +151,7 @@ def register_by_similarity(
 
 
 def move_scene(scene: Gaussians, fit: Similarity) -> Gaussians:
-    """Move the scene to the lifted Gaussians, differentiable in `fit`."""
+    """Move the scene to the scaled lifted Gaussians, differentiable in `fit`."""
     unit = torch.nn.functional.normalize(fit.quaternion, dim=0)
     means = scene.means @ fit.rotation.T + fit.translation
     return replace(scene, means=means, quats=multiply_quats(unit, scene.quats), encoded=None)
@@ -156,7 +173,7 @@ def move_into_scene(lifted: Gaussians, fit: Similarity, camera: Camera) -> Gauss
 
 
 def cluster_gaussians(gaussians: Gaussians, camera: Camera, components: int, seed: int) -> Mixture:
-    """Merge the Gaussians into k-means clusters, in the frame of the camera.
+    """Merge the Gaussians into at most `components` k-means clusters, in the axes of the camera.
 
     Weights are the softmax of the opacities: these lie in [0, 1], so that a faint Gaussian has at
     least a third of the weight of an opaque one.
@@ -176,7 +193,7 @@ def cluster_gaussians(gaussians: Gaussians, camera: Camera, components: int, see
 
 
 def move_mixture(mixture: Mixture, fit: Similarity, camera: Camera) -> Mixture:
-    """Move a mixture in the frame of the camera as `move_scene` moves the scene."""
+    """Move a mixture in the axes of the camera as `move_scene` moves the scene."""
     c2w = camera.c2w[:3, :3]
     # The similarity acts on world points; both mixtures are in camera axes, about the camera.
     rotation = c2w.T @ fit.rotation @ c2w
@@ -195,7 +212,10 @@ class Mixture:
 
 
 def reduce_mixture(mixture: Mixture, clusters: Int[Tensor, "n"]) -> Mixture:
-    """Merge each cluster into one component with its mean and covariance."""
+    """Merge each cluster into one component with its mean and covariance; drop empty ones.
+
+    `clusters` has the number of the cluster of each component, from 0.
+    """
     count = int(clusters.max()) + 1
     weight = mixture.weights.new_zeros(count).index_add(0, clusters, mixture.weights)
     filled = weight > 0
@@ -212,7 +232,7 @@ def reduce_mixture(mixture: Mixture, clusters: Int[Tensor, "n"]) -> Mixture:
 
 
 def compute_pairwise_costs(a: Mixture, b: Mixture) -> Float[Tensor, "n m"]:
-    """Compute squared 2-Wasserstein distances between components.
+    """Compute squared 2-Wasserstein distances between components, in squared scene units.
 
     |μ_i - μ_j|² + tr Σ_i + tr Σ_j - 2 tr (Σ_i^½ Σ_j Σ_i^½)^½
     """
@@ -228,7 +248,7 @@ def compute_pairwise_costs(a: Mixture, b: Mixture) -> Float[Tensor, "n m"]:
 def compute_matrix_root(matrices: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3 3"]:
     """Compute square roots of positive matrices, differentiable at equal eigenvalues."""
     # The gradient of `eigh` divides by differences of eigenvalues, which are 0 for round Gaussians;
-    # `_MatrixRoot` divides by their sums.
+    # `_MatrixRoot` divides by sums of their roots. The diagonal keeps these above 0 for flat ones.
     identity = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
     return _MatrixRoot.apply(matrices + 1e-6 * identity)
 
@@ -257,7 +277,10 @@ class _MatrixRoot(torch.autograd.Function):
 
 
 def compute_mixture_wasserstein(a: Mixture, b: Mixture) -> Float[Tensor, ""]:
-    """Compute Σ plan * cost by Sinkhorn iterations; the largest plan entry is 1 as in RegGS."""
+    """Compute Σ plan * cost by Sinkhorn iterations.
+
+    The plan is scaled so that its largest entry is 1, as in RegGS; its sum is then not 1.
+    """
     cost = compute_pairwise_costs(a, b)
     log_a = (a.weights + 1e-10).log()
     log_b = (b.weights + 1e-10).log()

@@ -60,9 +60,11 @@ def list_other_views(scenes: int, views: int, device: torch.device) -> Int[Tenso
 
 
 def find_nearest_views(cameras: Cameras, count: int) -> Int[Tensor, "b v s"]:
-    """Find the `count` nearest other views of each view; positions must differ."""
+    """Find the `count` nearest other views of each view, the nearest first."""
     centers = cameras.c2w[..., :3, 3]
     # Relative to their middle: distances between them would cancel far from the origin.
     centers = centers - centers.mean(dim=-2, keepdim=True)
-    # The nearest view is the view itself.
-    return torch.cdist(centers, centers).argsort(-1)[..., 1 : count + 1]
+    distances = torch.cdist(centers, centers)
+    # Each view comes first of its own row, also before others at its position, and is left out.
+    distances.diagonal(dim1=-2, dim2=-1).fill_(-1)
+    return distances.argsort(-1)[..., 1 : count + 1]

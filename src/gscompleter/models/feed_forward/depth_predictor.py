@@ -1,4 +1,8 @@
-"""The depth predictor that DepthSplat and VolSplat share: matching and monocular features."""
+"""The depth predictor that DepthSplat and VolSplat share: matching and monocular features.
+
+Attributes of modules are named as the keys of the published weights. Disparity is inverse z-depth,
+in 1 / scene units.
+"""
 
 from __future__ import annotations
 
@@ -26,7 +30,7 @@ from gscompleter.models.feed_forward.transformer import MultiViewTransformer
 from gscompleter.models.feed_forward.unet import UNet, create_conv3x3, create_refiner
 
 MAX_SOURCES = 2
-"""Number of nearest source views for more than three views; else all others are used."""
+"""Most source views that a view is matched with: the nearest ones."""
 
 
 @dataclass(frozen=True)
@@ -34,14 +38,18 @@ class VitSizes:
     """Sizes that depend on the vision transformer, and channels of its two DPT heads."""
 
     channels: int
+    """Channels of its tokens."""
     num_blocks: int
     heads: int
+    """Attention heads of a block."""
     feature_blocks: tuple[int, int, int, int]
     """Indices of the blocks that provide features."""
     widths: tuple[int, int, int, int]
     """Channels of the four levels of the DPT heads, finest first."""
     depth_features: int
+    """Channels of the DPT head that corrects the disparity."""
     gaussian_features: int
+    """Channels of the DPT head that `PixelFeatures` makes Gaussians of."""
 
 
 VITS = {
@@ -49,6 +57,7 @@ VITS = {
     "vitb": VitSizes(768, 12, 12, (2, 5, 8, 11), (96, 192, 384, 768), 48, 96),
     "vitl": VitSizes(1024, 24, 16, (4, 11, 17, 23), (128, 256, 512, 1024), 64, 128),
 }
+"""Sizes of DINOv2 and of what the authors built on it, by the name of the transformer."""
 
 LAYOUTS: Mapping[tuple[int, int], Layout] = {
     (4, 1): (("cnn0", "cnn1", "vit"), ("cnn2", "vit", "matching0", "disparity"), ("vit",)),
@@ -64,12 +73,13 @@ LAYOUTS: Mapping[tuple[int, int], Layout] = {
     ),
     (8, 1): (("cnn0", "vit"), ("cnn1", "vit"), ("cnn2", "vit", "matching0", "disparity")),
 }
-"""Maps joined at 1/2, 1/4 and 1/8 resolution, by upsampling factor and number of scales."""
+"""Names of the maps that a DPT head joins at 1/2, 1/4 and 1/8 resolution, by upsampling factor and
+number of scales. No published variant has another combination."""
 
 
 @dataclass(frozen=True)
 class DepthConfig:
-    """Architecture of the depth predictor."""
+    """Architecture of the depth predictor; `LAYOUTS` has the combinations that exist."""
 
     vit: Literal["vits", "vitb", "vitl"] = "vits"
     num_scales: Literal[1, 2] = 1
@@ -79,25 +89,28 @@ class DepthConfig:
     lowest_feature_resolution: Literal[4, 8] = 4
     """Full resolution divided by that of the coarsest features."""
     num_candidates: int = 128
-    """Number of inverse depths at the coarsest resolution; the next one has a quarter of it."""
+    """Number of disparities to try at the coarsest resolution; the next one has a quarter of it."""
     depth_chunk: int = 16
-    """Number of candidates per step; smaller values need less memory."""
+    """Number of candidates that are matched at a time; smaller values need less memory."""
 
     @property
     def patch(self) -> int:
-        """Side lengths of the images must be multiples of this, in pixels."""
+        """Side lengths of the images must be multiples of this, in pixels, as the authors' are."""
         return 16 if self.lowest_feature_resolution == 4 else 64
 
 
 @dataclass(frozen=True)
 class DepthPrediction:
-    """z-depth in scene units and features of n = b v views, scene by scene."""
+    """z-depth and features of n = b v views, the v views of a scene one after the other."""
 
     depth: Float[Tensor, "n 1 h w"]
+    """In scene units, between near and far of the camera."""
     certainty: Float[Tensor, "n 1 p q"]
     """Probability of the best candidate, at the finest matching resolution."""
     maps: Mapping[str, Float[Tensor, "n _ _ _"]]
+    """Maps of the encoder and of matching, by the names in `CHANNELS` of `dpt.py`."""
     vit_maps: list[Float[Tensor, "n _ _ _"]]
+    """Maps of the four `feature_blocks` of the vision transformer, at 1/8 resolution."""
 
 
 class Pyramid(nn.Module):
@@ -167,8 +180,8 @@ class MultiViewDepth(nn.Module):
         deepest = resize_bilinear(vit_maps[-1], encoded[-1].shape[2:])
         contexts = list(zip(encoded[::-1], matching, self.mono_pyramid(deepest), strict=False))
 
-        # Candidates over the whole range, evenly in inverse depth; the finer scale searches around
-        # what the coarser one found.
+        # Candidates over the whole range, evenly in disparity. The finer scale searches around what
+        # the coarser one found, at half its spacing.
         low, high = cameras.compute_inverse_range()
         candidates = space_evenly(low, high, self.config.num_candidates)
         disparity, probability = self.match_sources(0, contexts[0], cameras, sources, candidates)
@@ -180,7 +193,7 @@ class MultiViewDepth(nn.Module):
                 scale, contexts[scale], cameras, sources, candidates
             )
 
-        # Up to full resolution, with a correction that the heads learn.
+        # Up to full resolution, with a correction from all features.
         maps = {f"cnn{i}": x for i, x in enumerate(encoded)}
         maps |= {f"matching{i}": x for i, x in enumerate(matching)}
         residual = self.upsampler(vit_maps, {**maps, "disparity": disparity})
@@ -191,7 +204,10 @@ class MultiViewDepth(nn.Module):
     def compute_vit_features(
         self, images: Float[Tensor, "n 3 h w"]
     ) -> list[Float[Tensor, "n c p q"]]:
-        """Compute four feature maps of the vision transformer at 1/8 resolution."""
+        """Compute four feature maps of the vision transformer at 1/8 resolution.
+
+        `images` are normalised. They are made smaller to whole patches of the transformer.
+        """
         h, w = images.shape[2:]
         patches = resize_bilinear(images, (h // PATCH * PATCH, w // PATCH * PATCH))
         return [
@@ -207,7 +223,16 @@ class MultiViewDepth(nn.Module):
         sources: Int[Tensor, "b v s"],
         candidates: Float[Tensor, "n d _ _"],
     ) -> tuple[Float[Tensor, "n 1 h w"], Float[Tensor, "n d h w"]]:
-        """Estimate inverse depth and the probability of each candidate from features `context`."""
+        """Estimate the disparity and the probability of each candidate, at one scale.
+
+        Args:
+            scale: 0 for the coarsest.
+            context: Features at its resolution: of the encoder, after attention to the sources (the
+                ones that are matched), and of the vision transformer.
+            cameras: Cameras of the views.
+            sources: Indices of source views within their scene.
+            candidates: Disparities, for each view or each pixel.
+        """
         _, to_match, _ = context
         costs = compute_cost_volume(to_match, cameras, sources, candidates, self.config.depth_chunk)
         joined = torch.cat([costs, *context], 1)
@@ -221,7 +246,10 @@ class MultiViewDepth(nn.Module):
 def create_dpt_head(
     config: DepthConfig, features: int, with_disparity: bool, out: nn.Module | None = None
 ) -> DptHead:
-    """Create a DPT head that fuses the maps of a `DepthPrediction`."""
+    """Create a DPT head that fuses the maps of a `DepthPrediction` into `features` channels.
+
+    `out` are layers after them. Without `with_disparity` it leaves the disparity out.
+    """
     vit = VITS[config.vit]
     levels = LAYOUTS[config.upsample_factor, config.num_scales]
     layout = [[name for name in names if with_disparity or name != "disparity"] for names in levels]
@@ -229,7 +257,7 @@ def create_dpt_head(
 
 
 def create_residual_layers(features: int) -> nn.Sequential:
-    """Create the layers that map fused features to a correction of inverse depth."""
+    """Create the layers that map fused features to a correction of the disparity."""
     return nn.Sequential(
         create_padded_conv3x3(features, features // 2),
         nn.GELU(),
@@ -246,7 +274,10 @@ def sample_candidates(
     low: Float[Tensor, "n 1 1 1"],
     high: Float[Tensor, "n 1 1 1"],
 ) -> Float[Tensor, "n {number} h w"]:
-    """Sample inverse depths around `disparity`; only the ends are clamped to [`low`, `high`]."""
+    """Sample disparities around `disparity`, spaced evenly by `interval`.
+
+    Only both ends are clamped to [`low`, `high`]: beside these the samples lie closer together.
+    """
     start = (disparity - number // 2 * interval).clamp(low, high)
     stop = (disparity + (number // 2 - 1) * interval).clamp(low, high)
     return space_evenly(start, stop, number)

@@ -64,7 +64,7 @@ class DepthSplat(PixelFeatures):
         )
 
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> PixelGaussians:
-        """Predict a Gaussian for each pixel; see `DepthPredictor` for the images."""
+        """Predict a Gaussian for each pixel; see `MultiViewDepth` for the images."""
         depth, features = self.compute_pixel_features(images, cameras)
         raw = self.gaussian_head(features)
         flat = images.flatten(0, 1)

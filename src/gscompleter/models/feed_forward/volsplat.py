@@ -82,7 +82,7 @@ class VolSplat(PixelFeatures):
         self.gaussian_head = GaussianHead(self.channels, sum(CHANNEL_GROUPS))
 
     def forward(self, images: Float[Tensor, "b v 3 h w"], cameras: Cameras) -> VoxelGaussians:
-        """Predict a Gaussian for each voxel of one scene; see `DepthPredictor` for the images."""
+        """Predict a Gaussian for each voxel of one scene; see `MultiViewDepth` for the images."""
         if len(images) != 1:
             raise ValueError(f"VolSplat takes one scene at a time, got {len(images)}")
         depth, features = self.compute_pixel_features(images, cameras)

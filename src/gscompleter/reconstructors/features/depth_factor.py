@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 
 from gscompleter.numerics.geometry import measure_baseline
+from gscompleter.numerics.robust import MAD_TO_SIGMA
 from gscompleter.reconstructors.features.matches import triangulate
 from gscompleter.reconstructors.features.neighbours import find_neighbours
 from gscompleter.reconstructors.features.stereo_image import make_stereo_images
@@ -37,8 +38,6 @@ MIN_CORRELATION = -0.3
 """Smallest rank correlation of given and measured depths. Inverted depth comes near -1."""
 POSE_NOISE = np.log(1.1)
 """Largest logarithm that counts as no factor: errors of poses scale all depths of a pair."""
-MAD_TO_SIGMA = 1.4826
-"""Standard deviation of a normal distribution over its median absolute deviation."""
 
 
 @dataclass(frozen=True)
