@@ -255,7 +255,7 @@ def fade_harmful(
         set_error_budgets(view, shown.render.image, ~view.valid_mask, config)
         for view, shown in zip(views, frozen, strict=True)
     ]
-    plans = [shown.vary_opacities(added, is_fading=True) for shown in frozen]
+    plans = [shown.vary_opacities(added) for shown in frozen]
     faded = meet_error_budgets(added, frozen, budgets, plans, config)
     return list(split_into_parts(faded, parts)) if len(faded) else []
 

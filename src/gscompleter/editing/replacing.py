@@ -231,7 +231,7 @@ def fade_before_returned(
     added = merge([part.gaussians for part in state.added_parts])
     frozen = scenes.freeze_at((state.rendered_context,), [view.camera for view in views])
     budgets = [[ErrorBudget(view, "mse", limit)] for view, limit in zip(views, limits, strict=True)]
-    plans = [scene.vary_opacities(added, is_fading=True) for scene in frozen]
+    plans = [scene.vary_opacities(added) for scene in frozen]
     kept = meet_error_budgets(added, frozen, budgets, plans, state.config.psnr_guard)
     parts = (make_part(PartOrigin("photographs"), kept),) if len(kept) else ()
     return replace(state, added_parts=parts)

@@ -76,7 +76,7 @@ class PsnrGuard(Guard):
             for image, scene in zip(images, frozen, strict=True)
         ]
         added = fit_colors(added, frozen, wanted, [RELAXATION] * WORSE_COLOR_ROUNDS)
-        plans = [scene.vary_opacities(added, is_fading=True) for scene in view.frozen_photos]
+        plans = [scene.vary_opacities(added) for scene in view.frozen_photos]
 
         hole = dilate(view.empty, state.config.holes.dilation)
         labels, _ = label_regions(hole)

@@ -337,10 +337,12 @@ class _Composite(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         gaussians = GaussianArrays(*[to_float32(tensor) for tensor in tensors])
         splats = view.viewpoint.project(gaussians, is_antialiased)
-        binned = view.viewpoint.enter(splats, view.depth_limits)
-        frame, render = view.composite_layer(binned.layer)
+        layer = view.viewpoint.fill_lists(splats, view.depth_limits)
+        frame, render = view.composite_layer(layer)
+        if not any(ctx.needs_input_grad):
+            return render.image, render.depth, render.alpha
         # `save_for_backward` takes tensors alone; arrays are attributes.
-        ctx.scene = (view, splats.factors, binned, frame)
+        ctx.scene = (view, splats.factors, bin_layer(layer), frame)
         # Torch raises an error if a saved tensor is written to before the backward pass.
         ctx.save_for_backward(*tensors, render.depth, render.alpha)
         return render.image, render.depth, render.alpha

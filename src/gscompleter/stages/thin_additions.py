@@ -38,7 +38,7 @@ def drop_doubled(
 
     `frozen` is the scene at the photographs without them.
     """
-    plans = [scene.vary_opacities(added, is_fading=True) for scene in frozen]
+    plans = [scene.vary_opacities(added) for scene in frozen]
     none = torch.zeros_like(added.opacities, dtype=torch.bool)
     changes = sum_error_changes(added.opacities, none, views, frozen, plans, THINNING)
     doubled = find_doubled(added, changes.find_removable(THINNING), changes.lost)
