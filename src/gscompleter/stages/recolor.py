@@ -128,6 +128,8 @@ def fit_image_colors(
         opened, rows, sums[rows], reference.camera, held, config.ridge
     )
 
+    # Colours are given in each step, and harmonics, most of the memory, are not read any more.
+    opened = replace(opened, sh=torch.zeros_like(opened.means)[:, None])
     wanted = torch.lerp(frozen.render.image, reference.image, weight[..., None])
     others = scenes.freeze((context.hide(is_open), *added), reference.camera)
     errors = others.vary_colors(opened)

@@ -12,6 +12,7 @@ from gscompleter.system.files.mapping import (
     change_rows,
     find_changed_rows,
     is_mapped,
+    join_rows,
     move_to_file,
     release_pages,
     select_rows,
@@ -76,6 +77,17 @@ def test_rows_are_changed_and_compared_without_the_file_in_memory(tmp_path):
     assert torch.equal(mapped, make_values())
     assert is_mapped(change_rows(other, rows[:0], changed[:0]))
     assert os.listdir(tmp_path) == []
+
+
+def test_rows_are_joined_to_those_of_a_file_in_a_file(tmp_path):
+    values = make_values()
+    mapped = move_to_file(values, tmp_path)
+    joined = join_rows([values[:3], mapped, values[:0], values[5:9]])
+    assert is_mapped(joined)
+    for each in (mapped, joined):
+        assert read_resident(each) < 0.1 * values.nbytes
+    assert torch.equal(joined, torch.cat([values[:3], values, values[5:9]]))
+    assert not is_mapped(join_rows([values, values[:3]]))
 
 
 def test_numbers_in_memory_stay():

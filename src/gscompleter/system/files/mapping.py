@@ -6,11 +6,12 @@ The system keeps pages that were read, as memory of the process, until these are
 from __future__ import annotations
 
 import ctypes
+import math
 import mmap
 import os
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,7 +40,7 @@ def move_to_file(values: Tensor, beside: Path) -> Tensor:
     can_map = sys.platform == "linux" and os.path.isdir(OPEN_FILES)
     if not can_map or values.device.type != "cpu" or values.numel() == 0:
         return values
-    return _map_blocks([values], values, beside)
+    return _map_blocks([values], tuple(values.shape), values.dtype, beside)
 
 
 def change_rows(values: Tensor, rows: Int64[Tensor, "m"], changed: Tensor) -> Tensor:
@@ -59,11 +60,37 @@ def change_rows(values: Tensor, rows: Int64[Tensor, "m"], changed: Tensor) -> Te
             release_pages(values[start : start + SELECTED_BLOCK])
             yield block
 
-    return _map_blocks(make_blocks(), values, _FOLDERS[values.untyped_storage().data_ptr()])
+    return _map_blocks(make_blocks(), tuple(values.shape), values.dtype, _find_folder(values))
 
 
-def _map_blocks(blocks: Iterable[Tensor], like: Tensor, beside: Path) -> Tensor:
-    """Write blocks of rows to a temporary file, and map it with the shape of `like`."""
+def join_rows(parts: Sequence[Tensor]) -> Tensor:
+    """Concatenate rows; with those of a mapped file, in another file beside the same folder.
+
+    Raises OutputError as `move_to_file`.
+    """
+    first = next((part for part in parts if is_mapped(part)), None)
+    if first is None:
+        return torch.cat([*parts])
+
+    def make_blocks() -> Iterator[Tensor]:
+        for part in parts:
+            for block in part.split(SELECTED_BLOCK):
+                yield block.to(first.dtype)
+                release_pages(block)
+
+    shape = (sum(map(len, parts)), *first.shape[1:])
+    return _map_blocks(make_blocks(), shape, first.dtype, _find_folder(first))
+
+
+def _find_folder(mapped: Tensor) -> Path:
+    """Find what the file of mapped values lies beside."""
+    return _FOLDERS[mapped.untyped_storage().data_ptr()]
+
+
+def _map_blocks(
+    blocks: Iterable[Tensor], shape: tuple[int, ...], dtype: torch.dtype, beside: Path
+) -> Tensor:
+    """Write blocks of rows to a temporary file, and map it."""
     folder = next(each for each in (beside, *beside.absolute().parents) if each.is_dir())
     with (
         convert_write_errors(beside),
@@ -74,9 +101,9 @@ def _map_blocks(blocks: Iterable[Tensor], like: Tensor, beside: Path) -> Tensor:
             file.write(block.contiguous().numpy().data)
         file.flush()
         name = f"{OPEN_FILES}/{file.fileno()}"
-        mapped = torch.from_file(name, shared=True, size=like.numel(), dtype=like.dtype)
+        mapped = torch.from_file(name, shared=True, size=math.prod(shape), dtype=dtype)
     _FOLDERS[mapped.data_ptr()] = beside
-    return mapped.view(like.shape)
+    return mapped.view(shape)
 
 
 def select_rows(values: Tensor, rows: Int64[Tensor, "m"]) -> Tensor:
