@@ -66,7 +66,7 @@ FEW = [
 
 
 MOST = {
-    "complete": (2800, 2_800_000),
+    "complete": (2970, 2_800_000),
     "complete, alone": (1320, 6_500_000),
     "complete, mask": (2070, 6_000_000),
     "complete, painted": (970, 1_550_000),
@@ -76,7 +76,7 @@ MOST = {
     "remove, box": (1980, 9_700_000),
     "clean": (570, 560_000),
     "clean, alone": (56, 1_250_000),
-    "live, repair": (2280, 2_430_000),
+    "live, repair": (2280, 2_670_000),
     "live, remove, complete": (3290, 10_400_000),
     "batch": (740, 2_120_000),
     "evaluate": (800, 2_110_000),

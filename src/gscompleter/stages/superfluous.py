@@ -248,18 +248,19 @@ def exclude_needed_by_photographs(
             if returns_at_check[index] == returns:
                 continue
             needed = find_needed_by_photograph(check, opacities, missing)
-            if needed.any():
+            # A GPU is asked only about photographs that were above their limits.
+            if needed is None or not needed.any():
+                returns_at_check[index] = returns
+            else:
                 missing = missing & ~needed
                 returns += 1
-            else:
-                returns_at_check[index] = returns
     return missing
 
 
 def find_needed_by_photograph(
     check: PhotographCheck, opacities: Float[Tensor, "n"], missing: Bool[Tensor, "n"]
-) -> Bool[Tensor, "n"]:
-    """Find the missing Gaussians that a photograph needs back to be within its limit.
+) -> Bool[Tensor, "n"] | None:
+    """Find the missing Gaussians that a photograph needs back; None if it is within its limit.
 
     Opacities [n] are those that the Gaussians have if they are not missing. After
     `MAX_RETURN_ROUNDS` rounds the photograph gets back all that it sees.
@@ -274,7 +275,7 @@ def find_needed_by_photograph(
             image = plan(torch.where(absent, 0.0, opacities)).image
         error = compute_squared_error(view.fill_ignored(image), view.image).item()
         if error <= check.max_error or not absent.any():
-            return back
+            return None if plan is None else back
 
         # Most photographs are within their limits after the first pass, and need no plan.
         plan = plan or check.make_plan()
