@@ -66,7 +66,7 @@ FEW = [
 
 
 MOST = {
-    "complete": (2800, 2_800_000),
+    "complete": (2970, 2_800_000),
     "complete, alone": (1320, 6_500_000),
     "complete, mask": (2070, 6_000_000),
     "complete, painted": (970, 1_550_000),
@@ -76,8 +76,15 @@ MOST = {
     "remove, box": (1980, 9_700_000),
     "clean": (570, 560_000),
     "clean, alone": (56, 1_250_000),
+    "live, repair": (2280, 2_670_000),
+    "live, remove, complete": (3290, 10_400_000),
+    "batch": (740, 2_120_000),
+    "evaluate": (800, 2_110_000),
 }
 """Most waits of the host for the device in a command, and most bytes that it holds at once.
+
+Of `live` they are those of a session with one or two steps, of `batch` of a row, and of `evaluate`
+of a case.
 
 A twentieth more than was counted: work that moves to the host, or what a stage does not free.
 """
@@ -272,7 +279,7 @@ def test_a_splat_is_cleaned(room, tmp_path, monkeypatch, device, with_photograph
 # `tests/apps/test_live.py` has sessions, and `update`, above, completes on the device.
 @pytest.mark.slow
 @pytest.mark.parametrize("actions", [("repair",), ("remove", "complete")])
-def test_a_session_in_the_browser_is_saved(room, tmp_path, actions):
+def test_a_session_in_the_browser_is_saved(room, tmp_path, device, actions):
     options = LiveOptions(
         folder=room,
         scene=room / "splat.ply",
@@ -303,10 +310,13 @@ def test_a_session_in_the_browser_is_saved(room, tmp_path, actions):
     assert session.steps
     saving.save_session(ready, session)
     check_result(tmp_path / "out", 10)
+    assert_bounded(device, f"live, {', '.join(actions)}")
 
 
 @pytest.mark.slow
-def test_photographs_are_completed_in_a_batch_and_unused_ones_score_it(room, tmp_path, monkeypatch):
+def test_photographs_are_completed_in_a_batch_and_unused_ones_score_it(
+    room, tmp_path, monkeypatch, device
+):
     row = {"folder": str(room), "context": [0, 1], "target": [3], "near": 0.5, "far": 20}
     manifest = tmp_path / "manifest.jsonl"
     manifest.write_text(json.dumps(row | {"resolution": SIZE, "device": "cuda"}) + "\n")
@@ -319,10 +329,11 @@ def test_photographs_are_completed_in_a_batch_and_unused_ones_score_it(room, tmp
     held_out = check_result(path.parent, 10)["held_out"]
     assert [row["frame"] for row in held_out] == [2, 4]
     assert all(row["psnr_after"] > 10 for row in held_out)
+    assert_bounded(device, "batch")
 
 
 @pytest.mark.slow
-def test_methods_are_evaluated(room, tmp_path, monkeypatch):
+def test_methods_are_evaluated(room, tmp_path, monkeypatch, device):
     case = {"scene": "room", "context": [0, 2], "target": 3, "neighbours": [1]}
     case |= {"near": 0.5, "far": 20.0}
     content = {"resolution": [SIZE, SIZE], "cases": [case]}
@@ -333,3 +344,4 @@ def test_methods_are_evaluated(room, tmp_path, monkeypatch):
     for path in list_row_paths(tmp_path / "out"):
         (step,) = json.loads(path.read_text())["steps"]
         assert step["scores"]["target_after"]["psnr"] > 10, path.name
+    assert_bounded(device, "evaluate")

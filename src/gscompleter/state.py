@@ -16,6 +16,7 @@ from gscompleter.config import CompleterConfig
 from gscompleter.numerics.given_geometry import GivenGeometry
 from gscompleter.parts import Part, PartKind, find_last_target_id
 from gscompleter.system.files.display import Displayed
+from gscompleter.system.files.mapping import change_rows, find_changed_rows, select_rows
 from gscompleter.system.plugins import load_function
 from gscompleter.system.timing import add_seconds
 from gscompleter.target_result import TargetResult
@@ -189,7 +190,7 @@ class Completion(Displayed):
         if after is before:
             return torch.zeros_like(self.source.chosen_mask)
         # Their labels do not tell: a Gaussian may have had this label before.
-        return self.source.expand((after.sh != before.sh).flatten(1).any(dim=1))
+        return self.source.expand(find_changed_rows(before.sh, after.sh))
 
     @cached_property
     def scene(self) -> Gaussians:
@@ -209,7 +210,7 @@ class Completion(Displayed):
         is_changed = self.recolored_mask
         rows = self.source.stand_ins[is_changed]
         gaussians = self.context[is_changed]
-        change = after.sh[rows] - before.sh[rows]
+        change = select_rows(after.sh, rows) - select_rows(before.sh, rows)
         return replace(gaussians, sh=gaussians.sh + change, generated=after.generated[rows])
 
     @cached_property
@@ -221,7 +222,7 @@ class Completion(Displayed):
         rows = self.recolored_mask.nonzero()[:, 0]
         return replace(
             self.context,
-            sh=self.context.sh.index_copy(0, rows, self.recolored.sh),
+            sh=change_rows(self.context.sh, rows, self.recolored.sh),
             generated=self.context.generated.index_copy(0, rows, self.recolored.generated),
         )
 

@@ -25,7 +25,7 @@ from torch import Tensor
 from gscompleter.config.settings import COVERED
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.display import Displayed
-from gscompleter.system.files.mapping import select_rows
+from gscompleter.system.files.mapping import join_rows, select_rows
 from gscompleter.system.tensor_checks import (
     BOOLS,
     BYTE_DTYPES,
@@ -596,7 +596,7 @@ def merge(parts: Sequence[Gaussians]) -> Gaussians:
         quats=torch.cat([part.quats for part in parts]),
         scales=torch.cat([part.scales for part in parts]),
         opacities=torch.cat([part.opacities for part in parts]),
-        sh=torch.cat(sh),
+        sh=join_rows(sh),
         generated=torch.cat([part.generated for part in parts]),
         encoded=encoded,
         is_antialiased=parts[0].is_antialiased,

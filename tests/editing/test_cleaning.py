@@ -16,6 +16,7 @@ from gscompleter.apps.inputs import splat as splat_reading
 from gscompleter.config import CleaningConfig
 from gscompleter.editing.cleaning import find_removable, find_superfluous
 from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.render.cpu import CpuFrozenScene
 from gscompleter.render.loading import load_renderer
 from gscompleter.splats.ply import load_ply
 from gscompleter.stages.error_budgets import compute_squared_error
@@ -69,6 +70,21 @@ def test_what_stays_is_not_copied_to_be_drawn_without_the_rest(monkeypatch):
     assert sum(copied) <= len(FLOATERS)
 
 
+def test_photographs_within_their_limits_are_drawn_once_and_have_no_plan(monkeypatch):
+    drawn = []
+    composite = CpuFrozenScene.composite
+
+    def counted(frozen, new):
+        drawn.append(new)
+        return composite(frozen, new)
+
+    monkeypatch.setattr(CpuFrozenScene, "composite", counted)
+    monkeypatch.delattr(CpuFrozenScene, "vary_opacities")
+    removed = exclude_needed(SCENE, FLOAT, VIEWS, [1.0] * len(VIEWS), RENDERER)
+    assert torch.equal(removed, FLOAT)
+    assert len(drawn) == len(VIEWS)
+
+
 def find_all(*arguments) -> torch.Tensor:
     """Find what is superfluous, whatever the reason."""
     return torch.stack(list(find_superfluous(*arguments).values())).any(dim=0)
@@ -119,7 +135,7 @@ def test_what_no_photograph_shows_or_what_was_generated_stays():
 def test_the_change_is_the_one_that_drawing_shows():
     view, generator = VIEWS[0], torch.Generator().manual_seed(1)
     plan = RENDERER.freeze(SCENE[:0], view.camera).vary_opacities(SCENE)
-    change = predict_error_change(plan, SCENE.opacities, NONE, view, 64, generator)
+    change, _ = predict_error_change(plan, SCENE.opacities, NONE, view, 64, generator)
 
     def error(scene):
         return compute_squared_error(RENDERER.render(scene, view.camera).image, view.image).item()

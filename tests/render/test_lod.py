@@ -209,6 +209,18 @@ def test_evidence_is_thinned_with_the_scene():
     assert thin.areas.sum().item() == pytest.approx(whole.areas.sum().item(), rel=0.1)
 
 
+def test_a_scene_of_which_a_proxy_would_keep_most_is_its_own_proxy(monkeypatch):
+    """Unless it is too large for frozen views at so many cameras."""
+    monkeypatch.setattr(proxies, "MIN_PROXY_GAUSSIANS", 0)
+    kept = len(PROXY.rendered) / len(CROWD)
+    for share, is_whole in ((0.9 * kept, True), (1.1 * kept, False)):
+        monkeypatch.setattr(proxies, "MAX_PROXY_SHARE", share)
+        assert (build_proxy(CROWD, CAMERAS).rendered is CROWD) == is_whole
+    monkeypatch.setattr(proxies, "MAX_PROXY_SHARE", 0.9 * kept)
+    monkeypatch.setattr(proxies, "count_fitting_gaussians", lambda number: len(CROWD) - 1)
+    assert len(build_proxy(CROWD, CAMERAS).rendered) == len(PROXY.rendered)
+
+
 class KnowingReconstructor:
     def __call__(self, views):
         return reconstruction_of(views, [view_of(Room(), view.camera).depth for view in views])

@@ -13,6 +13,7 @@ from gscompleter.numerics.kernels import composite
 from gscompleter.render import cpu, device
 from gscompleter.render.cpu import CpuRenderer
 from gscompleter.render.gsplat import CudaRenderer
+from gscompleter.render.protocols import JointOpacityRender
 from gscompleter.render.redraw import RedrawnScene
 from gscompleter.types import make_observed, sh_from_rgb
 from parity import assert_close
@@ -320,6 +321,40 @@ def test_a_plan_is_the_composite_with_other_opacities(renderer, antialiased):
         )
         assert_same_render(planned, truth)
         assert_same_gradients({"opacities": grad}, {"opacities": expected})
+
+
+@MODES
+@pytest.mark.parametrize("renderer", [CPU, REFERENCE], ids=["cpu", "reference"])
+def test_a_plan_of_what_fades_is_any_other_plan_at_lower_opacities(renderer, antialiased):
+    context, new = context_and_new(antialiased)
+    frozen = renderer.freeze(context, CAMERA)
+    hidden = new.hide(torch.arange(len(new)) % 3 == 0)
+    plan, usual = frozen.vary_opacities(hidden, is_fading=True), frozen.vary_opacities(hidden)
+    for opacities in (hidden.opacities, 0.3 * hidden.opacities):
+        faded, grad = opacity_gradient(plan, opacities)
+        truth, expected = opacity_gradient(usual, opacities)
+        assert_same_render(faded, truth)
+        # A usual plan has gradients of transparent ones, too.
+        assert torch.equal(grad[hidden.opacities > 0], expected[hidden.opacities > 0])
+
+
+@MODES
+def test_several_gradients_at_once_are_those_of_each_function_alone(antialiased):
+    context, new = context_and_new(antialiased)
+    plan = CPU.freeze(context, CAMERA).vary_opacities(new)
+    assert isinstance(plan, JointOpacityRender)
+    for opacities in (new.opacities, torch.where(new.opacities > 0.5, 0.0, new.opacities)):
+        render, backpropagate = plan.begin(opacities)
+        images = torch.randn(5, *render.image.shape, generator=torch.Generator().manual_seed(0))
+        for image, gradient in zip(images, backpropagate(images), strict=True):
+            variable = opacities.clone().requires_grad_()
+            drawn = plan(variable)
+            assert torch.equal(drawn.image, render.image)
+            # With depth and alpha, gradients are those of the kernel for all outputs.
+            loss = (drawn.image * image).sum() + 0 * drawn.depth.sum() + 0 * drawn.alpha.sum()
+            (expected,) = torch.autograd.grad(loss, variable)
+            assert gradient.any()
+            assert torch.equal(gradient, expected)
 
 
 @MODES

@@ -267,8 +267,10 @@ def score_cleaning(
     rows = []
     seen = []
     for view in track(views, "scores"):
-        seen.append(measure_removal_visibility(given, taken, view.camera, renderer))
-        before = renderer.render(given, view.camera).image
+        frozen = renderer.freeze(given, view.camera)
+        seen.append(measure_removal_visibility(frozen, taken, view.camera))
+        before = frozen.render.image
+        del frozen  # before the next render, since both take memory
         after = renderer.render(kept, view.camera).image
         rows.append(
             {

@@ -17,6 +17,7 @@ from torch.nn.functional import avg_pool2d, max_pool2d
 
 from gscompleter.config import CleaningConfig
 from gscompleter.render.protocols import Renderer
+from gscompleter.stages.error_budgets import add_psnr_loss
 from gscompleter.stages.superfluous import (
     ErrorChanges,
     exclude_needed,
@@ -48,10 +49,11 @@ def find_superfluous(
 
     # One at a time they are superfluous; together they may not be. Photographs are compared at half
     # size as well.
-    checks = [*views, *(halve_view(view) for view in views)]
-    images = (renderer.render(scene, view.camera).image for view in checks)
-    max_errors = limit_errors(images, checks, config.tolerance)
-    removed = exclude_needed(scene, removable, checks, max_errors, renderer)
+    halves = [halve_view(view) for view in views]
+    images = (renderer.render(scene, view.camera).image for view in halves)
+    limits = [add_psnr_loss(error, config.tolerance) for error in changes.errors]
+    limits += limit_errors(images, halves, config.tolerance)
+    removed = exclude_needed(scene, removable, [*views, *halves], limits, renderer)
     return {"harmful": removed & is_harmful, "not needed": removed & ~is_harmful}
 
 
@@ -77,7 +79,10 @@ def rate_by_photographs(
     """Rate each Gaussian of a scene by how photographs change without it."""
     nothing = [renderer.freeze(scene[:0], view.camera) for view in views]
     # One after the other, since the plan of a large scene takes memory.
-    plans = (empty.vary_opacities(scene) for empty in track(nothing, "Comparing photographs"))
+    plans = (
+        empty.vary_opacities(scene, is_fading=True)
+        for empty in track(nothing, "Comparing photographs")
+    )
     return sum_error_changes(scene.opacities, faded, views, nothing, plans, config)
 
 

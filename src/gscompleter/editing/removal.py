@@ -9,7 +9,7 @@ are completed. The trust from before is kept for holes elsewhere.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 
 import torch
@@ -21,11 +21,15 @@ from gscompleter.guards import prepare_guards
 from gscompleter.parts import Part, PartOrigin, make_part, split_into_parts
 from gscompleter.render.cache import Parts, SceneRenderer
 from gscompleter.render.fit_colors import RELAXATION, fit_colors
-from gscompleter.render.protocols import FrozenScene, OpacityRender, Renderer
+from gscompleter.render.protocols import FrozenScene, Renderer
 from gscompleter.render.removed import mask_removed
 from gscompleter.render.view_map import get_view_map
 from gscompleter.stages.error_budgets import meet_error_budgets, set_error_budgets
-from gscompleter.stages.superfluous import exclude_needed_additions, limit_errors
+from gscompleter.stages.superfluous import (
+    PhotographCheck,
+    exclude_needed_by_photographs,
+    limit_errors,
+)
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
 from gscompleter.trust import Trust
@@ -197,14 +201,18 @@ def find_needed_revealed(
     images = (scene.extend(known).extend(candidates).render.image for scene in context)
     limits = limit_errors(images, views, REVEALED_TOLERANCE)
 
-    def iterate_plans() -> Iterator[OpacityRender]:
-        for scene in context:
-            yield scene.extend(others).vary_opacities(candidates)
+    def check(scene: FrozenScene, view: View, max_error: float) -> PhotographCheck:
+        # Extended anew each time: for all photographs it would take too much memory.
+        return PhotographCheck(
+            view,
+            max_error,
+            lambda missing: scene.extend(others).composite(candidates.hide(missing)).image,
+            lambda: scene.extend(others).vary_opacities(candidates, is_fading=True),
+        )
 
     everything = torch.ones_like(candidates.opacities, dtype=torch.bool)
-    superfluous = exclude_needed_additions(
-        iterate_plans, candidates.opacities, everything, views, limits
-    )
+    checks = [check(*parts) for parts in zip(context, views, limits, strict=True)]
+    superfluous = exclude_needed_by_photographs(checks, candidates.opacities, everything)
     return is_outside.masked_scatter(is_outside, ~superfluous)
 
 

@@ -206,16 +206,14 @@ def return_needed(
     candidates = given.source.rendered[contested.rows]
     views = [photo.view for photo in state.photos]
     frozen = scenes.freeze_at(state.parts, [view.camera for view in views])
-    plans = [scene.vary_opacities(candidates) for scene in frozen]
+    plans = [scene.vary_opacities(candidates, is_fading=True) for scene in frozen]
     is_dropped = find_unneeded_candidates(candidates, views, frozen, plans, scenes.renderer, config)
 
     # No photograph may be worse than it was with all of them.
     whole = merge(given.parts)
     images = (scenes.renderer.render(whole, view.camera).image for view in views)
     limits = limit_errors(images, views, config.tolerance)
-    dropped = exclude_needed_additions(
-        lambda: plans, candidates.opacities, is_dropped, views, limits
-    )
+    dropped = exclude_needed_additions(plans, candidates.opacities, is_dropped, views, limits)
     gone = contested.rows.masked_scatter(contested.rows, dropped)
     return fade_before_returned(drop_rows(state, given, gone), views, limits, scenes)
 

@@ -11,6 +11,7 @@ from torch.nn.functional import pad
 from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, thin_gaussians
 from gscompleter.render.protocols import FrozenScene, HidingScene, Renderer
 from gscompleter.render.view_map import get_view_map
+from gscompleter.system.files.mapping import find_changed_rows
 from gscompleter.types import Camera, Gaussians
 
 Parts = tuple[Gaussians, ...]
@@ -65,7 +66,7 @@ class SceneRenderer:
         recoloured is repainted, and one of which some were hidden is drawn again where it showed.
         """
         if frozen is not None and known[0] is not parts[0] and differ_in_color(known[0], parts[0]):
-            rows = (known[0].sh != parts[0].sh).any(dim=(1, 2)).nonzero()[:, 0]
+            rows = find_changed_rows(known[0].sh, parts[0].sh).nonzero()[:, 0]
             frozen = frozen.repaint(rows, parts[0][rows])
             known = (parts[0], *known[1:])
         if (

@@ -19,7 +19,7 @@ from gscompleter.numerics.kernels import composite, project
 from gscompleter.numerics.kernels.composite import Layer, RasterFrame
 from gscompleter.numerics.kernels.project import CameraArrays, GaussianArrays
 from gscompleter.numerics.kernels.simd import TILE
-from gscompleter.render.protocols import ColorErrors, ColorSums, DepthRender, OpacityRender
+from gscompleter.render.protocols import Backpropagation, ColorErrors, ColorSums, DepthRender
 from gscompleter.render.viewpoint import (
     BinnedSplats,
     Splats,
@@ -249,16 +249,19 @@ class CpuFrozenScene:
         frame = self.viewpoint.composite(self.layer, self.frame, new)
         return frame, to_render(frame)
 
-    def vary_opacities(self, new: Gaussians) -> OpacityRender:
-        """Project, sort and bin `new` once at opacity 1, so that boxes hold for every opacity."""
-        opaque = to_arrays(replace(new, opacities=torch.ones_like(new.opacities)))
-        splats = self.viewpoint.project(opaque, new.is_antialiased)
-        binned = self.viewpoint.enter(splats, self.depth_limits)
+    def vary_opacities(self, new: Gaussians, is_fading: bool = False) -> CpuOpacityRender:
+        """Project, sort and bin `new` once, so that boxes hold for every opacity to come.
 
-        def render(opacities: Float[Tensor, "n"]) -> Render:
-            return Render(*_VaryOpacities.apply(self, binned, opacities.to("cpu", torch.float32)))
-
-        return render
+        That is up to 1, or what Gaussians have that are fading: of faint ones boxes are small.
+        """
+        largest = new.opacities if is_fading else torch.ones_like(new.opacities)
+        splats = self.viewpoint.project(
+            to_arrays(replace(new, opacities=largest)), new.is_antialiased
+        )
+        # Opacities are given in each render, and multiply the factors of antialiasing.
+        factors = np.ones(len(new), np.float32) if splats.factors is None else splats.factors
+        splats = replace(splats, opacities=factors)
+        return CpuOpacityRender(self, self.viewpoint.enter(splats, self.depth_limits))
 
     def vary_colors(self, new: Gaussians) -> ColorErrors:
         """Project, sort and bin `new` once."""
@@ -283,6 +286,48 @@ class CpuFrozenScene:
         return render
 
 
+@dataclass(frozen=True)
+class CpuOpacityRender:
+    """A frozen scene with Gaussians that vary in opacity."""
+
+    scene: CpuFrozenScene
+    binned: BinnedSplats
+    """The Gaussians, with factors on the opacities in place of these."""
+
+    def __call__(self, opacities: Float[Tensor, "n"]) -> Render:
+        """Render the scene with the Gaussians at other opacities; differentiable."""
+        return Render(*_VaryOpacities.apply(self, opacities.to("cpu", torch.float32)))
+
+    def begin(self, opacities: Float[Tensor, "n"]) -> tuple[Render, Backpropagation]:
+        """Render, and prepare the gradients of several functions of the image at once."""
+        opacities = opacities.to("cpu", torch.float32)
+        binned = self.set_opacities(opacities)
+        frame, render = self.scene.composite_layer(binned.layer)
+
+        def backpropagate(images: Float[Tensor, "images h w 3"]) -> list[Float[Tensor, "n"]]:
+            return self.differentiate(binned, frame, opacities, images)
+
+        return render, backpropagate
+
+    def set_opacities(self, opacities: Float[Tensor, "n"]) -> BinnedSplats:
+        """Give the Gaussians other opacities."""
+        layer = self.binned.layer
+        layer = layer._replace(opacities=to_float32(opacities) * layer.opacities)
+        return replace(self.binned, layer=layer)
+
+    def differentiate(
+        self,
+        binned: BinnedSplats,
+        frame: RasterFrame,
+        opacities: Float[Tensor, "n"],
+        images: Float[Tensor, "images h w 3"],
+    ) -> list[Float[Tensor, "n"]]:
+        """Compute a gradient in the opacities from each gradient of the image of `frame`."""
+        view = self.scene
+        sums = view.viewpoint.backpropagate_images(view.layer, binned, frame, to_float32(images))
+        return [divide_by_opacity(column, to_float32(opacities)) for column in sums.T]
+
+
 class _Composite(torch.autograd.Function):
     """Image, depth and alpha of a frozen context with new Gaussians."""
 
@@ -292,10 +337,12 @@ class _Composite(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         gaussians = GaussianArrays(*[to_float32(tensor) for tensor in tensors])
         splats = view.viewpoint.project(gaussians, is_antialiased)
-        binned = view.viewpoint.enter(splats, view.depth_limits)
-        frame, render = view.composite_layer(binned.layer)
+        layer = view.viewpoint.fill_lists(splats, view.depth_limits)
+        frame, render = view.composite_layer(layer)
+        if not any(ctx.needs_input_grad):
+            return render.image, render.depth, render.alpha
         # `save_for_backward` takes tensors alone; arrays are attributes.
-        ctx.scene = (view, splats.factors, binned, frame)
+        ctx.scene = (view, splats.factors, bin_layer(layer), frame)
         # Torch raises an error if a saved tensor is written to before the backward pass.
         ctx.save_for_backward(*tensors, render.depth, render.alpha)
         return render.image, render.depth, render.alpha
@@ -327,27 +374,38 @@ class _VaryOpacities(torch.autograd.Function):
     """Image, depth and alpha for varying opacities: nothing is projected, sorted or binned."""
 
     @staticmethod
-    def forward(
-        ctx: Any, view: CpuFrozenScene, binned: BinnedSplats, opacities: Tensor
-    ) -> tuple[Tensor, ...]:
-        # The layer was projected at opacity 1: its opacities are the factors of antialiasing.
-        layer = binned.layer._replace(opacities=to_float32(opacities) * binned.layer.opacities)
-        frame, render = view.composite_layer(layer)
-        ctx.scene = (view, replace(binned, layer=layer), frame)
+    def forward(ctx: Any, plan: CpuOpacityRender, opacities: Tensor) -> tuple[Tensor, ...]:
+        binned = plan.set_opacities(opacities)
+        frame, render = plan.scene.composite_layer(binned.layer)
+        ctx.scene = (plan, binned, frame)
         ctx.save_for_backward(opacities, render.depth, render.alpha)
+        # An output that nothing depends on has no gradient then, where it would have zeros.
+        ctx.set_materialize_grads(False)
         return render.image, render.depth, render.alpha
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, *d_frame: Tensor) -> tuple[Tensor | None, ...]:
-        view, binned, frame = ctx.scene
-        opacities = to_float32(ctx.saved_tensors[0])
-        gradients = view.viewpoint.composite_backward(view.layer, binned, frame, d_frame)
+    def backward(ctx: Any, *d_frame: Tensor | None) -> tuple[Tensor | None, ...]:
+        plan, binned, frame = ctx.scene
+        opacities, *_ = ctx.saved_tensors
+        d_image, d_depth, d_alpha = d_frame
+        if d_image is not None and d_depth is None and d_alpha is None:
+            # Most functions read the image alone, and this way fills a tenth of the memory.
+            (result,) = plan.differentiate(binned, frame, opacities, d_image[None])
+            return None, result
+        view = plan.scene
+        outputs = (frame.image, frame.depth, frame.alpha)
+        gradients = view.viewpoint.composite_backward(
+            view.layer,
+            binned,
+            frame,
+            tuple(
+                torch.zeros(output.shape) if gradient is None else gradient
+                for gradient, output in zip(d_frame, outputs, strict=True)
+            ),
+        )
         sums = view.viewpoint.sum_by_gaussian(binned, gradients)[:, project.SUM]
-        # Sums are of alpha · dL/dalpha, and alpha is proportional to the opacity. An opacity of 0
-        # has no sum, and keeps the gradient 0.
-        result = np.divide(sums, opacities, out=np.zeros_like(opacities), where=sums != 0)
-        return None, None, torch.from_numpy(result)
+        return None, divide_by_opacity(sums, to_float32(opacities))
 
 
 class _VaryDepths(torch.autograd.Function):
@@ -373,6 +431,17 @@ class _VaryDepths(torch.autograd.Function):
         gradients = view.viewpoint.composite_backward(view.layer, binned, frame, d_frame)
         sums = view.viewpoint.sum_by_gaussian(binned, gradients)[:, project.SUM_DEPTH]
         return None, None, torch.from_numpy(sums.copy())
+
+
+def divide_by_opacity(
+    sums: Float32[ndarray, "n"], opacities: Float32[ndarray, "n"]
+) -> Float[Tensor, "n"]:
+    """Compute gradients in the opacities from sums of alpha times dL/dalpha.
+
+    Alpha is proportional to the opacity. An opacity of 0 has no sum, and keeps the gradient 0.
+    """
+    result = np.divide(sums, opacities, out=np.zeros_like(opacities), where=sums != 0)
+    return torch.from_numpy(result)
 
 
 def freeze_nothing(viewpoint: Viewpoint) -> CpuFrozenScene:

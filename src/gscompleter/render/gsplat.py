@@ -353,8 +353,12 @@ class CudaFrozenScene(RedrawnScene):
         )
         return here, there
 
-    def vary_opacities(self, new: Gaussians) -> OpacityRender:
-        """Fix all of `new` but the opacities, with boxes that hold for every opacity."""
+    def vary_opacities(self, new: Gaussians, is_fading: bool = False) -> OpacityRender:
+        """Fix all of `new` but the opacities, with boxes that hold for every opacity to come."""
+        if is_fading:
+            rows = new.opacities.nonzero()[:, 0]
+            render = self.renderer.vary_opacities(merge([self.scene, new[rows]]), self.camera)
+            return lambda opacities: render(torch.cat([self.scene.opacities, opacities[rows]]))
         opaque = replace(new, opacities=torch.ones_like(new.opacities))
         render = self.renderer.vary_opacities(merge([self.scene, opaque]), self.camera)
         return lambda opacities: render(torch.cat([self.scene.opacities, opacities]))

@@ -30,6 +30,9 @@ from gscompleter.types import Camera, ContextScene, Gaussians
 
 MIN_PROXY_GAUSSIANS = 500_000
 """Gaussians from which on a proxy saves more time than it takes to build."""
+MAX_PROXY_SHARE = 2 / 3
+"""Largest share of its scene that a proxy may keep: one that keeps more saves little time, and its
+harmonics, which are its own, take more memory than it saves."""
 MAX_REACH = 0.5
 """Largest distance of a Gaussian from the first of its run, in pixels."""
 MAX_RUN_DEVIATION = 2.0
@@ -53,21 +56,28 @@ MIN_BLOCK_RUNS = 16
 def build_proxy(scene: Gaussians, cameras: Sequence[Camera]) -> ContextScene:
     """Build the LOD proxy of a large `scene`; one that is small or on a GPU is its own.
 
-    Runs are found and merged on the CPU, and a proxy is to save its time and memory.
+    So is one of which the proxy would keep most, if the frozen views of `cameras` hold it. Runs are
+    found and merged on the CPU, and a proxy is to save its time and memory.
     """
     if len(scene) < MIN_PROXY_GAUSSIANS or scene.means.is_cuda:
         return ContextScene.whole(scene)
-    return simplify_scene(scene, cameras)
+    fits = len(scene) <= count_fitting_gaussians(len(cameras))
+    return simplify_scene(scene, cameras, MAX_PROXY_SHARE if fits else 1.0)
 
 
-def simplify_scene(scene: Gaussians, cameras: Sequence[Camera]) -> ContextScene:
+def simplify_scene(
+    scene: Gaussians, cameras: Sequence[Camera], max_share: float = 1.0
+) -> ContextScene:
     """Merge runs of adjacent, close Gaussians of one provenance to one Gaussian each.
 
     Runs become longer until their number fits in the memory of the frozen views of `cameras`. In a
-    scene in random order adjacent Gaussians are far apart, and almost nothing is merged.
+    scene in random order adjacent Gaussians are far apart, and almost nothing is merged. A scene of
+    which more than `max_share` would be left stays as it is.
     """
     arrays = to_arrays(scene)
     start = find_run_starts(arrays.means, arrays.scales, scene.generated.numpy(), cameras)
+    if len(start) - 1 > max_share * len(scene):
+        return ContextScene.whole(scene)
     merged = merge_runs(scene, start)
     run_of_gaussian = torch.arange(len(merged)).repeat_interleave(torch.from_numpy(np.diff(start)))
     return ContextScene.build(scene, merged, run_of_gaussian)

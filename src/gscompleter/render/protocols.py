@@ -12,6 +12,8 @@ from gscompleter.types import Camera, Gaussians, Render
 
 OpacityRender = Callable[[Float[Tensor, "n"]], Render]
 """Renders a frozen scene with Gaussians that vary in opacity [n] only."""
+Backpropagation = Callable[[Float[Tensor, "images h w 3"]], Sequence[Float[Tensor, "n"]]]
+"""Computes a gradient in the opacities from each of several gradients of an image."""
 DepthRender = OpacityRender
 """Renders a frozen scene with Gaussians that vary in z-depth [n] only."""
 
@@ -20,6 +22,14 @@ ColorSums = tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]
 
 ColorErrors = Callable[[Float[Tensor, "n 3"], Float[Tensor, "h w 3"]], ColorSums]
 """Backprojects the residual of a photograph [h, w, 3], at given colours [n, 3]."""
+
+
+@runtime_checkable
+class JointOpacityRender(Protocol):
+    """An `OpacityRender` that computes several gradients at once, in less time than one by one."""
+
+    def begin(self, opacities: Float[Tensor, "n"]) -> tuple[Render, Backpropagation]:
+        """Render, and prepare the gradients at these opacities."""
 
 
 @runtime_checkable
@@ -48,8 +58,11 @@ class FrozenScene(Protocol):
     def composite(self, new: Gaussians) -> Render:
         """Render the scene with `new`; differentiable in `new`."""
 
-    def vary_opacities(self, new: Gaussians) -> OpacityRender:
-        """Fix all of `new` but the opacities; the result is differentiable."""
+    def vary_opacities(self, new: Gaussians, is_fading: bool = False) -> OpacityRender:
+        """Fix all of `new` but the opacities; the result is differentiable.
+
+        If it is fading, no opacity will exceed that of `new`, and what is transparent stays so.
+        """
 
     def vary_colors(self, new: Gaussians) -> ColorErrors:
         """Fix all of `new` but its colours, which the camera sees as given, from 0 up."""

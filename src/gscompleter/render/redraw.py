@@ -68,7 +68,7 @@ class RedrawnScene:
         """Render the visible Gaussians and `new`."""
         return self.renderer.render(merge([self.scene, new]), self.camera)
 
-    def vary_opacities(self, new: Gaussians) -> OpacityRender:
+    def vary_opacities(self, new: Gaussians, is_fading: bool = False) -> OpacityRender:
         """Fix all of `new` but the opacities."""
         return lambda opacities: self.composite(replace(new, opacities=opacities))
 

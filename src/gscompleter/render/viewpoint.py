@@ -175,6 +175,31 @@ class Viewpoint:
         )
         return values, written
 
+    def backpropagate_images(
+        self,
+        context: Layer,
+        new: BinnedSplats,
+        frame: RasterFrame,
+        d_images: Float32[ndarray, "images h w 3"],
+    ) -> Float32[ndarray, "n images"]:
+        """Compute opacity times gradient of each new Gaussian from gradients of the image."""
+        values = np.empty((len(new.slots), len(d_images)), np.float32)
+        written = np.zeros(len(new.slots), np.bool_)
+        tiles = find_touched_tiles(new.layer)
+        self.share(
+            composite.backpropagate_images,
+            len(tiles),
+            tiles,
+            context,
+            new.layer,
+            frame,
+            d_images,
+            new.slots,
+            values,
+            written,
+        )
+        return self.sum_by_gaussian(new, (values, written))
+
     def backproject_residual(
         self, context: Layer, new: BinnedSplats, photograph: Float32[ndarray, "h w 3"]
     ) -> Float32[ndarray, "n 4"]:

@@ -113,26 +113,43 @@ def add_observed(
     """
     if not state.is_given or not state.config.add_observed:
         return state
-    views = [photo.view for photo in state.photos]
     reconstructed: set[int] = set()
     for _ in track(range(MAX_RECONSTRUCTIONS), "Adding what photographs show"):
-        frozen = scenes.freeze_at(state.parts, [view.camera for view in views])
-        renders = [scene.render for scene in frozen]
-        lacks = find_lacks(views, renders, state.config.holes)
-        chosen = choose_photographs(views, lacks, reconstructed)
-        if not chosen:
-            break
-        reconstructed.update(chosen)
-        photos = [Evidence(views[i], frozen[i], lacks[i]) for i in chosen]
-        lacking, notes = reconstruct_lacking(reconstructor, photos, state)
-        state = replace(state, context_notes=(*state.context_notes, *notes))
-        candidates = Additions.begin(PartOrigin("photographs"), "select", lacking)
-        part = accept_photographed(candidates, frozen, state).to_part()
+        num_parts = len(state.added_parts)
+        state = add_lacking(reconstructor, state, scenes, reconstructed)
         # What was found and could not be added would be found again.
-        if len(part) == 0:
+        if len(state.added_parts) == num_parts:
             break
-        state = replace(state, added_parts=(*state.added_parts, part))
     return state
+
+
+def add_lacking(
+    reconstructor: Reconstructor,
+    state: Completion,
+    scenes: SceneRenderer,
+    reconstructed: set[int],
+) -> Completion:
+    """Add what photographs show and the scene lacks once, and note which were `reconstructed`.
+
+    Frozen views of the scene before are forgotten at the end, so that those of the scene after take
+    their place: both together would be the most memory of the context.
+    """
+    views = [photo.view for photo in state.photos]
+    frozen = scenes.freeze_at(state.parts, [view.camera for view in views])
+    renders = [scene.render for scene in frozen]
+    lacks = find_lacks(views, renders, state.config.holes)
+    chosen = choose_photographs(views, lacks, reconstructed)
+    if not chosen:
+        return state
+    reconstructed.update(chosen)
+    photos = [Evidence(views[i], frozen[i], lacks[i]) for i in chosen]
+    lacking, notes = reconstruct_lacking(reconstructor, photos, state)
+    state = replace(state, context_notes=(*state.context_notes, *notes))
+    candidates = Additions.begin(PartOrigin("photographs"), "select", lacking)
+    part = accept_photographed(candidates, frozen, state).to_part()
+    if len(part) == 0:
+        return state
+    return replace(state, added_parts=(*state.added_parts, part))
 
 
 def find_lacks(

@@ -29,7 +29,6 @@ from gscompleter.reconstructors.features.given_range import DepthRange, find_dep
 from gscompleter.render.lod import build_proxy
 from gscompleter.render.protocols import Renderer
 from gscompleter.system.errors import InputError
-from gscompleter.system.files.mapping import release_pages
 from gscompleter.trust.lifted import is_lifted
 from gscompleter.types import Camera, ContextScene, Gaussians, Reconstruction, View
 
@@ -226,9 +225,7 @@ def measure_depth_range(
     Half the nearest and twice the farthest percentile leave space for what the scene lacks.
     """
     # Depths do not depend on colours, whose harmonics are most of what a renderer reads.
-    constant = scene.sh[:, :1].contiguous()
-    release_pages(scene.sh)
-    scene = replace(scene, sh=constant)
+    scene = replace(scene, sh=torch.zeros_like(scene.means)[:, None])
     depths = []
     for camera in cameras:
         if not (compute_z_depths(scene.means, camera) > 0).any():

@@ -315,18 +315,18 @@ def select_fewest(relief: Float[Tensor, "n"], needed: float) -> Bool[Tensor, "n"
     return torch.zeros_like(relief, dtype=torch.bool).index_fill(0, taken, True)
 
 
-def compute_mse_and_gradient(
-    plan: OpacityRender, view: View, opacities: Float[Tensor, "n"]
-) -> tuple[float, Float[Tensor, "n"]]:
-    """Compute the mean squared error against a photograph and its gradient in the opacities.
+def compute_mse_and_derivative(
+    view: View, image: Float[Tensor, "h w 3"]
+) -> tuple[float, Float[Tensor, "h w 3"]]:
+    """Compute the mean squared error against a photograph and its derivative in the image.
 
-    The error is that of the clipped image, as it is shown. The gradient is that of the image as it
-    is rendered, since a clipped value has none.
+    The error is that of the clipped image, as it is shown. The derivative is that of the image as
+    it is rendered, since a clipped value has none.
     """
-    variable, image = render_with_gradient(plan, opacities)
-    gradient = compute_gradient(image, ErrorBudget(view, "mse", 0.0), variable)
+    variable = image.detach().requires_grad_()
+    derivative = compute_gradient(variable, ErrorBudget(view, "mse", 0.0), variable)
     error = compute_squared_error(view.fill_ignored(image.detach()), view.image).item()
-    return error, gradient
+    return error, derivative
 
 
 def render_with_gradient(
@@ -339,8 +339,8 @@ def render_with_gradient(
 
 
 def compute_gradient(
-    image: Float[Tensor, "h w 3"], budget: ErrorBudget, variable: Float[Tensor, "n"]
-) -> Float[Tensor, "n"]:
+    image: Float[Tensor, "h w 3"], budget: ErrorBudget, variable: Float[Tensor, "*shape"]
+) -> Float[Tensor, "*shape"]:
     """Differentiate the error that a budget limits."""
     with torch.enable_grad():
         error = compute_pixel_errors(image, budget).sum()

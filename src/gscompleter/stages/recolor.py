@@ -24,6 +24,7 @@ from gscompleter.render.spherical_harmonics import evaluate_sh_basis
 from gscompleter.stages.synthesize import GeneratedView
 from gscompleter.stages.target_view import TargetView
 from gscompleter.state import Completion
+from gscompleter.system.files.mapping import change_rows, select_rows
 from gscompleter.system.threads import use_one_torch_thread
 from gscompleter.system.timing import timed_stage
 from gscompleter.trust import HeldViews
@@ -85,7 +86,7 @@ def recolor(reference: GeneratedView, view: TargetView, origin: PartOrigin) -> R
 
     recolored = replace(
         context,
-        sh=context.sh.index_add(0, rows, delta),
+        sh=change_rows(context.sh, rows, select_rows(context.sh, rows) + delta),
         generated=context.generated.index_fill(0, rows, origin.label),
     )
     # Trusted at later targets: otherwise targets in a row compound their errors (decision 038).
@@ -127,6 +128,8 @@ def fit_image_colors(
         opened, rows, sums[rows], reference.camera, held, config.ridge
     )
 
+    # Colours are given in each step, and harmonics, most of the memory, are not read any more.
+    opened = replace(opened, sh=torch.zeros_like(opened.means)[:, None])
     wanted = torch.lerp(frozen.render.image, reference.image, weight[..., None])
     others = scenes.freeze((context.hide(is_open), *added), reference.camera)
     errors = others.vary_colors(opened)

@@ -6,7 +6,7 @@ predicts the error without each.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -14,11 +14,18 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import CleaningConfig
-from gscompleter.render.protocols import FrozenScene, OpacityRender, Renderer
+from gscompleter.render.protocols import (
+    Backpropagation,
+    FrozenScene,
+    JointOpacityRender,
+    OpacityRender,
+    Renderer,
+)
 from gscompleter.stages.error_budgets import (
     add_psnr_loss,
-    compute_mse_and_gradient,
+    compute_mse_and_derivative,
     compute_squared_error,
+    render_with_gradient,
     select_fewest,
 )
 from gscompleter.trust.photometric import sum_weights
@@ -44,6 +51,8 @@ class ErrorChanges:
     """By how much errors rise, likewise."""
     equal_share: float
     """What a Gaussian would lose if all that a photograph shows were equally important."""
+    errors: Sequence[float]
+    """Mean squared error of each photograph with all of them."""
 
     @property
     def are_observed(self) -> Bool[Tensor, "n"]:
@@ -76,13 +85,15 @@ def sum_error_changes(
     gained = torch.zeros_like(opacities)
     lost = torch.zeros_like(opacities)
     equal_share = 0.0
+    errors = []
     for view, scene, plan in zip(views, frozen, plans, strict=True):
-        change = predict_error_change(plan, opacities, faded, view, config.probes, generator)
+        change, error = predict_error_change(plan, opacities, faded, view, config.probes, generator)
+        errors.append(error)
         gained += (-change).clamp_min(0)
         lost += change.clamp_min(0)
         num_shown = int((change != 0).sum()) + int((sum_weights(scene) > 0).sum())
         equal_share += 1 / max(num_shown, 1) / len(views)
-    return ErrorChanges(gained, lost, equal_share)
+    return ErrorChanges(gained, lost, equal_share, errors)
 
 
 def predict_error_change(
@@ -92,42 +103,51 @@ def predict_error_change(
     view: View,
     probes: int,
     generator: torch.Generator,
-) -> Float[Tensor, "n"]:
+) -> tuple[Float[Tensor, "n"], float]:
     """Predict the relative change of a photograph's squared error without each Gaussian.
 
     `plan` renders them with other opacities than their `full` ones; those in `faded` are faint.
+    Also returns the mean squared error with all of them.
     """
     current = torch.where(faded, full.clamp_max(FADED_OPACITY), full)
-    error, gradient = compute_mse_and_gradient(plan, view, current)
-    square = estimate_squared_gradient(plan, current, view.valid_mask, probes, generator)
+    image, backpropagate = begin_gradients(plan, current)
+    error, d_image = compute_mse_and_derivative(view, image)
+    # Unbiased: with random signs, products of different pixels cancel on average.
+    signs = [
+        torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1
+        for _ in range(probes)
+    ]
+    probed = [sign * view.valid_mask[..., None] for sign in signs]
+    gradient, *probed_gradients = backpropagate(torch.stack([d_image, *probed]))
+    # Mean squared gradient of the pixels' colours in each opacity, over the whole image.
+    square = torch.zeros_like(full)
+    for probed_gradient in probed_gradients:
+        square += probed_gradient**2
+    square = square / probes / image.numel()
     # A pixel is linear in the opacity of one Gaussian, so the error is a parabola in it:
     # E(o) = E + gradient (o - current) + square (o - current)², and this is E(0) - E(full).
     change = square * (current**2 - (full - current) ** 2) - gradient * full
-    return change / max(error, MIN_REFERENCE_ERROR)
+    return change / max(error, MIN_REFERENCE_ERROR), error
 
 
-def estimate_squared_gradient(
-    plan: OpacityRender,
-    opacities: Float[Tensor, "n"],
-    counted: Bool[Tensor, "h w"],
-    probes: int,
-    generator: torch.Generator,
-) -> Float[Tensor, "n"]:
-    """Estimate the mean squared gradient of the counted pixels' colours in each opacity.
+def begin_gradients(
+    plan: OpacityRender, opacities: Float[Tensor, "n"]
+) -> tuple[Float[Tensor, "h w 3"], Backpropagation]:
+    """Render an image once, for several gradients in the opacities; at once where possible."""
+    if isinstance(plan, JointOpacityRender):
+        render, backpropagate = plan.begin(opacities)
+        return render.image, backpropagate
+    variable, image = render_with_gradient(plan, opacities)
 
-    The mean is over the whole image. The estimate is unbiased: with random signs, products of
-    different pixels cancel on average.
-    """
-    with torch.enable_grad():
-        variable = opacities.detach().clone().requires_grad_()
-        image = plan(variable).image
-        squares = torch.zeros_like(opacities)
-        for _ in range(probes):
-            signs = torch.randint(0, 2, image.shape, generator=generator).to(image) * 2 - 1
-            signs = signs * counted[..., None]
-            (gradient,) = torch.autograd.grad((signs * image).sum(), variable, retain_graph=True)
-            squares += gradient**2
-    return squares / probes / image.numel()
+    def backpropagate_one_by_one(
+        images: Float[Tensor, "images h w 3"],
+    ) -> list[Float[Tensor, "n"]]:
+        return [
+            torch.autograd.grad(image, variable, d_image, retain_graph=True)[0]
+            for d_image in images
+        ]
+
+    return image.detach(), backpropagate_one_by_one
 
 
 def limit_errors(
@@ -144,6 +164,19 @@ def limit_errors(
     return limits
 
 
+@dataclass(frozen=True)
+class PhotographCheck:
+    """A photograph that may lose no more than some error by what is taken out of a scene."""
+
+    view: View
+    max_error: float
+    """Largest mean squared error of the photograph."""
+    draw_without: Callable[[Bool[Tensor, "n"]], Float[Tensor, "h w 3"]]
+    """Draws the scene without some of its n Gaussians."""
+    make_plan: Callable[[], OpacityRender]
+    """Makes the render of the scene in which those that may go have other opacities [n]."""
+
+
 def exclude_needed(
     scene: Gaussians,
     removable: Bool[Tensor, "n"],
@@ -153,70 +186,103 @@ def exclude_needed(
 ) -> Bool[Tensor, "n"]:
     """Remove needed Gaussians from a mask until every photograph is within its MSE limit.
 
-    The rest of the scene is frozen anew in each pass: for all photographs it would take too much
-    memory. Additions to a scene that is frozen already have `exclude_needed_additions`.
+    A plan is made anew each time that a photograph needs it: for all photographs they would take
+    too much memory. Nothing is copied but opacities.
     """
-    candidates = scene[removable]
     rest = scene.hide(removable)
+    candidates = scene.hide(~removable)
 
-    def iterate_plans() -> Iterator[OpacityRender]:
-        for view in views:
-            yield renderer.freeze(rest, view.camera).vary_opacities(candidates)
+    def check(view: View, max_error: float) -> PhotographCheck:
+        camera = view.camera
+        return PhotographCheck(
+            view,
+            max_error,
+            lambda missing: renderer.render(scene.hide(missing), camera).image,
+            lambda: renderer.freeze(rest, camera).vary_opacities(candidates, is_fading=True),
+        )
 
-    everything = torch.ones_like(candidates.opacities, dtype=torch.bool)
-    missing = exclude_needed_additions(
-        iterate_plans, candidates.opacities, everything, views, max_errors
-    )
-    return removable.masked_scatter(removable, missing)
+    checks = [check(view, limit) for view, limit in zip(views, max_errors, strict=True)]
+    return exclude_needed_by_photographs(checks, scene.opacities, removable)
 
 
 def exclude_needed_additions(
-    iterate_plans: Callable[[], Iterable[OpacityRender]],
+    plans: Sequence[OpacityRender],
     opacities: Float[Tensor, "n"],
     removable: Bool[Tensor, "n"],
     views: Sequence[View],
     max_errors: Sequence[float],
 ) -> Bool[Tensor, "n"]:
-    """Remove needed ones of n additions from a mask until every photograph is within its MSE limit.
+    """Remove needed ones of n additions from a mask, as `exclude_needed`.
 
-    One at a time they are superfluous; together they may not be. A plan for each photograph renders
-    the scene with the additions, at other opacities than their own ones [n].
+    A plan for each photograph renders the scene with the additions.
+    """
+
+    def check(plan: OpacityRender, view: View, max_error: float) -> PhotographCheck:
+        return PhotographCheck(
+            view,
+            max_error,
+            lambda missing: plan(torch.where(missing, 0.0, opacities)).image,
+            lambda: plan,
+        )
+
+    checks = [check(*parts) for parts in zip(plans, views, max_errors, strict=True)]
+    return exclude_needed_by_photographs(checks, opacities, removable)
+
+
+def exclude_needed_by_photographs(
+    checks: Sequence[PhotographCheck],
+    opacities: Float[Tensor, "n"],
+    removable: Bool[Tensor, "n"],
+) -> Bool[Tensor, "n"]:
+    """Remove needed Gaussians from a mask until every photograph is within its MSE limit.
+
+    One at a time they are superfluous; together they may not be.
     """
     missing = removable
-    # What returns for one photograph may change others, so all are checked until nothing changes.
-    while True:
-        missing_before = missing
-        for plan, view, max_error in zip(iterate_plans(), views, max_errors, strict=True):
-            missing = missing & ~find_needed_by_photographs(
-                plan, opacities, missing, view, max_error
-            )
-        if torch.equal(missing, missing_before):
-            return missing
+    # What returns for one photograph may change others, so all are checked until each one was
+    # within its limit after the last return.
+    returns = 0
+    returns_at_check = [-1] * len(checks)
+    while any(number < returns for number in returns_at_check):
+        for index, check in enumerate(checks):
+            if returns_at_check[index] == returns:
+                continue
+            needed = find_needed_by_photograph(check, opacities, missing)
+            # A GPU is asked only about photographs that were above their limits.
+            if needed is None or not needed.any():
+                returns_at_check[index] = returns
+            else:
+                missing = missing & ~needed
+                returns += 1
+    return missing
 
 
-def find_needed_by_photographs(
-    plan: OpacityRender,
-    opacities: Float[Tensor, "n"],
-    missing: Bool[Tensor, "n"],
-    view: View,
-    max_error: float,
-) -> Bool[Tensor, "n"]:
-    """Find the missing Gaussians that a photograph needs back to be within its limit.
+def find_needed_by_photograph(
+    check: PhotographCheck, opacities: Float[Tensor, "n"], missing: Bool[Tensor, "n"]
+) -> Bool[Tensor, "n"] | None:
+    """Find the missing Gaussians that a photograph needs back; None if it is within its limit.
 
     Opacities [n] are those that the Gaussians have if they are not missing. After
     `MAX_RETURN_ROUNDS` rounds the photograph gets back all that it sees.
     """
+    view = check.view
     back = torch.zeros_like(missing)
+    image = check.draw_without(missing)
+    plan = None
     for _ in range(MAX_RETURN_ROUNDS):
         absent = missing & ~back
-        image = view.fill_ignored(plan(torch.where(absent, 0.0, opacities)).image)
-        error = compute_squared_error(image, view.image).item()
-        if error <= max_error or not absent.any():
-            return back
+        if plan is not None:
+            image = plan(torch.where(absent, 0.0, opacities)).image
+        error = compute_squared_error(view.fill_ignored(image), view.image).item()
+        if error <= check.max_error or not absent.any():
+            return None if plan is None else back
 
+        # Most photographs are within their limits after the first pass, and need no plan.
+        plan = plan or check.make_plan()
         # To first order, the error falls by -gradient * opacity if a Gaussian returns.
         faint = torch.where(absent, GRADIENT_OPACITY, 1.0) * opacities
-        _, gradient = compute_mse_and_gradient(plan, view, faint)
+        image, backpropagate = begin_gradients(plan, faint)
+        (gradient,) = backpropagate(compute_mse_and_derivative(view, image)[1][None])
         relief = torch.where(absent, -gradient * opacities, 0.0)
-        back = back | select_fewest(relief, error - max_error)
+        back = back | select_fewest(relief, error - check.max_error)
     return back | (missing & (gradient != 0))

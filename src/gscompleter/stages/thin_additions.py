@@ -17,11 +17,8 @@ from torch import Tensor
 
 from gscompleter.config import CleaningConfig
 from gscompleter.render.protocols import FrozenScene
-from gscompleter.stages.superfluous import (
-    exclude_needed_additions,
-    limit_errors,
-    sum_error_changes,
-)
+from gscompleter.stages.error_budgets import add_psnr_loss
+from gscompleter.stages.superfluous import exclude_needed_additions, sum_error_changes
 from gscompleter.types import Gaussians, View
 
 THINNING = CleaningConfig(probes=2)
@@ -46,9 +43,8 @@ def drop_doubled(
     changes = sum_error_changes(added.opacities, none, views, frozen, plans, THINNING)
     doubled = find_doubled(added, changes.find_removable(THINNING), changes.lost)
 
-    images = (plan(added.opacities).image for plan in plans)
-    limits = limit_errors(images, views, THINNING.tolerance)
-    gone = exclude_needed_additions(lambda: plans, added.opacities, doubled, views, limits)
+    limits = [add_psnr_loss(error, THINNING.tolerance) for error in changes.errors]
+    gone = exclude_needed_additions(plans, added.opacities, doubled, views, limits)
     return added[~gone]
 
 

@@ -8,7 +8,15 @@ from pathlib import Path
 import pytest
 import torch
 
-from gscompleter.system.files.mapping import is_mapped, move_to_file, release_pages, select_rows
+from gscompleter.system.files.mapping import (
+    change_rows,
+    find_changed_rows,
+    is_mapped,
+    join_rows,
+    move_to_file,
+    release_pages,
+    select_rows,
+)
 
 pytestmark = pytest.mark.linux
 
@@ -50,6 +58,36 @@ def test_pages_leave_the_memory_and_are_read_again(tmp_path):
     release_pages(mapped)
     assert read_resident(mapped) < 0.1 * values.nbytes
     assert torch.equal(mapped, values)
+
+
+def test_rows_are_changed_and_compared_without_the_file_in_memory(tmp_path):
+    values = make_values()
+    mapped = move_to_file(values, tmp_path)
+    rows = torch.tensor([0, 7, 8191, 8192, ROWS - 1])
+    changed = values[rows] + 1
+    other, plain = change_rows(mapped, rows, changed), change_rows(values, rows, changed)
+    assert is_mapped(other)
+    assert not is_mapped(plain)
+    for each in (mapped, other):
+        assert read_resident(each) < 0.1 * values.nbytes
+    for before, after in ((mapped, other), (other, values), (values, plain)):
+        assert torch.equal(find_changed_rows(before, after).nonzero()[:, 0], rows)
+    assert read_resident(other) < 0.1 * values.nbytes
+    assert torch.equal(other, plain)
+    assert torch.equal(mapped, make_values())
+    assert is_mapped(change_rows(other, rows[:0], changed[:0]))
+    assert os.listdir(tmp_path) == []
+
+
+def test_rows_are_joined_to_those_of_a_file_in_a_file(tmp_path):
+    values = make_values()
+    mapped = move_to_file(values, tmp_path)
+    joined = join_rows([values[:3], mapped, values[:0], values[5:9]])
+    assert is_mapped(joined)
+    for each in (mapped, joined):
+        assert read_resident(each) < 0.1 * values.nbytes
+    assert torch.equal(joined, torch.cat([values[:3], values, values[5:9]]))
+    assert not is_mapped(join_rows([values, values[:3]]))
 
 
 def test_numbers_in_memory_stay():

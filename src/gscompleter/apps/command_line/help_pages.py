@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, make_dataclass, replace
+from dataclasses import dataclass, fields, make_dataclass, replace
 from types import UnionType
 from typing import Annotated, Any, ClassVar, Union, get_args, get_origin
 
@@ -19,6 +19,7 @@ from tyro.constructors import (
 )
 
 from gscompleter.apps.command_line.chosen_config import ChosenConfig
+from gscompleter.apps.command_line.field_texts import find_field_text
 from gscompleter.config.settings import Settings
 
 HELP = ("-h", "--help")
@@ -92,7 +93,7 @@ def make_help_rule(show_all: bool) -> Rule:
         # The options of a command itself come first, those that it shares with others after them.
         own = inspect.get_annotations(kind)
         ordered = sorted(spec.fields, key=lambda field: (field.name in LAST, field.name not in own))
-        fields = [tidy_field(field, show_all) for field in ordered]
+        fields = [tidy_field(kind, field, show_all) for field in ordered]
         return replace(spec, fields=tuple(group_fields(fields)))
 
     return rule
@@ -124,8 +125,8 @@ def is_positional(field: StructFieldSpec) -> bool:
     return tyro.conf.Positional in get_args(field.type)[1:]
 
 
-def tidy_field(field: StructFieldSpec, show_all: bool) -> StructFieldSpec:
-    """Join the lines of a help text, and hide a default that says nothing.
+def tidy_field(owner: type, field: StructFieldSpec, show_all: bool) -> StructFieldSpec:
+    """Join the lines of the help text of a field, and hide a default that says nothing.
 
     Unless `show_all` is set, the settings of the method become one option.
     """
@@ -134,7 +135,11 @@ def tidy_field(field: StructFieldSpec, show_all: bool) -> StructFieldSpec:
 
     def text() -> str | None:
         # Docstrings are wrapped in the source; tyro wraps them again to the terminal's width.
-        original = field.helptext() if callable(field.helptext) else field.helptext
+        # Fields of another class may be shown as those of `owner`.
+        if any(field.name == own.name for own in fields(owner)):
+            original = find_field_text(owner, field.name)
+        else:
+            original = field.helptext() if callable(field.helptext) else field.helptext
         return None if original is None else " ".join(original.split())
 
     kind: Any = field.type

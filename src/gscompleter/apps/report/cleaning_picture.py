@@ -13,7 +13,7 @@ from torch.nn.functional import pad
 from gscompleter.apps.report.pictures import join_images
 from gscompleter.render.lod import DEFAULT_THINNED, MAX_PREVIEW_GAUSSIANS, thin_gaussians
 from gscompleter.render.outside import DISTANCE, list_outside_cameras, measure_extent
-from gscompleter.render.protocols import Renderer
+from gscompleter.render.protocols import FrozenScene, Renderer
 from gscompleter.render.view_map import get_view_map
 from gscompleter.types import Camera, Gaussians, merge
 
@@ -47,11 +47,10 @@ class RemovalVisibility:
 
 
 def measure_removal_visibility(
-    given: Gaussians, removed: Bool[Tensor, "n"], camera: Camera, renderer: Renderer
+    frozen: FrozenScene, removed: Bool[Tensor, "n"], camera: Camera
 ) -> RemovalVisibility:
-    """Measure how much a camera sees of what goes: True in `removed`."""
-    frozen = renderer.freeze(given, camera)
-    weights = frozen.splat(removed.to(given.means))
+    """Measure how much a camera, of a frozen splat, sees of what goes: True in `removed`."""
+    weights = frozen.splat(removed.to(frozen.render.image))
     return RemovalVisibility(camera, weights.sum().item(), frozen.render.alpha.sum().item())
 
 
@@ -73,7 +72,7 @@ def choose_outside_cameras(
     cut = [replace(camera, near=section) for camera in cameras]
 
     def measure(camera: Camera) -> RemovalVisibility:
-        return measure_removal_visibility(both, goes, camera, renderer)
+        return measure_removal_visibility(renderer.freeze(both, camera), goes, camera)
 
     view_map = get_view_map(given.means)
     whole = list(view_map(measure, cameras))

@@ -343,3 +343,71 @@ def composite_backward(
             gradients[slot, project.SUM_TT] = w * w * yy
             for channel in range(4):
                 gradients[slot, project.SUM_DEPTH + channel] = sums[6 + channel]
+
+
+@njit(nogil=True, fastmath={"contract"}, error_model="numpy")
+def backpropagate_images(
+    begin, end, tiles, context, new, frame, d_images, slots, gradients, written
+):
+    """Traverse tiles[begin:end] back to front, as `composite_backward`, for opacities alone.
+
+    d_images [count, h, w, 3]: gradients of the image of as many functions. gradients [slots, count]
+    receives the sum of alpha dL/dalpha of each function, in one walk for all of them.
+    """
+    c_splats, c_opacities, c_boxes, c_start, c_entries = context
+    n_splats, n_opacities, n_boxes, n_start, n_entries = new
+    _, _, alphas, transmittances, lasts, used, _ = frame
+    height, width = alphas.shape
+    count = d_images.shape[0]
+    passing = np.empty((TILE, TILE), np.float32)
+    behinds = np.empty((TILE * count, TILE), np.float32)
+    images = np.empty((TILE * count, 3, TILE), np.float32)
+    last = np.empty((TILE, TILE), np.int32)
+    row_limit = np.empty(TILE, np.int32)
+    sums = np.empty((count, TILE), np.float32)
+    nothing = np.float32(-np.inf)
+    for index in range(begin, end):
+        tile = tiles[index]
+        n_begin = n_start[tile]
+        n = n_begin + used[tile, 1]
+        if n == n_begin:
+            continue
+        left, top, rows, columns = _locate_tile(tile, height, width)
+        passing[:] = 0
+        behinds[:] = 0
+        images[:] = 0
+        last[:] = -1
+        row_limit[:] = -1
+        for row in range(rows):
+            for column in range(columns):
+                y, x = top + row, left + column
+                passing[row, column] = transmittances[y, x]
+                last[row, column] = lasts[y, x]
+                row_limit[row] = max(row_limit[row], last[row, column])
+                for image in range(count):
+                    for channel in range(3):
+                        place = row * count + image
+                        images[place, channel, column] = d_images[image, y, x, channel]
+
+        c_begin = c_start[tile]
+        c = c_begin + used[tile, 0]
+        c_depth = _get_depth(c_splats, c_entries, c - 1, c_begin, c, nothing)
+        n_depth = _get_depth(n_splats, n_entries, n - 1, n_begin, n, nothing)
+        while n > n_begin:
+            position = np.int32(c - c_begin + n - n_begin - 1)
+            if c_depth > n_depth:
+                c -= 1
+                first, stop, splat = _place(c_splats, c_opacities, c_boxes, c_entries[c], left, top)
+                c_depth = _get_depth(c_splats, c_entries, c - 1, c_begin, c, nothing)
+                of_splat = first, stop, position, count
+                simd.pass_images(*of_splat, passing, behinds, images, last, row_limit, sums, splat)
+                continue
+            n -= 1
+            first, stop, splat = _place(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
+            n_depth = _get_depth(n_splats, n_entries, n - 1, n_begin, n, nothing)
+            of_splat = first, stop, position, count
+            simd.revert_images(*of_splat, passing, behinds, images, last, row_limit, sums, splat)
+            slot = slots[n]
+            written[slot] = True
+            for image in range(count):
+                gradients[slot, image] = sums[image, 0]

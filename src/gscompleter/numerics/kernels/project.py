@@ -267,11 +267,13 @@ def project_splats(begin, end, gaussians, pinhole, splats, boxes, factors):
     root_half = np.float32(math.sqrt(0.5))
     for i in range(begin, end):
         boxes[i, 0] = boxes[i, 1] = boxes[i, 2] = boxes[i, 3] = 0
+        # Conditions are written so that NaN fails them. What is hidden reads nothing else.
+        if not opacities[i] >= MIN_ALPHA:
+            continue
         x, y, z = _apply_matrix(
             view, means[i, 0] - center[0], means[i, 1] - center[1], means[i, 2] - center[2]
         )
-        # Conditions are written so that NaN fails them.
-        if not (z > near and z < np.inf and opacities[i] >= MIN_ALPHA):
+        if not (z > near and z < np.inf):
             continue
         tan_x, tan_y = x * (one / z), y * (one / z)
         quat, _ = normalize_quat(quats, i)

@@ -415,3 +415,79 @@ def _make_revert(wanted):
 pass_rows = _make_revert("nothing")
 revert_rows_for_color = _make_revert("colour")
 revert_rows = _make_revert("all")
+
+
+def _make_revert_for_opacity(is_summed):
+    """Make an intrinsic that reverts a splat for several images, with or without its sums."""
+
+    @intrinsic
+    def undraw_images(
+        typing, begin, end, position, count, passing, behinds, images, last, row_limit, sums, splat
+    ):
+        """Revert the rows begin..end of the frontmost splat that is left, for `count` images dL/dC.
+
+        What depends on the splat alone, its falloff above all, is computed once for all images, and
+        every sum is that of `revert_rows` with the image alone.
+        passing [16, 16]: transmittances behind the splat. behinds [16 count, 16], row by row, image
+        by image: the sum of weight times dL/dC behind it. images [16 count, 3, 16]: dL/dC.
+        sums [count, 16] receives the sum of alpha dL/dalpha of each image in its first lane.
+        """
+        arrays = passing, behinds, images, last, row_limit, sums
+        numbers = types.int64, types.int64, types.int32, types.int64
+        signature = types.void(*numbers, *arrays, splat)
+
+        def generate(context, builder, signature, arguments):
+            begin, end, position, count, *arrays, row_limit, sums, splat = arguments
+            splat = _Splat(builder, *cgutils.unpack_tuple(builder, splat))
+            types_of_arrays = signature.args[4:10]
+            forms = (_FLOATS, 1), (_FLOATS, 1), (_FLOATS, 3), (_INTS, 1)
+            passing, behinds, images, last = [
+                _Rows(context, builder, array_type, array, *form)
+                for array_type, array, form in zip(types_of_arrays[:4], arrays, forms, strict=True)
+            ]
+            limits = context.make_array(types_of_arrays[4])(context, builder, row_limit).data
+            sums = _Rows(context, builder, types_of_arrays[5], sums, _FLOATS, 1)
+            positions = _broadcast(builder, position, _INTS)
+            zero = ir.Constant(_LONG, 0)
+            if is_summed:
+                with cgutils.for_range(builder, count, start=zero, intp=_LONG) as image:
+                    sums.store(image.index, 0, _Lanes(builder, _make_constant(0.0)))
+
+            def revert(row):
+                _, raw, alpha, visible = splat.compute_falloff(row)
+                reached = builder.icmp_signed("<=", positions.value, last.load(row, 0).value)
+                alpha = alpha.where(builder.and_(visible, reached), 0.0)
+                inverse_passing = 1.0 / (1.0 - alpha)
+                before = passing.load(row, 0) * inverse_passing
+                weight = alpha * before
+                passing.store(row, 0, before)
+                # A capped alpha does not depend on the splat.
+                is_uncapped = raw.compare("<=", MAX_ALPHA)
+                first = builder.mul(row, count)
+                with cgutils.for_range(builder, count, start=zero, intp=_LONG) as image:
+                    place = builder.add(first, image.index)
+                    value = splat.channels[0] * images.load(place, 0)
+                    for index in (1, 2):
+                        gradient = images.load(place, index)
+                        value = splat.channels[index].multiply_add(gradient, plus=value)
+                    behind = behinds.load(place, 0)
+                    behinds.store(place, 0, weight.multiply_add(value, plus=behind))
+                    if is_summed:
+                        q = (before * value - behind * inverse_passing) * alpha
+                        total = sums.load(image.index, 0) + q.where(is_uncapped, 0.0)
+                        sums.store(image.index, 0, total)
+
+            _loop_over_rows(builder, (begin, end), position, limits, revert)
+            if is_summed:
+                with cgutils.for_range(builder, count, start=zero, intp=_LONG) as image:
+                    total = _sum_lanes(builder, [sums.load(image.index, 0)])
+                    sums.store(image.index, 0, total)
+            return context.get_dummy_value()
+
+        return signature, generate
+
+    return undraw_images
+
+
+pass_images = _make_revert_for_opacity(is_summed=False)
+revert_images = _make_revert_for_opacity(is_summed=True)

@@ -6,16 +6,18 @@ The system keeps pages that were read, as memory of the process, until these are
 from __future__ import annotations
 
 import ctypes
+import math
 import mmap
 import os
 import sys
 import tempfile
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import Int64
+from jaxtyping import Bool, Int64
 from torch import Tensor
 
 from gscompleter.system.files.writing import convert_write_errors
@@ -24,6 +26,8 @@ OPEN_FILES = "/proc/self/fd"
 """Folder of Linux in which open files have names, also those that have none elsewhere."""
 SELECTED_BLOCK = 8192
 """Rows that are selected at a time, before their pages are released."""
+_FOLDERS: dict[int, Path] = {}
+"""What the file of mapped values lies beside, by their address; of those that are gone, too."""
 
 
 def move_to_file(values: Tensor, beside: Path) -> Tensor:
@@ -36,17 +40,70 @@ def move_to_file(values: Tensor, beside: Path) -> Tensor:
     can_map = sys.platform == "linux" and os.path.isdir(OPEN_FILES)
     if not can_map or values.device.type != "cpu" or values.numel() == 0:
         return values
+    return _map_blocks([values], tuple(values.shape), values.dtype, beside)
+
+
+def change_rows(values: Tensor, rows: Int64[Tensor, "m"], changed: Tensor) -> Tensor:
+    """Return values with other rows; of a mapped file, in another file beside the same folder.
+
+    `rows` ascend, and `changed` is what stands there. Raises OutputError as `move_to_file`.
+    """
+    if not is_mapped(values):
+        return values.index_copy(0, rows, changed)
+
+    def make_blocks() -> Iterator[Tensor]:
+        starts = range(0, len(values), SELECTED_BLOCK)
+        ends = torch.searchsorted(rows, torch.tensor([*starts, len(values)]))
+        for start, first, last in zip(starts, ends.tolist(), ends[1:].tolist(), strict=False):
+            block = values[start : start + SELECTED_BLOCK].clone()
+            block[rows[first:last] - start] = changed[first:last]
+            release_pages(values[start : start + SELECTED_BLOCK])
+            yield block
+
+    return _map_blocks(make_blocks(), tuple(values.shape), values.dtype, _find_folder(values))
+
+
+def join_rows(parts: Sequence[Tensor]) -> Tensor:
+    """Concatenate rows; with those of a mapped file, in another file beside the same folder.
+
+    Raises OutputError as `move_to_file`.
+    """
+    first = next((part for part in parts if is_mapped(part)), None)
+    if first is None:
+        return torch.cat([*parts])
+
+    def make_blocks() -> Iterator[Tensor]:
+        for part in parts:
+            for block in part.split(SELECTED_BLOCK):
+                yield block.to(first.dtype)
+                release_pages(block)
+
+    shape = (sum(map(len, parts)), *first.shape[1:])
+    return _map_blocks(make_blocks(), shape, first.dtype, _find_folder(first))
+
+
+def _find_folder(mapped: Tensor) -> Path:
+    """Find what the file of mapped values lies beside."""
+    return _FOLDERS[mapped.untyped_storage().data_ptr()]
+
+
+def _map_blocks(
+    blocks: Iterable[Tensor], shape: tuple[int, ...], dtype: torch.dtype, beside: Path
+) -> Tensor:
+    """Write blocks of rows to a temporary file, and map it."""
     folder = next(each for each in (beside, *beside.absolute().parents) if each.is_dir())
     with (
         convert_write_errors(beside),
         tempfile.TemporaryFile(dir=folder) as file,
     ):
         # Written, and not stored through the map: there a full disk would end the process.
-        file.write(values.contiguous().numpy().data)
+        for block in blocks:
+            file.write(block.contiguous().numpy().data)
         file.flush()
         name = f"{OPEN_FILES}/{file.fileno()}"
-        mapped = torch.from_file(name, shared=True, size=values.numel(), dtype=values.dtype)
-    return mapped.view(values.shape)
+        mapped = torch.from_file(name, shared=True, size=math.prod(shape), dtype=dtype)
+    _FOLDERS[mapped.data_ptr()] = beside
+    return mapped.view(shape)
 
 
 def select_rows(values: Tensor, rows: Int64[Tensor, "m"]) -> Tensor:
@@ -59,6 +116,19 @@ def select_rows(values: Tensor, rows: Int64[Tensor, "m"]) -> Tensor:
         selected.index_copy_(0, places, values.index_select(0, part))
         release_pages(values[part[0] : part[-1] + 1])
     return selected
+
+
+def find_changed_rows(before: Tensor, after: Tensor) -> Bool[Tensor, "n"]:
+    """Mark the rows in which two arrays differ; of mapped files, pages are released behind."""
+    if not is_mapped(before) and not is_mapped(after):
+        return (before != after).flatten(1).any(dim=1)
+    parts = []
+    blocks = (each.split(SELECTED_BLOCK) for each in (before, after))
+    for one, other in zip(*blocks, strict=True):
+        parts.append((one != other).flatten(1).any(dim=1))
+        release_pages(one)
+        release_pages(other)
+    return torch.cat(parts)
 
 
 def is_mapped(values: Tensor) -> bool:

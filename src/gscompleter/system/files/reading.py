@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import stat
@@ -66,7 +65,9 @@ def read_head(path: Path, count: int) -> bytes:
 
 def hash_file(path: Path) -> str:
     """Compute the SHA-256 of a file, in hexadecimal; files of gigabytes are not held in memory."""
-    digest = hashlib.sha256()
+    from hashlib import sha256  # help pages do not wait for OpenSSL
+
+    digest = sha256()
     with open_file(path) as file:
         while block := file.read(BLOCK_BYTES):
             digest.update(block)

@@ -12,12 +12,9 @@ which do not tell when a process began.
 
 from __future__ import annotations
 
-import hashlib
 import os
 import re
-import secrets
 import shutil
-import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -120,7 +117,7 @@ def make_unfinished_name(target: str) -> str:
 
 def digest_target(name: str) -> str:
     """Return the part of an unfinished name that stands for the name of the result."""
-    return hashlib.sha256(os.fsencode(name)).hexdigest()[:8]
+    return _digest(os.fsencode(name))
 
 
 def is_unfinished(name: str) -> bool:
@@ -179,7 +176,7 @@ def give_signs(path: Path) -> Iterator[None]:
 
 
 def _make_name(digest: str) -> str:
-    return f"{UNFINISHED_PREFIX}{digest}-{_describe_owner()}-{secrets.token_hex(4)}"
+    return f"{UNFINISHED_PREFIX}{digest}-{_describe_owner()}-{os.urandom(4).hex()}"
 
 
 def _describe_owner() -> str:
@@ -193,12 +190,20 @@ def _describe_machine() -> str:
 
     Containers of one machine can have the same host name, but each numbers its own processes.
     """
+    import socket  # help pages do not wait for it
+
     parts = [socket.gethostname()]
     with suppress(OSError):
         parts.append(Path("/proc/sys/kernel/random/boot_id").read_text("ascii"))
     with suppress(OSError):
         parts.append(os.readlink("/proc/self/ns/pid"))
-    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:8]
+    return _digest("\n".join(parts).encode())
+
+
+def _digest(content: bytes) -> str:
+    from hashlib import sha256  # nor for OpenSSL
+
+    return sha256(content).hexdigest()[:8]
 
 
 def _read_start(pid: int) -> int | None:
