@@ -50,7 +50,7 @@ def test_a_case_is_read(tmp_path, monkeypatch):
         ({"cases": 3}, "and is 3."),
         ({"cases": ["room"]}, "case 1 has to be an object"),
         ({"case": []}, "cases: it has the key 'case', which is none of resolution, cases"),
-        ({"scenes": ["room"]}, "a protocol chooses the frames; give --protocol."),
+        ({"scenes": ["room"]}, "a protocol chooses the frames; give one."),
         (with_case(neighbors=[1]), "case 1 has the key 'neighbors', which is none of scene"),
         (with_case(scene=""), 'needs scene, a folder relative to the file; it has "".'),
         (with_case(context=[0]), "a list of at least two frames"),

@@ -68,7 +68,7 @@ def measure_road(inverse: np.ndarray) -> Measurement:
 @pytest.fixture
 def drive():
     """Three photographs of a drive, what is measured in them, and the true inverse depths."""
-    seen = [see_road(z) for z in (0.0, 0.5, 1.0)]
+    seen = [see_road(z) for z in (0.0, 2.0, 4.0)]
     images = [image for image, _ in seen]
     inverses = [inverse for _, inverse in seen]
     return make_rig(images), [measure_road(inverse) for inverse in inverses], inverses
@@ -91,11 +91,15 @@ def test_the_ground_is_found_below_the_cameras_though_a_third_is_measured_wrong(
 def test_the_near_road_lies_on_the_ground(drive):
     rig, measured, inverses = drive
     held = hold_to_ground(rig, measured, skies_of(inverses))
-    for before, after, inverse in zip(measured, held, inverses, strict=True):
+    for number, (before, after, inverse) in enumerate(zip(measured, held, inverses, strict=True)):
         near = np.zeros((SIZE, SIZE), bool)
         near[NEAR_ROAD:] = True
         assert (after.weight[near] == BACKGROUND_WEIGHT).all()
-        assert (after.confidence[near] == 0).all()
+        # Below the view of the others nothing confirms it.
+        unconfirmed = near & (after.confidence == 0)
+        assert (after.confidence[near & ~unconfirmed] == BACKGROUND_WEIGHT).all()
+        compared = np.isfinite(measure_difference(rig, number, inverse))
+        np.testing.assert_array_equal(unconfirmed, near & ~compared)
         np.testing.assert_allclose(after.inverse[near], inverse[near], rtol=0.02)
         np.testing.assert_array_equal(after.index[~near], before.index[~near])
         np.testing.assert_array_equal(after.weight[~near], before.weight[~near])
@@ -140,7 +144,7 @@ def test_given_depth_is_left(drive):
 
 
 def test_cameras_at_different_heights_have_no_ground_below_them():
-    seen = [see_road(0.0), see_road(0.5, 1.5 * HEIGHT), see_road(1.0, 2 * HEIGHT)]
+    seen = [see_road(0.0), see_road(2.0, 1.5 * HEIGHT), see_road(4.0, 2 * HEIGHT)]
     images = [image for image, _ in seen]
     inverses = [inverse for _, inverse in seen]
     measured = [measure_road(inverse) for inverse in inverses]
@@ -158,6 +162,18 @@ def test_cameras_that_move_to_a_side_are_left_alone(drive):
     assert not moves_forward(images)
     held = hold_to_ground(make_rig(images), measured, skies_of(inverses))
     assert all(after is before for before, after in zip(measured, held, strict=True))
+
+
+def test_a_photograph_with_another_one_near_it_is_left(drive):
+    rig, measured, inverses = drive
+    beside, inverse = see_road(4.5)
+    held = hold_to_ground(
+        make_rig([*rig.images, beside]),
+        [*measured, measure_road(inverse)],
+        skies_of([*inverses, inverse]),
+    )
+    assert held[2] is measured[2]
+    assert held[1] is not measured[1]
 
 
 def test_two_photographs_stay_as_they_are(drive):

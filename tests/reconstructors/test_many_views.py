@@ -29,6 +29,7 @@ from gscompleter.reconstructors.features.stereo_image import (
 )
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.reconstructors.plane_sweep.fit import (
+    MAX_SIZE_GROWTH,
     STEPS_PER_CHECK,
     STEPS_PER_VIEW,
     fit_jointly,
@@ -391,6 +392,17 @@ def test_check_views_fade_what_is_wrong_in_them_alone():
         psnr(RENDERER.render(s, check.camera).image, check.image) for s in (without, fitted)
     )
     assert after > before + 1
+
+
+def test_gaussians_grow_by_a_bounded_factor():
+    views = row_of_views(3, size=32)
+    start = gaussians_of(views[1])
+    # Far too small, so that the photographs show through between them.
+    small = replace(start, scales=start.scales / 8)
+    fitted = fit_jointly(small, views, torch.ones(3, 3), RENDERER)
+    growth = fitted.scales / small.scales
+    assert growth.max() > 0.9 * MAX_SIZE_GROWTH
+    assert growth.max() <= 1.0001 * MAX_SIZE_GROWTH
 
 
 def test_without_check_views_nothing_changes_and_they_have_turns_of_their_own():

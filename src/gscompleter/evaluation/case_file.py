@@ -91,7 +91,8 @@ def read_case_file(path: Path) -> CaseFile:
         raise InputError(f"{name}: it has to be an object with resolution and cases.")
     if "scenes" in content:
         raise InputError(
-            f"{name}: it names scenes, of which a protocol chooses the frames; give --protocol."
+            f"{name}: it names scenes, of which a protocol chooses the frames; give one.",
+            "protocol",
         )
     refuse_unknown(content, FILE_KEYS, f"{name}: it")
 

@@ -8,6 +8,7 @@ Each step uses one photograph.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -40,6 +41,8 @@ FINAL_RATE = 0.5
 """Final step size relative to the initial one; the decay is linear."""
 BETAS = 0.8, 0.99
 """Adam decay rates of the joint fit."""
+MAX_SIZE_GROWTH = 3.0
+"""Largest factor by which a Gaussian grows in it; near a camera a few become a fog."""
 FAINTEST = 0.02
 """Margin from 0 and 1 to which the initial opacities are clamped."""
 
@@ -94,6 +97,8 @@ def fit_jointly(
         image = renderer.render(fitted, view.camera).image
         rate_factor = 1 - (1 - FINAL_RATE) * step / len(order)
         optimizer.step((gains[number] * image - view.image).square().mean(), rate_factor)
+        with torch.no_grad():
+            unknown["grown"].clamp_(max=math.log(MAX_SIZE_GROWTH))
 
     fitted = apply_parameters(gaussians, {name: v.detach() for name, v in unknown.items()})
     # The scene has one exposure, so that each photograph is divided by its own.

@@ -49,6 +49,9 @@ MAX_SIDEWAYS = 0.2
 """Largest sine of the angle by which it leans to a side, since people keep horizons level."""
 MIN_GROUND_SHARE = 0.1
 """Smallest share of the points that lies on the ground."""
+MAX_GROUND_SLOPE = 0.1
+"""Largest sine of the angle between the ground and the way of the cameras. Without it a slanted
+plane through the furniture of a room is the ground of a short walk."""
 MAX_HEIGHT_RATIO = 1.4
 """Largest height of a camera above the ground, relative to the smallest one."""
 MAX_GROUND_MISS = 0.03
@@ -56,6 +59,9 @@ MAX_GROUND_MISS = 0.03
 GROUND_REFITS = 5
 """Number of least-squares fits to the inliers, each to those of the last one."""
 
+MIN_STRIDE = 1.0
+"""Smallest distance to the nearest other camera, in heights above the ground, of a photograph that
+is held to it. Nearer ones see the near ground with parallax, and its colours hardly tell depth."""
 MIN_GROUND_INDEX = 4.0
 """Smallest inverse depth of ground that is judged, in planes of the sweep. Nearer to the horizon
 all that is far lies on it."""
@@ -136,16 +142,21 @@ def hold_to_ground(
 
 def moves_forward(images: Sequence[StereoImage]) -> bool:
     """Check whether most cameras look along the way to the nearest other one, or back along it."""
+    axes = np.stack([image.rotation[:, 2] for image in images])
+    return float(np.median(np.abs((find_ways(images) * axes).sum(axis=1)))) > MIN_FORWARD
+
+
+def find_ways(images: Sequence[StereoImage]) -> Places:
+    """Find the direction from each camera to the nearest other one, in world axes; 0 at its own."""
     centers = np.stack([image.center for image in images])
-    cosines = []
-    for image in images:
-        ways = centers - image.center
-        distances = np.linalg.norm(ways, axis=1)
-        # Cameras in one place are no way.
+    ways = []
+    for center in centers:
+        offsets = centers - center
+        distances = np.linalg.norm(offsets, axis=1)
+        # Cameras in one place are no way apart.
         nearest = np.where(distances > 0, distances, np.inf).argmin()
-        way = ways[nearest] / max(float(distances[nearest]), 1e-9)
-        cosines.append(abs(float(way @ image.rotation[:, 2])))
-    return float(np.median(cosines)) > MIN_FORWARD
+        ways.append(offsets[nearest] / max(float(distances[nearest]), 1e-9))
+    return np.stack(ways)
 
 
 def find_ground(
@@ -156,6 +167,7 @@ def find_ground(
     None if no plane has points and all cameras at about one height above it.
     """
     centers = np.stack([image.center for image in images])
+    ways = find_ways(images)
     # Rotations are from camera to world axes, and y points down in a camera.
     sideways, downwards, _ = np.mean([image.rotation for image in images], axis=0).T
     upwards = -downwards / max(float(np.linalg.norm(downwards)), 1e-9)
@@ -165,12 +177,13 @@ def find_ground(
         return None
 
     def is_possible(ground: Ground) -> bool:
-        """Check that a plane is level, and below all cameras at about the same height."""
+        """Check that cameras move along a plane, upright and at about the same height above it."""
         heights = ground.measure_heights(centers)
         lowest = float(heights.min())
         return (
             float(ground.normal @ upwards) > MIN_UPWARDS
             and abs(float(ground.normal @ sideways)) < MAX_SIDEWAYS
+            and float(np.median(np.abs(ways @ ground.normal))) < MAX_GROUND_SLOPE
             and 0 < float(heights.max()) < MAX_HEIGHT_RATIO * lowest
         )
 
@@ -259,6 +272,9 @@ def hold_view(
     image = rig.images[number]
     centers = np.stack([other.center for other in rig.images])
     heights = ground.measure_heights(centers)
+    distances_to_others = np.delete(np.linalg.norm(centers - image.center, axis=1), number)
+    if float(distances_to_others.min()) < MIN_STRIDE * heights[number]:
+        return measured
     rays = compute_rays(image)
     inverse = (-(rays @ ground.normal) / heights[number]).astype(np.float32)
     index = compute_plane_index(measured.planes, inverse)
@@ -281,11 +297,13 @@ def hold_view(
 
     is_beyond = (measured.inverse < BEYOND * inverse) & (measured.index < index - BEYOND_PLANES)
     held = agrees & (is_beyond | (measured.weight == 0))
+    # What others confirm counts as measured, so that each place of the ground is kept once.
+    confirmed = np.where(is_compared, BACKGROUND_WEIGHT, np.float32(0))
     return replace(
         measured,
         index=np.where(held, index, measured.index),
         weight=np.where(held, BACKGROUND_WEIGHT, measured.weight),
-        confidence=np.where(held, np.float32(0), measured.confidence),
+        confidence=np.where(held, confirmed, measured.confidence),
     )
 
 
