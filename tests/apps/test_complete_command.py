@@ -141,6 +141,7 @@ def test_the_summary_says_what_was_opened_and_between_which_depths(chosen):
         "format": "nerfstudio",
         "photographs": 5,
         "used": 3,
+        "fitted": 0,
         "splat": None,
         "refined_poses": None,
         "renders_from": None,

@@ -30,7 +30,7 @@ from gscompleter.evaluation.verdict.outcome import describe_gain, is_like, make_
 from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow, ScoreRow
 from gscompleter.system.errors import InputError
 from gscompleter.system.jobs.jobs import Job
-from scenes import camera_at, photographed
+from scenes import Room, camera_at, gaussians_of, photographed, view_of
 
 PLACES = [(-0.9 + 0.3 * number, -12 + 4 * number) for number in range(7)]
 CONTEXT, TARGET = (0, 2, 4), 6
@@ -79,6 +79,7 @@ def test_the_unused_photographs_nearest_to_the_target_are_held_out(tmp_path, mon
         frame=np.eye(4),
         origin=np.zeros(3),
         depths={},
+        scene=gaussians_of(view_of(Room(), cameras[0])),
         check_views=photographs.views([5]),
     )
     (folder / "3.png").write_bytes(b"damaged")
@@ -87,6 +88,9 @@ def test_the_unused_photographs_nearest_to_the_target_are_held_out(tmp_path, mon
     assert [(row.view.frame, row.is_check) for row in rows] == [(4, False), (5, True), (6, False)]
     (row,) = read_held_out(replace(opened, held_out=(8,)), task, by_frame)
     assert row.view.frame == 8
+    # What a reconstructed scene was fitted to says nothing about it.
+    fitted = read_held_out(opened, replace(task, scene=None), by_frame)
+    assert [row.view.frame for row in fitted] == [4, 6, 7]
 
 
 def outcome_of(out: Path) -> dict:

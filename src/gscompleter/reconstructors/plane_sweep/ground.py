@@ -3,7 +3,8 @@
 From one photograph of a drive to the next the near road leaves the image. Its even asphalt then
 matches itself at the same pixel, as if it stood at infinity, and is built hundreds of metres away.
 But cameras that keep one height move over ground: the plane below all of them on which most of
-what is measured lies. A pixel is held to it only if the other photographs show the same there.
+what is measured lies. A photograph far from all others is held to it where these show the same
+colours (decision 138).
 Lengths are in widest baselines.
 """
 
