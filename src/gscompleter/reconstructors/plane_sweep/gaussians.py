@@ -113,7 +113,9 @@ class Splatter:
             self.replace_ignored(scene, view, gain)
             for view, gain in zip(on_cpu, gains, strict=True)
         ]
-        checks = [self.prepare_check(scene, view.to("cpu"), gains) for view in check_views]
+        # One or two views are not fitted jointly, and check views take no part in their fits.
+        used = check_views if len(views) > 2 else ()
+        checks = [self.prepare_check(scene, view.to("cpu"), gains) for view in used]
         fitted = self.fit_gaussians(scene, photographs, gains, checks)
         fitted = restore_sky_colors(scene, fitted, on_cpu[0].camera)
 

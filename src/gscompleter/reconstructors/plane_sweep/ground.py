@@ -197,7 +197,8 @@ def find_ground(
         if is_possible(ground):
             count = float(ground.find_inliers(points).sum())
             if count > most:
-                best, most = ground, count
+                best = ground
+                most = count
     for _ in range(GROUND_REFITS):
         if best is None:
             break
