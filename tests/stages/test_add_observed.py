@@ -1,5 +1,6 @@
 """Photographs add what a given scene lacks, before any target."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 import pytest
@@ -15,6 +16,7 @@ from gscompleter.stages.add_observed import (
     Lack,
     choose_photographs,
     keep_large_regions,
+    limit_stereo_photos,
     select_pixels,
 )
 from gscompleter.types import ChooseMasks, DepthMap, Gaussians, Reconstruction, View, merge
@@ -220,20 +222,40 @@ def make_lack(empty: float, contradicted: float = 0.0) -> Lack:
 
 def test_photographs_that_show_nothing_new_are_not_reconstructed():
     views = [PHOTOS[index] for index in range(3)]
-    assert choose_photographs(views, [make_lack(0.0)] * 3) == []
+    assert choose_photographs(views, [make_lack(0.0)] * 3, 8) == []
     # A single one gets the nearest as its stereo partner.
-    assert choose_photographs(views, [make_lack(0.1), make_lack(0.0), make_lack(0.0)]) == [0, 1]
-    assert choose_photographs(views[:1], [make_lack(0.1)]) == []
+    assert choose_photographs(views, [make_lack(0.1), make_lack(0.0), make_lack(0.0)], 8) == [0, 1]
+    assert choose_photographs(views[:1], [make_lack(0.1)], 8) == []
     # Nor are those from one place, unless there is another.
     same = [views[0], replace(views[0], frame=7)]
-    assert choose_photographs(same, [make_lack(0.1)] * 2) == []
+    assert choose_photographs(same, [make_lack(0.1)] * 2, 8) == []
     lacks = [make_lack(0.1), make_lack(0.1), make_lack(0.0)]
-    assert choose_photographs([*same, views[1]], lacks) == [0, 1, 2]
+    assert choose_photographs([*same, views[1]], lacks, 8) == [0, 1, 2]
     # What photographs still show that were reconstructed before could not be added.
-    assert choose_photographs(views, [make_lack(0.1)] * 3, {0, 1}) == [1, 2]
-    assert choose_photographs(views, [make_lack(0.1)] * 3, {0, 1, 2}) == []
+    assert choose_photographs(views, [make_lack(0.1)] * 3, 8, {0, 1}) == [1, 2]
+    assert choose_photographs(views, [make_lack(0.1)] * 3, 8, {0, 1, 2}) == []
     small = view_of(ROOM, camera_at(0.1, size=32))
-    assert choose_photographs([*views, small], [make_lack(0.1)] * 4) == [0, 1, 2]
+    assert choose_photographs([*views, small], [make_lack(0.1)] * 4, 8) == [0, 1, 2]
+
+
+def test_small_photographs_are_reconstructed_together():
+    class BuildsParts:
+        def __call__(self, views: Sequence[View]) -> Reconstruction:
+            raise AssertionError
+
+        def reconstruct_part(self, views: Sequence[View], choose_masks: ChooseMasks):
+            raise AssertionError
+
+    def of_size(height: int, width: int) -> View:
+        camera = replace(PHOTOS[0].camera, width=width, height=height)
+        return View(torch.zeros(height, width, 3), camera)
+
+    builds_parts = BuildsParts()
+    assert limit_stereo_photos(builds_parts, [of_size(352, 628)]) == 24
+    assert limit_stereo_photos(builds_parts, [of_size(540, 960), of_size(10, 10)]) == 10
+    assert limit_stereo_photos(builds_parts, [of_size(1080, 1920)]) == 8
+    # A network that makes whole scenes gets few photographs of any size.
+    assert limit_stereo_photos(reconstruct_exactly, [of_size(10, 10)]) == 8
 
 
 def test_small_regions_are_no_contradiction():

@@ -54,8 +54,9 @@ DISC_SIGMA = 0.55
 """Standard deviation of a disc across the viewing ray, in pixels."""
 OPACITY = 0.98
 """Initial opacity of every disc."""
-FIT_MARGIN = 8
-"""Pixels around a part that is built alone in which it is built, too, as Gaussians overlap."""
+FIT_MARGIN = 3
+"""Pixels around a part that is built alone in which it is built, too, as Gaussians overlap. With 8
+a fox is as good, and takes a sixth longer."""
 IMAGE_COLOR_ROUNDS = 4
 """Rounds of the colour fit to a synthesized image."""
 
@@ -104,8 +105,9 @@ class Splatter:
         # Nothing is reconstructed from masked pixels.
         kept &= flatten_masks([view.valid_mask for view in on_cpu])
         if masks is not None:
-            on_cpu = ignore_elsewhere(candidates[kept], on_cpu, depths, masks)
-            kept &= find_in_valid(candidates, on_cpu)
+            of_scene = candidates[kept]
+            on_cpu = ignore_elsewhere(of_scene, on_cpu, depths, masks)
+            kept = kept.masked_scatter(kept, find_in_valid(of_scene, on_cpu))
         skies = self.extend_skies(normalized, depths)
         scene = merge([candidates[kept], *(gaussians.to("cpu") for _, gaussians, _ in skies)])
 
