@@ -296,9 +296,9 @@ def check_context(context: Names | None) -> None:
         )
 
 
-def check_generator(synthesis: GeneratorOptions) -> None:
+def check_generator(name: str) -> None:
     """Refuse the generator of painted images for a command that is given none."""
-    if synthesis.generator == "painted":
+    if name == "painted":
         raise InputError(
             "The generator 'painted' needs painted images, which `complete --images` names; choose "
             "another one where there are none.",
