@@ -132,14 +132,15 @@ def main() -> None:
 
         # tyro converts the words to types, and `validate` adds the ranges of the annotations.
         command_options = validate(parse_command(words))
+        # Torch and numba read the number of threads when they are imported, which the check of the
+        # output may do.
+        if isinstance(command_options, ComputeOptions):
+            limit_threads(command_options.threads)
         if isinstance(command_options, Options):
             command_options.check_overlap()
             if command_options.quiet:
                 logging.getLogger("gscompleter").setLevel(logging.ERROR)
 
-        # Numba reads the number of threads when it is imported, which the command does.
-        if isinstance(command_options, ComputeOptions):
-            limit_threads(command_options.threads)
         run_command = getattr(import_command(words[0]), f"run_{words[0]}")
         code = run_command(command_options)
     except InputError as error:

@@ -23,7 +23,7 @@ from gscompleter.apps.inputs.memory import estimate_memory
 from gscompleter.apps.inputs.reading import read_task
 from gscompleter.apps.inputs.selection import select_near_and_far
 from gscompleter.apps.inputs.task import CompletionTask, Opened
-from gscompleter.apps.requests.scene import parse_resolution
+from gscompleter.apps.requests.scene import decide_resolution
 from gscompleter.apps.viewer.exhibit import load_viewer_completion
 from gscompleter.cli import parse_command
 from gscompleter.data.formats import open_photographs
@@ -82,7 +82,7 @@ def test_the_longer_side_is_shrunk_and_never_enlarged(tmp_path):
 
 
 def test_the_longer_side_has_640_pixels_unless_another_size_is_asked_for():
-    assert parse_resolution(None) == 640
+    assert decide_resolution(None) == 640
     words = ["complete", "SCENE", "--target", "8", "--out", "OUT"]
     sizes = {(): None, ("full",): "full", ("300",): 300, ("300", "200"): (300, 200)}
     for given, size in sizes.items():

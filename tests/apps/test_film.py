@@ -113,6 +113,25 @@ def test_the_way_goes_around_what_was_photographed_and_not_through_it():
     assert min(camera.center.norm().item() for camera in straight) < 0.1
 
 
+def test_the_way_from_a_stop_to_the_same_pose_stays_there():
+    here = camera_at(size=SIZE)
+    photographs = [here, camera_at(1.0, size=SIZE), camera_at(2.0, size=SIZE)]
+    way = plan_camera_path([here, here], photographs, 12)
+    assert max(measure_baseline(camera, here) for camera in way) < 1e-5
+
+
+def test_targets_that_only_got_new_colours_are_passed(completion):
+    (added,) = completion.targets
+    recolored = replace(added, added=added.added[:0], num_recolored=7)
+    nothing = replace(added, added=added.added[:0])
+    targets = tuple(
+        replace(result, target=camera_at(x, size=SIZE))
+        for result, x in ((nothing, 0.1), (added, 0.2), (recolored, 0.3))
+    )
+    _, *passed = choose_stops(replace(completion, targets=targets))
+    assert [round(camera.center[0].item(), 3) for camera in passed] == [0.2, 0.3]
+
+
 @pytest.mark.parametrize("size", [(48, 32), (256, 256), (200, 600), (640, 480)])
 def test_a_film_is_wide_enough(completion, size):
     width, height = size

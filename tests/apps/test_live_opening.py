@@ -117,6 +117,12 @@ def actions_in(out: Path, key: str = "frames") -> list[str]:
     return [row["action"] for row in json.loads((out / "strokes.json").read_text())[key]]
 
 
+def test_a_size_of_nothing_is_not_taken_for_none(room, tmp_path):
+    words = ["live", str(room), "--resolution", "0", "--out", str(tmp_path / "out")]
+    session = decide_live(parse_command(words)).session
+    assert session.completion.source.scene.resolution == 0  # which opening the scene refuses
+
+
 @pytest.mark.slow
 def test_each_step_is_kept_at_once_and_a_session_goes_on(room, splat, tmp_path):
     out = tmp_path / "out"

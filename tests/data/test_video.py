@@ -110,6 +110,19 @@ def test_rotation_metadata_and_containers_are_honoured(video, tmp_path, ending):
     assert small.shape == (40, 30)
 
 
+def test_pixels_that_are_not_square_are_shown_as_players_show_them(video, tmp_path):
+    """As in HDV and other anamorphic files; frames would be squeezed, which no lens explains."""
+    narrow = tmp_path / "narrow.mp4"
+    squeezed = ("-vf", "scale=120:120,setsar=4/3", "-c:v", "libx264", "-crf", "1")
+    command = [find_ffmpeg(), "-v", "error", "-i", str(video), *squeezed, str(narrow)]
+    subprocess.run(command, check=True)
+    shown, true = (next(read_video(path, "null", False)) for path in (narrow, video))
+    assert shown.shape == true.shape
+    assert np.abs(shown.astype(int) - true).mean() < 0.03 * true.max()
+    chosen = extracted(narrow, tmp_path / "frames", 6)
+    assert {pixels.shape for pixels in chosen.values()} == {(120, 160, 3)}
+
+
 def test_of_each_window_the_sharpest_frame_is_chosen_half_a_window_on():
     motion = np.array([0, 0.2, 0.9, 1, 2, 2.6, 3, 3.4])
     sharpness = np.array([1, 2, 3, 8, 1, 2, 9, 6.0])

@@ -19,6 +19,7 @@ import torch
 from chunk_files import as_tensor, example, save_chunk
 from command import run
 from gscompleter import GSCompleter, InputError
+from gscompleter.apps.commands.evaluate import EvaluateOptions
 from gscompleter.evaluation import methods as runs_methods
 from gscompleter.evaluation import runner
 from gscompleter.evaluation.baselines.reggs import RegGSConfig
@@ -504,6 +505,19 @@ def test_chunks_run_end_to_end_and_a_broken_image_costs_its_own_cases(
         (("--protocol", "stress"), "chooses none of its"),
         (("--limit", "0"), "--limit"),
         (("--generator", "dall-e"), "no generator"),
+        (("--generator", "warp-inpaint", "painted"), "needs painted images"),
+        (("--outlines",), "There is no figure to apply this to"),
+        (("--crops", "--table", "rotation"), "There is no figure to apply this to"),
+        (("--figure-cases", "box"), "There is no figure to apply this to"),
+        (("--table", "rotation", "--methods", "context"), "have methods of their own"),
+        (("--preset", "re10k", "--methods", "context"), "have methods of their own"),
+        (("--depth-weights", "no.onnx"), "No monocular depth is chosen that could take no.onnx"),
+        (("--workers", "2"), "is for --engine local or ray or submitit"),
+        (("--gpus", "1", "--engine", "local"), "is for --engine ray or submitit"),
+        (("--address", "auto", "--engine", "submitit"), "is for --engine ray;"),
+        (("--slurm", "time=1", "--engine", "ray"), "is for --engine submitit;"),
+        (("--depth", "none", "moge-2", "--generator", "oracle", "lama"), "one after the other"),
+        (("--depth", "none", "moge-2", "--preset", "re10k"), "leave --preset, --table and"),
     ],
 )
 def test_wrong_options_are_refused(scenes, tmp_path, monkeypatch, capsys, more, sentence):
@@ -512,6 +526,33 @@ def test_wrong_options_are_refused(scenes, tmp_path, monkeypatch, capsys, more, 
     assert run(monkeypatch, "evaluate", data, "--out", out, *more) == 2
     assert sentence in capsys.readouterr().err
     assert not out.exists()
+
+
+@pytest.mark.parametrize("option", ["weights", "depth-weights"])
+@pytest.mark.parametrize("prefix", ["", "{}="])
+def test_weights_in_the_output_are_refused_however_they_are_named(
+    tmp_path, monkeypatch, capsys, option, prefix
+):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "own.ckpt").touch()
+    named = prefix.format({"weights": "mvsplat-re10k", "depth-weights": "moge-2"}[option])
+    models = ("--reconstructor", "mvsplat-re10k", "--depth", "moge-2")
+    given = (f"--{option}", f"{named}{out / 'own.ckpt'}")
+    assert run(monkeypatch, "evaluate", tmp_path / "no", "--out", out, *models, *given) == 2
+    assert "holds the input" in capsys.readouterr().err
+
+
+def test_threads_are_limited_before_anything_reads_their_number(tmp_path, monkeypatch):
+    """The check of the output imports torch, which reads it once."""
+    seen = []
+    monkeypatch.setenv("OMP_NUM_THREADS", "2")
+    monkeypatch.setattr(
+        EvaluateOptions, "check_overlap", lambda self: seen.append(os.environ["OMP_NUM_THREADS"])
+    )
+    words = ("evaluate", tmp_path / "no", "--threads", 1, "--out", tmp_path / "out")
+    assert run(monkeypatch, *words) == 2
+    assert seen == ["1"]
 
 
 def test_scenes_need_a_protocol_and_an_index_is_kept(scenes, tmp_path, monkeypatch, capsys):

@@ -81,6 +81,23 @@ def test_networks_reconstruct_on_the_device(device, name):
     assert found.gaussians.means.cpu().isfinite().all()
 
 
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param(name, marks=[pytest.mark.slow] * (name != "depth-anything"))
+        for name in NETWORKS
+    ],
+)
+def test_networks_run_on_the_gpu_of_a_mac(name):
+    """It has no numbers of 64 bits. The views stay on the CPU, which draws there."""
+    torch.manual_seed(0)
+    size = 56 if name == "depth-anything" else 64
+    views = [view_of(Room(), camera_at(x, size=size), i) for i, x in enumerate((-0.3, 0.1))]
+    with fake_cuda(has_doubles=False):
+        found = run_reconstructor(NETWORKS[name](), views)
+    assert found.gaussians.means.isfinite().all()
+
+
 def move(render: Render) -> Render:
     return Render(*(part.to("cuda") for part in (render.image, render.depth, render.alpha)))
 

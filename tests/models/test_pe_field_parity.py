@@ -13,6 +13,7 @@ import pytest
 import torch
 
 from feed_forward_fixtures import rule_v1
+from gscompleter.models.diffusion import rotary
 from gscompleter.models.diffusion.position_ids import (
     LEVELS,
     compute_source_ids,
@@ -251,3 +252,14 @@ def test_a_transformer_of_other_heads_is_refused():
     config["num_attention_heads"] = 12
     with pytest.raises(ValueError, match="24 heads, got 12"):
         enable_per_head_positions(diffusers.FluxTransformer2DModel(**config))
+
+
+def test_the_gpu_of_a_mac_gets_angles_of_32_bits_that_are_as_good(monkeypatch):
+    """It has no others."""
+    assert rotary.choose_angle_dtype(torch.device("mps")) is torch.float32
+    assert rotary.choose_angle_dtype(torch.device("cuda")) is torch.float64
+    ids = compute_target_ids((1024, 1024), (64, 64), torch.float32)
+    exact = PerHeadRotary((16, 56, 56))(ids)
+    monkeypatch.setattr(rotary, "choose_angle_dtype", lambda device: torch.float32)
+    for found, true in zip(PerHeadRotary((16, 56, 56))(ids), exact, strict=True):
+        assert (found - true).abs().max() < 1e-4 * true.abs().max()

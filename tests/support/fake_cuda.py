@@ -175,6 +175,8 @@ class FakeCudaTensor(Tensor):
     @staticmethod
     def __new__(cls, values: Tensor) -> FakeCudaTensor:
         assert not isinstance(values, FakeCudaTensor)
+        if values.dtype is torch.float64 and not get_device().has_doubles:
+            raise TypeError("Cannot convert a MPS Tensor to float64 dtype; use float32 instead.")
         # Never a tensor of the inference mode: it could be no view of one from outside of it.
         with torch.inference_mode(False):
             wrapper = Tensor._make_wrapper_subclass(
@@ -303,7 +305,8 @@ class Thread(threading.local):
 class FakeDevice:
     """The device: runs operations of torch, raises where devices mix, and counts."""
 
-    def __init__(self) -> None:
+    def __init__(self, has_doubles: bool) -> None:
+        self.has_doubles = has_doubles
         self.counts = Counts()
         self.memory = Memory(self.counts)
         self.thread = Thread()
@@ -508,11 +511,14 @@ SEEN_BY_TORCH: dict[str, Any] = {
 
 
 @contextmanager
-def fake_cuda() -> Iterator[Counts]:
-    """Let torch see a GPU inside the block, and count what it has to do."""
+def fake_cuda(has_doubles: bool = True) -> Iterator[Counts]:
+    """Let torch see a GPU inside the block, and count what it has to do.
+
+    Without doubles it refuses numbers of 64 bits after the point, as the GPU of a Mac does.
+    """
     global _device
     assert _device is None
-    _device = FakeDevice()
+    _device = FakeDevice(has_doubles)
     overwriting = torch.__future__.get_overwrite_module_params_on_conversion()
     # Parameters of a network change their class with their device.
     torch.__future__.set_overwrite_module_params_on_conversion(True)

@@ -26,9 +26,8 @@ Values = Float[np.ndarray, "n"]
 
 SOURCE_VIDEO_ENDINGS = (".mp4", ".mov", ".m4v", ".mkv", ".webm")
 """Endings of videos, in any case."""
-NUM_FRAMES = 40
-"""Default number of frames to choose."""
 MIN_FRAMES = 3
+"""Fewest frames of which cameras can be found."""
 SMALL_SIDE = 640
 """Longer side in pixels at which frames are measured."""
 REFERENCE_MOTION = 0.02
@@ -96,9 +95,8 @@ def _measure_motion(reference: Image8, corners: MotionCorners, frame: Image8) ->
     if status.mean() < MIN_TRACKED:
         return 1.0
     moved = np.linalg.norm((corners_now - corners)[status == 1], axis=-1)
-    return min(
-        float(np.quantile(moved, MOTION_QUANTILE)) / (REFERENCE_MOTION * max(frame.shape)), 1.0
-    )
+    steps = np.quantile(moved, MOTION_QUANTILE) / (REFERENCE_MOTION * max(frame.shape))
+    return min(float(steps), 1.0)
 
 
 def select_frames(sharpness: Values, motion: Values, count: int) -> list[int]:
@@ -106,12 +104,15 @@ def select_frames(sharpness: Values, motion: Values, count: int) -> list[int]:
 
     Selected frames are at least half a window apart; a window may have none.
     """
+    if len(motion) == 0:
+        return []
+    # Windows of whole steps: the camera has moved by as much in each, however fast it went.
+    steps = int(motion.max()) + 1
+    windows = min(count, steps)
+    bounds = [steps * n // windows for n in range(windows + 1)]
     selected = list[int]()
     last = -np.inf
-    # Windows of whole steps: the camera has moved by as much in each, however fast it went.
-    steps = int(motion.max(initial=-1)) + 1
-    windows = min(count, steps)
-    for start, end in pairwise(steps * n // windows for n in range(windows + 1) if windows):
+    for start, end in pairwise(bounds):
         inside = (motion >= max(start, last + (end - start) / 2)) & (motion < end)
         if inside.any():
             selected.append(int(np.where(inside, sharpness, -1.0).argmax()))

@@ -346,6 +346,12 @@ def load_reconstructor(
         assert load is not None
         reconstructor = load(None if weights is None else Path(weights), device)
     if depth == "none":
+        if depth_weights is not None:
+            raise InputError(
+                f"No monocular depth is chosen that could take {quote_value(depth_weights)}; "
+                "choose one, or leave the weights out.",
+                "depth-weights",
+            )
         return reconstructor
     if not isinstance(reconstructor, DepthAware) or not is_dataclass(reconstructor):
         raise InputError(

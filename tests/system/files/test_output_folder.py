@@ -20,7 +20,7 @@ from gscompleter.system.files.output_folder import (
     read_listing,
     reserve_output,
 )
-from gscompleter.system.files.unfinished import make_unfinished_name
+from gscompleter.system.files.unfinished import list_unfinished, make_unfinished_name
 from gscompleter.system.files.writing import replace_file
 
 SUMMARY = "summary.json"
@@ -242,6 +242,23 @@ def test_what_a_killed_run_left_is_removed_by_the_next_and_that_of_others_is_not
     os.utime(quiet, (0, 0))
     check_output(out)
     assert sorted(tmp_path.glob(".gscompleter-*")) == sorted([other, neighbour])
+
+
+@pytest.mark.skipif(not Path("/proc/self/stat").exists(), reason="needs a list of processes")
+def test_a_process_of_another_user_that_has_ended_is_not_running(tmp_path, monkeypatch):
+    """It stays listed as a zombie until its parent asks for it, and no signal may be sent to it."""
+
+    def refuse(pid: int, number: int) -> None:
+        raise PermissionError
+
+    with subprocess.Popen([sys.executable, "-c", ""]) as ended:
+        os.waitid(os.P_PID, ended.pid, os.WEXITED | os.WNOWAIT)
+        name = make_unfinished_name("out").replace(f"-{os.getpid()}-", f"-{ended.pid}-")
+        (tmp_path / name).mkdir()
+        monkeypatch.setattr(os, "kill", refuse)
+        (entry,) = list_unfinished(tmp_path)
+        assert entry.pid == ended.pid
+        assert not entry.is_running()
 
 
 def test_the_summary_leaves_first_and_arrives_last(results, monkeypatch):

@@ -123,7 +123,7 @@ def decide_holes(
         )
     check_ending(options)
     if options.images is None:
-        check_generator(options.synthesis)
+        check_generator(options.synthesis.generator)
         cameras = NamedCameras(options.target, options.context)
         synthesis = options.synthesis
     else:

@@ -8,11 +8,30 @@ from collections.abc import Sequence
 from gscompleter.apps.commands.shared_options import EngineOptions
 from gscompleter.apps.requests.batch import EngineRequest
 from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.jobs.engine_names import EngineName
 from gscompleter.system.jobs.jobs import parse_shard
+
+ENGINES_THAT_FOLLOW: dict[str, tuple[EngineName, ...]] = {
+    "workers": ("local", "ray", "submitit"),
+    "address": ("ray",),
+    "gpus": ("ray", "submitit"),
+    "slurm": ("submitit",),
+}
+"""Engines that follow an option, by its name."""
 
 
 def decide_engine(options: EngineOptions) -> EngineRequest:
-    """Decide what runs the cases, and which share of them."""
+    """Decide what runs the cases, and which share of them.
+
+    Raise InputError for an option that the engine does not follow.
+    """
+    for name, engines in ENGINES_THAT_FOLLOW.items():
+        if getattr(options, name) != getattr(EngineOptions, name) and options.engine not in engines:
+            raise InputError(
+                f"This option is for --engine {' or '.join(engines)}; choose it, or leave this "
+                "option out.",
+                name,
+            )
     return EngineRequest(
         name=options.engine,
         workers=options.workers,

@@ -11,6 +11,7 @@ import tyro
 from annotated_types import Interval
 
 from gscompleter.apps.commands.engines import decide_engine
+from gscompleter.apps.commands.shared_decisions import check_generator
 from gscompleter.apps.commands.shared_options import (
     EngineOptions,
     MaskOptions,
@@ -53,8 +54,12 @@ FigureName = Literal[
 ComparedKind = Literal["depth", "generator"]
 """Kind of models that are compared in a table of their own."""
 
+FIGURE_OPTIONS = ("figure_cases", "outlines", "crops")
+"""Options of figures alone."""
 AUTO = "auto"
 """Generator of the preset, or else the default one."""
+DEPTH_WORDS = ("depth", "depth-weights")
+"""Kind and option of `assign_weights` for a monocular depth."""
 WEIGHTS_SETTING = "generator_weights"
 """Setting that several generators cannot share: a file of weights is of one network."""
 
@@ -202,7 +207,21 @@ class EvaluateOptions(SynthesisOptions, EngineOptions, MaskOptions):
 
     def check_overlap(self) -> None:
         """Refuse an output that is, holds or lies in an input."""
-        refuse_overlap(self.out, replace_by_scenes(list_inputs(self), self.paths))
+        # Weights may be given as NAME=FILE, which is no path.
+        files = [
+            *assign_weights(choose_reconstructors(self), self.weights).values(),
+            *assign_weights(self.depth, self.depth_weights, *DEPTH_WORDS).values(),
+        ]
+        others = list_inputs(replace(self, weights=(), depth_weights=()))
+        inputs = [*others, *(file for file in files if file is not None)]
+        refuse_overlap(self.out, replace_by_scenes(inputs, self.paths))
+
+
+def choose_reconstructors(options: EvaluateOptions) -> tuple[str, ...]:
+    """Return the reconstructors that are named, or else those of the preset, or the default one."""
+    from gscompleter.evaluation.paper import get_data_set  # no help page waits for torch
+
+    return options.reconstructor or get_data_set(options.preset).reconstructor
 
 
 def decide_evaluation(
@@ -217,7 +236,7 @@ def decide_evaluation(
 
     # What is not given is as in the preset, or as without one.
     preset = get_data_set(options.preset)
-    reconstructors = options.reconstructor or preset.reconstructor
+    reconstructors = choose_reconstructors(options)
     is_reproduction = bool(
         options.preset or options.table or options.figure or len(reconstructors) > 1
     )
@@ -225,12 +244,15 @@ def decide_evaluation(
         preset.generator if name == AUTO else name for name in options.synthesis.generator
     )
     refuse_repeated(reconstructors, options.depth, generators)
+    refuse_unused(options, is_reproduction)
+    for generator in generators:
+        check_generator(generator)
     compared = find_compared(options.depth, generators, is_reproduction)
     if not options.paths:
         raise InputError("No data is given; name a cases.json, or scenes with --protocol.")
 
     weights = assign_weights(reconstructors, options.weights)
-    depth_weights = assign_weights(options.depth, options.depth_weights, "depth", "depth-weights")
+    depth_weights = assign_weights(options.depth, options.depth_weights, *DEPTH_WORDS)
     models = decide_models_by_generator(
         options, generators, reconstructors[0], weights[reconstructors[0]], depth_weights
     )
@@ -317,22 +339,42 @@ def refuse_repeated(
         raise InputError("A generator is named twice, or none is; name each once.", "generator")
 
 
+def refuse_unused(options: EvaluateOptions, is_reproduction: bool) -> None:
+    """Refuse options that nothing would follow."""
+    for name in FIGURE_OPTIONS:
+        if getattr(options, name) and not options.figure:
+            raise InputError("There is no figure to apply this to; name one with --figure.", name)
+    if is_reproduction and options.methods != EvaluateOptions.methods:
+        raise InputError(
+            "Tables and figures of the paper have methods of their own; leave this out.", "methods"
+        )
+
+
 def find_compared(
     depths: Sequence[str], generators: Sequence[str], is_reproduction: bool
 ) -> ComparedKind | None:
     """Find the kind of which several models are named, or None.
 
-    Raise InputError if both are, or beside what a reproduction of the paper runs.
+    Raise InputError if several of both kinds are, or some beside a reproduction of the paper.
     """
     named: dict[ComparedKind, Sequence[str]] = {"depth": depths, "generator": generators}
     several = [kind for kind, names in named.items() if len(names) > 1]
-    if len(several) > 1 or (several and is_reproduction):
+    if not several:
+        return None
+    kind = several[0]
+    if len(several) > 1:
         raise InputError(
-            f"Several {several[0]}s are compared with one reconstructor in a table of their own; "
-            "leave --preset, --table and --figure out, and name one of the others.",
-            several[0],
+            "Depths and generators are compared one after the other; name several depths with one "
+            "generator, or several generators with one depth.",
+            kind,
         )
-    return several[0] if several else None
+    if is_reproduction:
+        raise InputError(
+            f"Several {kind}s are compared with one reconstructor, in a table of their own; leave "
+            "--preset, --table and --figure out, and name one reconstructor.",
+            kind,
+        )
+    return kind
 
 
 def decide_run_models(

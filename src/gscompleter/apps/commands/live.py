@@ -55,8 +55,11 @@ def decide_live(options: LiveOptions) -> LiveRequest:
     from gscompleter.apps.commands.sessions import decide_session  # no help page waits for torch
     from gscompleter.apps.live.opening import LiveRequest
 
-    session = decide_session(replace(options, strokes=None), options.strokes)
-    return LiveRequest(session, options.host, options.port, not options.no_open)
+    # The file of steps is given beside the options: among them it would count as an input, which a
+    # session that goes on in its own folder could not have there.
+    without_strokes = replace(options, strokes=None)
+    session = decide_session(without_strokes, options.strokes)
+    return LiveRequest(session, options.host, options.port, opens_browser=not options.no_open)
 
 
 def run_live(options: LiveOptions) -> None:

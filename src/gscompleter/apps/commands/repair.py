@@ -66,7 +66,7 @@ def decide_repair(options: RepairOptions) -> RepairRequest:
     has_masks = options.select is None
     check_splat_named(options, "marked")
     check_context(options.context)
-    check_generator(options.synthesis)
+    check_generator(options.synthesis.generator)
     completion = decide_filling(
         options,
         TargetRequest(options.target),

@@ -70,7 +70,8 @@ def decide_session(options: AnyOptions, strokes: Path | None) -> SessionRequest:
     options, path = find_session(options, strokes)
     if path is None:
         out = options.out or DEFAULT_OUT
-        size = options.resolution or DEFAULT_RESOLUTION
+        # A size of 0 is refused by who reads the photographs, not taken for none.
+        size = DEFAULT_RESOLUTION if options.resolution is None else options.resolution
         options = replace(options, out=out, resolution=size)
         if holds_session(out) and not options.overwrite:
             raise InputError(
@@ -115,7 +116,7 @@ def decide_replay(options: CompletingOptions, strokes: Path) -> SessionRequest:
 def begin_with(options: CompletingOptions) -> SessionRequest:
     """Decide on a session without steps, with a record of its options."""
     check_context(options.context)
-    check_generator(options.synthesis)
+    check_generator(options.synthesis.generator)
     completion = decide_filling(
         options,
         # A session begins wherever the splat looks well, if nothing tells where its cameras were.

@@ -23,18 +23,18 @@ from gscompleter.apps.requests.completion import (
 )
 from gscompleter.apps.requests.models import ModelRequest
 from gscompleter.apps.requests.scene import (
-    NUM_VIDEO_FRAMES,
     AloneRequest,
     Names,
     PhotographsRequest,
     PosesRequest,
     SceneRequest,
-    parse_resolution,
+    decide_resolution,
 )
 from gscompleter.apps.requests.splat import SplatRequest
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.data.mask_reading import MaskReading
+from gscompleter.data.sfm import NUM_VIDEO_FRAMES
 from gscompleter.system.errors import InputError, quote_value
 
 # Functions import what needs torch when they are called, so that no help page waits for it.
@@ -129,7 +129,7 @@ def decide_scene(
     return SceneRequest(
         folder,
         options.format,
-        parse_resolution(options.resolution),
+        decide_resolution(options.resolution),
         follows_training=has_splat and options.resolution is None,
         near=options.near,
         far=options.far,
@@ -296,9 +296,9 @@ def check_context(context: Names | None) -> None:
         )
 
 
-def check_generator(synthesis: GeneratorOptions) -> None:
+def check_generator(name: str) -> None:
     """Refuse the generator of painted images for a command that is given none."""
-    if synthesis.generator == "painted":
+    if name == "painted":
         raise InputError(
             "The generator 'painted' needs painted images, which `complete --images` names; choose "
             "another one where there are none.",

@@ -12,9 +12,10 @@ from annotated_types import Interval
 
 from gscompleter.apps.command_line.chosen_config import ChosenConfig
 from gscompleter.apps.requests.answer import AnswerRequest
-from gscompleter.apps.requests.scene import FRAME_NUMBER, NUM_VIDEO_FRAMES, Names, Size
+from gscompleter.apps.requests.scene import FRAME_NUMBER, Names, Size
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Device, Seed, Settings
+from gscompleter.data.sfm import NUM_VIDEO_FRAMES
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.jobs.engine_names import EngineName

@@ -15,13 +15,13 @@ from gscompleter.apps.inputs.describing import describe_missing_photographs
 from gscompleter.apps.inputs.selection import select_closest
 from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.apps.requests.scene import (
-    NUM_VIDEO_FRAMES,
     AloneRequest,
     PhotographsRequest,
 )
 from gscompleter.apps.requests.splat import SplatRequest
 from gscompleter.config import CleaningConfig, CompleterConfig
 from gscompleter.data.local_origin import compute_frame_from_photographs
+from gscompleter.data.sfm import NUM_VIDEO_FRAMES
 from gscompleter.evaluation.verdict.held_out import HeldOut
 from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, View

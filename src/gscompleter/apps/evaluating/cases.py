@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.console import Console
 
 from gscompleter.apps.requests.evaluation import CasesRequest
-from gscompleter.apps.requests.scene import DEFAULT_LONG_SIDE, parse_resolution
+from gscompleter.apps.requests.scene import DEFAULT_LONG_SIDE, decide_resolution
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.limits import check_planes
 from gscompleter.data.mask_checks import read_masks_as_asked
@@ -132,7 +132,7 @@ def apply_request(case: Case, request: CasesRequest) -> Case:
         case,
         near=case.near if request.near is None else request.near,
         far=case.far if request.far is None else request.far,
-        resolution=case.resolution if size is None else parse_resolution(size),
+        resolution=case.resolution if size is None else decide_resolution(size),
         masks=request.uses_masks,
         invert_masks=request.masks.is_inverted,
         ignore_moving=request.ignore_moving,
@@ -157,7 +157,7 @@ def iterate_tasks(
         height, width = resolution
         size = loader.make_crop(height, width)
     else:
-        size = parse_resolution(resolution)
+        size = decide_resolution(resolution)
     # Their code also keeps clips whose coordinates are large.
     max_translation = MAX_TRANSLATION if loader is None else None
     for place in places:

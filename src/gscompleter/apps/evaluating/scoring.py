@@ -15,7 +15,7 @@ from gscompleter.apps.command_line.exit_codes import choose_exit_code
 from gscompleter.apps.evaluating.cases import collect_tasks, find_authors_loader, print_skipped
 from gscompleter.apps.evaluating.tables import write_and_print_tables
 from gscompleter.apps.requests.evaluation import CasesRequest, EvaluationRequest
-from gscompleter.apps.requests.scene import DEFAULT_LONG_SIDE, parse_resolution
+from gscompleter.apps.requests.scene import DEFAULT_LONG_SIDE, decide_resolution
 from gscompleter.apps.warmup import compile_kernels
 from gscompleter.data.photographs import check_resolution
 from gscompleter.data.sfm.refining import has_pycolmap
@@ -66,7 +66,7 @@ def score_methods(request: EvaluationRequest) -> Scored:
     methods = expand_methods(request.methods)
     cases = request.cases
     if cases.resolution is not None:
-        check_resolution(parse_resolution(cases.resolution))
+        check_resolution(decide_resolution(cases.resolution))
 
     skipped: list[SkippedScene] = []
     notes: list[str] = []

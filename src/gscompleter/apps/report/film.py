@@ -1,7 +1,8 @@
 """A video that moves through the completed holes, before and after side by side.
 
-The camera starts at the photograph nearest to the first target, passes all targets and returns the
-same way, so the video can loop and each frame is rendered once. Its path is smooth and level.
+The camera starts at the photograph nearest to the first target that changed the scene, passes up to
+`MAX_TARGETS` of these targets and returns the same way, so the video can loop and each frame is
+rendered once. Its path is smooth and level.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ FRAMES_PER_SECOND = 24
 ONE_WAY_SECONDS = 3.0
 MIN_LEG_SECONDS = 0.75
 MAX_TARGETS = 6
+"""Most targets that the camera passes: the first ones."""
 MAX_FILM_SIDE = 640
 """Longer side of one half in pixels, unless `MIN_FILM_WIDTH` needs more."""
 GAP_PIXELS = 4
@@ -58,11 +60,12 @@ def write_comparison_video(
 
 
 def choose_stops(completion: Completion) -> list[Camera]:
-    """Choose a photograph and the targets with added Gaussians, or all targets if none has any.
+    """Choose a photograph and the first targets that changed the scene, or any if none did.
 
-    All cameras get the intrinsics of the first target.
+    All cameras get the intrinsics of the first of these targets.
     """
-    results = [r for r in completion.targets if len(r.added)] or list(completion.targets)
+    changed = [result for result in completion.targets if result.has_changed_scene]
+    results = changed or completion.targets
     targets = [result.target for result in results[:MAX_TARGETS]]
     photographs = [view.camera for view in completion.views]
     nearest = min(photographs, key=lambda camera: measure_baseline(camera, targets[0]))
@@ -127,14 +130,16 @@ def plan_camera_path(
 def find_waypoints(first: Camera, second: Camera, photographs: Sequence[Camera]) -> list[Camera]:
     """Find the path along photographs with the smallest sum of squared steps."""
     # Imported here, since SciPy is slow to import and only videos need it.
-    from scipy.sparse.csgraph import shortest_path
+    from scipy.sparse.csgraph import csgraph_from_dense, shortest_path
 
     # Squared steps make many short ones cheaper than one long one, so that the path follows the
     # photographs. Positions and viewing directions count together (`embed_cameras`).
     cameras = [first, *photographs, second]
     where = embed_cameras(cameras).double().cpu()
     squares = (where[:, None] - where).square().sum(dim=-1).numpy()
-    _, before = shortest_path(squares, indices=0, return_predecessors=True)
+    # In a plain array SciPy takes steps below 1e-8 for none, as between two cameras of one pose.
+    graph = csgraph_from_dense(squares, null_value=np.inf)
+    _, before = shortest_path(graph, indices=0, return_predecessors=True)
     # Predecessors lead from the second camera back to the first, which has index 0.
     way = [second]
     number = before[-1]

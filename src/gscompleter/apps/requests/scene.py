@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Literal
 
 from gscompleter.data.mask_reading import MaskReading
+from gscompleter.data.sfm import NUM_VIDEO_FRAMES
 
 DEFAULT_LONG_SIDE = 640
 """Default length of a photograph's longer side, in pixels."""
-NUM_VIDEO_FRAMES = 40
-"""Default number of frames that are taken of a video as photographs, at most."""
 
 Size = tuple[int, int] | int | Literal["full"]
 """Height and width, the longest side, or `full` for the photographs' own size."""
@@ -94,7 +93,7 @@ class AloneRequest:
     """What a hole is; `auto` looks whether the splat is an object on nothing."""
 
 
-def parse_resolution(given: Size | None) -> tuple[int, int] | int | None:
+def decide_resolution(given: Size | None) -> tuple[int, int] | int | None:
     """Return a size as the readers of photographs take it; the default one if none is given."""
     size = DEFAULT_LONG_SIDE if given is None else given
     return None if size == "full" else size

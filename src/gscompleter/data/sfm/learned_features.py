@@ -19,7 +19,13 @@ import torch
 from jaxtyping import Float, Int
 from PIL import Image
 
-from gscompleter.data.sfm.matching import MATCHING_SEED, ColmapJob, Pairs, read_image_number
+from gscompleter.data.sfm.matching import (
+    ColmapJob,
+    Pairs,
+    choose_verification,
+    read_image_number,
+    write_pairs,
+)
 
 MAX_LEARNED_FEATURES = 2048
 """Most features in a photograph; the time of a pair grows with their square."""
@@ -134,8 +140,4 @@ def match_learned(
             rows = matcher.match(features[i], features[j])
             database.write_matches(numbers[i], numbers[j], rows.astype(np.uint32))
 
-    listed = Path(job.work) / "pairs.txt"
-    listed.write_bytes("".join(f"{names[i]} {names[j]}\n" for i, j in sorted(pairs)).encode())
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = MATCHING_SEED
-    pycolmap.verify_matches(job.database, listed, verification)
+    pycolmap.verify_matches(job.database, write_pairs(job, names, pairs), choose_verification())

@@ -111,13 +111,25 @@ def _read_features(database: Any, name: str) -> Float[np.ndarray, "k 128"]:
 
 def match(job: ColmapJob, names: Sequence[str], pairs: Pairs) -> None:
     """Match the features of pairs of photographs, and verify them with an essential matrix."""
-    listed = pycolmap.ImportedPairingOptions(match_list_path=Path(job.work) / "pairs.txt")
-    lines = "".join(f"{names[i]} {names[j]}\n" for i, j in sorted(pairs))
-    listed.match_list_path.write_bytes(lines.encode())
+    listed = pycolmap.ImportedPairingOptions(match_list_path=write_pairs(job, names, pairs))
     matching = pycolmap.FeatureMatchingOptions(num_threads=job.threads, use_gpu=False)
+    verification = choose_verification()
+    pycolmap.match_image_pairs(job.database, matching, listed, verification, pycolmap.Device.cpu)
+
+
+def write_pairs(job: ColmapJob, names: Sequence[str], pairs: Pairs) -> Path:
+    """Write the pairs of photographs as COLMAP reads them; return the file."""
+    listed = Path(job.work) / "pairs.txt"
+    lines = "".join(f"{names[i]} {names[j]}\n" for i, j in sorted(pairs))
+    listed.write_bytes(lines.encode())
+    return listed
+
+
+def choose_verification() -> pycolmap.TwoViewGeometryOptions:
+    """Return the options of the verification of matches, with a fixed seed."""
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = MATCHING_SEED
-    pycolmap.match_image_pairs(job.database, matching, listed, verification, pycolmap.Device.cpu)
+    return verification
 
 
 def is_sequence(names: Sequence[str]) -> bool:

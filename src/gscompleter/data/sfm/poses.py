@@ -42,12 +42,13 @@ from gscompleter.data.masks import (
 from gscompleter.data.panorama import has_panoramas, split_panorama
 from gscompleter.data.photograph import StoredPhotograph, read_focal, read_lens
 from gscompleter.data.photographs import Photographs
+from gscompleter.data.sfm import NUM_VIDEO_FRAMES
 from gscompleter.data.unused_files import (
     DEPTH_FOLDERS,
     OTHER_FOLDERS,
     is_depth_map,
 )
-from gscompleter.data.video import NUM_FRAMES, extract_frames, is_video
+from gscompleter.data.video import extract_frames, is_video
 from gscompleter.system.children import run_module
 from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.image import (
@@ -188,7 +189,7 @@ def find_poses(
     photographs: Path,
     out: Path,
     overwrite: bool = False,
-    num_frames: int = NUM_FRAMES,
+    num_frames: int = NUM_VIDEO_FRAMES,
     reading: MaskReading = MaskReading(),
 ) -> FoundPoses:
     """Find the cameras of a folder of photographs or of a video's frames; write them to `out`.

@@ -67,23 +67,22 @@ def add_position_encoding(x: Float[Tensor, "n c h w"], aspect: float) -> Float[T
     # Positions in a frame whose half diagonal is 1, so that they do not depend on the resolution
     # and an image that is not square keeps its proportions.
     diagonal = (aspect**2 + 1) ** 0.5
-    columns = compute_cell_positions(w, aspect / diagonal, x.device)
-    rows = compute_cell_positions(h, 1 / diagonal, x.device)
-    across = compute_sinusoids(columns, c // 4)[:, None, :].expand(-1, h, -1)
-    down = compute_sinusoids(rows, c // 4)[:, :, None].expand(-1, -1, w)
+    columns = compute_cell_positions(w, aspect / diagonal)
+    rows = compute_cell_positions(h, 1 / diagonal)
+    across = compute_sinusoids(columns, c // 4).to(x.device)[:, None, :].expand(-1, h, -1)
+    down = compute_sinusoids(rows, c // 4).to(x.device)[:, :, None].expand(-1, -1, w)
     return x + POSITION_WEIGHT * torch.cat([across, down])
 
 
-def compute_cell_positions(
-    count: int, extent: float, device: torch.device
-) -> Float[Tensor, "count"]:
+def compute_cell_positions(count: int, extent: float) -> Float[Tensor, "count"]:
     """Compute the centres of `count` cells between -extent and extent."""
     last = extent * (count - 1) / count
-    return torch.linspace(-last, last, count, device=device)
+    return torch.linspace(-last, last, count)
 
 
 def compute_sinusoids(at: Float[Tensor, "m"], count: int) -> Float[Tensor, "k m"]:
     """Compute `count` sines of decreasing frequency, then their cosines."""
-    k = torch.arange(count, device=at.device, dtype=torch.float64)
+    # In float64 on the CPU: the GPU of a Mac has none.
+    k = torch.arange(count, dtype=torch.float64)
     angles = (POSITION_BASE ** (-k / count))[:, None] * at.double()
     return torch.cat([angles.sin(), angles.cos()]).to(at.dtype)

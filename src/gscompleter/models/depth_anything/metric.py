@@ -18,10 +18,10 @@ from gscompleter.models.feed_forward.resampling import resize_bilinear
 
 METRIC_FOCAL = 300.0
 """Focal length in pixels for which the network predicts metres."""
-MAX_SKY = 0.3
-"""Largest sky output of a pixel that does not count as sky."""
+MIN_SKY = 0.3
+"""Smallest sky output of a pixel that counts as sky."""
 MIN_PIXELS = 10
-"""Sky and foreground need more pixels than this to be considered."""
+"""Pixels beyond which a sky, or a foreground, is more than chance."""
 FAR_QUANTILE = 0.99
 """Quantile of the foreground depth at which the sky is placed."""
 
@@ -33,11 +33,12 @@ class MetricDepth:
     depth: Float[Tensor, "b v h w"]
     """z-depth in metres at a focal length of 300 pixels; undefined in the sky."""
     sky: Float[Tensor, "b v h w"]
+    """How much it looks like sky, from 0 upwards."""
 
     @property
     def solid_mask(self) -> Bool[Tensor, "b v h w"]:
         """True outside the sky."""
-        return self.sky < MAX_SKY
+        return self.sky < MIN_SKY
 
     def convert_to_metres(self, K: Float[Tensor, "b v 3 3"]) -> Float[Tensor, "b v h w"]:
         """Compute z-depth in metres for intrinsics in pixels."""
@@ -76,6 +77,7 @@ class MetricDepthAnything(nn.Module):
 
     def forward(self, images: Float[Tensor, "b v 3 h w"]) -> MetricDepth:
         """Predict depth and sky of normalised images with sides divisible by 14."""
+        views = images.shape[:2]
         size = (images.shape[3], images.shape[4])
         tokens = [tokens.float() for tokens in self.backbone["pretrained"](images)]
         with disable_autocast(images):
@@ -85,14 +87,16 @@ class MetricDepthAnything(nn.Module):
             # Two outputs of one fused map: log depth, and a sky score that is not negative.
             depth = scratch.output_conv2(x)[:, 0].exp()
             sky = scratch.sky_output_conv2(x)[:, 0].relu()
-        views = images.shape[:2]
         return MetricDepth(depth.unflatten(0, views), sky.unflatten(0, views))
 
 
 def set_sky_depth(
     depth: Float[Tensor, "b v h w"], solid: Bool[Tensor, "b v h w"], max_depth: float = torch.inf
 ) -> Float[Tensor, "b v h w"]:
-    """Set the sky to the depth of the far foreground, at most `max_depth`, as the authors do."""
+    """Set the sky to the depth of the far foreground of all views, at most `max_depth`.
+
+    So do the authors.
+    """
     # Of a few pixels neither a quantile nor a sky is certain.
     if min(int(solid.sum()), int((~solid).sum())) <= MIN_PIXELS:
         return depth

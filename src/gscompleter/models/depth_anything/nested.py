@@ -79,7 +79,7 @@ def fit_metres_per_unit(prediction: Prediction, metric: MetricDepth) -> float:
     counts = (prediction.confidence >= middle) & deep & solid
     if int(counts.sum()) <= MIN_PIXELS:
         return 1.0
-    # Least squares without a shift: (a · b) / (b · b).
-    a = metres[counts].double()
-    b = prediction.depth[counts].double()
+    # Least squares without a shift: (a · b) / (b · b). On the CPU: the GPU of a Mac has no float64.
+    a = metres[counts].cpu().double()
+    b = prediction.depth[counts].cpu().double()
     return float((a * b).sum() / (b * b).sum())

@@ -148,7 +148,8 @@ def run_depth_network(
 
 def get_camera_centers(poses: Poses) -> Float[np.ndarray, "b v 3"]:
     """Return the camera centres of each scene."""
-    return poses.centers.double().cpu().numpy()
+    # In this order: the GPU of a Mac has no float64.
+    return poses.centers.cpu().double().numpy()
 
 
 def normalize_confidence(confidence: Float[Tensor, "*n h w"]) -> Float[Tensor, "*n h w"]:

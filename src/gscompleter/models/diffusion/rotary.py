@@ -37,7 +37,8 @@ class PerHeadRotary(nn.Module):
         self, ids: Float[Tensor, "tokens numbers"]
     ) -> tuple[Float[Tensor, "b tokens 24 d"], Float[Tensor, "b tokens 24 d"]]:
         """Compute cosines and sines from the 63 `ids` of each token, image by image."""
-        triples = ids.unflatten(-1, (-1, IDS // 3, 3)).transpose(0, 1).double()
+        triples = ids.unflatten(-1, (-1, IDS // 3, 3)).transpose(0, 1)
+        triples = triples.to(choose_angle_dtype(ids.device))
         # Of the channels of a head, a part turns with z, one with the row, one with the column.
         angles = torch.cat(
             [triples[..., axis, None] * self.compute_frequencies(axis, ids) for axis in range(3)],
@@ -52,8 +53,14 @@ class PerHeadRotary(nn.Module):
 
     def compute_frequencies(self, axis: int, ids: Tensor) -> Float[Tensor, "pairs"]:
         """Compute the radians per token for each channel pair of an axis."""
-        channels = torch.arange(0, self.axes[axis], 2, dtype=torch.float64, device=ids.device)
+        dtype = choose_angle_dtype(ids.device)
+        channels = torch.arange(0, self.axes[axis], 2, dtype=dtype, device=ids.device)
         return 1.0 / THETA ** (channels / self.axes[axis])
+
+
+def choose_angle_dtype(device: torch.device) -> torch.dtype:
+    """Return the precision of angles, as in diffusers; the GPU of a Mac has no float64."""
+    return torch.float32 if device.type == "mps" else torch.float64
 
 
 class PerHeadAttention:

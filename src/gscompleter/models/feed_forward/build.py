@@ -87,11 +87,14 @@ def create_network(published: PublishedWeights) -> Network:
     """Create the network that fits a file of weights, with random parameters."""
     if published.name in depth_anything.VARIANTS:
         return create_depth_anything(depth_anything.VARIANTS[published.name])
-    if published.model == "DepthSplat":
-        # Published names omit a size of 256x256.
-        key = published.name.removeprefix("depthsplat-")
-        return DepthSplat(VARIANTS[key if key in VARIANTS else f"{key}-256x256"])
-    return MVSplat() if published.model == "MVSplat" else VolSplat()
+    if published.model == "MVSplat":
+        return MVSplat()
+    if published.model == "VolSplat":
+        return VolSplat()
+    assert published.model == "DepthSplat", published.name
+    # Published names omit a size of 256x256.
+    variant = published.name.removeprefix("depthsplat-")
+    return DepthSplat(VARIANTS[variant if variant in VARIANTS else f"{variant}-256x256"])
 
 
 def create_depth_anything(

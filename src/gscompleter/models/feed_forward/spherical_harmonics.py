@@ -37,11 +37,12 @@ def compute_wigner_matrices(
     degree: int, rotations: Float[Tensor, "*n 3 3"]
 ) -> Float[Tensor, "*n m m"]:
     """Compute Wigner matrices D with `Y(R d) = D Y(d)` for all directions d, by least squares."""
-    # Y(R d) as a combination of Y(d), fitted at the sample directions.
+    # Y(R d) as a combination of Y(d), fitted at the sample directions. In float64 on the CPU: the
+    # GPU of a Mac has none.
     directions, inverse = sample_harmonics(degree)
-    rotated = directions.to(rotations.device) @ rotations.double().transpose(-1, -2)
-    matrices = inverse.to(rotations.device) @ evaluate_harmonics(degree, rotated)
-    return matrices.transpose(-1, -2).to(rotations.dtype)
+    rotated = directions @ rotations.cpu().double().transpose(-1, -2)
+    matrices = inverse @ evaluate_harmonics(degree, rotated)
+    return matrices.transpose(-1, -2).to(rotations.dtype).to(rotations.device)
 
 
 @cache

@@ -39,8 +39,9 @@ MAX_AHEAD_SECONDS = 30.0
 farther ahead was given before a clock was set back."""
 
 MAX_GIVEN_LENGTH = 60
+"""Longest path of the file in the sentence about it, which as a whole may have 300 characters."""
 MAX_ENTRY_LENGTH = 100
-"""Longest paths in the sentence about a file: as a whole it would be shortened beyond 300."""
+"""Longest path of the entry in that sentence."""
 
 _UNFINISHED_NAME = re.compile(
     re.escape(UNFINISHED_PREFIX)
@@ -207,7 +208,10 @@ def _digest(content: bytes) -> str:
 
 
 def _read_start(pid: int) -> int | None:
-    """Return when a process began, in ticks of the kernel; None if it has ended or is unknown."""
+    """Return when a process began, in ticks of the kernel.
+
+    0 if the system says that it has ended; None if it says nothing of it.
+    """
     try:
         line = Path(f"/proc/{pid}/stat").read_text("utf-8", errors="replace")
     except OSError:
@@ -215,7 +219,7 @@ def _read_start(pid: int) -> int | None:
     # The second field is the name of the program in parentheses and may contain any characters.
     state, *fields = line.rpartition(")")[2].split()
     # A process that was killed stays in the list as a zombie until its parent asks for it.
-    return None if state in "ZX" else int(fields[18])
+    return 0 if state in "ZX" else int(fields[18])
 
 
 def _is_hidden(pid: int) -> bool:

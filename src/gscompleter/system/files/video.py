@@ -34,6 +34,11 @@ OPTIONS = (
 """Options of ffmpeg for the output."""
 SAFE = ("-protocol_whitelist", "file", "-format_whitelist", "mov,matroska")
 """Options of ffmpeg for the input: these containers, and no further files or addresses."""
+SQUARE_PIXELS = "scale='round(iw*clip(sar,1/4,4))':ih"
+"""Filter of ffmpeg that scales the width as players do, where pixels of the file are not square.
+
+`sar` is the width of a pixel over its height; no camera has one beyond these bounds.
+"""
 CUT_OFF = "ended prematurely"
 """Message of ffmpeg about a truncated Matroska file, which is no error to it."""
 
@@ -52,13 +57,17 @@ def find_ffmpeg() -> str:
 
 
 def read_video(path: Path, filters: str, is_grey: bool) -> Iterator[UInt8[np.ndarray, "h w *c"]]:
-    """Decode a video upright, in grey or colours, after `filters` of ffmpeg; frame by frame."""
+    """Decode a video frame by frame, in grey or colours, after `filters` of ffmpeg.
+
+    Frames are upright and of square pixels, as players show them.
+    """
     refuse_pointer(path)
     command = [
         *(find_ffmpeg(), "-v", "error", "-nostdin", "-xerror", *SAFE),
         *("-threads", str(get_thread_count()), "-i", f"file:{path}", "-an", "-sn", "-dn"),
         # Every frame once, whatever its time; the header of a PNM has its size.
-        *("-fps_mode", "passthrough", "-vf", filters, "-sws_flags", "accurate_rnd+bitexact"),
+        *("-fps_mode", "passthrough", "-vf", f"{SQUARE_PIXELS},{filters}"),
+        *("-sws_flags", "accurate_rnd+bitexact"),
         *("-f", "image2pipe", "-c:v", "pgm" if is_grey else "ppm"),
         *("-pix_fmt", "gray" if is_grey else "rgb24", "pipe:1"),
     ]
