@@ -388,7 +388,9 @@ def test_cells_set_what_stands_in_groups_of_options(tmp_path):
         "add_observed": False,
         "guards": ("psnr", "free-space"),
     }
-    assert not parse_batch_row({**row, "generator_offload": 0}, tmp_path).synthesis.generator_offload
+    assert not parse_batch_row(
+        {**row, "generator_offload": 0}, tmp_path
+    ).synthesis.generator_offload
 
 
 def test_rows_of_one_scene_need_names(tmp_path):

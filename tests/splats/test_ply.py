@@ -373,7 +373,9 @@ def test_a_header_that_lies_is_refused(tmp_path, before, after, sentence):
     refused(path, sentence)
 
 
-@pytest.mark.parametrize("rows", ["1 2 3 4 5 6\n7 8 9 10 11 12\n", "1 2 3\n4 5\n", "1 2 a\n4 5 6\n"])
+@pytest.mark.parametrize(
+    "rows", ["1 2 3 4 5 6\n7 8 9 10 11 12\n", "1 2 3\n4 5\n", "1 2 a\n4 5 6\n"]
+)
 def test_ascii_rows_have_a_number_for_each_property(tmp_path, rows):
     """Two points with normals, of which the header knows nothing, would become four points."""
     path = tmp_path / "points.ply"

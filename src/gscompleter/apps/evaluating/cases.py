@@ -135,8 +135,8 @@ def apply_request(case: Case, request: CasesRequest) -> Case:
         near=case.near if request.near is None else request.near,
         far=case.far if request.far is None else request.far,
         resolution=case.resolution if size is None else parse_resolution(size),
-        masks=request.uses_masks,
-        invert_masks=request.masks.is_inverted,
+        uses_masks=request.uses_masks,
+        has_inverted_masks=request.masks.is_inverted,
         ignore_moving=request.ignore_moving,
         ego_mask=request.ego_mask,
     )

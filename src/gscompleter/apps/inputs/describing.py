@@ -7,7 +7,7 @@ from pathlib import Path
 from rich.console import Console
 
 from gscompleter.apps.inputs.memory import estimate_memory
-from gscompleter.apps.inputs.task import CompletionTask, Opened
+from gscompleter.apps.inputs.task import CompletionTask, Opened, Target
 from gscompleter.data.frame import Frame
 from gscompleter.data.photograph_names import name_photograph
 from gscompleter.data.photographs import Photographs
@@ -15,6 +15,7 @@ from gscompleter.numerics.image_ops import compute_mask_fraction
 from gscompleter.splats.formats import describe_oddities
 from gscompleter.system.errors import join_names, quote_value
 from gscompleter.system.memory import format_whole_gigabytes, read_memory_bytes
+from gscompleter.types import View
 
 MAX_LISTED_PHOTOGRAPHS = 8
 """Most photographs that a line names."""
@@ -140,7 +141,7 @@ def describe_masks(photographs: Photographs, task: CompletionTask) -> list[str]:
     if masks is None:
         return []
     # A mask may be that of a target, or of a photograph that checks the scene.
-    used = (*task.views, *(task.check_views or ()), *task.targets)
+    used: list[View | Target] = [*task.views, *(task.check_views or ()), *task.targets]
     most = max(compute_mask_fraction(one.ignore_mask) for one in used)
     if most == 0:
         return [f"Masks: {masks}; they hide nothing of the photographs in use."]

@@ -109,7 +109,8 @@ def _parse_elements(lines: Iterable[bytes]) -> list[Element]:
                 case _:
                     raise DamagedError
         except (LookupError, ValueError) as error:
-            # An unknown or second format, an unknown type, a property of no element, or other words.
+            # An unknown format or a second one, an unknown type, a property of no element, or other
+            # words.
             raise DamagedError(" ".join(words)) from error
     for name, _, columns in tables:
         if len({column for column, _ in columns}) < len(columns):
