@@ -80,7 +80,7 @@ def describe_opening(opened: Opened, task: CompletionTask) -> list[str]:
         unused = join_names(photographs.unused, MAX_LISTED_PHOTOGRAPHS, MAX_PHRASE)
         unused = f"; not used: {unused}"
     return [
-        f"Opened: {describe_source(opened, task)}{unused}.",
+        f"Opened: {describe_opened(opened, task)}{unused}.",
         f"Found: {task.frame_description.rstrip('.')}; depths from {camera.near:.3g} to "
         f"{camera.far:.3g}; worked at {camera.width} x {camera.height} (--resolution changes it).",
         *describe_missing_photographs(photographs),
@@ -90,7 +90,7 @@ def describe_opening(opened: Opened, task: CompletionTask) -> list[str]:
     ]
 
 
-def describe_source(opened: Opened, task: CompletionTask) -> str:
+def describe_opened(opened: Opened, task: CompletionTask) -> str:
     """Describe in a clause the photographs and the splat that were opened."""
     scene = task.scene
     splat = ""
