@@ -558,3 +558,25 @@ def test_photographs_without_texture_are_refused():
         views = [View(image, camera_at(x, size=SIZE)) for x in (0.0, 0.3)]
         with pytest.raises(InputError, match="2 of the 2 context photographs show no texture"):
             GSCompleter()(views, camera_at(0.6, size=SIZE))
+
+
+def test_texture_that_is_ignored_is_none():
+    """Features are looked for outside of ignored pixels alone."""
+    views = [view_of(Room(), camera_at(x, size=SIZE)) for x in (0.0, 0.3)]
+    rows = torch.arange(SIZE)[:, None].expand(-1, SIZE)
+    shown = [
+        replace(
+            view,
+            image=view.image.where(rows[..., None] > SIZE // 2, 0.6),
+            ignore_mask=rows > SIZE // 3,
+        )
+        for view in views
+    ]
+    with pytest.raises(InputError, match="2 of the 2 context photographs show no texture"):
+        GSCompleter()(shown, camera_at(0.6, size=SIZE))
+
+
+def test_no_photograph_is_refused_with_a_scene_and_without():
+    for scene in (None, gaussians_of(view_of(Room(), camera_at(size=SIZE)))):
+        with pytest.raises(InputError, match="No context view was given; name at least one"):
+            GSCompleter()([], camera_at(0.6, size=SIZE), scene)

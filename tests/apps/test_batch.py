@@ -345,6 +345,54 @@ def test_all_that_a_row_names_lies_beside_its_manifest(tmp_path):
     }
 
 
+def test_options_have_one_name_in_both_spellings(tmp_path):
+    manifest = tmp_path / "m.csv"
+    manifest.write_text("folder,depth-weights\nroom,depth.pth\n")
+    (job,) = read_manifest(manifest, {"depth-weights": "other.pth"})
+    assert job.options == {
+        "folder": str(tmp_path / "room"),
+        "depth_weights": str(tmp_path / "depth.pth"),
+    }
+    manifest.write_text("folder,no-masks,no_masks\nroom,no,yes\n")
+    with pytest.raises(InputError, match="no_masks in two spellings"):
+        read_manifest(manifest, {})
+
+
+def test_a_cell_names_a_mask_for_each_target(tmp_path):
+    (tmp_path / "one mask.png").touch()
+    manifest = tmp_path / "m.csv"
+    for cell, names in {
+        "a.png b.png": ["a.png", "b.png"],
+        "one mask.png": ["one mask.png"],
+        "'one mask.png' b.png": ["one mask.png", "b.png"],
+        "it's.png": ["it's.png"],
+    }.items():
+        manifest.write_text(f"folder,mask\nroom,{cell}\n")
+        (job,) = read_manifest(manifest, {})
+        assert job.options["mask"] == [str(tmp_path / name) for name in names]
+
+
+def test_cells_set_what_stands_in_groups_of_options(tmp_path):
+    """Flags of a generator, and settings that are true or false or have several values."""
+    row = {
+        "folder": "room",
+        "generator_offload": "true",
+        "config.ego_mask": "yes",
+        "config.add_observed": "no",
+        "config.guards": "psnr free-space",
+    }
+    options = parse_batch_row(row, tmp_path / "out")
+    assert options.synthesis.generator_offload
+    assert options.config.changes == {
+        "ego_mask": True,
+        "add_observed": False,
+        "guards": ("psnr", "free-space"),
+    }
+    assert not parse_batch_row(
+        {**row, "generator_offload": 0}, tmp_path
+    ).synthesis.generator_offload
+
+
 def test_rows_of_one_scene_need_names(tmp_path):
     manifest = tmp_path / "m.jsonl"
     rows = [{"folder": "room"}, {"folder": "room", "seed": 1, "name": "a/b"}]
@@ -365,6 +413,9 @@ def test_rows_of_one_scene_need_names(tmp_path):
         ({"format": "--overwrite"}, "begins with a dash"),
         ({"seed": -1}, "seed must be greater than or equal to 0"),
         ({"folder": None}, "no folder"),
+        ({"help": True}, "all rows of a batch are alike"),
+        ({"target": "it's.jpg"}, "target is 'it's.jpg', which has an unmatched"),
+        ({"config": {"ego_mask": "perhaps"}}, "config.ego-mask is perhaps"),
     ],
 )
 def test_a_wrong_row_is_a_sentence(row, sentence, tmp_path):

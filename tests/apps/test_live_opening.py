@@ -29,7 +29,7 @@ from gscompleter.apps.live.journal import Journal
 from gscompleter.apps.live.opening import SessionRequest
 from gscompleter.apps.live.page import LivePage
 from gscompleter.apps.live.session import Session, SessionStep, apply_step, redo_step, undo_step
-from gscompleter.apps.live.strokes import list_steps
+from gscompleter.apps.live.strokes import list_steps, read_steps, read_strokes
 from gscompleter.apps.viewer.packages import Libraries
 from gscompleter.cli import parse_command
 from gscompleter.config.generators import GeneratorOptions
@@ -59,6 +59,11 @@ STEPS = (
     SessionStep("remove", CAMERAS[1], OTHER),
 )
 """Three steps that only remove, which takes no time."""
+NO_START = saving.SessionStart({}, None, None, None, None, None)
+
+
+def die(*_: object) -> None:
+    raise KeyboardInterrupt
 
 
 @pytest.fixture(scope="module")
@@ -326,8 +331,7 @@ def test_a_session_is_not_begun_over(saved, splat, tmp_path, monkeypatch, capsys
 
 def test_a_program_that_is_killed_while_it_writes_leaves_whole_steps(begun, tmp_path, monkeypatch):
     """Another mask takes the place of one that was undone."""
-    start = saving.SessionStart({}, None, None, None, None, None)
-    journal = Journal(tmp_path / "out", start)
+    journal = Journal(tmp_path / "out", NO_START)
     two = begun.extended(begun.latest, STEPS[1]).extended(begun.latest, STEPS[2])
     journal.write(two)
     back = undo_step(two)
@@ -336,9 +340,6 @@ def test_a_program_that_is_killed_while_it_writes_leaves_whole_steps(begun, tmp_
         ["remove"],
         ["remove"],
     )
-
-    def die(*_: object) -> None:
-        raise KeyboardInterrupt
 
     monkeypatch.setattr("gscompleter.apps.live.journal.write_masks", die)
     with pytest.raises(KeyboardInterrupt):
@@ -351,6 +352,39 @@ def test_a_program_that_is_killed_while_it_writes_leaves_whole_steps(begun, tmp_
     assert list_session(tmp_path / "out") >= {"strokes.json", "images/stroke1.png"}
     assert redo_step(undo_step(back)).steps == back.steps
     assert list_steps(undo_step(back)) == list_steps(two)[:2]
+
+
+def test_a_session_that_goes_on_touches_no_mask_that_it_has(begun, tmp_path, monkeypatch):
+    """A program that is killed while it begins would damage the steps that it goes on from."""
+    two = begun.extended(begun.latest, STEPS[1]).extended(begun.latest, STEPS[2])
+    Journal(tmp_path, NO_START).write(two)
+    written = tmp_path / "images" / "stroke1.png"
+    os.utime(written, (0, 0))
+    Journal(tmp_path, NO_START).write(two)
+    assert written.stat().st_mtime == 0
+    assert actions_in(tmp_path) == ["remove", "remove"]
+    # A session that begins anew in the folder drops the steps whose masks it replaces.
+    monkeypatch.setattr("gscompleter.apps.live.journal.write_masks", die)
+    with pytest.raises(KeyboardInterrupt):
+        Journal(tmp_path, NO_START).write(begun.extended(begun.latest, STEPS[2]))
+    assert actions_in(tmp_path) == []
+
+
+def test_a_folder_that_somebody_removed_gets_all_masks_again(begun, tmp_path):
+    journal = Journal(tmp_path / "out", NO_START)
+    one = begun.extended(begun.latest, STEPS[1])
+    journal.write(one)
+    shutil.rmtree(tmp_path / "out")
+    journal.write(one.extended(begun.latest, STEPS[2]))
+    rows = read_strokes(tmp_path / "out" / "strokes.json").frames
+    assert [step.mask for step in read_steps(rows, tmp_path / "out")] == [SPOT, OTHER]
+
+
+def test_a_step_without_a_mask_leaves_none_of_the_step_in_its_place(begun, tmp_path):
+    journal = Journal(tmp_path, NO_START)
+    journal.write(begun.extended(begun.latest, STEPS[1]))
+    journal.write(begun.extended(begun.latest, STEPS[0]))
+    assert list_session(tmp_path) == {"strokes.json"}
 
 
 @contextmanager

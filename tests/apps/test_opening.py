@@ -4,6 +4,7 @@ import json
 import zipfile
 
 import pytest
+from PIL import Image
 
 from command import run
 from exact_room import make_cameras, write_photographs, write_transforms
@@ -189,3 +190,29 @@ def test_depth_that_is_not_used_is_named_where_the_scene_is_opened(tmp_path, mon
     assert run(monkeypatch, *words, tmp_path / "out") == 0
     opened = next(line for line in capsys.readouterr().err.splitlines() if "Opened:" in line)
     assert opened.endswith("nerfstudio, 4 of 4 photographs; not used: depths (1 files of depth).")
+
+
+def test_cameras_without_a_photograph_count_as_no_photographs(tmp_path, monkeypatch, capsys):
+    scene = write_transforms(tmp_path / "scene", CAMERAS)
+    file = scene / "transforms.json"
+    content = json.loads(file.read_text())
+    del content["frames"][3]["file_path"]
+    file.write_text(json.dumps(content))
+    (scene / "images" / "photo_002.png").unlink()
+    words = ("complete", scene, "--target", 3, "--dry-run", "--out", tmp_path / "out")
+    assert run(monkeypatch, *words) == 0
+    said = capsys.readouterr().err
+    assert "nerfstudio, 2 of 3 photographs, cameras without one: 1" in said
+    assert "1 of 3 photographs are missing" in said
+
+
+def test_a_mask_of_the_target_hides_what_it_hides(tmp_path, monkeypatch, capsys):
+    scene = write_transforms(tmp_path / "scene", CAMERAS)
+    camera = CAMERAS[3]
+    mask = Image.new("L", (camera.width, camera.height), 255)
+    mask.paste(0, (0, 0, camera.width // 2, camera.height))
+    (scene / "masks").mkdir()
+    mask.save(scene / "masks" / "photo_003.png")
+    words = ("complete", scene, "--target", 3, "--dry-run", "--out", tmp_path / "out")
+    assert run(monkeypatch, *words) == 0
+    assert "what they hide, up to 50.0 % of a photograph, is neither" in capsys.readouterr().err

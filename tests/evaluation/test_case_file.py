@@ -99,7 +99,7 @@ def test_what_is_ignored_is_hidden_in_every_photograph(tmp_path, is_mask):
         ignore = "bonnet.png"
     row = {"scene": "room", "context": [0, 1], "target": 2, "ignore": ignore}
     (case,) = read_cases(write(tmp_path, cases=[row], resolution=[16, 16]))
-    for view in replace(case, masks=False).load((0, 1, 2)):
+    for view in replace(case, uses_masks=False).load((0, 1, 2)):
         assert view.ignore_mask is not None
         assert view.ignore_mask[12:].all()
         assert not view.ignore_mask[:12].any()

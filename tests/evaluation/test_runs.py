@@ -565,6 +565,37 @@ def test_scenes_need_a_protocol_and_an_index_is_kept(scenes, tmp_path, monkeypat
     assert run(monkeypatch, "tables", tmp_path) == 2
 
 
+def test_an_index_is_of_the_scenes_that_a_file_names(scenes, tmp_path, monkeypatch):
+    file = tmp_path / "scenes.json"
+    file.write_text(json.dumps({"scenes": [str(scenes / "box")], "apart": ["box"]}))
+    index = tmp_path / "n-1.json"
+    assert run(monkeypatch, "index", file, "--protocol", "n-1", "--out", index) == 0
+    assert list(read_evaluation_index(index).scenes) == ["box"]
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [("cases.json", ()), ("scenes.json", ("--protocol", "n-1"))],
+)
+def test_results_never_lie_in_a_scene_that_a_file_names(
+    scenes, tmp_path, monkeypatch, capsys, name, words
+):
+    box = shutil.copytree(scenes / "box", tmp_path / "box")
+    case = {"scene": "box", "context": [0, 1], "target": 2}
+    (tmp_path / "scenes.json").write_text('{"scenes": ["box"]}')
+    (tmp_path / "cases.json").write_text(json.dumps({"resolution": [24, 24], "cases": [case]}))
+    before = sorted(os.listdir(box))
+    given = ("evaluate", tmp_path / name, *words, "--methods", "context")
+    assert run(monkeypatch, *given, "--out", box / "out") == 2
+    assert f"lies in the input {box}" in capsys.readouterr().err
+    cameras = (box / "transforms.json").read_bytes()
+    index = ("index", tmp_path / "scenes.json", "--protocol", "n-1", "--overwrite")
+    for out in (box / "transforms.json", tmp_path / "scenes.json"):
+        assert run(monkeypatch, *index, "--out", out) == 2
+    assert (box / "transforms.json").read_bytes() == cameras
+    assert sorted(os.listdir(box)) == before
+
+
 @pytest.mark.slow
 def test_one_case_per_scene_is_the_first(scenes, tmp_path, monkeypatch, capsys):
     def names(out: Path, *words: object) -> set[str]:

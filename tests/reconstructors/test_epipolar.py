@@ -33,11 +33,12 @@ def pair() -> list[View]:
     return [view_of(Room(), camera_at(x=x, size=160)) for x in (-0.2, 0.2)]
 
 
-def test_matches_contradict_a_camera_that_is_turned(pair):
+@pytest.mark.parametrize("degrees", [0.3, 8.0])
+def test_matches_contradict_a_camera_that_is_turned(pair, degrees):
     right = measure_pose_fit(pair)
     assert right is not None
     assert not right.is_contradicted
-    turned = measure_pose_fit([pair[0], turn_view(pair[1], 0.3)])
+    turned = measure_pose_fit([pair[0], turn_view(pair[1], degrees)])
     assert turned is not None
     assert turned.is_contradicted
     assert turned.given > 3 * right.given

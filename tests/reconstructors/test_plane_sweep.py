@@ -153,6 +153,11 @@ def test_what_the_camera_knows_of_the_range_is_taken_and_the_rest_estimated():
     assert get_depth_range(known(None, 90.0), lambda _: (0.125, 3.0)) == (0.125, 90.0)
     with pytest.raises(InputError, match="near must be positive and less than far"):
         get_depth_range(known(None, 90.0), lambda _: (99.0, 100.0))
+    # Any of the cameras may know it, and all of what they know lies in it.
+    first, *others = known(None, None)
+    assert get_depth_range([first, *known(0.25, 90.0)[1:]]) == (0.25, 90.0)
+    assert get_depth_range([*known(0.5, 90.0)[:1], *known(0.25, 80.0)[1:]]) == (0.25, 90.0)
+    assert get_depth_range([first, *others]) == (low, high)
 
 
 def test_too_few_views_no_baseline_and_an_empty_range_are_refused():

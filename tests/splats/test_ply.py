@@ -15,6 +15,7 @@ import torch
 from gsply import plyread
 
 from gscompleter import Gaussians, InputError, load_ply, merge, save_ply
+from gscompleter.system.files.ply import read_ply_file
 from scenes import random_gaussians
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated", "encoded")
@@ -359,6 +360,10 @@ def test_community_files_are_read_or_refused(shared):
         ),
         (b"property float nx", b"property quad nx", "broken header"),
         (b"property float nx", b"property list uchar float nx", "no lists"),
+        (b"format binary_little_endian 1.0\n", b"", "no format is named before"),
+        (b"element vertex", b"format ascii 1.0\nelement vertex", r"broken header \(format ascii"),
+        # The number of rows could be read there, but not replaced.
+        (b"element vertex", b"  element vertex", "'element vertex 3' is indented"),
         (b"vertex 3", b"vertex 99999999999999999999", "ends after 3 of 99,999,999,999,999,999,999"),
     ],
 )
@@ -366,6 +371,18 @@ def test_a_header_that_lies_is_refused(tmp_path, before, after, sentence):
     path = saved(tmp_path, random_gaussians(3))
     path.write_bytes(path.read_bytes().replace(before, after))
     refused(path, sentence)
+
+
+@pytest.mark.parametrize(
+    "rows", ["1 2 3 4 5 6\n7 8 9 10 11 12\n", "1 2 3\n4 5\n", "1 2 a\n4 5 6\n"]
+)
+def test_ascii_rows_have_a_number_for_each_property(tmp_path, rows):
+    """Two points with normals, of which the header knows nothing, would become four points."""
+    path = tmp_path / "points.ply"
+    names = "".join(f"property float {axis}\n" for axis in "xyz")
+    path.write_text(f"ply\nformat ascii 1.0\nelement vertex 2\n{names}end_header\n{rows}")
+    with pytest.raises(InputError, match="rows that are not 3 numbers each"):
+        read_ply_file(path, tuple("xyz"), "point cloud")
 
 
 @pytest.mark.parametrize(

@@ -33,13 +33,13 @@ class FolderListings:
     def find(self, folder: Path, relative: str) -> Path | None:
         """Find `relative` below `folder`, as written or else in any case; None without it.
 
-        Copies for COLMAP, and what is named as they are, also stand for a file whose name has
-        blanks or # instead of _.
+        A name with _ also finds a file that has blanks or # there: copies for COLMAP are named so.
         """
         if os.path.isabs(relative):
             return Path(relative) if _exists(Path(relative)) else None
         path = folder
-        for part in PurePosixPath(relative).parts:
+        parts = PurePosixPath(relative).parts
+        for number, part in enumerate(parts):
             if part == "..":  # which no listing has
                 path = path / part
                 continue
@@ -48,7 +48,8 @@ class FolderListings:
             name = names.get(part) or names.get(fold_name(part))
             if name is None:
                 # A folder may be entered but not listed.
-                return folder / relative if not names and _exists(folder / relative) else None
+                unlisted = path.joinpath(*parts[number:])
+                return unlisted if not names and _exists(unlisted) else None
             path = path / name
         return path
 
@@ -92,7 +93,7 @@ def list_endings(written: str) -> list[str]:
     A relative path with `/` means itself. One with `\`, with a drive or from the root may be of
     another machine, of which any end may exist here.
     """
-    is_foreign = "\\" in written or PureWindowsPath(written).drive or written.startswith("/")
+    is_foreign = "\\" in written or written.startswith("/") or PureWindowsPath(written).drive != ""
     if not is_foreign:
         return [written]
     parts = [part for part in re.split(r"[\\/]+", written) if part not in ("", ".")]
@@ -108,8 +109,7 @@ def locate(root: Path, written: str, find: Callable[[Path], Path | None]) -> Pat
     `find` returns the file at a path, or None: a photograph may lack its ending.
     """
     as_written = root / written
-    candidates = (as_written, *(root / ending for ending in list_endings(written)))
-    for path in candidates:
+    for path in dict.fromkeys([as_written, *(root / end for end in list_endings(written))]):
         file = find(path)
         if file is not None:
             return file

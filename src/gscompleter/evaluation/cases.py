@@ -45,9 +45,9 @@ class Case:
     resolution: Resolution
     near: float | None = None
     far: float | None = None
-    masks: bool = True
+    uses_masks: bool = True
     """True if pixels that masks and alpha channels hide are ignored."""
-    invert_masks: bool = False
+    has_inverted_masks: bool = False
     """True if white pixels of masks are ignored, not black ones."""
     ignore_moving: bool = False
     """True if pixels in boxes of moving objects are ignored."""
@@ -68,8 +68,8 @@ class Case:
         """Open the photographs of the scene."""
         scene = open_photographs(self.scene, near=self.near, far=self.far)
         scene = scene if self.ego_mask else scene.keep_ego_vehicle()
-        scene = scene if self.masks else scene.leave_out_masks()
-        scene = scene.invert_masks() if self.invert_masks else scene
+        scene = scene if self.uses_masks else scene.leave_out_masks()
+        scene = scene.invert_masks() if self.has_inverted_masks else scene
         scene = scene.ignore_moving() if self.ignore_moving else scene
         return scene.ignore_regions(self.ignore)
 
@@ -84,13 +84,13 @@ def read_cases(path: Path) -> list[Case]:
     check_regions(content, path)
     return [
         Case(
-            locate_named(path, row.scene),
-            row.context,
-            row.target,
-            row.neighbours,
-            content.resolution,
-            row.near,
-            row.far,
+            scene=locate_named(path, row.scene),
+            context=row.context,
+            target=row.target,
+            neighbours=row.neighbours,
+            resolution=content.resolution,
+            near=row.near,
+            far=row.far,
             ignore=row.ignore,
             apart_by=path if row.is_apart else None,
         )

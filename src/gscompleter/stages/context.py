@@ -24,7 +24,11 @@ from gscompleter.reconstructors import (
     run_fitting_reconstructor,
 )
 from gscompleter.reconstructors.depth_predictors import give_prediction
-from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
+from gscompleter.reconstructors.features.depth_range import (
+    get_depth_range,
+    get_given_range,
+    set_depth_range,
+)
 from gscompleter.reconstructors.features.given_range import DepthRange, find_depth_range
 from gscompleter.render.lod import build_proxy
 from gscompleter.render.protocols import Renderer
@@ -82,12 +86,11 @@ def init_context(
     A given scene that is large is rendered through an LOD proxy, which is made fine enough for all
     photographs and targets.
     """
+    if not views:
+        raise InputError("No context view was given; name at least one frame.")
     views = sort_by_frame(views)
     if scene is None:
         views = prepare_single(reconstructor, views)
-    if not views:
-        raise InputError("No context view was given; name at least one frame.")
-    if scene is None:
         return reconstruct_context(reconstructor, views, check_views)
 
     photos = [*views, *check_views]
@@ -148,7 +151,8 @@ def find_scene_range(reconstructor: Reconstructor, views: Sequence[View]) -> Dep
         return found
     near = reconstructor.find_near_plane(views, found.near, found.far)
     notes = found.notes
-    if near < found.near == views[0].camera.near:
+    is_given = found.near == get_given_range(views)[0]
+    if is_given and near < found.near:
         note = (
             f"Surfaces of the photographs stand nearer than the near plane at {found.near:.3g}: "
             f"the depth range was widened to {near:.2g} to {found.far:.3g}."
@@ -158,14 +162,21 @@ def find_scene_range(reconstructor: Reconstructor, views: Sequence[View]) -> Dep
 
 
 def check_texture(views: Sequence[View]) -> None:
-    """Raise InputError if fewer than two of several photographs have any texture to match."""
+    """Raise InputError if fewer than two of several photographs have any texture to match.
+
+    Pixels that are ignored are not matched.
+    """
     num_flat = 0
     for view in views:
         # A mean of 3 x 3 pixels removes most noise, before the range in 5 x 5 of them is taken.
         smooth = avg_pool2d(view.image.mean(dim=-1)[None, None], 3, stride=1)
         highest = max_pool2d(smooth, 5, stride=1)
         lowest = -max_pool2d(-smooth, 5, stride=1)
-        textured_share = (highest - lowest > MIN_CONTRAST).float().mean().item()
+        # Both lose 3 pixels at each border.
+        counted = view.valid_mask[3:-3, 3:-3]
+        is_textured = (highest - lowest)[0, 0] > MIN_CONTRAST
+        textured_share = is_textured[counted].float().mean().item()
+        # It is NaN if nothing counts.
         if not textured_share >= MIN_TEXTURED:
             num_flat += 1
 
@@ -206,7 +217,7 @@ def normalize_exposures(
     """Normalize photographs to the exposure of the context."""
     if gains is None:
         return tuple(views)
-    return tuple(view.normalize_exposure(gain) for view, gain in zip(views, gains, strict=False))
+    return tuple(view.normalize_exposure(gain) for view, gain in zip(views, gains, strict=True))
 
 
 def find_splat_range(

@@ -11,8 +11,10 @@ import io
 import json
 import os
 import re
+import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -63,8 +65,9 @@ def read_manifest(manifest: Path, common: Mapping[str, Any], out: Path | None = 
     # Options of the command line count from the working folder, those of a row from the manifest,
     # and the row wins.
     base = manifest.resolve().parent
-    here = resolve_paths(common, Path.cwd())
-    rows = [{**here, **resolve_paths(row, base)} for row in read_manifest_rows(manifest, out)]
+    here = resolve_paths(unify_names(common), Path.cwd())
+    own = [unify_names(row) for row in read_manifest_rows(manifest, out)]
+    rows = [{**here, **resolve_paths(row, base)} for row in own]
     if not rows:
         raise InputError("The manifest names no job; give it a row for each scene.")
     names = [make_job_name(row) for row in rows]
@@ -79,6 +82,20 @@ def read_manifest(manifest: Path, common: Mapping[str, Any], out: Path | None = 
         Job(name, {key: value for key, value in row.items() if key != NAME_COLUMN})
         for name, row in zip(names, rows, strict=True)
     ]
+
+
+def unify_names(row: Mapping[str, Any]) -> OptionValues:
+    """Name options as in `depth_weights`, which may also be written as in `depth-weights`.
+
+    Raise InputError if a row has both, of which only one would count.
+    """
+    counts = Counter(key.replace("-", "_") for key in row)
+    for name, count in counts.items():
+        if count > 1:
+            raise InputError(
+                f"A row has {quote_value(name)} in two spellings, with - and with _; give it once."
+            )
+    return {key.replace("-", "_"): value for key, value in row.items()}
 
 
 def resolve_paths(row: Mapping[str, Any], base: Path) -> OptionValues:
@@ -104,12 +121,21 @@ def resolve_paths(row: Mapping[str, Any], base: Path) -> OptionValues:
     # keeps a path with spaces in one piece.
     if exists(target) and not re.fullmatch(r"[\d\s]*", str(target)):
         result["target"] = [join(target)]
-    if isinstance(result.get("mask"), (str, list)):
-        masks = result["mask"] if isinstance(result["mask"], list) else [result["mask"]]
+    masks = result.get("mask")
+    if isinstance(masks, str):
+        masks = [masks] if exists(masks) else split_masks(masks)
+    if isinstance(masks, list):
         result["mask"] = [join(mask) for mask in masks]
     if isinstance(config, str) and config.endswith((".yaml", ".yml")):
         result["config"] = join(config)
     return result
+
+
+def split_masks(text: str) -> list[str]:
+    """Split the paths of masks as a shell does; what it cannot split is one path."""
+    with suppress(ValueError):
+        return shlex.split(text) or [text]
+    return [text]
 
 
 def read_manifest_rows(manifest: Path, out: Path | None = None) -> list[OptionValues]:

@@ -162,9 +162,9 @@ def explain_words(words: Sequence[str], kinds: Mapping[str, type], box: str) -> 
     return sentence
 
 
-def list_options(kind: Any, prefix: str = "") -> set[str]:
-    """List the names of the options of a command, without dashes before them."""
-    options = set()
+def list_options(kind: Any, prefix: str = "") -> dict[str, Any]:
+    """List the options of a command by name, without dashes before it, with their types."""
+    options: dict[str, Any] = {}
     for field, hint in get_type_hints(kind, include_extras=True).items():
         # `Annotated[inner, *marks]`. Of a plain union the first member is `inner`, and the others
         # count as marks, none of which is searched for.
@@ -177,7 +177,7 @@ def list_options(kind: Any, prefix: str = "") -> set[str]:
             is_flat = tyro.conf.OmitArgPrefixes in marks
             options |= list_options(inner, "" if is_flat else f"{name}.")
         elif tyro.conf.Positional not in marks:
-            options.add(name)
+            options[name] = hint
     return options
 
 

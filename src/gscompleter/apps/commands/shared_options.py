@@ -272,9 +272,12 @@ def refuse_size_alone(resolution: tuple[int, int] | None, cameras: Path | None) 
         )
 
 
-def replace_by_scenes(inputs: Sequence[Path], folders: Sequence[Path]) -> list[Path]:
-    """Replace `folders` among the inputs by the scenes in them, beside which results may lie."""
-    from gscompleter.evaluation.cases import list_scenes  # it needs torch, for which no help waits
+def replace_by_scenes(inputs: Sequence[Path], data: Sequence[Path]) -> list[Path]:
+    """Replace the paths of `data` among the inputs by their scenes, beside which results may lie.
 
-    scenes = {path: list_scenes(path) for path in folders}
+    A file that names scenes or cases stays, and the scenes that it names are added.
+    """
+    from gscompleter.apps.evaluating.cases import list_data  # it needs torch, no help waits for it
+
+    scenes = {path: list_data(path) for path in data}
     return [scene for path in inputs for scene in scenes.get(path, [path])]

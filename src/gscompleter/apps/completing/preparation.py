@@ -24,7 +24,11 @@ from gscompleter.apps.inputs.depth_range import (
     apply_scene_range,
     apply_splat_range,
 )
-from gscompleter.apps.inputs.describing import list_missing_photographs, print_lines
+from gscompleter.apps.inputs.describing import (
+    list_missing_photographs,
+    list_named,
+    print_lines,
+)
 from gscompleter.apps.inputs.earlier_work import mark_earlier_work
 from gscompleter.apps.inputs.memory import check_gpu, check_scene
 from gscompleter.apps.inputs.named_photographs import check_target_files
@@ -286,8 +290,8 @@ def load_models(
             if not missing:
                 raise
             raise InputError(
-                f"{len(missing)} of {len(opened.photographs)} photographs are missing, such as "
-                f"{quote_value(missing[0])}, and too few are left: {error}"
+                f"{len(missing)} of {len(list_named(opened.photographs))} photographs are missing, "
+                f"such as {quote_value(missing[0])}, and too few are left: {error}"
             ) from error
 
     # The depth range is counted as a part of the context stage, whose seconds it is added to.

@@ -25,12 +25,14 @@ from gscompleter.evaluation.apart import (
     leave_out_apart,
 )
 from gscompleter.evaluation.authors_loader import AuthorsLoader
+from gscompleter.evaluation.case_file import is_scene_file, locate_named, read_case_file
 from gscompleter.evaluation.cases import (
     Case,
     ScenePlace,
     SkippedScene,
     filter_usable,
     list_places,
+    list_scenes,
     open_clips,
     read_cases,
 )
@@ -133,8 +135,8 @@ def apply_request(case: Case, request: CasesRequest) -> Case:
         near=case.near if request.near is None else request.near,
         far=case.far if request.far is None else request.far,
         resolution=case.resolution if size is None else decide_resolution(size),
-        masks=request.uses_masks,
-        invert_masks=request.masks.is_inverted,
+        uses_masks=request.uses_masks,
+        has_inverted_masks=request.masks.is_inverted,
         ignore_moving=request.ignore_moving,
         ego_mask=request.ego_mask,
     )
@@ -221,6 +223,17 @@ def find_cases_file(path: Path) -> Path:
             "--protocol n-10."
         )
     return file
+
+
+def list_data(path: Path) -> list[Path]:
+    """List the scenes that a path stands for, and the file that names them if it is one."""
+    named = [place.path for place in list_places(path)]
+    # Whatever is no file of cases names none.
+    with suppress(InputError):
+        file = find_cases_file(path)
+        named += [file, *(locate_named(file, row.scene) for row in read_case_file(file).rows)]
+    scenes = [scene for place in named for scene in list_scenes(place)]
+    return list(dict.fromkeys([*scenes, *([path] if is_scene_file(path) else [])]))
 
 
 def print_skipped(skipped: Sequence[SkippedScene], console: Console) -> None:

@@ -8,7 +8,7 @@ from gscompleter.apps.command_line.answers import print_json
 from gscompleter.apps.evaluating.cases import print_skipped
 from gscompleter.apps.requests.evaluation import IndexRequest
 from gscompleter.evaluation import protocols
-from gscompleter.evaluation.cases import SkippedScene, filter_usable, open_clips
+from gscompleter.evaluation.cases import SkippedScene, filter_usable, list_places, open_clips
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_file import reserve_file
@@ -24,7 +24,9 @@ def write_index(request: IndexRequest) -> None:
         show_progress(make_console(stderr=True, quiet=request.answer.quiet)),
         show_preparation("reading clips"),
     ):
-        index = protocols.build_index(rule, filter_usable(open_clips(request.path), skipped))
+        # An index chooses frames and scores nothing, so it also names what a file keeps apart.
+        clips = (clip for place in list_places(request.path) for clip in open_clips(place.path))
+        index = protocols.build_index(rule, filter_usable(clips, skipped))
         # Skipped scenes are recorded as scenes without a case, not left out.
         index = replace(index, scenes={**index.scenes, **{clip.name: () for clip in skipped}})
         if not any(index.scenes.values()):

@@ -5,6 +5,7 @@ A program that is killed loses no step: `live OUT` does them again (`opening.py`
 
 from __future__ import annotations
 
+from contextlib import suppress
 from pathlib import Path
 
 from gscompleter.apps.live.session import Session, SessionStep
@@ -23,22 +24,14 @@ from gscompleter.system.files.writing import STROKES_FILE, convert_write_errors,
 class Journal:
     """Keeps `strokes.json` and its masks in the output folder of a session."""
 
-    def __init__(
-        self,
-        folder: Path,
-        start: SessionStart,
-        saved: str | None = None,
-        known: tuple[SessionStep, ...] = (),
-    ) -> None:
-        """Begin with what the folder has already.
+    def __init__(self, folder: Path, start: SessionStart, saved: str | None = None) -> None:
+        """Begin with what the folder has already, which may be the steps of another session.
 
-        `known` are the steps of its `strokes.json`, `saved` is the digest of those that its
-        completed scene has; None without one.
+        `saved` is the digest of the steps that its completed scene has; None without a scene.
         """
         self.folder = folder
         self._start = start
         self._saved = saved
-        self._known = known
 
     def write(self, session: Session) -> None:
         """Write the steps of a session, so that at any time the file has masks for all its steps.
@@ -46,28 +39,25 @@ class Journal:
         A program that is killed meanwhile leaves the steps that both states begin with, or more.
         """
         steps = list_steps(session)
-        num_same = count_same(self._known, steps)
         path = self.folder / STROKES_FILE
         with convert_write_errors(path):
             self.folder.mkdir(parents=True, exist_ok=True)
             # Masks are numbered by step, so a new one may replace that of a step which is gone:
             # the file drops those steps first. It is also written before the first mask, since
             # masks without it would be taken for files of somebody else.
-            if num_same < len(self._known) or not path.exists():
-                self._write_file(encode_strokes(session, self._start, self._saved, num_same))
-                self._known = steps[:num_same]
-            write_masks(self.folder, steps, num_same)
+            num_kept = self._count_kept(steps)
+            if num_kept < len(steps):
+                self._write_file(encode_strokes(session, self._start, self._saved, num_kept))
+                write_masks(self.folder, steps, num_kept)
             self._write_file(encode_strokes(session, self._start, self._saved))
-            self._known = steps
             # Masks that no step has any more.
-            named = {name_mask(index) for index in range(len(steps))}
+            named = {name_mask(index) for index, step in enumerate(steps) if step.mask is not None}
             for name in list_session(self.folder) - {STROKES_FILE, *named}:
                 (self.folder / name).unlink(missing_ok=True)
 
     def set_saved(self, session: Session) -> None:
         """Remember that the folder has a session as it was saved there, with its `strokes.json`."""
         self._saved = digest_steps(session.steps)
-        self._known = list_steps(session)
 
     def is_saved(self, session: Session) -> bool:
         """Return True if the folder has what a session shows, or nothing was done."""
@@ -80,13 +70,17 @@ class Journal:
         """True if the folder has a completed scene of the session."""
         return self._saved is not None
 
+    def _count_kept(self, steps: tuple[SessionStep, ...]) -> int:
+        """Count the steps at the beginning whose masks the folder has."""
+        for index, step in enumerate(steps):
+            found = None
+            if step.mask is not None:
+                with suppress(OSError):
+                    found = (self.folder / name_mask(index)).read_bytes()
+            if found != step.mask:
+                return index
+        return len(steps)
+
     def _write_file(self, content: bytes) -> None:
         with replace_file(self.folder / STROKES_FILE) as file:
             file.write(content)
-
-
-def count_same(before: tuple[SessionStep, ...], after: tuple[SessionStep, ...]) -> int:
-    """Count the steps at the beginning that are the same objects in both: steps never change."""
-    pairs = zip(before, after, strict=False)
-    different = (index for index, (one, other) in enumerate(pairs) if one is not other)
-    return next(different, min(len(before), len(after)))

@@ -27,13 +27,17 @@ class ChannelNorm(nn.LayerNorm):
 
 
 def create_five_convolutions(features: int) -> nn.Sequential:
-    """Create five consecutive convolutions."""
+    """Create five convolutions in a row, to half of the channels and back in turn."""
     widths = pairwise([features, features // 2] * 3)
-    return nn.Sequential(*(nn.Conv2d(a, b, 3, 1, 1) for a, b in widths))
+    return nn.Sequential(*(nn.Conv2d(before, after, 3, 1, 1) for before, after in widths))
 
 
 class RayLayers(nn.Sequential):
-    """Output layers of a level. The four levels share one norm, which files store at the first."""
+    """Output layers of a level: six numbers of the ray of each pixel, and their confidence.
+
+    The four levels share one norm, which files store at the first. As these layers never run, an
+    identity stands for it at the others, and for the authors' permutations around it.
+    """
 
     def __init__(self, channels: int, level: int) -> None:
         first = nn.Conv2d(channels, HIDDEN, 3, 1, 1)
@@ -45,7 +49,7 @@ class RayLayers(nn.Sequential):
 class DualScratch(ImageScratch):
     """Two fusions of the levels: for depth, and for rays, which given cameras make needless.
 
-    The layers for rays are there because files of weights hold them.
+    The layers for rays, with `aux` in their names, are there because files of weights hold them.
     """
 
     def __init__(self, widths: Sequence[int], features: int) -> None:
@@ -78,7 +82,7 @@ class DualDpt(Dpt):
     def predict_depth(
         self, pyramid: Pyramid, size: tuple[int, int]
     ) -> tuple[Float[Tensor, "n h w"], Float[Tensor, "n h w"]]:
-        """Predict depth up to scale, and its confidence from 1 upwards."""
+        """Predict depth up to scale, and its confidence from 1 upwards; `size` is height, width."""
         x = resize_bilinear(self.scratch.output_conv1(self.scratch(pyramid)), size)
         raw = self.scratch.output_conv2(add_position_encoding(x, size[1] / size[0]))
         # Positive depth, and a confidence above 1, as the authors trained them.

@@ -5,20 +5,27 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from gscompleter.reconstructors.features.matches import fit_poses, measure_match_errors
+from gscompleter.reconstructors.features.matches import (
+    MAX_EPIPOLAR_DISTANCE,
+    Pixels,
+    fit_poses,
+    measure_match_errors,
+)
 from gscompleter.reconstructors.features.neighbours import find_neighbours
 from gscompleter.reconstructors.features.stereo_image import (
+    StereoImage,
     has_distinct_centers,
     make_stereo_images,
 )
 from gscompleter.types import View
 
 MAX_POSE_ERROR = 8.0
-"""Largest error of a match that is not false, in pixels of the working size of the photograph that
-it is measured in."""
+"""Largest error of a match that the poses confirm, in pixels of the working size of the photograph
+that it is measured in."""
 MIN_POSE_MATCHES = 30
 """Fewest matches by which the pose of a photograph is judged, and those of a pair that count:
 photographs without a common surface have up to 25 false ones."""
@@ -67,9 +74,30 @@ def measure_pose_errors(views: Sequence[View]) -> list[float | None]:
     for (i, j), (in_i, in_j) in find_neighbours(images).matches.items():
         if len(in_i) < MIN_POSE_MATCHES:
             continue
+        is_true = find_true_matches(images[i], images[j], in_i, in_j)
         distances, is_ahead = measure_match_errors(images[i], images[j], in_i, in_j)
-        counted = distances[is_ahead & (distances < MAX_POSE_ERROR)]
+        # No pose is off by more than an image, also where it puts a match behind the camera.
+        counted = np.where(is_ahead, distances, np.inf).clip(max=max(images[j].size))[is_true]
         errors[i].append(counted)
         errors[j].append(counted)
     joined = [np.concatenate([np.zeros(0), *parts]) for parts in errors]
     return [float(np.median(e)) if len(e) >= MIN_POSE_MATCHES else None for e in joined]
+
+
+def find_true_matches(
+    reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
+) -> Bool[np.ndarray, "n"]:
+    """Find the matches of two photographs that are not false.
+
+    A match lies far off because it is false, or because a pose is wrong, so the poses alone do not
+    decide: if another epipolar geometry explains more matches, and most of all, these are true.
+    """
+    errors, is_ahead = measure_match_errors(reference, source, pixels, matched)
+    is_near = is_ahead & (errors < MAX_POSE_ERROR)
+    if len(pixels) < MIN_POSE_MATCHES:
+        return is_near
+    # RANSAC of OpenCV, whose samples are the same in each call; it may find no geometry at all.
+    _, found = cv2.findFundamentalMat(pixels, matched, cv2.FM_RANSAC, MAX_EPIPOLAR_DISTANCE)
+    is_explained = is_near if found is None else found.ravel() > 0
+    is_clear = is_explained.sum() >= max(MIN_POSE_MATCHES, len(pixels) / 2)
+    return is_explained if is_clear and is_explained.sum() > is_near.sum() else is_near

@@ -80,9 +80,8 @@ def get_depth_range(
     views: Sequence[View],
     estimate: Callable[[Sequence[View]], tuple[float, float]] = estimate_depth_range,
 ) -> tuple[float, float]:
-    """Return near and far z-depth of the first camera, in scene units, estimated if unknown."""
-    near = views[0].camera.near
-    far = views[0].camera.far
+    """Return near and far z-depth of the cameras, in scene units, estimated if unknown."""
+    near, far = get_given_range(views)
     if near is None or far is None:
         low, high = estimate(views)
         near = low if near is None else near
@@ -93,6 +92,13 @@ def get_depth_range(
             "than far."
         )
     return near, far
+
+
+def get_given_range(views: Sequence[View]) -> tuple[float | None, float | None]:
+    """Return the nearest near and the farthest far plane of the cameras; None if none has one."""
+    nears = [view.camera.near for view in views if view.camera.near is not None]
+    fars = [view.camera.far for view in views if view.camera.far is not None]
+    return min(nears, default=None), max(fars, default=None)
 
 
 def set_depth_range(views: Sequence[View], near: float, far: float) -> list[View]:

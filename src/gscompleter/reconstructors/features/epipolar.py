@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.numerics.two_views import ERROR_SIDE, Focals, Rays, compute_sampson_distances
-from gscompleter.reconstructors.features.consistency import MAX_POSE_ERROR, MIN_POSE_MATCHES
-from gscompleter.reconstructors.features.matches import Pixels, measure_match_errors
+from gscompleter.reconstructors.features.consistency import MIN_POSE_MATCHES, find_true_matches
+from gscompleter.reconstructors.features.matches import Pixels
 from gscompleter.reconstructors.features.neighbours import find_neighbours
 from gscompleter.reconstructors.features.stereo_image import (
     StereoImage,
@@ -75,9 +75,7 @@ def measure_pose_fit(views: Sequence[View]) -> PoseFit | None:
     pairs = []
     for (i, j), (in_i, in_j) in find_neighbours(images).matches.items():
         reference, source = images[i], images[j]
-        errors, is_ahead = measure_match_errors(reference, source, in_i, in_j)
-        # What lies farther off, in pixels of the source, is a false match.
-        is_true = is_ahead & (errors < MAX_POSE_ERROR)
+        is_true = find_true_matches(reference, source, in_i, in_j)
         if is_true.sum() < MIN_POSE_MATCHES:
             continue
         rays = (make_rays(reference, in_i[is_true]), make_rays(source, in_j[is_true]))

@@ -23,6 +23,7 @@ from gscompleter.reconstructors.features.depth_range import (
     MIN_RANGE_MATCHES,
     SHARE_OUTSIDE,
     get_depth_range,
+    get_given_range,
     measure_feature_depths,
 )
 from gscompleter.reconstructors.features.matches import Pixels, triangulate
@@ -80,11 +81,11 @@ def find_depth_range(
 ) -> DepthRange:
     """Find near and far z-depth of a scene, in scene units, and say what contradicts them.
 
-    They are those of the first camera; else those that Ψ was `trained` on; else those of matched
+    They are those of the cameras; else those that Ψ was `trained` on; else those of matched
     features. A given one is widened to what photographs show, unless Ψ `keeps` it. Raise InputError
     for an empty range.
     """
-    known = (views[0].camera.near, views[0].camera.far)
+    known = get_given_range(views)
     if trained is None:
         found = DepthRange(*get_depth_range(views))
     else:

@@ -57,7 +57,7 @@ class PlyFile:
     rows: np.ndarray
     """One structured row per vertex, [n]."""
     trailer: UInt8[np.ndarray, "m"]
-    """Everything after the last row of a binary file, in bytes."""
+    """Everything after the last row of a binary file, in bytes; nothing of an ASCII one."""
     is_ascii: bool = False
 
 
@@ -86,25 +86,31 @@ def read_header(file: BinaryIO, path: Path) -> tuple[bytes, list[Element]]:
 
 def _parse_elements(lines: Iterable[bytes]) -> list[Element]:
     tables: list[tuple[str, int, list[tuple[str, str]]]] = []
-    byte_order = ""
+    byte_order: str | None = None
     for line in lines:
         words = line.decode("latin-1").split()
+        # The header is changed by expressions that look for words at the beginnings of lines.
+        if words and line[:1].isspace():
+            raise DamagedError(f"'{' '.join(words)}' is indented")
+        if words[:1] == ["element"] and byte_order is None:
+            raise DamagedError("no format is named before the first element")
         try:
             match words:
                 case [] | ["comment" | "obj_info", *_]:
                     pass
-                case ["format", name, *_]:
+                case ["format", name, *_] if byte_order is None:
                     byte_order = _BYTE_ORDERS[name]
                 case ["element", name, count] if count.isdecimal():
                     tables.append((name, int(count), []))
                 case ["property", "list", _, _, name]:
                     tables[-1][2].append((name, "O"))
                 case ["property", kind, name]:
-                    tables[-1][2].append((name, byte_order + PLY_SCALARS[kind]))
+                    tables[-1][2].append((name, f"{byte_order}{PLY_SCALARS[kind]}"))
                 case _:
                     raise DamagedError
         except (LookupError, ValueError) as error:
-            # An unknown format or type, a property of no element, or other words.
+            # An unknown format or a second one, an unknown type, a property of no element, or other
+            # words.
             raise DamagedError(" ".join(words)) from error
     for name, _, columns in tables:
         if len({column for column, _ in columns}) < len(columns):
@@ -141,14 +147,15 @@ def read_ply_file(
         is_ascii = re.search(rb"^format\s+ascii", header, re.M) is not None
         if is_ascii:
             rows = _read_ascii_rows(file, vertex, path)
+            trailer = np.empty(0, np.uint8)
         else:
             rows = _map_rows(file, vertex.dtype, len(header), vertex.count)
+            trailer = _map_rows(file, np.dtype(np.uint8), len(header) + rows.nbytes)
         if len(rows) < vertex.count:
             raise InputError(
                 f"{quote_value(path)} is truncated: it ends after {len(rows):,} of "
                 f"{quote_value(f'{vertex.count:,}')} {unit}; fetch or write the file again."
             )
-        trailer = _map_rows(file, np.dtype(np.uint8), len(header) + rows.nbytes)
         return PlyFile(header, rows, trailer, is_ascii)
 
 
@@ -164,9 +171,10 @@ def _map_rows(file: BinaryIO, dtype: np.dtype, start: int, count: int | None = N
 
 def _read_ascii_rows(file: BinaryIO, vertex: Element, path: Path) -> np.ndarray:
     lines = (line.split() for line in file if line.strip())
+    rows = list(islice(lines, vertex.count))
     width = len(vertex.dtype.names or ())
     try:
-        table = np.array(list(islice(lines, vertex.count)), np.float64).reshape(-1, width)
+        table = np.array(rows, np.float64).reshape(len(rows), width)
     except ValueError as error:
         raise InputError(
             f"{quote_value(path)} holds rows that are not {width} numbers each; write it anew."
