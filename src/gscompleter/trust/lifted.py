@@ -112,6 +112,6 @@ def find_pixel_center(scene: Gaussians) -> Float[Tensor, "3"] | None:
 def measure_spread(values: Float[Tensor, "c n"]) -> Float[Tensor, "c"]:
     """Measure the mean absolute deviation of each row, on the CPU, from its lower median."""
     middle = (values.shape[1] - 1) // 2
-    # The values that torch.median finds, in a fifth of its time. A NaN in a row stays one in the mean.
+    # What torch.median finds, in a fifth of its time. A NaN in a row stays one in the mean.
     medians = np.partition(values.detach().numpy(), middle, axis=1)[:, middle]
     return (values - torch.from_numpy(medians)[:, None]).abs().mean(dim=1)
