@@ -6,6 +6,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import redirect_stderr
 from dataclasses import is_dataclass
+from functools import cache
 from io import StringIO
 from typing import Any, get_args, get_type_hints
 
@@ -162,9 +163,10 @@ def explain_words(words: Sequence[str], kinds: Mapping[str, type], box: str) -> 
     return sentence
 
 
-def list_options(kind: Any, prefix: str = "") -> set[str]:
+@cache
+def list_options(kind: Any, prefix: str = "") -> frozenset[str]:
     """List the names of the options of a command, without dashes before them."""
-    options = set()
+    options: set[str] = set()
     for field, hint in get_type_hints(kind, include_extras=True).items():
         # `Annotated[inner, *marks]`. Of a plain union the first member is `inner`, and the others
         # count as marks, none of which is searched for.
@@ -178,7 +180,7 @@ def list_options(kind: Any, prefix: str = "") -> set[str]:
             options |= list_options(inner, "" if is_flat else f"{name}.")
         elif tyro.conf.Positional not in marks:
             options.add(name)
-    return options
+    return frozenset(options)
 
 
 def describe_foreign_option(
