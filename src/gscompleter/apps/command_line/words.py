@@ -177,7 +177,7 @@ def list_options(kind: Any, prefix: str = "") -> frozenset[str]:
             options |= list_options(CompleterConfig, f"{CONFIG_OPTION}.")
         elif is_dataclass(inner):
             is_flat = tyro.conf.OmitArgPrefixes in marks
-            options |= list_options(inner, "" if is_flat else f"{name}.")
+            options |= list_options(inner, "" if is_flat else f"{name}.")  # type: ignore[arg-type]
         elif tyro.conf.Positional not in marks:
             options.add(name)
     return frozenset(options)
