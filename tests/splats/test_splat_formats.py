@@ -348,7 +348,7 @@ def test_what_is_no_splat_is_refused(tmp_path):
         refused(tmp_path / name, sentence)
 
 
-MANY = 100_000
+MANY = 300_000
 """Gaussians of which a property that is the same for all shrinks to a thousandth and less."""
 
 
