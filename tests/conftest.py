@@ -16,6 +16,7 @@ if "PYTEST_XDIST_WORKER_COUNT" in os.environ:
 # Imports and collected tests stay; searches among them for garbage cost seconds in each worker.
 gc.disable()
 
+import jaxtyping
 import pytest
 from jaxtyping import install_import_hook
 
@@ -32,6 +33,7 @@ CHECKED = sorted(
     and path.stem not in ("__init__", "numerics", "kernels")
 )
 install_import_hook(CHECKED, "checked_calls.check_first_calls")
+jaxtyping.jaxtyped = checked_calls.leave_checked_functions
 
 
 LONGEST = (

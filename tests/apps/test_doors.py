@@ -249,7 +249,7 @@ def test_a_closed_or_full_output_is_no_traceback(splat, tmp_path):
     closed = run_apart("convert", splat, out, shell="{} >&-")
     assert (closed.returncode, closed.stderr) == (0, "")
     assert out.is_file()
-    both = run_apart("convert", splat, out, shell="{} >&- 2>&-")
+    both = run_apart("nonsense", shell="{} >&- 2>&-")
     assert both.returncode == 2
     full = run_apart("models", shell="{} > /dev/full")
     assert full.returncode == 1

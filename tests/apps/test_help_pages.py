@@ -20,9 +20,9 @@ from gscompleter.apps.command_line.help_pages import HELP_GROUPS, LAST
 from gscompleter.apps.command_line.words import list_options
 from gscompleter.cli import COMMANDS, OptionClasses, parse_command
 from paths import TESTS
+from sources import list_nodes, parse_package
 
 ROOT = TESTS.parent
-SOURCES = ROOT / "src" / "gscompleter"
 NEGATIONS = ("ignore", "instead of", "keep", "without", "leave out")
 """Words of which the help of an option `--no-X` has one."""
 OF_OTHERS = {
@@ -159,7 +159,7 @@ def options_of(command: str) -> set[str]:
 def texts_of(path: Path) -> list[str]:
     """List the texts of a file, with `{}` for what is filled in."""
     found = []
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+    for node in list_nodes(path):
         if isinstance(node, ast.JoinedStr):
             parts = [part.value if isinstance(part, ast.Constant) else "{}" for part in node.values]
             found.append("".join(map(str, parts)))
@@ -172,7 +172,7 @@ def test_texts_name_files_of_the_repository_and_options_that_there_are():
     """In all sentences of the program: errors, lines, notes and pages of doctor."""
     known = {f"--{name}" for kind in OptionClasses().values() for name in list_options(kind)}
     known |= OF_OTHERS
-    for path in SOURCES.rglob("*.py"):
+    for path in parse_package():
         for text in texts_of(path):
             for file in re.findall(
                 r"(?<![\w/])(?:docs|examples|benchmarks|integrations)/[\w./-]+\.(?:md|py|ipynb|json)",

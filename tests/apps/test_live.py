@@ -13,8 +13,9 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import replace
-from functools import partial
+from functools import partial, partialmethod
 from pathlib import Path
+from socketserver import BaseServer
 from types import SimpleNamespace
 
 import numpy as np
@@ -531,6 +532,13 @@ def page(splat_ready, splat_begun, journal, monkeypatch) -> LivePage:
     built = serving.build_page(splat_ready, splat_begun, Libraries({}, {}), QUIET, journal)
     monkeypatch.setattr(built, "_save", lambda _: "Saved.")
     return built
+
+
+@pytest.fixture(autouse=True)
+def quick_end(monkeypatch) -> None:
+    """Let a server notice at once that it is shut down; Python looks twice a second."""
+    serve = partialmethod(BaseServer.serve_forever, poll_interval=0.01)
+    monkeypatch.setattr(LiveServer, "serve_forever", serve)
 
 
 @pytest.fixture

@@ -550,11 +550,15 @@ def test_without_a_file_to_save_to_the_page_is_served_and_opened(
 # ---------------------------------------------------------------------------------- the server
 
 
+POLL_SECONDS = 0.01
+"""Time in which a server notices that it is shut down; Python's is half a second."""
+
+
 @pytest.fixture
 def port() -> Iterator[int]:
     """Return the port of a server of a page."""
     with make_page_server(b"<!doctype html>") as server:
-        thread = threading.Thread(target=server.serve_forever)
+        thread = threading.Thread(target=server.serve_forever, args=(POLL_SECONDS,))
         thread.start()
         yield server.server_address[1]
         server.shutdown()
@@ -593,7 +597,7 @@ def test_nothing_can_be_sent(port, method):
 def test_a_browser_that_leaves_leaves_no_traceback(monkeypatch, capfd):
     """The page is larger than what fits between both programs."""
     with make_page_server(bytes(2**26)) as server:
-        thread = threading.Thread(target=server.serve_forever)
+        thread = threading.Thread(target=server.serve_forever, args=(POLL_SECONDS,))
         thread.start()
         for _ in range(3):
             with socket.create_connection(server.server_address) as browser:

@@ -295,7 +295,7 @@ def test_nothing_was_asked_for_and_nothing_went_wrong(bare):
 
 
 def test_a_link_opens_at_its_camera(browser, saved):
-    tab = Window(browser, saved, 320, 240, "#camera=camera-1&mode=slider&generated=hide")
+    tab = Window(browser, saved, 160, 120, "#camera=camera-1&mode=slider&generated=hide")
     stats = tab.do("gsc.stats()")
     assert (stats["camera"], stats["mode"], stats["generated"]) == ("camera-1", "slider", "hide")
     assert tab.page.get_by_role("button", name="Left").get_attribute("aria-current") == "true"

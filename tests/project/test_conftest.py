@@ -51,6 +51,24 @@ def test_functions_are_checked_in_their_first_calls_of_each_test():
         quats_to_rotations(torch.zeros(5, 3))
 
 
+def test_a_function_in_another_is_checked_in_its_first_calls_of_each_test():
+    def make_inner():
+        @checked_calls.leave_checked_functions(typechecker=checked_calls.check_first_calls)
+        def inner(number: int) -> int:
+            return number
+
+        return inner
+
+    for _ in range(checked_calls.MOST_CHECKS):
+        with pytest.raises(TypeCheckError):
+            make_inner()("1")
+    assert make_inner()("1") == "1"
+    # As another test begins.
+    checked_calls.pytest_runtest_setup()
+    with pytest.raises(TypeCheckError):
+        make_inner()("1")
+
+
 def test_long_tests_are_named_at_the_end(pytestconfig, capsys):
     def report(name: str, seconds: float, **keywords: int) -> pytest.TestReport:
         where = ("a.py", 1, name)

@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 
-from paths import ROOT
-
-PACKAGE = ROOT / "src" / "gscompleter"
+from paths import PACKAGE, ROOT
+from sources import list_nodes, parse_package
 
 
 def floors() -> dict[str, int]:
@@ -28,14 +27,9 @@ def room_of(path: Path) -> str:
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
-@cache
-def parse(path: Path) -> ast.Module:
-    return ast.parse(path.read_text())
-
-
 def imported_rooms(path: Path) -> Iterator[str]:
     """Return the rooms that a file imports from, anywhere in it."""
-    for node in ast.walk(parse(path)):
+    for node in list_nodes(path):
         if isinstance(node, ast.ImportFrom) and node.module == "gscompleter":
             yield from (alias.name for alias in node.names if alias.name != "__version__")
         elif isinstance(node, ast.ImportFrom) and (node.module or "").startswith("gscompleter."):
@@ -96,7 +90,7 @@ def list_imports_inside(package: str) -> dict[str, set[str]]:
     for path in sorted((PACKAGE / package).rglob("*.py")):
         room = path.relative_to(PACKAGE / package).parts[0].removesuffix(".py")
         others = found.setdefault(room, set())
-        for node in ast.walk(parse(path)):
+        for node in list_nodes(path):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("gscompleter."):
                 _, owner, *inner = node.module.split(".")
                 if owner == package:
@@ -131,7 +125,7 @@ def test_no_application_knows_the_options_of_a_command():
     known = [
         (path.name, name.id)
         for path in paths
-        for name in ast.walk(parse(path))
+        for name in list_nodes(path)
         if isinstance(name, ast.Name)
         and re.fullmatch(r"\w+Options", name.id)
         # Options of a generator are settings; those of a help page are a group of fields.
@@ -163,8 +157,8 @@ def test_no_circle_of_modules():
     graph = TopologicalSorter()
     for path in files():
         own = ".".join(path.relative_to(ROOT / "src").with_suffix("").parts)
-        tree = parse(path)
-        for node in ast.walk(tree) if room_of(path) in ("apps", "cli") else tree.body:
+        is_application = room_of(path) in ("apps", "cli")
+        for node in list_nodes(path) if is_application else parse_package()[path].body:
             if isinstance(node, ast.ImportFrom) and node.module:
                 names = {f"{node.module}.{alias.name}" for alias in node.names} & modules
                 graph.add(own.removesuffix(".__init__"), *(names or {node.module} & modules))
@@ -183,7 +177,7 @@ def test_sentences_of_the_library_name_no_option_of_the_command_line():
     found = [
         (path.name, text.value)
         for path in rooms
-        for call in ast.walk(parse(path))
+        for call in list_nodes(path)
         if isinstance(call, ast.Call) and getattr(call.func, "id", "").endswith("Error")
         for text in ast.walk(call)
         if isinstance(text, ast.Constant) and re.search(r"(^|[^-])--[a-z]", str(text.value))

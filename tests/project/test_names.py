@@ -1,9 +1,8 @@
 """A name of a module has one meaning in the whole package."""
 
-from density import find_repeated, parse_files
-from paths import ROOT
-
-PACKAGE = ROOT / "src" / "gscompleter"
+from density import find_repeated
+from paths import PACKAGE
+from sources import parse_package
 
 REPEATED = {
     # The slow renderer states the numbers of rasterisation for itself, as it is the twin that the
@@ -19,7 +18,7 @@ REPEATED = {
 
 def test_a_name_is_defined_in_one_module():
     # Adapters of learned models keep the names of the code that they follow.
-    places = [place for place in PACKAGE.iterdir() if place.name != "models"]
-    modules = parse_files([place for place in places if place.is_dir() or place.suffix == ".py"])
+    models = PACKAGE / "models"
+    modules = {path: tree for path, tree in parse_package().items() if models not in path.parents}
     repeated = set(find_repeated(modules)) - REPEATED
     assert not repeated, f"name these for what they mean where they stand: {sorted(repeated)}"

@@ -4,14 +4,12 @@ import ast
 import os
 import subprocess
 import sys
-from functools import cache
-from pathlib import Path
 
 import pytest
 
-from paths import ROOT
+from paths import PACKAGE
+from sources import list_nodes, parse_package
 
-PACKAGE = ROOT / "src" / "gscompleter"
 UNIX_MODULES = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty"}
 UNIX_NAMES = {"fork", "forkpty", "getuid", "geteuid", "getpgid", "killpg", "mkfifo", "nice"}
 UNIX_NAMES |= {"setsid", "statvfs", "sched_getaffinity", "sysconf", "uname", "wait4"}
@@ -25,14 +23,6 @@ GUARDED = {
 """Names that a condition or `suppress` precedes."""
 ENCODED = {"read_text": 0, "write_text": 1, "TextIOWrapper": 1}
 """Positions of the encoding."""
-
-
-@cache
-def trees() -> list[tuple[Path, ast.Module]]:
-    return [
-        (path.relative_to(PACKAGE), ast.parse(path.read_text(encoding="utf-8")))
-        for path in sorted(PACKAGE.rglob("*.py"))
-    ]
 
 
 def name_of(call: ast.Call) -> str:
@@ -50,7 +40,7 @@ def has_encoding(call: ast.Call) -> bool:
 
 
 def test_no_text_is_read_or_written_in_the_encoding_of_the_system():
-    calls = ((p, n) for p, tree in trees() for n in ast.walk(tree) if isinstance(n, ast.Call))
+    calls = ((p, n) for p in parse_package() for n in list_nodes(p) if isinstance(n, ast.Call))
     assert [f"{path}:{call.lineno}" for path, call in calls if not has_encoding(call)] == []
 
 
@@ -65,8 +55,9 @@ def test_such_calls_are_found(text):
 
 def test_nothing_is_used_that_only_unix_has():
     found = set()
-    for path, tree in trees():
-        for node in ast.walk(tree):
+    for file in parse_package():
+        path = file.relative_to(PACKAGE)
+        for node in list_nodes(file):
             if isinstance(node, ast.Import) and {a.name for a in node.names} & UNIX_MODULES:
                 found.add((str(path), "import"))
             if isinstance(node, ast.ImportFrom) and node.module in UNIX_MODULES:

@@ -10,7 +10,8 @@ import pytest
 from gscompleter.data.sfm.poses import run_colmap
 from gscompleter.system.children import hide_working_folder, run_module, run_python
 from gscompleter.system.jobs.engines import check_processes, open_local
-from paths import ROOT
+from paths import PACKAGE
+from sources import list_nodes, parse_package
 
 STRANGERS = ("json", "numpy", "runpy", "selectors", "struct", "multiprocessing", "gscompleter")
 """Modules that children import, some of them before any code of ours."""
@@ -112,15 +113,15 @@ def test_the_working_folder_and_the_environment_are_as_before(tmp_path, monkeypa
 
 
 def test_every_process_of_python_is_started_in_one_place():
-    package = ROOT / "src" / "gscompleter"
+    last_words = {name.split(".")[-1] for name in STARTING}
     found = {}
-    for path in sorted(package.rglob("*.py")):
+    for path in parse_package():
         names = set()
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.Attribute):
+        for node in list_nodes(path):
+            if isinstance(node, ast.Attribute) and node.attr in last_words:
                 names |= {node.attr, ast.unparse(node)}
             elif isinstance(node, ast.ImportFrom) and node.module in ("subprocess", "sys"):
                 names |= {f"{node.module}.{alias.name}" for alias in node.names}
         if names & STARTING:
-            found[path.relative_to(package).as_posix()] = names & STARTING
+            found[path.relative_to(PACKAGE).as_posix()] = names & STARTING
     assert found == STARTS

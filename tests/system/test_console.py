@@ -6,6 +6,7 @@ import ast
 import io
 import json
 import shutil
+from collections.abc import Iterable
 from pathlib import Path
 
 import pytest
@@ -15,22 +16,25 @@ from command import run
 from gscompleter.apps.completing.printing import print_completion
 from gscompleter.apps.requests.completion import ResultsRequest
 from gscompleter.system.console import make_console
-from paths import TESTS
+from paths import PACKAGE, TESTS
 from scenes import camera_at, photographed
+from sources import list_nodes, parse_package
 
-SOURCES = TESTS.parent / "src" / "gscompleter"
 ODD = "b].png [red][/b] :cat: [link=x]"
 """A name of which rich would leave out parts, colour others, draw one, and end with an error."""
 
 
-def find_consoles(source: str) -> list[str]:
+PRINTERS = {"Console", "get_console", "print_json", "from_markup", "render_markup"}
+
+
+def find_consoles(nodes: Iterable[ast.AST]) -> list[str]:
     """List what a file takes from rich that would print: names other than the type of a console."""
     found = []
-    for node in ast.walk(ast.parse(source)):
-        if isinstance(node, ast.Call) and ast.unparse(node.func).split(".")[-1] in (
-            *("Console", "get_console", "print_json", "from_markup", "render_markup"),
-        ):
-            found.append(ast.unparse(node.func))
+    for node in nodes:
+        if isinstance(node, ast.Call):
+            function = node.func
+            name = getattr(function, "attr", getattr(function, "id", ""))
+            found += [ast.unparse(function)] * (name in PRINTERS)
         if isinstance(node, ast.ImportFrom) and node.module == "rich":
             found += [f"rich.{name.name}" for name in node.names if name.name == "print"]
         found += [
@@ -44,17 +48,23 @@ def find_consoles(source: str) -> list[str]:
 def test_there_is_no_other_console():
     """Each file prints with `make_console`, and none turns the markup on again."""
     allowed = {"system/console.py": ["markup=False", "emoji=False"]}
-    for path in SOURCES.rglob("*.py"):
-        name = path.relative_to(SOURCES).as_posix()
-        found = [one for one in find_consoles(path.read_text()) if one != "print_json"]
+    for path in parse_package():
+        name = path.relative_to(PACKAGE).as_posix()
+        found = [one for one in find_consoles(list_nodes(path)) if one != "print_json"]
         assert found == allowed.get(name, []), name
 
 
-def test_other_consoles_are_found():
-    assert find_consoles("Console(stderr=True)") == ["Console"]
-    assert find_consoles("import rich.console\nrich.console.Console()") == ["rich.console.Console"]
-    assert find_consoles("from rich import print") == ["rich.print"]
-    assert find_consoles("console.print(name, markup=True)") == ["markup=True"]
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("Console(stderr=True)", "Console"),
+        ("import rich.console\nrich.console.Console()", "rich.console.Console"),
+        ("from rich import print", "rich.print"),
+        ("console.print(name, markup=True)", "markup=True"),
+    ],
+)
+def test_other_consoles_are_found(source, found):
+    assert find_consoles(ast.walk(ast.parse(source))) == [found]
 
 
 def test_lines_and_cells_hold_a_name_as_it_is():

@@ -14,7 +14,7 @@ from gscompleter.data.sfm.poses import write_upright
 from gscompleter.models.weights.reading import check_kind
 from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.image import read_pixels
-from paths import ROOT
+from sources import list_nodes, parse_package
 
 
 def test_a_short_value_is_quoted_as_it_is():
@@ -37,9 +37,10 @@ def test_a_quote_stays_on_its_line_and_shows_no_control_characters():
 def test_errors_quote_the_paths_that_they_name():
     """A name of a file may hold line breaks, and be longer than the sentence about it."""
     bare = []
-    for file in sorted((ROOT / "src").rglob("*.py")):
-        for call in ast.walk(ast.parse(file.read_text())):
-            if isinstance(call, ast.Call) and ast.unparse(call.func) in ("InputError", "require"):
+    for file in parse_package():
+        for call in list_nodes(file):
+            is_call = isinstance(call, ast.Call)
+            if is_call and getattr(call.func, "id", "") in ("InputError", "require"):
                 shown = [part for part in ast.walk(call) if isinstance(part, ast.FormattedValue)]
                 words = {ast.unparse(part.value) for part in shown}
                 bare += [f"{file}:{call.lineno}"] * bool(words & {"path", "folder", "file", "out"})

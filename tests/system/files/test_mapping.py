@@ -1,13 +1,13 @@
 """Numbers in a mapped file take memory only while they are read."""
 
 import os
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
 import torch
 
+from full_disk import limit_file_size
+from gscompleter.system.errors import FullDiskError
 from gscompleter.system.files.mapping import (
     change_rows,
     find_changed_rows,
@@ -123,18 +123,8 @@ def test_rows_are_selected_in_any_order_with_few_pages(tmp_path, count):
 
 
 def test_a_full_disk_is_one_sentence(tmp_path):
-    code = (
-        "import resource, sys, torch; from pathlib import Path\n"
-        "from gscompleter.system.errors import FullDiskError\n"
-        "from gscompleter.system.files.mapping import move_to_file\n"
-        "resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000))\n"
-        "try: move_to_file(torch.ones(100_000), Path(sys.argv[1]))\n"
-        "except FullDiskError as error: print(error)\n"
-    )
     out = tmp_path / "out"
-    done = subprocess.run(
-        [sys.executable, "-c", code, str(out)], capture_output=True, text=True, check=False
-    )
-    assert done.stdout.startswith("Cannot write"), done.stderr
-    assert str(out) in done.stdout
+    with limit_file_size(100_000), pytest.raises(FullDiskError, match="^Cannot write") as error:
+        move_to_file(torch.ones(100_000), out)
+    assert str(out) in str(error.value)
     assert os.listdir(tmp_path) == []

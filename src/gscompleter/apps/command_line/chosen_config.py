@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
+from functools import cache
 from typing import Annotated, Any, TypedDict, get_type_hints
 
 import tyro
@@ -71,6 +72,7 @@ def make_parsing_rule(
     return rule
 
 
+@cache
 def make_changes_type(config: type) -> Any:
     """Make the type of a mapping with some settings of a group; none of them has a default."""
     hints = get_type_hints(config, include_extras=True)

@@ -6,6 +6,7 @@ import re
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import redirect_stderr
 from dataclasses import is_dataclass
+from functools import cache
 from io import StringIO
 from typing import Any, get_args, get_type_hints
 
@@ -162,7 +163,8 @@ def explain_words(words: Sequence[str], kinds: Mapping[str, type], box: str) -> 
     return sentence
 
 
-def list_options(kind: Any, prefix: str = "") -> dict[str, Any]:
+@cache
+def list_options(kind: Any, prefix: str = "") -> Mapping[str, Any]:
     """List the options of a command by name, without dashes before it, with their types."""
     options: dict[str, Any] = {}
     for field, hint in get_type_hints(kind, include_extras=True).items():
@@ -175,7 +177,7 @@ def list_options(kind: Any, prefix: str = "") -> dict[str, Any]:
             options |= list_options(CompleterConfig, f"{CONFIG_OPTION}.")
         elif is_dataclass(inner):
             is_flat = tyro.conf.OmitArgPrefixes in marks
-            options |= list_options(inner, "" if is_flat else f"{name}.")
+            options |= list_options(inner, "" if is_flat else f"{name}.")  # type: ignore[arg-type]
         elif tyro.conf.Positional not in marks:
             options[name] = hint
     return options

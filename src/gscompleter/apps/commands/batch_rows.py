@@ -104,7 +104,7 @@ def option_to_words(name: str, value: Any) -> list[str]:
 
 
 @cache
-def find_kinds() -> dict[str, Any]:
+def find_kinds() -> Mapping[str, Any]:
     """Find the type of each option of `complete`; of a large manifest each row asks for some."""
     return list_options(CompleteOptions)
 

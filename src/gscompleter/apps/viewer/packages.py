@@ -12,7 +12,7 @@ import io
 import json
 import tarfile
 import urllib.request
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -79,14 +79,19 @@ def load_libraries() -> Libraries:
 def extract_libraries(lock: Path) -> Libraries:
     """Extract the modules and licences of the packages pinned in `lock`."""
     packages = read_lock(lock)
-    archives = {package.name: get_archive(package) for package in packages}
+    files = {
+        package.name: read_archive(
+            get_archive(package),
+            {"LICENSE", *(f for p, f in MODULES.values() if p == package.name)},
+        )
+        for package in packages
+    }
     modules = {
-        name: read_archive_member(archives[package], file).replace(*CORE_IMPORT)
+        name: files[package][file].replace(*CORE_IMPORT)
         for name, (package, file) in MODULES.items()
     }
     licences = {
-        f"{package.name} {package.version}": read_archive_member(archives[package.name], "LICENSE")
-        for package in packages
+        f"{package.name} {package.version}": files[package.name]["LICENSE"] for package in packages
     }
     return Libraries(modules, licences)
 
@@ -139,10 +144,16 @@ def fetch_archive(package: NpmPackage) -> bytes:
     )
 
 
-def read_archive_member(archive: bytes, name: str) -> str:
-    """Read a text file of an npm archive, below its folder `package`."""
-    # The archive is never unpacked to disk.
-    with tarfile.open(fileobj=io.BytesIO(archive), mode="r:gz") as files:
-        file = files.extractfile(f"package/{name}")
-        assert file is not None
-        return file.read().decode()
+def read_archive(archive: bytes, names: Collection[str]) -> dict[str, str]:
+    """Read text files of an npm archive, below its folder `package`."""
+    found = {}
+    # The archive is never unpacked to disk, and decompressed once for all of them, up to the last.
+    with tarfile.open(fileobj=io.BytesIO(archive), mode="r|gz") as files:
+        for member in files:
+            name = member.name.removeprefix("package/")
+            content = files.extractfile(member) if name in names else None
+            if content is not None:
+                found[name] = content.read().decode()
+            if len(found) == len(names):
+                break
+    return found
