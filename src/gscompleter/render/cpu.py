@@ -30,7 +30,7 @@ from gscompleter.render.viewpoint import (
     to_float32,
 )
 from gscompleter.system.errors import InputError
-from gscompleter.system.files.mapping import move_beside, release_pages
+from gscompleter.system.files.mapping import file_array_beside, release_pages
 from gscompleter.types import Camera, Gaussians, Render
 
 FROZEN_BLOCK = 4_000_000
@@ -86,8 +86,8 @@ class CpuFrozenScene:
 
     def move_beside(self, mapped: Tensor) -> CpuFrozenScene:
         """Move the lists to files, beside the file in which `mapped` lies."""
-        layer = Layer(*[move_beside(array, mapped) for array in self.layer])
-        return replace(self, layer=layer, rows=move_beside(self.rows, mapped))
+        layer = Layer(*[file_array_beside(array, mapped) for array in self.layer])
+        return replace(self, layer=layer, rows=file_array_beside(self.rows, mapped))
 
     def release(self) -> None:
         """Release the memory of lists that lie in files, after all of them were read."""

@@ -10,10 +10,10 @@ import torch
 
 from gscompleter.system.files.mapping import (
     change_rows,
+    file_array_beside,
     find_changed_rows,
     is_mapped,
     join_rows,
-    move_beside,
     move_to_file,
     release_pages,
     select_rows,
@@ -94,12 +94,12 @@ def test_rows_are_joined_to_those_of_a_file_in_a_file(tmp_path):
 def test_arrays_move_beside_values_of_a_file_once(tmp_path):
     mapped = move_to_file(make_values(), tmp_path)
     array = make_values().numpy()
-    moved = move_beside(array, mapped)
+    moved = file_array_beside(array, mapped)
     assert (moved == array).all()
     release_pages(moved)
     assert read_resident(torch.from_numpy(moved)) < 0.1 * array.nbytes
     assert (moved == array).all()
-    assert move_beside(moved, mapped) is moved
+    assert file_array_beside(moved, mapped) is moved
 
 
 def test_numbers_in_memory_stay():

@@ -15,7 +15,10 @@ HELP = ("-h", "--help")
 HELP_ALL = "--help-all"
 
 DESCRIPTION = "Complete 3D Gaussian Splatting scenes: generate, then register."
-OPTIONS = {"-h, --help": "show this help message and exit", "--version": "Print the version."}
+GENERAL_OPTIONS = {
+    "-h, --help": "show this help message and exit",
+    "--version": "Print the version.",
+}
 COMMANDS_FOLDER = Path(__file__).parents[1] / "commands"
 WIDTHS = (40, 106)
 """Fewest and most characters in a line; with the most, each sentence is in one."""
@@ -27,16 +30,16 @@ def format_command_list(names: Sequence[str]) -> str:
     """Format the page of the commands with these names, as wide as the terminal."""
     narrowest, widest = WIDTHS
     width = min(max(narrowest, shutil.get_terminal_size().columns), widest)
-    commands = {f"  • {name}": read_summary(name) for name in names}
+    commands = {f"  • {name}": read_command_sentence(name) for name in names}
     boxes = (
-        format_box("options", format_rows(OPTIONS, 4, width), width),
-        format_box("subcommands", ["(required)", *format_rows(commands, 2, width)], width),
+        format_box("options", format_list_rows(GENERAL_OPTIONS, 4, width), width),
+        format_box("subcommands", ["(required)", *format_list_rows(commands, 2, width)], width),
     )
     usage = f"usage: gscompleter [-h] [--version] {{{','.join(names)}}}"
     return "\n".join([usage, "", DESCRIPTION, "", *boxes, ""])
 
 
-def read_summary(name: str) -> str:
+def read_command_sentence(name: str) -> str:
     """Read the first paragraph of the docstring of a command's options from its file."""
     text = (COMMANDS_FOLDER / f"{name}.py").read_text(encoding="utf-8")
     start = text.index(f"class {name.capitalize()}Options(")
@@ -44,7 +47,7 @@ def read_summary(name: str) -> str:
     return " ".join(docstring.split("\n\n")[0].split())
 
 
-def format_rows(texts: dict[str, str], gap: int, width: int) -> Iterable[str]:
+def format_list_rows(texts: dict[str, str], gap: int, width: int) -> Iterable[str]:
     """Format lines of a box: each name, and its text beside it."""
     indent = max(map(len, texts)) + gap
     for name, text in texts.items():

@@ -43,7 +43,7 @@ def move_to_file(values: Tensor, beside: Path) -> Tensor:
     return _map_blocks([values], tuple(values.shape), values.dtype, beside)
 
 
-def move_beside(values: np.ndarray, mapped: Tensor) -> np.ndarray:
+def file_array_beside(values: np.ndarray, mapped: Tensor) -> np.ndarray:
     """Copy values to a temporary file beside that of others, and return them mapped from there.
 
     Values that are mapped already stay where they are. Raises OutputError as `move_to_file`.
