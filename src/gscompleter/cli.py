@@ -14,11 +14,8 @@ from types import ModuleType
 from typing import Any
 
 from gscompleter import __version__
+from gscompleter.apps.command_line.command_list import HELP, HELP_ALL, format_command_list
 from gscompleter.apps.command_line.exit_codes import ERROR, INTERRUPTED, WRONG_INPUT
-from gscompleter.apps.command_line.failures import explain_failure
-from gscompleter.apps.command_line.words import format_error, parse_words
-from gscompleter.apps.commands.shared_options import ComputeOptions, Options
-from gscompleter.config.settings import validate
 from gscompleter.system.errors import (
     FullDiskError,
     InputError,
@@ -124,6 +121,17 @@ def main() -> None:
         print(__version__)
         return
     handle_stop_signals()
+    if words and words[0] in (*HELP, HELP_ALL):
+        sys.stdout.write(format_command_list(COMMANDS))
+        return
+
+    # Imported here, since tyro and the classes of options and settings take most of the time of a
+    # help page, and the page of all commands does without them.
+    from gscompleter.apps.command_line.failures import explain_failure
+    from gscompleter.apps.command_line.words import format_error
+    from gscompleter.apps.commands.shared_options import ComputeOptions, Options
+    from gscompleter.config.settings import validate
+
     skip_last_collection()
     # Damaged photographs are read or refused with a sentence; Pillow's warnings add nothing.
     warnings.filterwarnings("ignore", module="PIL")
@@ -176,6 +184,8 @@ def check_working_folder() -> None:
 
 def parse_command(words: Sequence[str]) -> Any:
     """Parse the words into the options of their command; raise the errors of `parse_words`."""
+    from gscompleter.apps.command_line.words import parse_words
+
     return parse_words(words, OptionClasses())
 
 

@@ -8,6 +8,7 @@ import torch
 
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.cpu import CpuRenderer
+from gscompleter.system.files.mapping import is_mapped, move_to_file
 from gscompleter.types import merge
 from render_scenes import CAMERA, SCENES
 from scenes import Room, camera_at, gaussians_of, view_of
@@ -50,6 +51,28 @@ def test_a_recoloured_scene_is_painted_over(frozen_scenes, is_longer):
         assert torch.equal(getattr(ours.render, name), getattr(truth.render, name)), name
     image = truth.render.image
     assert torch.equal(ours.backproject(image), truth.backproject(image))
+
+
+@pytest.mark.linux
+def test_views_of_a_scene_in_a_file_lie_in_files_too(tmp_path):
+    """They are painted over, extended and hidden as those in memory."""
+    scene = replace(SCENE, sh=move_to_file(SCENE.sh, tmp_path))
+    sh = SCENE.sh.clone()
+    sh[::3] = sh[::3].flip(0)
+    recolored = replace(scene, sh=move_to_file(sh, tmp_path))
+    hidden = recolored.hide(torch.arange(len(SCENE)) % 5 == 0)
+    scenes = SceneRenderer(CpuRenderer())
+    for parts in [(scene,), (recolored,), (recolored, ADDED), (hidden, ADDED)]:
+        (ours,) = scenes.freeze_at(parts, [CAMERA])
+        for array in (ours.layer.splats, ours.layer.entries, ours.rows):
+            assert is_mapped(array.base), len(parts)
+        truth = SceneRenderer(CpuRenderer()).freeze(parts, CAMERA)
+        image = truth.render.image
+        assert torch.equal(ours.render.image, image)
+        assert torch.equal(ours.backproject(image), truth.backproject(image))
+        values = torch.rand(sum(map(len, parts)), generator=torch.Generator().manual_seed(0))
+        assert torch.equal(ours.splat(values), truth.splat(values))
+        assert scenes.freeze_at(parts, [CAMERA])[0] is ours
 
 
 @pytest.mark.parametrize(

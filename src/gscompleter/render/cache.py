@@ -9,9 +9,9 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, thin_gaussians
-from gscompleter.render.protocols import FrozenScene, HidingScene, Renderer
+from gscompleter.render.protocols import FilingScene, FrozenScene, HidingScene, Renderer
 from gscompleter.render.view_map import get_view_map
-from gscompleter.system.files.mapping import find_changed_rows
+from gscompleter.system.files.mapping import find_changed_rows, is_mapped
 from gscompleter.types import Camera, Gaussians
 
 Parts = tuple[Gaussians, ...]
@@ -46,7 +46,11 @@ class SceneRenderer:
             # and not twice until all are done. No thread waits for another: a view that is not
             # there is frozen anew, with the same result.
             key = make_camera_key(camera)
-            frozen = self._update(parts, camera, *self._views.pop(key, ((), None)))
+            known, before = self._views.pop(key, ((), None))
+            frozen = self._update(parts, camera, known, before)
+            # Of a scene whose harmonics lie in a file, frozen views would be most of the memory.
+            if frozen is not before and is_mapped(parts[0].sh) and isinstance(frozen, FilingScene):
+                frozen = frozen.move_beside(parts[0].sh)
             self._views[key] = (parts, frozen)
             return frozen
 

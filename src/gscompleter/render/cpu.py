@@ -30,6 +30,7 @@ from gscompleter.render.viewpoint import (
     to_float32,
 )
 from gscompleter.system.errors import InputError
+from gscompleter.system.files.mapping import file_array_beside, release_pages
 from gscompleter.types import Camera, Gaussians, Render
 
 FROZEN_BLOCK = 4_000_000
@@ -83,6 +84,16 @@ class CpuFrozenScene:
         """The render of the context alone."""
         return to_render(self.frame)
 
+    def move_beside(self, mapped: Tensor) -> CpuFrozenScene:
+        """Move the lists to files, beside the file in which `mapped` lies."""
+        layer = Layer(*[file_array_beside(array, mapped) for array in self.layer])
+        return replace(self, layer=layer, rows=file_array_beside(self.rows, mapped))
+
+    def release(self) -> None:
+        """Release the memory of lists that lie in files, after all of them were read."""
+        for array in (*self.layer, self.rows):
+            release_pages(array)
+
     def extend(self, new: Gaussians) -> CpuFrozenScene:
         """Freeze context and `new` together, in that order, some at a time to save memory."""
         frozen = self
@@ -126,6 +137,7 @@ class CpuFrozenScene:
         layer, (context_rows, new_rows) = join_layers(self.layer, added, tile_start, entries)
         rows = np.concatenate([self.rows[context_rows], order[new_rows] + np.int32(self.count)])
         frame = frame._replace(used=used)
+        self.release()
         # They may be limits of `freeze_occluders`. Those of what is shown never grow.
         np.minimum(depth_limits, self.depth_limits, out=depth_limits)
         return CpuFrozenScene(self.viewpoint, layer, frame, depth_limits, rows, count)
@@ -193,6 +205,7 @@ class CpuFrozenScene:
             *[join(name, is_drawn if name in of_tiles else pixels) for name in RasterFrame._fields]
         )
         depth_limits = np.where(is_drawn, drawn.depth_limits, self.depth_limits)
+        self.release()
         return CpuFrozenScene(self.viewpoint, layer, frame, depth_limits, rows, self.count)
 
     def repaint(self, rows: Int64[Tensor, "m"], painted: Gaussians) -> CpuFrozenScene:
@@ -210,6 +223,7 @@ class CpuFrozenScene:
         frame, _ = freeze_nothing(self.viewpoint).composite_layer(layer)
         # The layer was composited as a new one, whose entries the second column counts.
         frame = frame._replace(used=np.ascontiguousarray(frame.used[:, ::-1]))
+        self.release()
         return replace(self, layer=layer, frame=frame)
 
     def backproject(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
@@ -226,6 +240,7 @@ class CpuFrozenScene:
 
         totals = np.zeros((self.count, 3), np.float32)
         totals[self.rows] = self.viewpoint.sum_by_gaussian(itself, gradients)
+        self.release()
         return torch.from_numpy(totals)
 
     def splat(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
@@ -235,6 +250,7 @@ class CpuFrozenScene:
         splats[:, project.RED] = np.maximum(to_float32(values)[self.rows], 0)
         nothing = freeze_nothing(self.viewpoint)
         _, render = nothing.composite_layer(self.layer._replace(splats=splats))
+        self.release()
         return render.image[..., 0].clone()
 
     def composite(self, new: Gaussians) -> Render:

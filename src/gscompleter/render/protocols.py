@@ -91,6 +91,14 @@ class HidingScene(Protocol):
 
 
 @runtime_checkable
+class FilingScene(Protocol):
+    """A frozen scene of which memory holds no more than what is read at the moment."""
+
+    def move_beside(self, mapped: Tensor) -> FrozenScene:
+        """Move what was frozen to files, beside the file in which `mapped` lies."""
+
+
+@runtime_checkable
 class Renderer(Protocol):
     """Renders Gaussians; differentiable in means, quats, scales, opacities and sh."""
 

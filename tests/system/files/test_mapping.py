@@ -10,6 +10,7 @@ from full_disk import limit_file_size
 from gscompleter.system.errors import FullDiskError
 from gscompleter.system.files.mapping import (
     change_rows,
+    file_array_beside,
     find_changed_rows,
     is_mapped,
     join_rows,
@@ -88,6 +89,17 @@ def test_rows_are_joined_to_those_of_a_file_in_a_file(tmp_path):
         assert read_resident(each) < 0.1 * values.nbytes
     assert torch.equal(joined, torch.cat([values[:3], values, values[5:9]]))
     assert not is_mapped(join_rows([values, values[:3]]))
+
+
+def test_arrays_move_beside_values_of_a_file_once(tmp_path):
+    mapped = move_to_file(make_values(), tmp_path)
+    array = make_values().numpy()
+    moved = file_array_beside(array, mapped)
+    assert (moved == array).all()
+    release_pages(moved)
+    assert read_resident(torch.from_numpy(moved)) < 0.1 * array.nbytes
+    assert (moved == array).all()
+    assert file_array_beside(moved, mapped) is moved
 
 
 def test_numbers_in_memory_stay():

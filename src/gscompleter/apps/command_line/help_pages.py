@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, make_dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, fields, replace
 from types import UnionType
 from typing import Annotated, Any, ClassVar, Union, get_args, get_origin
 
@@ -19,11 +19,9 @@ from tyro.constructors import (
 )
 
 from gscompleter.apps.command_line.chosen_config import ChosenConfig
+from gscompleter.apps.command_line.command_list import HELP_ALL
 from gscompleter.apps.command_line.field_texts import find_field_text
 from gscompleter.config.settings import Settings
-
-HELP = ("-h", "--help")
-HELP_ALL = "--help-all"
 
 CONFIG = StructFieldSpec(
     "config",
@@ -32,8 +30,6 @@ CONFIG = StructFieldSpec(
     "Settings of the method: default, paper, an ablation such as no-sa, or a YAML file. Single "
     f"settings are changed by options such as --config.holes.dilation 5; {HELP_ALL} lists them.",
 )
-
-DESCRIPTION = "Complete 3D Gaussian Splatting scenes: generate, then register."
 
 Rule = Callable[[StructTypeInfo], StructConstructorSpec | None]
 
@@ -173,18 +169,3 @@ def describe_command(kind: type) -> str:
     """Return the description of a command: the paragraphs of its docstring, one a line."""
     paragraphs = inspect.cleandoc(kind.__doc__ or "").split("\n\n")
     return "\n\n".join(" ".join(paragraph.split()) for paragraph in paragraphs)
-
-
-def make_program(kinds: Mapping[str, type]) -> type:
-    """Make the class of the page of all commands, from the class of each one's options."""
-    # A line for each: the further paragraphs are on the page of the command itself.
-    named = [
-        Annotated[
-            kind,
-            tyro.conf.subcommand(name, description=describe_command(kind).split("\n\n")[0]),
-        ]
-        for name, kind in kinds.items()
-    ]
-    of_any: Any = Union[tuple(named)]  # noqa: UP007  (of as many as there are)
-    version = Annotated[bool, tyro.conf.arg(help="Print the version.", help_behavior_hint="")]
-    return make_dataclass("Program", [("command", of_any), ("version", version, False)])

@@ -19,15 +19,8 @@ from gscompleter.apps.command_line.chosen_config import (
     make_parsing_rule,
     make_showing_rule,
 )
-from gscompleter.apps.command_line.help_pages import (
-    DESCRIPTION,
-    HELP,
-    HELP_ALL,
-    Rule,
-    describe_command,
-    make_help_rule,
-    make_program,
-)
+from gscompleter.apps.command_line.command_list import HELP, HELP_ALL
+from gscompleter.apps.command_line.help_pages import Rule, describe_command, make_help_rule
 from gscompleter.apps.command_line.old_spellings import refuse_old_spellings
 from gscompleter.apps.requests.completion import DEFAULT_NUM_TARGETS
 from gscompleter.config import CompleterConfig, load_config
@@ -64,11 +57,9 @@ def parse_words(words: Sequence[str], kinds: Mapping[str, type]) -> Any:
     It raises InputError for wrong words, and SystemExit after printing the help.
     """
     refuse_old_spellings(words)
-    if words and words[0] not in kinds and words[0] not in (*HELP, HELP_ALL):
-        raise InputError(
-            f"There is no command {quote_value(words[0])}; choose one of {', '.join(kinds)} "
-            "(see gscompleter --help)."
-        )
+    if not words or words[0] not in kinds:
+        wrong = f"There is no command {quote_value(words[0])}" if words else "No command is named"
+        raise InputError(f"{wrong}; choose one of {', '.join(kinds)} (see gscompleter --help).")
     refuse_empty_words(words)
     check_once(words)
 
@@ -107,10 +98,6 @@ def parse_known_words(words: Sequence[str], kinds: Mapping[str, type], knows_set
     registry = ConstructorRegistry()
     for rule in rules:
         registry.struct_rule(rule)
-    # tyro prepares all options of what it is given. For 18 commands that takes 0.1 s longer than
-    # for one, which is 2 % of a completion.
-    if not words or words[0] not in kinds:
-        return call_tyro(make_program(kinds), "gscompleter", DESCRIPTION, words, registry, ())
     about = describe_command(kinds[words[0]])
     prog = f"gscompleter {words[0]}"
     parsed = call_tyro(kinds[words[0]], prog, about, words[1:], registry, marks)
@@ -147,11 +134,8 @@ def call_tyro(
 
 def explain_words(words: Sequence[str], kinds: Mapping[str, type], box: str) -> str:
     """Explain wrong words by tyro's message; `kinds` has the option class of each command."""
-    kind = kinds.get(words[0]) if words else None
-    if kind is None:
-        return extract_sentence(box, ())
     # tyro only says that an option is unknown; that it belongs to another command says more.
-    own = list_options(kind)
+    own = list_options(kinds[words[0]])
     sentence = describe_foreign_option(words, own, kinds) or extract_sentence(box, own)
     # Of words that are no options, tyro says so as well.
     surplus = sentence.removeprefix(SURPLUS)

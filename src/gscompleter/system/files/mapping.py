@@ -43,6 +43,18 @@ def move_to_file(values: Tensor, beside: Path) -> Tensor:
     return _map_blocks([values], tuple(values.shape), values.dtype, beside)
 
 
+def file_array_beside(values: np.ndarray, mapped: Tensor) -> np.ndarray:
+    """Copy values to a temporary file beside that of others, and return them mapped from there.
+
+    Values that are mapped already stay where they are. Raises OutputError as `move_to_file`.
+    """
+    owner = _find_owner(values)
+    if isinstance(owner, Tensor) and is_mapped(owner):
+        return values
+    filed: np.ndarray = move_to_file(torch.from_numpy(values), _find_folder(mapped)).numpy()
+    return filed
+
+
 def change_rows(values: Tensor, rows: Int64[Tensor, "m"], changed: Tensor) -> Tensor:
     """Return values with other rows; of a mapped file, in another file beside the same folder.
 
@@ -152,11 +164,7 @@ def release_pages(rows: np.ndarray | Tensor) -> None:
         if not is_mapped(rows):
             return
         rows = rows.detach().numpy()
-    owner: Any = rows
-    while isinstance(owner, np.ndarray) and owner.base is not None:
-        owner = owner.base
-    if isinstance(owner, memoryview):
-        owner = owner.obj
+    owner = _find_owner(rows)
     if not hasattr(mmap, "MADV_DONTNEED") or rows.size == 0:
         return
     # The advice is about whole pages, of which the first and the last one have other rows, too.
@@ -169,3 +177,11 @@ def release_pages(rows: np.ndarray | Tensor) -> None:
         begin = rows.ctypes.data - rows.ctypes.data % mmap.PAGESIZE
         size = rows.ctypes.data + rows.nbytes - begin
         ctypes.CDLL(None).madvise(ctypes.c_void_p(begin), ctypes.c_size_t(size), mmap.MADV_DONTNEED)
+
+
+def _find_owner(values: np.ndarray) -> Any:
+    """Find the object that holds the memory of an array: a file that is mapped, tensor or array."""
+    owner: Any = values
+    while isinstance(owner, np.ndarray) and owner.base is not None:
+        owner = owner.base
+    return owner.obj if isinstance(owner, memoryview) else owner
