@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import shlex
 from collections.abc import Iterator, Mapping
-from functools import cache
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
@@ -74,7 +73,7 @@ def row_to_words(row: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
 
 def option_to_words(name: str, value: Any) -> list[str]:
     """Convert an option to words; a text is split like a shell if it can have several values."""
-    kind = find_kinds().get(name)
+    kind = list_options(CompleteOptions).get(name)
     if kind is bool:
         if str(value).lower() not in TRUE + FALSE:
             raise InputError(f"{name} is {quote_value(str(value))}; it must be true or false.")
@@ -101,12 +100,6 @@ def option_to_words(name: str, value: Any) -> list[str]:
         if re.match(r"-(?![\d.])", word):
             raise InputError(f"{name} cannot be '{quote_value(word)}', which begins with a dash.")
     return [f"--{name}", *words]
-
-
-@cache
-def find_kinds() -> Mapping[str, Any]:
-    """Find the type of each option of `complete`; of a large manifest each row asks for some."""
-    return list_options(CompleteOptions)
 
 
 def has_tuple(kind: Any) -> bool:
