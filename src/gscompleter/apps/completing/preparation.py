@@ -225,9 +225,14 @@ def read_inputs(
     with compile_beside(list_parts(work)):
         with show_preparation("reading photographs"):
             has_splat = splat is not None
-            task = read_task(opened, photographs.context, targets.named, device, has_splat)
+            is_free = splat is None and not follows_paper(work)
+            # Networks were trained with few photographs.
+            is_fitted = is_free and work.models.reconstructor == "plane-sweep"
+            task = read_task(
+                opened, photographs.context, targets.named, device, has_splat, is_fitted
+            )
             task = add_paintings(task, targets, opened)
-            if splat is None and photographs.context is None and not follows_paper(work):
+            if is_free and photographs.context is None:
                 task = add_fit_views(task, opened)
         if splat is not None:
             with show_preparation("reading the scene"):

@@ -41,17 +41,21 @@ def read_task(
     target_words: Sequence[str],
     device: str,
     has_splat: bool,
+    is_fitted: bool,
 ) -> CompletionTask:
     """Read the context and the targets, after checking the memory.
 
-    A context that is not named is chosen. `has_splat` is True if an input splat is completed.
+    A context that is not named is chosen. `has_splat` is True if an input splat is completed, and
+    `is_fitted` if Ψ makes the scene and fits it to all photographs of the context together.
     """
     photographs = opened.photographs
     resolution = opened.request.resolution
     targets = read_targets(photographs, target_words, resolution, has_splat)
     frames = find_context(photographs, context)
     if not frames:
-        frames = choose_context(photographs, targets, resolution, has_splat, opened.held_out)
+        frames = choose_context(
+            photographs, targets, resolution, has_splat, opened.held_out, is_fitted
+        )
 
     # Cameras are enough to estimate the memory, before any photograph is loaded.
     cameras = [photographs.camera(frame, resolution) for frame in frames]

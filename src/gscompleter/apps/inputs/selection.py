@@ -22,8 +22,13 @@ from gscompleter.types import Camera
 NUM_CONTEXT = 3
 """Number of context photographs if targets but no context are named (decision 030)."""
 NUM_CONTEXT_WITH_SPLAT = 8
-"""Number of context photographs with an input splat. It is also the number without one if no
-targets are named either, so that the photographs have to show the whole scene (decision 030)."""
+"""Number of context photographs with an input splat. It is also the smallest number without one if
+no targets are named either, so that the photographs have to show the whole scene (decision 030)."""
+MAX_FITTED_CONTEXT = 16
+"""Most photographs of a context that has to show the whole scene and is fitted jointly (decision
+140)."""
+MAX_FITTED_PIXELS = MAX_FITTED_CONTEXT * 640 * 480
+"""Most pixels of more photographs than `NUM_CONTEXT_WITH_SPLAT`, which bound its time and memory."""
 NUM_DEPTH_VIEWS = 6
 """Number of photographs from which a depth range is estimated."""
 CHECK_VIEW_SIZE = 320
@@ -47,9 +52,11 @@ def choose_context(
     resolution: Resolution,
     has_splat: bool,
     held_out: Sequence[int] = (),
+    is_fitted: bool = False,
 ) -> tuple[int, ...]:
     """Choose context frames for the targets, or for the whole scene without any.
 
+    `is_fitted` is True if Ψ makes the scene of them and fits it to all of them together.
     Targets and `held_out` are never chosen, because their photographs score the result, and neither
     are photographs of which a mask hides everything.
     """
@@ -58,7 +65,7 @@ def choose_context(
 
     # Only chosen photographs are asked for their masks, since each has to be read for it.
     while True:
-        chosen = _choose_frames(photographs, targets, others, resolution, has_splat)
+        chosen = _choose_frames(photographs, targets, others, resolution, has_splat, is_fitted)
         hidden = {frame for frame in chosen if photographs.is_hidden(frame)}
         if not hidden:
             return chosen
@@ -71,6 +78,7 @@ def _choose_frames(
     others: Sequence[int],
     resolution: Resolution,
     has_splat: bool,
+    is_fitted: bool,
 ) -> tuple[int, ...]:
     """Choose context frames among `others`, hidden by a mask or not."""
     cameras = collect_usable_cameras(photographs, others, resolution)
@@ -92,12 +100,23 @@ def _choose_frames(
     # Without targets, medoids of all photographs with a partner each; with targets, photographs
     # that show what the targets see (decision 030).
     if not targets:
-        chosen = select_overview(candidates, points, NUM_CONTEXT_WITH_SPLAT)
+        count = count_overview(candidates) if is_fitted else NUM_CONTEXT_WITH_SPLAT
+        chosen = select_overview(candidates, points, count)
     else:
         count = NUM_CONTEXT_WITH_SPLAT if has_splat else NUM_CONTEXT
         chosen = select_context(target_cameras, candidates, points, count)
     frames = list(cameras)
     return tuple(frames[index] for index in chosen)
+
+
+def count_overview(cameras: Sequence[Camera]) -> int:
+    """Compute how many of the photographs at `cameras` are the context of a fitted scene.
+
+    Half of them at most: to some of the others it is fitted, too, and the rest scores it.
+    """
+    pixels = max(camera.width * camera.height for camera in cameras)
+    most = min(MAX_FITTED_CONTEXT, len(cameras) // 2, MAX_FITTED_PIXELS // pixels)
+    return max(most, NUM_CONTEXT_WITH_SPLAT)
 
 
 def collect_usable_cameras(
