@@ -1,6 +1,7 @@
 """A context that the command chooses is fitted to further photographs, and half of the rest."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ from command import run
 from exact_room import make_cameras, write_transforms
 from gscompleter import GSCompleter, InputError
 from gscompleter.apps.inputs.reading import MAX_FIT_VIEWS, add_fit_views, read_task
+from gscompleter.apps.inputs.selection import count_overview
 from gscompleter.apps.inputs.task import Opened
 from gscompleter.apps.requests.scene import SceneRequest
 from gscompleter.data.formats import open_photographs
@@ -28,7 +30,7 @@ def open_room(folder: Path, count: int, **changes) -> Opened:
 
 def add_to(opened: Opened, context: tuple[str, ...]) -> list[int | None]:
     """Add photographs to a context; return their frames."""
-    task = read_task(opened, context, (), "cpu", has_splat=False)
+    task = read_task(opened, context, (), "cpu", False, is_fitted=True)
     return [view.frame for view in add_fit_views(task, opened).check_views or ()]
 
 
@@ -72,6 +74,32 @@ def open_again(opened: Opened) -> Opened:
     """Open the same folder again, without what was read of it."""
     folder = opened.request.folder
     return Opened(opened.request, open_photographs(folder), "nerfstudio", opened.num_photographs)
+
+
+def count_context(opened: Opened, is_fitted: bool) -> int:
+    """Count the photographs of the context that is chosen for the whole scene."""
+    return len(read_task(opened, None, (), "cpu", False, is_fitted).views)
+
+
+def test_half_of_the_photographs_are_the_context_of_a_fitted_scene(tmp_path):
+    few = open_room(tmp_path / "few", 9)
+    more = open_room(tmp_path / "more", 24)
+    many = open_room(tmp_path / "many", 40)
+    assert count_context(few, is_fitted=True) == 8
+    assert count_context(more, is_fitted=True) == 12
+    assert count_context(many, is_fitted=True) == 16
+    # A network was trained with few.
+    assert count_context(many, is_fitted=False) == 8
+
+
+def test_large_photographs_are_no_more_than_before():
+    def choose(width: int, height: int) -> int:
+        camera = replace(camera_at(0.0), width=width, height=height)
+        return count_overview([camera] * 100)
+
+    assert choose(640, 480) == 16
+    assert choose(800, 600) == 10
+    assert choose(1920, 1080) == 8
 
 
 @pytest.mark.slow

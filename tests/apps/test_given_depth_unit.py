@@ -91,7 +91,7 @@ def test_a_photograph_that_scores_the_result_tells_no_unit(tmp_path, held_out):
     photographs = open_photographs(scene)
     opened = Opened(SceneRequest(scene), photographs, "nerfstudio", len(photographs), held_out)
     targets = () if held_out else ("1",)
-    (note,) = read_task(opened, (0,), targets, "cpu", has_splat=True).depth_notes
+    (note,) = read_task(opened, (0,), targets, "cpu", True, False).depth_notes
     assert "2.5 times" in note
 
 

@@ -28,7 +28,7 @@ MAX_FITTED_CONTEXT = 16
 """Most photographs of a context that has to show the whole scene and is fitted jointly (decision
 140)."""
 MAX_FITTED_PIXELS = MAX_FITTED_CONTEXT * 640 * 480
-"""Most pixels of more photographs than `NUM_CONTEXT_WITH_SPLAT`, which bound its time and memory."""
+"""Most pixels of such a context, for its time and memory; of large photographs there are fewer."""
 NUM_DEPTH_VIEWS = 6
 """Number of photographs from which a depth range is estimated."""
 CHECK_VIEW_SIZE = 320
