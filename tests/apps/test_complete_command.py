@@ -119,7 +119,7 @@ def opened_with(scene: Path, *words: object) -> CompletionTask:
     request = decide_completion(options)
     opened = Opened(request.source.scene, photographs, "nerfstudio", 5)
     named = request.targets.named
-    return read_task(opened, request.source.context, named, "cpu", has_splat=False)
+    return read_task(opened, request.source.context, named, "cpu", False, False)
 
 
 def test_a_context_that_is_named_is_the_one_that_is_taken(scene):
