@@ -85,8 +85,12 @@ def fit_jointly(
     The images are linear in the colours, so that these are then fitted alone, by direction, to all
     views at once and without gradients. `check_views`, in the exposure of the scene, are
     photographs that no Gaussian comes from: what looks right to `views` alone is wrong there.
+
+    Each step is drawn before a backdrop of a random colour, so that surfaces become opaque. Before
+    black, one that lets 5 % through only gets brighter, and what is added behind it shines through.
     """
     order = shuffle_views(len(views), len(check_views))
+    backdrops = torch.rand(len(order), 3, generator=torch.Generator().manual_seed(0))
     views = [*views, *check_views]
     gains = torch.cat([gains, torch.ones(len(check_views), 3)])
     unknown = init_parameters(gaussians)
@@ -94,7 +98,10 @@ def fit_jointly(
     for step, number in enumerate(order):
         view = views[number]
         fitted = apply_parameters(gaussians, unknown)
-        image = renderer.render(fitted, view.camera).image
+        render = renderer.render(fitted, view.camera)
+        # In ignored pixels the scene is wanted as it was, which may be open there.
+        is_open = (1 - render.alpha) * view.valid_mask
+        image = render.image + is_open[..., None] * backdrops[step]
         rate_factor = 1 - (1 - FINAL_RATE) * step / len(order)
         optimizer.step((gains[number] * image - view.image).square().mean(), rate_factor)
         with torch.no_grad():
