@@ -27,6 +27,8 @@ MAX_TARGET_ID = NOT_INVENTED - 1
 PartKind = Literal["photographs", "target", "gap", "piece"]
 """Origin of additions: what photographs show and a scene lacked; what was invented for a target;
 what closes thin gaps beside a target; a piece of a Gaussian that a removal cut."""
+INVENTED_KINDS: tuple[PartKind, ...] = ("target", "gap")
+"""Kinds that no photograph and no given scene shows."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class PartOrigin:
     @property
     def is_invented(self) -> bool:
         """True if no photograph and no given scene shows them."""
-        return self.kind in ("target", "gap")
+        return self.kind in INVENTED_KINDS
 
     @property
     def label(self) -> int:

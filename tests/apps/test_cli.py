@@ -24,7 +24,7 @@ import torch
 from command import run
 from gscompleter import load_ply
 from gscompleter.cli import COMMANDS, OptionClasses, parse_command
-from gscompleter.config import CompleterConfig
+from gscompleter.config import CompleterConfig, load_config
 from gscompleter.config.generators import GeneratorSettings
 from gscompleter.data.scene import write_cameras
 from gscompleter.models.settings import DiffusersInpaintSettings, PEFieldSettings
@@ -362,10 +362,29 @@ def test_what_is_no_command_gets_a_sentence_too(monkeypatch, capsys, words):
             ("complete", "a", "--out", "b", "--wrokers", "3"),  # of batch
             "Unrecognized options: --wrokers, 3 (see gscompleter complete --help).",
         ),
+        (
+            ("inspect", "a", "--config", "bare"),
+            "inspect has no option --config, which belongs to complete, live, update and 2 more",
+        ),
+        (("complete", "a", "--out", "b", "--confg", "bare"), "; the nearest is --config STR"),
     ],
 )
 def test_an_option_of_another_command_is_told_as_such(monkeypatch, capsys, words, sentence):
     assert run(monkeypatch, *words) == 2
+    assert sentence in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("number", "sentence"),
+    [
+        ("-3", "auto must be greater than or equal to 1, got -3 (--auto)."),
+        ("2.5", "could be instantiated from ['2.5']; give --auto INT"),
+    ],
+)
+def test_a_wrong_number_of_targets_is_told_as_that_of_its_option(
+    monkeypatch, capsys, number, sentence
+):
+    assert run(monkeypatch, "complete", "a", "--auto", number, "--out", "b") == 2
     assert sentence in capsys.readouterr().err
 
 
@@ -475,6 +494,33 @@ def test_help_all_knows_every_setting(monkeypatch, capsys):
         assert all(f"--generator-{f.name.replace('_', '-')}" in said for f in fields(kind))
     assert "--config.alignment.min-agreement" in said
     assert "Further seeds to try if" in said
+
+
+@pytest.mark.parametrize(
+    ("command", "adapt"),
+    [
+        ("update", lambda config: config),
+        ("remove", CompleterConfig.for_removal),
+        ("repair", CompleterConfig.for_marks),
+    ],
+)
+def test_help_of_a_command_for_splats_shows_the_settings_that_it_has(
+    monkeypatch, capsys, command, adapt
+):
+    monkeypatch.setenv("COLUMNS", "100")
+    assert run(monkeypatch, command, "--help-all") == 0
+    said = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    config = adapt(load_config("default", is_splat=True))
+    for name, value in (
+        ("trust", config.trust),
+        ("guards", " ".join(config.guards)),
+        ("holes.max-alpha", config.holes.max_alpha),
+    ):
+        text = said.partition(f"--config.{name} ")[2].partition(" --config.")[0]
+        assert f"(default: {value})" in text
+    # Of what is off by default, pages say nothing.
+    text = said.partition("--config.holes.forces-removed ")[2].partition(" --config.")[0]
+    assert ("(default: True)" in text) == config.holes.forces_removed
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")

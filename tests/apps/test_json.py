@@ -91,6 +91,7 @@ def test_files_of_a_completion_answer(completed_room, tmp_path, answer, monkeypa
         "generated_removed": count,
         # The scene was reconstructed, so that no file was given.
         "is_same_file": False,
+        "missing": 0,
     }
     assert hash_file(given) == hash_file(out / "context.ply")
     page = tmp_path / "page.html"

@@ -13,11 +13,12 @@ from gscompleter import load_ply, save_ply
 from gscompleter.apps.inputs import refined_poses
 from gscompleter.apps.inputs.reading import read_photographs
 from gscompleter.apps.inputs.splat import locate_splat, move_to_splat
-from gscompleter.apps.inputs.task import Opened
+from gscompleter.apps.inputs.task import InputSplatFile, Opened
 from gscompleter.apps.requests.scene import SceneRequest
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
-from scenes import Room, gaussians_of, photographed, view_of
+from gscompleter.splats.edits import EditDraft, Edits, record_edit
+from scenes import Room, gaussians_of, photographed, random_gaussians, view_of
 from shaken_room import CAMERAS, CONTEXT, DONE, SHAKEN, correct, write_shaken
 
 
@@ -79,6 +80,14 @@ def test_without_colmap_a_line_says_what_would_help(scene, tmp_path, monkeypatch
     monkeypatch.setattr(refined_poses, "has_pycolmap", lambda: False)
     complete(monkeypatch, scene, tmp_path / "out", "--dry-run")
     assert "pip install 'gscompleter[poses]' refines them" in capsys.readouterr().err
+
+
+def test_poses_that_cannot_be_refined_are_told(scene, tmp_path, monkeypatch, capsys):
+    pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
+    monkeypatch.setattr(refined_poses, "refine_poses", lambda given: (given, None))
+    complete(monkeypatch, scene, tmp_path / "out", "--dry-run")
+    said = capsys.readouterr().err.replace("\n", " ")
+    assert "Given poses are kept, though matches contradict them by" in said
 
 
 @pytest.mark.slow
@@ -145,6 +154,24 @@ def test_poses_that_a_given_splat_contradicts_are_kept(scene, splat, monkeypatch
     assert not done.is_accepted
     assert "Given poses are kept, though they miss matches by 0.40 px" in done.describe()
     assert refined_poses.ask_splat(photographs, refined, task, DONE).is_accepted
+
+
+def test_a_splat_is_asked_with_what_was_taken_out_of_it(scene, tmp_path, monkeypatch):
+    given, taken_out = random_gaussians(20), random_gaussians(7, seed=1)
+    save_ply(tmp_path / "given.ply", given)
+    save_ply(tmp_path / "completed.ply", given)
+    record_edit(
+        *(tmp_path, EditDraft("remove"), 27, [], tmp_path / "given.ply", Edits(tmp_path), None),
+        taken_out,
+    )
+    photographs = open_photographs(scene)
+    opened = Opened(SceneRequest(scene), photographs, "nerfstudio", len(photographs))
+    splat_file = InputSplatFile(tmp_path / "completed.ply")
+    task = replace(read_photographs(opened, CONTEXT, "cpu"), scene=given, splat_file=splat_file)
+    asked = []
+    monkeypatch.setattr(refined_poses, "compare_poses", lambda splat, *_: asked.append(len(splat)))
+    refined_poses.ask_splat(photographs, photographs, task, DONE)
+    assert asked == [len(given) + len(taken_out)]
 
 
 def test_a_cleaning_compares_at_refined_poses_and_the_next_command_takes_them(

@@ -4,12 +4,18 @@ import json
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from command import run
 from gscompleter import load_ply, save_ply
+from gscompleter.apps.completing.update import hold_out
+from gscompleter.apps.inputs.task import Opened
+from gscompleter.apps.requests.scene import SceneRequest
+from gscompleter.data.formats import open_photographs
 from gscompleter.evaluation.verdict import held_out
 from gscompleter.evaluation.verdict.held_out import render_before_after as render
 from gscompleter.parts import NOT_INVENTED
+from gscompleter.system.errors import InputError
 from gscompleter.system.files.image import write_image
 from gscompleter.types import merge
 from scenes import Room, camera_at, gaussians_of, photographed, room_without_a_box, view_of
@@ -133,6 +139,32 @@ def test_wrong_options_are_refused_in_a_sentence(
     assert run(monkeypatch, "update", room, "--scene", cut, "--out", out, *more) == 2
     assert sentence in capsys.readouterr().err
     assert not out.exists()
+
+
+def open_room(folder: Path) -> Opened:
+    photographs = open_photographs(folder)
+    return Opened(SceneRequest(folder, resolution=64), photographs, "nerfstudio", len(photographs))
+
+
+def test_a_photograph_that_a_mask_hides_wholly_is_not_kept_back(tmp_path):
+    folder = photographed(tmp_path / "masked", CAMERAS)
+    assert hold_out(open_room(folder), 2, None, ()).held_out == (2, 6)
+    (folder / "masks").mkdir()
+    for name in ("2.png", "4.png"):
+        Image.new("L", (SIZE, SIZE)).save(folder / "masks" / name)
+    held = hold_out(open_room(folder), 2, None, ()).held_out
+    assert len(held) == 2
+    assert not {2, 4} & set(held)
+    with pytest.raises(InputError, match="there are 6 to choose from, and at least 2 of 6"):
+        hold_out(open_room(folder), 6, None, ())
+
+
+def test_a_photograph_that_cannot_be_read_is_not_kept_back_in_silence(tmp_path):
+    folder = photographed(tmp_path / "damaged", CAMERAS)
+    path = folder / "2.png"
+    path.write_bytes(path.read_bytes()[:500])
+    with pytest.raises(InputError, match=r"2\.png"):
+        hold_out(open_room(folder), 2, None, ())
 
 
 def test_a_scene_without_cameras_has_no_place_for_new_photographs(

@@ -159,6 +159,47 @@ def test_a_record_that_does_not_fit_is_refused(states, tmp_path):
         record.write_text(text)
 
 
+def test_gaussians_that_labels_do_not_tell_are_counted(states, tmp_path):
+    folder = shutil.copytree(states[2].parent, tmp_path / "changed")
+    splat = folder / "completed.ply"
+    scene = load_ply(splat)
+    save_ply(splat, replace(scene, means=scene.means + 0.01), provenance=True)
+    undone = strip_edits(splat, tmp_path / "out.ply")
+    # What the first edit left out stays out.
+    assert undone.kept == len(load_ply(tmp_path / "out.ply"))
+    assert undone.missing == len(load_ply(states[0])) - undone.kept > 0
+
+
+def edit_in_another_degree(splat: Path, folder: Path) -> Path:
+    """Replace the first Gaussian of a splat by two with harmonics of degree 1."""
+    context = load_ply(splat)
+    changed = torch.arange(len(context)) == 0
+    added = random_gaussians(2, seed=1)
+    sh = torch.rand((2, 4, 3), generator=torch.Generator().manual_seed(0))
+    added = replace(added, sh=sh, generated=torch.ones_like(added.generated))
+    folder.mkdir()
+    splat_file = InputSplatFile(splat)
+    save_completed_splat(folder, context, changed, added, splat_file, None)
+    appended = [AppendedRows("target", 2)]
+    record_edit(
+        folder, EditDraft("complete"), len(context), appended, splat, splat_file.edits, None
+    )
+    return folder / "completed.ply"
+
+
+def test_the_only_edit_is_taken_off_by_its_number_as_well(tmp_path):
+    splat = tmp_path / "splat.ply"
+    save_ply(splat, random_gaussians(20))
+    completed = edit_in_another_degree(splat, tmp_path / "first")
+    for numbers in ([1], None):
+        assert strip_edits(completed, tmp_path / "out.ply", numbers).is_same_file
+        assert (tmp_path / "out.ply").read_bytes() == splat.read_bytes()
+    # Nobody who takes off all edits is told to do so.
+    again = edit_in_another_degree(completed, tmp_path / "second")
+    with pytest.raises(InputError, match="take the file that the first of them was given"):
+        strip_edits(again, tmp_path / "out.ply")
+
+
 def test_other_splats_of_the_folder_have_no_edits(states, tmp_path):
     folder = tmp_path / "out"
     shutil.copytree(states[-1].parent, folder)

@@ -19,7 +19,7 @@ class Hull(Guard):
 
     def place(self, candidates: Gaussians, view: TargetView) -> Gaussians:
         """Keep candidates that lie in the silhouettes of the scene from all sides."""
-        # Also with what was removed from it, whose place may be filled.
+        # What a removal took out of the scene still counts, so that its place may be filled.
         given = view.state.source.gaussians
         silhouettes = look_from_outside(given, view.scenes.renderer, SILHOUETTE_SIDE)
         return candidates[find_in_hull(candidates, silhouettes)]

@@ -59,20 +59,29 @@ class Undone:
     """Gaussians that the edits had added."""
     is_same_file: bool = False
     """True if the file is known to be byte for byte the one before these edits."""
+    missing: int = 0
+    """Gaussians that the splat had before all edits, and that nothing tells any more."""
 
 
 def strip_edits(path: Path, out: Path, numbers: Collection[int] | None = None) -> Undone:
     """Write a splat without some of its edits, which are numbered from 1; None for all of them.
 
-    A splat with a single edit, or whose earlier states are not known, is stripped by its labels.
+    If all edits go, a splat with at most one, or whose earlier states are not known, is stripped by
+    its labels. They do not tell what edits before the last one left out, which is then missing.
     """
     path = resolve_splat(path)
     edits = read_edits(path)
-    if numbers is None and (len(edits.edits) <= 1 or not can_undo(edits, 1)):
-        counts = strip(path, out)
-        given = edits.edits[0].given if edits else None
-        return Undone(*counts, given is not None and hash_file(out) == given)
-    return undo_edits(path, edits, numbers or range(1, len(edits.edits) + 1), out)
+    every = range(1, len(edits.edits) + 1)
+    chosen = every if numbers is None else numbers
+    is_all = numbers is None or (bool(edits) and set(numbers) == set(every))
+    if not is_all or (len(every) > 1 and can_undo(edits, 1)):
+        return undo_edits(path, edits, chosen, out)
+    kept, dropped = strip(path, out)
+    if not edits:
+        return Undone(kept, dropped)
+    first = edits.edits[0]
+    is_same = first.given is not None and hash_file(out) == first.given
+    return Undone(kept, dropped, is_same, max(first.rows - kept, 0))
 
 
 def can_undo(edits: Edits, first: int) -> bool:
@@ -130,8 +139,9 @@ def check_undone(path: Path, edits: Edits, numbers: Collection[int], out: Path) 
     first = min(numbers)
     if not can_undo(edits, first):
         raise InputError(
-            f"{quote_value(path)} was changed by another program after edit {first}, so that it "
-            "cannot be taken off alone; undo all edits at once."
+            f"{quote_value(path)} was changed by another program after edit {first}, or its "
+            "reconstruction got new colours, so that this edit cannot be taken off alone; undo all "
+            "edits at once."
         )
     if get_written_format(out) is not PLY:
         raise InputError("An earlier state is a .ply; name such a file.", "out")
@@ -272,6 +282,6 @@ def check_columns(scene: SceneFile, layout: SceneFile) -> None:
     is_same_mode = has_mode_comment(scene.header) == has_mode_comment(layout.header)
     if columns[0] != columns[1] or not is_same_mode:
         raise InputError(
-            "An edit changed the properties of the splat, such as the degree of its harmonics, so "
-            "that edits cannot be taken off one by one; undo all at once."
+            "Edits of this splat cannot be taken off: one of them changed its properties, such as "
+            "the degree of its harmonics; take the file that the first of them was given."
         )

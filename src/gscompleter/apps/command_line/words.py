@@ -30,9 +30,15 @@ CONTINUING = ("batch", "evaluate")
 """Commands that continue the run in their folder, and replace nothing there."""
 CONFIGURED = ("complete", "live", "update", "remove", "repair")
 """Commands with the option `--config NAME`."""
+OF_SPLATS = ("update", "remove", "repair")
+"""Those of them that always work on a splat."""
+ADAPTED = {"remove": CompleterConfig.for_removal, "repair": CompleterConfig.for_marks}
+"""Changes of the config for what a command does."""
 MAX_NAMED_COMMANDS = 3
 """Most commands that a sentence names as those with an option."""
 
+NUMBER = re.compile(r"[+-]?\d+(\.\d*)?")
+"""A word that is meant as a number, of whatever range."""
 NEAREST_WORD = "the nearest is"
 SURPLUS = "Unrecognized options: "
 """Beginning of tyro's message on words that nothing takes."""
@@ -87,12 +93,12 @@ def parse_words(words: Sequence[str], kinds: Mapping[str, type]) -> Any:
 
 def parse_known_words(words: Sequence[str], kinds: Mapping[str, type], knows_settings: bool) -> Any:
     """Let tyro parse a command line, with or without the settings of the method as options."""
-    # The rules for help pages change the fields, so that no option could be parsed by them.
     words = insert_auto_count(words)
     rules: list[Rule] = [make_parsing_rule(knows_settings)]
     # To find help texts tyro parses source code, also where it shows none.
     marks: tuple[Any, ...] = (tyro.conf.HelptextFromCommentsOff,)
     if any(word in (*HELP, HELP_ALL) for word in words):
+        # Rules for help pages change the fields, so that no option could be parsed by them.
         words, rules = prepare_help(words)
         marks = ()
     registry = ConstructorRegistry()
@@ -158,6 +164,7 @@ def list_options(kind: Any, prefix: str = "") -> Mapping[str, Any]:
         inner: Any = get_args(hint)[0] if marks else hint
         name = f"{prefix}{field.replace('_', '-')}"
         if inner is ChosenConfig:
+            options[CONFIG_OPTION] = str
             options |= list_options(CompleterConfig, f"{CONFIG_OPTION}.")
         elif is_dataclass(inner):
             is_flat = tyro.conf.OmitArgPrefixes in marks
@@ -210,11 +217,15 @@ def check_once(words: Sequence[str]) -> None:
 
 
 def insert_auto_count(words: Sequence[str]) -> list[str]:
-    """Insert the default number after an `--auto` without one."""
+    """Insert the default number after an `--auto` without one.
+
+    A word that is no number belongs to something else, as SCENE does. Wrong numbers stay, so that
+    they are refused as those of `--auto`.
+    """
     counted = [*words]
     if "--auto" in counted:
         place = counted.index("--auto") + 1
-        if not counted[place:] or not counted[place].isdecimal():
+        if not counted[place:] or not NUMBER.fullmatch(counted[place]):
             counted.insert(place, str(DEFAULT_NUM_TARGETS))
     return counted
 
@@ -242,9 +253,10 @@ def show_config(words: Sequence[str]) -> tuple[CompleterConfig, list[str]]:
             name = value if sign else next(left, name)
     if not words or words[0] not in CONFIGURED:
         return CompleterConfig(), others
-    is_splat = any(word.partition("=")[0] == "--scene" for word in others)
-    config = load_config(name, is_splat)
-    return config.for_removal() if words[0] == "remove" else config, others
+    has_scene = any(word.partition("=")[0] == "--scene" for word in others)
+    config = load_config(name, has_scene or words[0] in OF_SPLATS)
+    adapt = ADAPTED.get(words[0])
+    return config if adapt is None else adapt(config), others
 
 
 def extract_sentence(box: str, own: Collection[str]) -> str:

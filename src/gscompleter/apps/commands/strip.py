@@ -64,7 +64,15 @@ def run_strip(options: StripOptions) -> None:
         "gaussians": undone.kept,
         "generated_removed": undone.dropped,
         "is_same_file": undone.is_same_file,
+        "missing": undone.missing,
     }
     line = f"{undone.kept:,} Gaussians, {undone.dropped:,} generated ones removed: {options.out}"
-    same = ["The file is the one before this edit, byte for byte."] if undone.is_same_file else []
-    print_answer(options.answer, content, [line, *same])
+    lines = [line]
+    if undone.is_same_file:
+        lines.append("The file is the one before this edit, byte for byte.")
+    if undone.missing:
+        lines.append(
+            f"{undone.missing:,} Gaussians that the scene had before its edits are not restored: "
+            f"no {REMOVED_FILE} beside it holds them."
+        )
+    print_answer(options.answer, content, lines)

@@ -49,7 +49,7 @@ MAX_LACKING = 16
 """Most photographs of SCENE that join the context because they show what the splat lacks; of more,
 those that show most."""
 MIN_LEFT = 2
-"""Fewest photographs that are not kept back."""
+"""Fewest usable photographs that `--hold-out` has to leave."""
 NO_TARGETS = TargetRequest(max_found=0)
 """An update looks at photographs alone."""
 
@@ -118,14 +118,25 @@ def hold_out(opened: Opened, count: int, context: Names | None, new: Sequence[in
     # New photographs are what the update is judged by; of others the splat may have been trained
     # on all.
     candidates = [frame for frame in new or usable if frame in usable and frame not in named]
-    if count > len(candidates) or len(usable) - count < MIN_LEFT:
-        raise InputError(
-            f"{count} photographs cannot be kept back: there are {len(candidates)} to choose from, "
-            f"and at least {MIN_LEFT} of {len(usable)} have to be left; name a smaller number.",
-            "hold-out",
-        )
-    steps = [(2 * number + 1) * len(candidates) // (2 * count) for number in range(count)]
-    return replace(opened, held_out=tuple(candidates[step] for step in steps))
+    # One of which a mask hides everything scores nothing. Only chosen photographs are asked for
+    # their masks, since each has to be read for it.
+    while True:
+        if count > len(candidates) or len(usable) - count < MIN_LEFT:
+            raise InputError(
+                f"--hold-out {count} is too much: there are {len(candidates)} to choose from, and "
+                f"at least {MIN_LEFT} of {len(usable)} have to be left; name a smaller number.",
+                "hold-out",
+            )
+        steps = [(2 * number + 1) * len(candidates) // (2 * count) for number in range(count)]
+        chosen = tuple(candidates[step] for step in steps)
+        hidden = {frame for frame in chosen if photographs.is_hidden(frame)}
+        if not hidden:
+            break
+        candidates = [frame for frame in candidates if frame not in hidden]
+        usable = [frame for frame in usable if frame not in hidden]
+    # The comparison at the end leaves out what cannot be read, so it is refused here.
+    photographs.views(chosen, resolution)
+    return replace(opened, held_out=chosen)
 
 
 def choose_evidence(

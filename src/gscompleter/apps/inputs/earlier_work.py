@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile
-from gscompleter.parts import NOT_INVENTED, OBSERVED
+from gscompleter.parts import INVENTED_KINDS, NOT_INVENTED, OBSERVED
 from gscompleter.splats.edits import Edits
 from gscompleter.splats.formats import detect_splat_format
 from gscompleter.splats.row_kinds import find_rows_of_kinds, has_recolored, tells_kinds
@@ -27,15 +27,20 @@ def mark_earlier_work(task: CompletionTask) -> tuple[CompletionTask, tuple[str, 
     assert task.scene is not None
     assert task.splat_file is not None
     edits = task.splat_file.edits
-    invented = read_rows(task.splat_file, task.scene, ("target", "gap"))
+    invented = read_rows(task.splat_file, task.scene, INVENTED_KINDS)
     # What a first command lifted stays: its own photographs would lose (decision 113).
     lifted = read_rows(task.splat_file, task.scene, ("photographs",))
 
     # Of a file whose rows are not known, labels tell as much if nothing was ever recoloured: those
-    # of a user that were recoloured for a target have its number, too.
-    if invented is None and tells_kinds(edits) and not has_other_labels(edits):
-        invented = has_target(task.scene)
-    is_unknown = invented is None and bool(has_target(task.scene).any())
+    # of a user that were recoloured for a target have its number, too. Without a label nothing is
+    # told if anything was invented once, since many programs keep no labels.
+    labelled = has_target(task.scene)
+    has_labels = bool(labelled.any())
+    was_invented = has_invented(edits)
+    tells_labels = tells_kinds(edits) and not has_other_labels(edits)
+    if invented is None and tells_labels and (has_labels or not was_invented):
+        invented = labelled
+    is_unknown = invented is None and (has_labels or was_invented)
     notes = (describe_unknown(task.splat_file),) if is_unknown else ()
     return replace(task, invented=invented, lifted=lifted), notes
 
@@ -55,6 +60,11 @@ def read_rows(
     rows = rows if kept is None else rows[kept]
     order = splat_file.file_order
     return rows.to(scene.means.device) if order is None else rows[order].to(scene.means.device)
+
+
+def has_invented(edits: Edits) -> bool:
+    """Return True if edits invented Gaussians, of which later ones may have removed all."""
+    return any(rows.kind in INVENTED_KINDS for edit in edits.edits for rows in edit.appended)
 
 
 def has_other_labels(edits: Edits) -> bool:

@@ -1,7 +1,8 @@
 """Refinement of given poses that matches contradict, for the commands.
 
-Beside a splat its frame stays, and the photographs come to it: refined poses are taken only if the
-splat, seen from them, agrees with the photographs at least as well as seen from the given ones.
+Beside a splat its frame stays, and the photographs come to it: refined poses are not taken if the
+splat, seen from them, agrees less with the photographs than seen from the given ones. A splat that
+covers too little of every photograph says nothing, and matches decide alone.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from pathlib import Path
 from rich.console import Console
 
 from gscompleter.apps.inputs.describing import print_lines
+from gscompleter.apps.inputs.taken_out import merge_taken_out
 from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.photographs import Photographs
@@ -87,6 +89,11 @@ def refine_opened(
         return opened
     photographs, refinement = refine_poses(opened.photographs)
     if refinement is None:
+        print_lines(
+            console,
+            f"Given poses are kept, though matches contradict them by {fit.given:.2f} px (of "
+            f"{ERROR_SIDE}): too few photographs could be refined together, or compared.",
+        )
         return opened
     if task.scene is not None and refinement.is_accepted:
         with show_preparation("comparing poses with the splat"):
@@ -110,6 +117,9 @@ def ask_splat(
 ) -> PoseRefinement:
     """Add how well the splat of a task agrees with photographs at given and at refined poses."""
     assert task.scene is not None
+    assert task.splat_file is not None
+    # Photographs still show what earlier edits took out.
+    whole = merge_taken_out(task.scene, task.splat_file)
     # Photographs are read relative to their origin, and the frame of a task begins at their own.
     transform = task.frame @ compute_frame_from_photographs(-given.origin)
     before, after = (
@@ -119,7 +129,7 @@ def ask_splat(
         ]
         for photographs in (given, refined)
     )
-    agreement = compare_poses(task.scene, before, after, load_renderer(task.device.type))
+    agreement = compare_poses(whole, before, after, load_renderer(task.device.type))
     if agreement is None:
         return refinement
     return replace(refinement, splat_given=agreement[0], splat_refined=agreement[1])

@@ -15,7 +15,7 @@ from gscompleter.apps.inputs.selection import (
     collect_usable_cameras,
     select_near_and_far,
 )
-from gscompleter.apps.inputs.taken_out import load_taken_out
+from gscompleter.apps.inputs.taken_out import merge_taken_out
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened
 from gscompleter.apps.requests.splat import SplatRequest
 from gscompleter.data.local_origin import (
@@ -34,7 +34,7 @@ from gscompleter.splats.ply import find_finite_rows
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.mapping import move_to_file
 from gscompleter.system.process import give_large_arrays_own_pages
-from gscompleter.types import Camera, Gaussians, merge
+from gscompleter.types import Camera, Gaussians
 
 MAX_CHECK_VIEWS = 40
 """Most photographs that check a splat."""
@@ -111,8 +111,7 @@ def move_to_splat(
 
     # Photographs still show what was taken out, so they are compared with the splat as it was.
     splat_file = replace(splat_file, origin=origin)
-    taken_out = load_taken_out(splat_file)
-    whole = scene if taken_out is None else merge([scene, taken_out.to(task.device)])
+    whole = merge_taken_out(scene, splat_file)
 
     # A trainer may have moved and scaled the cameras before it trained the splat.
     splat = InputSplat(splat_file.path, whole, origin, opened.request.folder)

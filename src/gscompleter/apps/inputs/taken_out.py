@@ -31,6 +31,12 @@ def load_taken_out(splat_file: InputSplatFile) -> Gaussians | None:
     return replace(gaussians.move_origin((x, y, z)), origin=None)
 
 
+def merge_taken_out(scene: Gaussians, splat_file: InputSplatFile) -> Gaussians:
+    """Merge a splat with what earlier edits took out of it: the splat as it was."""
+    taken_out = load_taken_out(splat_file)
+    return scene if taken_out is None else merge([scene, taken_out.to(scene.means.device)])
+
+
 def take_over_edits(
     task: CompletionTask, forgets: bool, renderer: Renderer
 ) -> tuple[CompletionTask, tuple[str, ...]]:

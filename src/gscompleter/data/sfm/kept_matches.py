@@ -120,6 +120,8 @@ def drop_wrong_places(
     while model.num_reg_images() > 0:
         distances = measure_model(model, kept, keypoints)
         medians = rate_places(distances, list(model.reg_image_ids()))
+        # Of several that too few confirm any may go first: without it the others are confirmed no
+        # more than with it.
         worst = max(medians, key=lambda number: (medians[number], -number))
         if medians[worst] <= MAX_DISTANCE:
             return CheckedPlaces(dropped, float(np.median(np.concatenate([*distances.values()]))))

@@ -13,7 +13,8 @@ def draw_depth(corners, faces, width, height):
     """Draw the z-depth of the nearest triangle at each pixel centre; 0 where there is none.
 
     `corners` [n, 3], float64, are homogeneous pixels (x z, y z, z) of a camera, also behind it;
-    `faces` [m, 3], int64, are their indices. Both sides of a triangle are drawn.
+    `faces` [m, 3], int64, are their indices. Both sides of a triangle are drawn. Nothing is
+    checked: a `GivenGeometry` has finite vertices, and faces of vertices that exist.
     """
     depth = np.zeros((height, width), np.float64)
     share(_draw_rows, height, corners, faces, depth)
