@@ -59,18 +59,37 @@ print(*sys.modules)
 """
 
 
-def list_imported(*words: object) -> set[str]:
-    """Return the modules that parsing a command line imports."""
-    command = [sys.executable, "-c", PARSE, *map(str, words)]
+ALL_COMMANDS = """
+import sys
+from gscompleter.cli import main
+sys.argv = ["gscompleter", *sys.argv[1:]]
+main()
+print(*sys.modules)
+"""
+
+
+def list_imported(*words: object, code: str = PARSE) -> set[str]:
+    """Return the modules that parsing a command line imports, or what `code` does with it."""
+    command = [sys.executable, "-c", code, *map(str, words)]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     return set(done.stdout.splitlines()[-1].split())
 
 
-@pytest.mark.parametrize("words", [("--help",), ("complete", "--help"), ("complete", "--help-all")])
+COMPUTING = {"torch", "numba", "numpy", "rich.console"}
+"""Modules that take long to import, and that no help page needs."""
+
+
+@pytest.mark.parametrize("words", [("complete", "--help"), ("complete", "--help-all")])
 def test_help_waits_for_nothing_that_computes(words):
     modules = list_imported(*words)
     assert "gscompleter.apps.commands.complete" in modules
-    assert not modules & {"torch", "numba", "numpy", "rich.console"}
+    assert not modules & COMPUTING
+
+
+@pytest.mark.parametrize("word", ["-h", "--help", "--help-all"])
+def test_the_page_of_all_commands_waits_for_no_options(word):
+    modules = list_imported(word, code=ALL_COMMANDS)
+    assert not modules & {"tyro", "gscompleter.apps.commands.complete", *COMPUTING}
 
 
 def test_a_command_line_imports_the_options_of_its_command_alone():

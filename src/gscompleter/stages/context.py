@@ -175,9 +175,9 @@ def check_texture(views: Sequence[View]) -> None:
         # Both lose 3 pixels at each border.
         counted = view.valid_mask[3:-3, 3:-3]
         is_textured = (highest - lowest)[0, 0] > MIN_CONTRAST
-        textured_share = is_textured[counted].float().mean().item()
+        textured_share = (is_textured & counted).sum() / counted.sum()
         # It is NaN if nothing counts.
-        if not textured_share >= MIN_TEXTURED:
+        if not textured_share.item() >= MIN_TEXTURED:
             num_flat += 1
 
     # A single photograph needs none, since its depth is given.
