@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import torch
 
+from gscompleter import load_views
 from gscompleter.numerics.two_views import compute_sampson_distances
 from gscompleter.reconstructors.features.consistency import measure_pose_errors
 from gscompleter.reconstructors.features.epipolar import (
@@ -97,3 +98,11 @@ def test_the_pose_of_points_is_found_from_one_beside_it():
     rotation, direction = fit_relative_pose(start, rays, FOCALS)
     assert np.abs(rotation - turn).max() < 1e-6
     assert np.abs(direction - shift / np.linalg.norm(shift)).max() < 1e-5
+
+
+def test_false_matches_of_a_pair_with_nearly_right_poses_do_not_count(shared):
+    # More matches fit a geometry without poses, false ones among them; with these no pose fits.
+    views = load_views(shared / "data" / "hololens_room", [0, 3], (256, 256), near=0.5, far=10.0)
+    fit = measure_pose_fit(views)
+    assert fit is not None
+    assert fit.is_contradicted

@@ -90,7 +90,8 @@ def find_true_matches(
     """Find the matches of two photographs that are not false.
 
     A match lies far off because it is false, or because a pose is wrong, so the poses alone do not
-    decide: if another epipolar geometry explains more matches, and most of all, these are true.
+    decide: if another epipolar geometry explains most matches, and poses confirm less than half of
+    these, they are true.
     """
     errors, is_ahead = measure_match_errors(reference, source, pixels, matched)
     is_near = is_ahead & (errors < MAX_POSE_ERROR)
@@ -100,4 +101,7 @@ def find_true_matches(
     _, found = cv2.findFundamentalMat(pixels, matched, cv2.FM_RANSAC, MAX_EPIPOLAR_DISTANCE)
     is_explained = is_near if found is None else found.ravel() > 0
     is_clear = is_explained.sum() >= max(MIN_POSE_MATCHES, len(pixels) / 2)
-    return is_explained if is_clear and is_explained.sum() > is_near.sum() else is_near
+    # A geometry without poses explains some false matches, too, by which a fit of poses gets worse.
+    # So it counts only where poses miss most of what it explains.
+    is_missed = (is_near & is_explained).sum() < is_explained.sum() / 2
+    return is_explained if is_clear and is_missed else is_near
