@@ -1,4 +1,4 @@
-"""What earlier commands made of a splat, where its record and its labels disagree."""
+"""Mark the Gaussians of earlier commands in a splat whose record and labels disagree."""
 
 from __future__ import annotations
 

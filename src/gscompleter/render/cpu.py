@@ -90,7 +90,10 @@ class CpuFrozenScene:
         return replace(self, layer=layer, rows=file_array_beside(self.rows, mapped))
 
     def release(self) -> None:
-        """Release the memory of lists that lie in files, after all of them were read."""
+        """Release the memory of lists that lie in files, after all of them were read.
+
+        What was read stays in memory otherwise, for each of the frozen views (decision 134).
+        """
         for array in (*self.layer, self.rows):
             release_pages(array)
 

@@ -226,7 +226,8 @@ def read_inputs(
         with show_preparation("reading photographs"):
             has_splat = splat is not None
             is_free = splat is None and not follows_paper(work)
-            # Networks were trained with few photographs.
+            # Plane-sweep fits a scene to any number of photographs (decision 140); networks were
+            # trained with few.
             is_fitted = is_free and work.models.reconstructor == "plane-sweep"
             task = read_task(
                 opened, photographs.context, targets.named, device, has_splat, is_fitted

@@ -86,8 +86,9 @@ def fit_jointly(
     views at once and without gradients. `check_views`, in the exposure of the scene, are
     photographs that no Gaussian comes from: what looks right to `views` alone is wrong there.
 
-    Each step is drawn before a backdrop of a random colour, so that surfaces become opaque. Before
-    black, one that lets 5 % through only gets brighter, and what is added behind it shines through.
+    Each step is drawn before a backdrop of a random colour, in the exposure of the scene, so that
+    surfaces become opaque. Before black, one that lets 5 % through only gets brighter, and what is
+    added behind it shines through (decision 141).
     """
     order = shuffle_views(len(views), len(check_views))
     backdrops = torch.rand(len(order), 3, generator=torch.Generator().manual_seed(0))
