@@ -1,5 +1,6 @@
 """Videos in place of photographs: which frames are chosen, and what is refused."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -196,10 +197,22 @@ def test_too_few_or_too_many_frames_are_refused(video, tmp_path, monkeypatch, ca
     assert "frames" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", ["poses", "complete"])
+def test_frames_of_a_folder_of_photographs_are_refused(tmp_path, monkeypatch, capsys, command):
+    folder = tmp_path / "photographs"
+    folder.mkdir()
+    Image.new("RGB", (32, 24)).save(folder / "a.png")
+    words = (command, folder, "--out", tmp_path / "out", "--frames", 8)
+    assert run(monkeypatch, *words) == 2
+    assert "--frames chooses from a video" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_missing_video_is_refused(tmp_path, monkeypatch, capsys):
     for command in ("poses", "complete"):
-        assert run(monkeypatch, command, tmp_path / "no.mp4", "--out", tmp_path / "out") == 2
-        assert "no.mp4" in capsys.readouterr().err
+        words = (tmp_path / "no.mp4", "--out", tmp_path / "out", "--frames", 8)
+        assert run(monkeypatch, command, *words) == 2
+        assert re.search("There is no .*no.mp4;", capsys.readouterr().err)
 
 
 def test_a_missing_package_is_named(video, tmp_path, monkeypatch, capsys):

@@ -45,9 +45,11 @@ def run_poses(options: PosesOptions) -> None:
     with import_without_collection():
         from gscompleter.data.given_poses import has_cameras
         from gscompleter.data.sfm.poses import find_poses
+        from gscompleter.data.video import refuse_frames_of_no_video
         from gscompleter.system.console import make_console
         from gscompleter.system.progress import show_progress
 
+    refuse_frames_of_no_video(options.photographs, options.frames)
     if has_cameras(options.photographs):
         refine_cameras(options)
         return

@@ -30,7 +30,7 @@ from gscompleter.data.sfm.poses import (
     list_given_masks,
 )
 from gscompleter.data.unused_files import list_unused
-from gscompleter.data.video import is_video
+from gscompleter.data.video import is_video, refuse_frames_of_no_video
 from gscompleter.splats.alignment.training_size import find_training_size
 from gscompleter.splats.foreign import holds_splat_alone
 from gscompleter.splats.formats import has_splat_extension
@@ -62,6 +62,7 @@ def open_scene(
             f"{quote_value(folder, 80)} is a {kind} of Gaussians, which goes to --scene; SCENE has "
             "to be the folder of its photographs, with or without cameras, or a video."
         )
+    refuse_frames_of_no_video(folder, search.num_frames)
     check_planes(request.near, request.far)
     check_resolution(request.resolution)
 

@@ -194,9 +194,14 @@ def find_poses(
 ) -> FoundPoses:
     """Find the cameras of a folder of photographs or of a video's frames; write them to `out`.
 
-    Raises InputError if masks hide most of the photographs, unless `reading` allows that. The masks
-    that are written are black where something is hidden, however they are read.
+    Raises InputError if there is nothing at `photographs`, or if masks hide most of them, unless
+    `reading` allows that. The masks that are written are black where something is hidden, however
+    they are read.
     """
+    if not photographs.exists():
+        raise InputError(
+            f"There is no {quote_value(photographs)}; name a folder of photographs, or a video."
+        )
     names = [] if is_video(photographs) else list_all_photographs(photographs)
     masks = list_given_masks(photographs, names, reading.folder)
     refuse_nothing_to_invert(masks, reading)
