@@ -218,7 +218,9 @@ class GSCompleter:
         if geometry is not None:
             check_geometry(geometry, config)
         with record_seconds() as seconds, timed_stage("context"):
-            context = self.make_context(views, scene, check_views or (), targets, geometry)
+            # The authors' Ψ makes the same scene for all targets.
+            favored = () if config.registration_method == "paper" else targets
+            context = self.make_context(views, scene, check_views or (), targets, favored, geometry)
             photos = tuple(Photo(view) for view in context.views)
             state = Completion(
                 config,
@@ -263,9 +265,12 @@ class GSCompleter:
         scene: Gaussians | None,
         check_views: Sequence[View],
         targets: Sequence[Camera],
+        favored: Sequence[Camera],
         geometry: GivenGeometry | None,
     ) -> InitialContext:
         """Initialize the context, whose photographs get the depth of geometry if there is any.
+
+        Ψ fits a scene of its own most closely to the photographs near `favored` targets.
 
         Before Ψ makes the scene of them, so that it uses it; a scene that is given tells first
         where the geometry belongs.
@@ -273,7 +278,13 @@ class GSCompleter:
 
         def init(photographs: Sequence[View]) -> InitialContext:
             return init_context(
-                self.reconstructor, photographs, scene, check_views, targets, self.renderer
+                self.reconstructor,
+                photographs,
+                scene,
+                check_views,
+                targets,
+                favored,
+                self.renderer,
             )
 
         if geometry is None:

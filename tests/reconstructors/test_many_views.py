@@ -28,6 +28,7 @@ from gscompleter.reconstructors.features.stereo_image import (
     make_stereo_images,
 )
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
+from gscompleter.reconstructors.plane_sweep.emphasis import FAR_WEIGHT, NUM_REFINED, Emphasis
 from gscompleter.reconstructors.plane_sweep.fit import (
     MAX_SIZE_GROWTH,
     STEPS_PER_CHECK,
@@ -385,7 +386,7 @@ def test_check_views_fade_what_is_wrong_in_them_alone():
     start = merge([scene, shard])
     gains = torch.ones(3, 3)
     without = fit_jointly(start, given, gains, RENDERER)
-    fitted = fit_jointly(start, given, gains, RENDERER, [check])
+    fitted = fit_jointly(start, given, gains, RENDERER, Emphasis([check]))
     assert without.opacities[-1] > 0.9
     assert fitted.opacities[-1] < 0.7
     before, after = (
@@ -409,11 +410,45 @@ def test_without_check_views_nothing_changes_and_they_have_turns_of_their_own():
     views = row_of_views(3, size=32)
     start = gaussians_of(views[1])
     alone, empty = (
-        fit_jointly(start, views, torch.ones(3, 3), RENDERER, *rest) for rest in ((), ([],))
+        fit_jointly(start, views, torch.ones(3, 3), RENDERER, *rest) for rest in ((), (Emphasis(),))
     )
     assert torch.equal(alone.means, empty.means)
     turns = torch.bincount(torch.tensor(shuffle_views(4, 2))).tolist()
     assert turns == [STEPS_PER_VIEW] * 4 + [STEPS_PER_CHECK] * 2
+
+
+def test_photographs_near_a_target_have_further_steps_and_their_colours_count_most():
+    views = row_of_views(8, size=32)
+    emphasis = Emphasis(targets=[views[1].camera])
+    assert emphasis.find_refined(views) == [0, 1, 2]
+    turns = torch.bincount(torch.tensor(shuffle_views(8, 0, [0, 1, 2]))).tolist()
+    assert turns == [2 * STEPS_PER_VIEW] * 3 + [STEPS_PER_VIEW] * 5
+    assert emphasis.weigh_colors(views) == [1.0] * 5 + [FAR_WEIGHT] * 3
+    # Of three photographs all are near, and without targets all are alike.
+    assert emphasis.find_refined(views[:3]) == []
+    assert Emphasis().find_refined(views) == []
+    assert Emphasis().weigh_colors(views) == [1.0] * 8
+
+
+def test_more_targets_give_no_more_steps():
+    views = row_of_views(9, size=32)
+    refined = Emphasis(targets=[view.camera for view in views[:4]]).find_refined(views)
+    assert NUM_REFINED < len(refined) < len(views)
+    assert len(shuffle_views(9, 0, refined)) == STEPS_PER_VIEW * (9 + NUM_REFINED)
+
+
+def test_a_scene_for_a_target_looks_more_like_the_photographs_near_it():
+    """The farthest three are darker, which colours that are linear in the ray cannot follow."""
+    views = row_of_views(9)
+    views = [*views[:6], *(replace(view, image=0.75 * view.image) for view in views[6:])]
+    target = views.pop(1)
+    for_all = PlaneSweep()(views).gaussians
+    for_target = PlaneSweep().reconstruct_and_fit(views, [], [target.camera]).gaussians
+
+    def score(gaussians):
+        return psnr(RENDERER.render(gaussians, target.camera).image, target.image)
+
+    assert score(for_target) > score(for_all) + 0.2
 
 
 def test_a_check_view_is_compared_in_the_exposure_of_the_scene_where_that_covers_it():
@@ -440,7 +475,7 @@ def test_check_views_improve_what_lies_between_the_photographs():
     views = row_of_views(7)
     given, checks, unused = views[::3], [views[1], views[5]], [views[2], views[4]]
     alone = PlaneSweep()(given).gaussians
-    made = PlaneSweep().reconstruct_and_fit(given, checks)
+    made = PlaneSweep().reconstruct_and_fit(given, checks, [])
     assert len(made.depths) == len(given)
 
     def score(gaussians):

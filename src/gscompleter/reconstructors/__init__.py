@@ -18,7 +18,7 @@ from gscompleter.reconstructors.own_models import load_own_model
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.plugins import is_in_file, load_plugins
 from gscompleter.system.tensor_checks import describe, is_whole_number, iterate_tensors, name_dtype
-from gscompleter.types import ChooseMasks, Reconstruction, View
+from gscompleter.types import Camera, ChooseMasks, Reconstruction, View
 
 
 @runtime_checkable
@@ -59,12 +59,16 @@ class PartReconstructor(Protocol):
 
 @runtime_checkable
 class FittingReconstructor(Protocol):
-    """Interface of a Ψ that can fit its scene to photographs that it makes no Gaussians of."""
+    """Interface of a Ψ that can fit its scene to more than the photographs that it comes from."""
 
     def reconstruct_and_fit(
-        self, views: Sequence[View], check_views: Sequence[View]
+        self, views: Sequence[View], check_views: Sequence[View], targets: Sequence[Camera]
     ) -> Reconstruction:
-        """Reconstruct a scene from `views`, and fit it to `check_views`, too."""
+        """Reconstruct a scene from `views`, and fit it to `check_views`, too.
+
+        Photographs near `targets`, from which the scene will be looked at, count most. There may be
+        none of either.
+        """
 
 
 @runtime_checkable
@@ -110,20 +114,25 @@ def run_part_reconstructor(
 
 
 def run_fitting_reconstructor(
-    reconstructor: Reconstructor, views: Sequence[View], check_views: Sequence[View]
+    reconstructor: Reconstructor,
+    views: Sequence[View],
+    check_views: Sequence[View],
+    targets: Sequence[Camera],
 ) -> Reconstruction:
-    """Run Ψ on `views`, and let it fit the scene to `check_views`, too; there may be none.
+    """Run Ψ on `views`, and let it fit the scene to `check_views`, too, and for `targets`.
 
-    Raises InputError as `run_reconstructor`, and for check views that Ψ cannot use.
+    There may be none of either. Raises InputError as `run_reconstructor`, and for check views that
+    Ψ cannot use; a Ψ that cannot favour targets makes the same scene for all.
     """
-    if not check_views:
-        return run_reconstructor(reconstructor, views)
     if not isinstance(reconstructor, FittingReconstructor):
+        if not check_views:
+            return run_reconstructor(reconstructor, views)
         raise InputError(
             "Check views need a scene that they check, or a reconstructor that fits its own to "
             "them, such as plane-sweep; leave them out."
         )
-    return accept_reconstruction(reconstructor.reconstruct_and_fit(views, check_views), views)
+    made = reconstructor.reconstruct_and_fit(views, check_views, targets)
+    return accept_reconstruction(made, views)
 
 
 def accept_reconstruction(reconstruction: Reconstruction, views: Sequence[View]) -> Reconstruction:

@@ -79,11 +79,13 @@ def init_context(
     scene: Gaussians | None,
     check_views: Sequence[View],
     targets: Sequence[Camera],
+    favored: Sequence[Camera],
     renderer: Renderer,
 ) -> InitialContext:
     """Reconstruct the context from photographs, or take the scene that was given (Eq. 5).
 
-    A given scene that is large is rendered through an LOD proxy, which is made fine enough for all
+    A reconstruction is fitted most closely to the photographs near the `favored` targets. A given
+    scene that is large is rendered through an LOD proxy, which is made fine enough for all
     photographs and targets.
     """
     if not views:
@@ -91,7 +93,7 @@ def init_context(
     views = sort_by_frame(views)
     if scene is None:
         views = prepare_single(reconstructor, views)
-        return reconstruct_context(reconstructor, views, check_views)
+        return reconstruct_context(reconstructor, views, check_views, favored)
 
     photos = [*views, *check_views]
     source = build_proxy(scene.detach(), [*targets, *(view.camera for view in photos)])
@@ -113,11 +115,15 @@ def prepare_single(reconstructor: Reconstructor, views: Sequence[View]) -> list[
 
 
 def reconstruct_context(
-    reconstructor: Reconstructor, views: Sequence[View], check_views: Sequence[View] = ()
+    reconstructor: Reconstructor,
+    views: Sequence[View],
+    check_views: Sequence[View] = (),
+    favored: Sequence[Camera] = (),
 ) -> InitialContext:
     """Reconstruct `G_ctx = Ψ(V_in)` from posed photographs (paper, Eq. 5).
 
-    Ψ fits the scene to `check_views`, too, which are no photographs of the context.
+    Ψ fits the scene to `check_views`, too, which are no photographs of the context; photographs
+    near `favored` targets count most.
     """
     check_texture(views)
     found = find_scene_range(reconstructor, views)
@@ -125,7 +131,7 @@ def reconstruct_context(
         logging.getLogger("gscompleter").warning("gscompleter: %s", note)
     views = set_depth_range(views, found.near, found.far)
     checks = set_depth_range(check_views, found.near, found.far)
-    reconstruction = run_fitting_reconstructor(reconstructor, views, checks)
+    reconstruction = run_fitting_reconstructor(reconstructor, views, checks, favored)
     source = ContextScene.whole(drop_ignored(reconstruction, views))
     # The scene has one exposure, which the photographs have to share from here on.
     gains = reconstruction.exposure_gains

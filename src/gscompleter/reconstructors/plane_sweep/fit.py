@@ -18,6 +18,7 @@ from torch import Tensor
 
 from gscompleter.config.settings import COVERED
 from gscompleter.numerics.adam import Adam
+from gscompleter.reconstructors.plane_sweep.emphasis import NUM_REFINED, Emphasis
 from gscompleter.reconstructors.plane_sweep.linear_colors import fit_linear_colors
 from gscompleter.render.protocols import Renderer
 from gscompleter.types import DepthMap, Gaussians, View
@@ -78,19 +79,21 @@ def fit_jointly(
     views: Sequence[View],
     gains: Float[Tensor, "views 3"],
     renderer: Renderer,
-    check_views: Sequence[View] = (),
+    emphasis: Emphasis = Emphasis(),
 ) -> Gaussians:
     """Minimize the squared image error, with renders scaled by each view's exposure gain.
 
     The images are linear in the colours, so that these are then fitted alone, by direction, to all
-    views at once and without gradients. `check_views`, in the exposure of the scene, are
-    photographs that no Gaussian comes from: what looks right to `views` alone is wrong there.
+    views at once and without gradients. The check views of `emphasis`, in the exposure of the
+    scene, are photographs that no Gaussian comes from: what looks right to `views` alone is wrong
+    there. Views near its targets get further steps, and their colours count most.
 
     Each step is drawn before a backdrop of a random colour, in the exposure of the scene, so that
     surfaces become opaque. Before black, one that lets 5 % through only gets brighter, and what is
     added behind it shines through (decision 141).
     """
-    order = shuffle_views(len(views), len(check_views))
+    check_views = emphasis.check_views
+    order = shuffle_views(len(views), len(check_views), emphasis.find_refined(views))
     backdrops = torch.rand(len(order), 3, generator=torch.Generator().manual_seed(0))
     views = [*views, *check_views]
     gains = torch.cat([gains, torch.ones(len(check_views), 3)])
@@ -112,7 +115,8 @@ def fit_jointly(
     # The scene has one exposure, so that each photograph is divided by its own.
     normalized = [replace(v, image=v.image / gain) for v, gain in zip(views, gains, strict=True)]
     depths = [renderer.render(fitted, view.camera).depth_map() for view in views]
-    return fit_linear_colors(fitted, normalized, depths, renderer)
+    weights = emphasis.weigh_colors(views)
+    return fit_linear_colors(fitted, normalized, depths, renderer, weights)
 
 
 def init_parameters(gaussians: Gaussians) -> dict[str, Tensor]:
@@ -144,14 +148,18 @@ def apply_parameters(gaussians: Gaussians, unknown: dict[str, Tensor]) -> Gaussi
     )
 
 
-def shuffle_views(count: int, num_checks: int = 0) -> list[int]:
+def shuffle_views(count: int, num_checks: int = 0, refined: Sequence[int] = ()) -> list[int]:
     """Create a random order of `count` views, `STEPS_PER_VIEW` times each, and of check views.
 
     These are numbered after the views, and occur `STEPS_PER_CHECK` times each, in the first rounds.
+    Each round ends with steps for up to `NUM_REFINED` of the `refined` views.
     """
     generator = torch.Generator().manual_seed(0)
-    rounds = []
+    order: list[int] = []
     for number in range(STEPS_PER_VIEW):
         size = count + num_checks if number < STEPS_PER_CHECK else count
-        rounds.append(torch.randperm(size, generator=generator))
-    return torch.cat(rounds).tolist()
+        order += torch.randperm(size, generator=generator).tolist()
+        if refined:
+            shuffled = torch.randperm(len(refined), generator=generator).tolist()
+            order += [refined[place] for place in shuffled[:NUM_REFINED]]
+    return order

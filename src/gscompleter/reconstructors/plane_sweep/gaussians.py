@@ -19,6 +19,7 @@ from gscompleter.numerics.geometry import (
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.numerics.sky import extend_sky, is_sky, restore_sky_colors
 from gscompleter.reconstructors.plane_sweep.directional_colors import fit_directional_colors
+from gscompleter.reconstructors.plane_sweep.emphasis import Emphasis
 from gscompleter.reconstructors.plane_sweep.fit import fit_jointly, fit_opacities
 from gscompleter.reconstructors.plane_sweep.free_space import leave_free_space
 from gscompleter.reconstructors.plane_sweep.fusion import (
@@ -76,7 +77,7 @@ class Splatter:
         layers: Sequence[DepthLayer],
         transforms: Transforms,
         masks: Sequence[Bool[Tensor, "_ _"]] | None = None,
-        check_views: Sequence[View] = (),
+        emphasis: Emphasis = Emphasis(),
     ) -> Reconstruction:
         """Build the Gaussians of `views` and fit them to the photographs.
 
@@ -85,8 +86,8 @@ class Splatter:
         each other (decision 031). Clearly different exposures are normalized to their mean.
         `depths` are in scene units. `layers` hold the inverse depths, with the widest baseline as
         unit of length, and `transforms` relate the views of these layers. With `masks`, only what
-        any view shows in its mask is built and fitted. Of three views or more, the scene is fitted
-        to `check_views`, too, where it covers them.
+        any view shows in its mask is built and fitted. The scene of three views or more is fitted
+        with `emphasis`, to its check views where it covers them.
         """
         gains = torch.from_numpy(estimate_gains(layers, transforms)).float()
         device = views[0].image.device
@@ -116,9 +117,10 @@ class Splatter:
             for view, gain in zip(on_cpu, gains, strict=True)
         ]
         # One or two views are not fitted jointly, and check views take no part in their fits.
-        used = check_views if len(views) > 2 else ()
+        used = emphasis.check_views if len(views) > 2 else ()
         checks = [self.prepare_check(scene, view.to("cpu"), gains) for view in used]
-        fitted = self.fit_gaussians(scene, photographs, gains, checks)
+        emphasis = replace(emphasis, check_views=checks)
+        fitted = self.fit_gaussians(scene, photographs, gains, emphasis)
         fitted = restore_sky_colors(scene, fitted, on_cpu[0].camera)
 
         # View and pixel of each Gaussian, in the order of the scene.
@@ -245,7 +247,7 @@ class Splatter:
         gaussians: Gaussians,
         views: Sequence[View],
         gains: Float[Tensor, "views 3"],
-        check_views: Sequence[View] = (),
+        emphasis: Emphasis = Emphasis(),
     ) -> Gaussians:
         """Fit the Gaussians to views whose colours are `gains` times those of the scene.
 
@@ -258,7 +260,7 @@ class Splatter:
         if len(views) == 2:
             faded, depths = fit_opacities(gaussians, views, self.renderer)
             return fit_directional_colors(faded, views, depths, self.renderer)
-        return fit_jointly(gaussians, views, gains, self.renderer, check_views)
+        return fit_jointly(gaussians, views, gains, self.renderer, emphasis)
 
     def splat(self, view: View, depth: DepthMap) -> Gaussians:
         """Create one disc per pixel of `view`."""

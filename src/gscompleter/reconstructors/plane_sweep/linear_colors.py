@@ -206,11 +206,16 @@ class ColorEquations:
 
 
 def fit_linear_colors(
-    scene: Gaussians, views: Sequence[View], depths: Sequence[DepthMap], renderer: Renderer
+    scene: Gaussians,
+    views: Sequence[View],
+    depths: Sequence[DepthMap],
+    renderer: Renderer,
+    weights: Sequence[float] | None = None,
 ) -> Gaussians:
     """Fit colours that are linear in the direction to photographs and as many virtual ones.
 
-    `depths` are those of the scene at the photographs. The photographs have one exposure.
+    `depths` are those of the scene at the photographs. `weights` say how much each photograph
+    counts, by default all alike. They have one exposure.
     """
     # Rays, in world axes, are taken relative to those from the middle of the cameras: they differ
     # by angles of some hundredths, whose squares float32 would lose beside rays of length 1.
@@ -218,8 +223,11 @@ def fit_linear_colors(
     reference = normalize(scene.means - middle, dim=-1)
     fit = LinearColorFit(scene, reference, renderer)
     virtual = make_virtual_views(scene, views, depths, renderer)
-    photographs = [FittedImage(view, 1.0) for view in views]
-    all_images = [*photographs, *(FittedImage(view, VIRTUAL_WEIGHT) for view in virtual)]
+    weights = weights or [1.0] * len(views)
+    photographs = [FittedImage(view, weight) for view, weight in zip(views, weights, strict=True)]
+    # Each virtual photograph shows what one of the photographs does.
+    of_virtual = [VIRTUAL_WEIGHT * weight for weight in weights]
+    all_images = [*photographs, *map(FittedImage, virtual, of_virtual)]
 
     constant = scene.sh[:, 0] * SH_C0 + 0.5
     colors = LinearColors(reference, constant, torch.zeros_like(constant)[:, None].repeat(1, 3, 1))

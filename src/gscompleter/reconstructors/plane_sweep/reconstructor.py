@@ -24,6 +24,7 @@ from gscompleter.reconstructors.depth_predictors import (
 )
 from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.reconstructors.features.stereo_image import StereoImage
+from gscompleter.reconstructors.plane_sweep.emphasis import Emphasis
 from gscompleter.reconstructors.plane_sweep.fusion import DepthLayer
 from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
 from gscompleter.reconstructors.plane_sweep.given_depth import (
@@ -50,7 +51,7 @@ from gscompleter.reconstructors.plane_sweep.sweep import (
 )
 from gscompleter.system.errors import join_names
 from gscompleter.system.torch_modes import run_in_plain_torch
-from gscompleter.types import ChooseMasks, DepthMap, Reconstruction, View
+from gscompleter.types import Camera, ChooseMasks, DepthMap, Reconstruction, View
 
 LIFT_ITERATIONS = SMOOTHING_ITERATIONS // 2
 """Iterations of the surfaces of a synthesized image, which registration corrects."""
@@ -87,16 +88,19 @@ class PlaneSweep(Splatter):
 
     @run_in_plain_torch
     def reconstruct_and_fit(
-        self, views: Sequence[View], check_views: Sequence[View]
+        self, views: Sequence[View], check_views: Sequence[View], targets: Sequence[Camera]
     ) -> Reconstruction:
-        """Reconstruct the scene of `views`, from three of them on fitted to `check_views`, too."""
-        return self.reconstruct(views, None, check_views)
+        """Reconstruct the scene of `views`.
+
+        From three of them on it is fitted to `check_views`, too, and to those near `targets` most.
+        """
+        return self.reconstruct(views, None, Emphasis(check_views, targets))
 
     def reconstruct(
         self,
         views: Sequence[View],
         choose_masks: ChooseMasks | None = None,
-        check_views: Sequence[View] = (),
+        emphasis: Emphasis = Emphasis(),
     ) -> Reconstruction:
         """Reconstruct everything, or what any view shows in its mask, and fit it to all views."""
         check_given_views(views)
@@ -119,9 +123,9 @@ class PlaneSweep(Splatter):
             kinds = [by_stereo] if by_prediction is None else [by_stereo, by_prediction]
             chosen = [choose_masks(make_depth_maps(kind, rig.unit, views)) for kind in kinds]
             masks = [torch.stack(of_view).any(dim=0) for of_view in zip(*chosen, strict=True)]
-        scene = self.build(rig, views, by_stereo, masks, check_views)
+        scene = self.build(rig, views, by_stereo, masks, emphasis)
         if by_prediction is not None:
-            supported = self.build(rig, views, by_prediction, masks, check_views)
+            supported = self.build(rig, views, by_prediction, masks, emphasis)
             # Surfaces that are right do not hide what another photograph shows.
             judged = views if masks is None else ignore_outside(views, masks)
             losses = self.measure_losses(judged, scene, supported)
@@ -223,11 +227,11 @@ class PlaneSweep(Splatter):
         views: Sequence[View],
         layers: Sequence[DepthLayer],
         masks: Sequence[Bool[Tensor, "_ _"]] | None,
-        check_views: Sequence[View],
+        emphasis: Emphasis,
     ) -> Reconstruction:
         """Build the Gaussians of completed depths, and fit them to the photographs."""
         depths = make_depth_maps(layers, rig.unit, views)
-        return self.build_scene(views, depths, layers, rig.transforms, masks, check_views)
+        return self.build_scene(views, depths, layers, rig.transforms, masks, emphasis)
 
     def measure_losses(
         self, views: Sequence[View], before: Reconstruction, after: Reconstruction

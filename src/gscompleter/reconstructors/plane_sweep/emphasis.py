@@ -1,0 +1,53 @@
+"""Which photographs count most in a joint fit: those near the cameras that the scene is made for.
+
+Photographs of one surface differ by exposure, reflections, and errors of depth and pose. Fitted to
+all of them alike, a scene shows their mean, which is right at none (decision 143).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+
+from gscompleter.types import Camera, View
+
+NUM_REFINED = 3
+"""Number of photographs nearest to a target that get further steps."""
+NUM_FAVOURED = 5
+"""Number of photographs nearest to a target whose colours count whole."""
+FAR_WEIGHT = 0.2
+"""Weight of the colours of all others."""
+
+
+@dataclass(frozen=True)
+class Emphasis:
+    """What a joint fit is made for, beside the photographs that the scene comes from."""
+
+    check_views: Sequence[View] = ()
+    """Photographs that no Gaussian comes from, and to which the scene is fitted, too."""
+    targets: Sequence[Camera] = ()
+    """Cameras from which the scene will be looked at; without any, all photographs are alike."""
+
+    def find_refined(self, views: Sequence[View]) -> list[int]:
+        """Find the views that get further steps, in ascending order; none if all are as near."""
+        nearest = find_nearest(self.targets, views, NUM_REFINED)
+        return nearest if len(nearest) < len(views) else []
+
+    def weigh_colors(self, views: Sequence[View]) -> list[float]:
+        """Weigh the colours of each view."""
+        if not self.targets:
+            return [1.0] * len(views)
+        favoured = set(find_nearest(self.targets, views, NUM_FAVOURED))
+        return [1.0 if number in favoured else FAR_WEIGHT for number in range(len(views))]
+
+
+def find_nearest(targets: Sequence[Camera], views: Sequence[View], count: int) -> list[int]:
+    """Find the numbers of the `count` views nearest to each target; in ascending order."""
+    nearest: set[int] = set()
+    for target in targets:
+        centers = torch.stack([view.camera.center for view in views])
+        distances = (centers - target.center.to(centers)).norm(dim=-1)
+        nearest.update(distances.argsort(stable=True)[:count].tolist())
+    return sorted(nearest)
