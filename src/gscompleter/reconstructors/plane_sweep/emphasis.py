@@ -32,18 +32,18 @@ class Emphasis:
 
     def find_refined(self, views: Sequence[View]) -> list[int]:
         """Find the views that get further steps, in ascending order; none if all are as near."""
-        nearest = find_nearest(self.targets, views, NUM_REFINED)
+        nearest = find_nearest_views(self.targets, views, NUM_REFINED)
         return nearest if len(nearest) < len(views) else []
 
     def weigh_colors(self, views: Sequence[View]) -> list[float]:
         """Weigh the colours of each view."""
         if not self.targets:
             return [1.0] * len(views)
-        favoured = set(find_nearest(self.targets, views, NUM_FAVOURED))
+        favoured = set(find_nearest_views(self.targets, views, NUM_FAVOURED))
         return [1.0 if number in favoured else FAR_WEIGHT for number in range(len(views))]
 
 
-def find_nearest(targets: Sequence[Camera], views: Sequence[View], count: int) -> list[int]:
+def find_nearest_views(targets: Sequence[Camera], views: Sequence[View], count: int) -> list[int]:
     """Find the numbers of the `count` views nearest to each target; in ascending order."""
     nearest: set[int] = set()
     for target in targets:
