@@ -97,12 +97,13 @@ def reconstruct(case: Case) -> tuple[Gaussians, list[View], list[View], float]:
     """Reconstruct a case; return its scene, photographs, target and neighbours, and seconds."""
     models = RunConfig().load_models(())
     views = sort_by_frame(load(case, case.context))
+    shown = load(case, (case.target, *case.neighbours))
     start = time.perf_counter()
-    context = reconstruct_context(models.reconstructor, views)
+    # As for users, photographs near the target count most.
+    context = reconstruct_context(models.reconstructor, views, favored=[shown[0].camera])
     seconds = time.perf_counter() - start
     camera = context.views[0].camera
     given = normalize_exposures(views, context.exposure_gains)
-    shown = load(case, (case.target, *case.neighbours))
     # All are seen in the depth range that the scene was reconstructed in.
     given, shown = (set_depth_range(group, camera.near, camera.far) for group in (given, shown))
     return context.source.gaussians, given, shown, seconds

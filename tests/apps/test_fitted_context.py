@@ -10,7 +10,7 @@ from command import run
 from exact_room import make_cameras, write_transforms
 from gscompleter import GSCompleter, InputError
 from gscompleter.apps.inputs.reading import MAX_FIT_VIEWS, add_fit_views, read_task
-from gscompleter.apps.inputs.selection import count_overview
+from gscompleter.apps.inputs.selection import limit_fitted_context
 from gscompleter.apps.inputs.task import Opened
 from gscompleter.apps.requests.scene import SceneRequest
 from gscompleter.data.formats import open_photographs
@@ -76,9 +76,9 @@ def open_again(opened: Opened) -> Opened:
     return Opened(opened.request, open_photographs(folder), "nerfstudio", opened.num_photographs)
 
 
-def count_context(opened: Opened, is_fitted: bool) -> int:
-    """Count the photographs of the context that is chosen for the whole scene."""
-    return len(read_task(opened, None, (), "cpu", False, is_fitted).views)
+def count_context(opened: Opened, is_fitted: bool, targets: tuple[str, ...] = ()) -> int:
+    """Count the photographs of the context that is chosen for targets, or for the whole scene."""
+    return len(read_task(opened, None, targets, "cpu", False, is_fitted).views)
 
 
 def test_half_of_the_photographs_are_the_context_of_a_fitted_scene(tmp_path):
@@ -92,14 +92,25 @@ def test_half_of_the_photographs_are_the_context_of_a_fitted_scene(tmp_path):
     assert count_context(many, is_fitted=False) == 8
 
 
-def test_large_photographs_are_no_more_than_before():
-    def choose(width: int, height: int) -> int:
-        camera = replace(camera_at(0.0), width=width, height=height)
-        return count_overview([camera] * 100)
+def test_up_to_eight_photographs_are_the_context_of_a_scene_fitted_for_targets(tmp_path):
+    few = open_room(tmp_path / "few", 5)
+    more = open_room(tmp_path / "more", 13)
+    many = open_room(tmp_path / "many", 24)
+    assert count_context(few, True, ("2",)) == 3
+    assert count_context(more, True, ("6",)) == 6
+    assert count_context(many, True, ("12",)) == 8
+    assert count_context(many, False, ("12",)) == 3
 
-    assert choose(640, 480) == 16
-    assert choose(800, 600) == 10
-    assert choose(1920, 1080) == 8
+
+def test_large_photographs_are_no_more_than_before():
+    def limit(width: int, height: int) -> int:
+        camera = replace(camera_at(0.0), width=width, height=height)
+        return limit_fitted_context([camera] * 100, 16)
+
+    assert limit(640, 480) == 16
+    assert limit(800, 600) == 10
+    # Whatever is asked at least is more than that.
+    assert limit(1920, 1080) == 2
 
 
 @pytest.mark.slow

@@ -74,3 +74,15 @@ def test_no_more_are_chosen_than_there_are():
     assert chosen([camera_at(0.2), camera_at(0.4)], 8) == [0, 1]
     same = [replace(camera_at(0.2)) for _ in range(3)]
     assert len(chosen(same, 3)) == 3
+
+
+def test_the_nearest_follow_before_those_that_show_a_little_more():
+    """A camera that moves ahead: those far behind the target show more of its borders."""
+    places = [number for number in range(-8, 9) if number]
+    ahead = [camera_at(0.1 * (i % 3), z=0.1 * number) for i, number in enumerate(places)]
+    points = make_points_in_front(TARGET, 0.6, 27.0)
+    found = select_context([TARGET], ahead, points, 5)
+    assert [places[index] for index in found] == [-4, -2, -1, 1, 2]
+    # One that looks away is none of them, wherever it stands.
+    away = camera_at(0.01, yaw=180)
+    assert 0 not in select_context([TARGET], [away, *ahead], points, 5)

@@ -3,6 +3,10 @@
 A photograph scores by the target's points that it shows, from similar directions; a pair also by
 its triangulation angle. The score of a set is that of its best pair, summed over points. Selection
 is greedy; of two further photographs that are needed to show new points, each counts half.
+
+The score hardly tells photographs apart once one good pair shows each point, and then photographs
+that stand farther off show a little more. So those that stand nearest to the targets follow the
+first three, and what they leave open decides about the rest (decision 143).
 """
 
 from __future__ import annotations
@@ -37,6 +41,12 @@ WIDE_FALLOFF = 20.0
 """Angle above it, in degrees, at which the score of a pair falls to a third."""
 MIN_SHOWING_SCORE = 0.1
 """Pair score below which no pair shows a point."""
+NUM_SCORED = 3
+"""Photographs that are chosen by their score before the nearest ones."""
+NUM_NEAREST = 2
+"""Nearest photographs that follow them."""
+MIN_NEAR_WORTH = 0.25
+"""Least score of a nearest photograph, relative to the best; one that looks elsewhere has less."""
 OUTSIDE_SCORE = 1e-3
 """Score of a point outside of an image; it ranks photographs that show none."""
 
@@ -64,15 +74,30 @@ def select_context(
 
     # Pairs are scored for the best candidates alone: their number grows with the square.
     closest = worth.sum(1).argsort(descending=True, stable=True)[:MAX_NEAR_PHOTOGRAPHS]
-    rays = compute_directions([candidates[i] for i in closest.tolist()], torch.cat(seen))
-    chosen = select_greedily(worth[closest], rays, count)
+    near = [candidates[i] for i in closest.tolist()]
+    rays = compute_directions(near, torch.cat(seen))
+    chosen = select_greedily(worth[closest], rays, measure_distances(targets, near), count)
     return sorted(closest[chosen].tolist())
 
 
+def measure_distances(
+    targets: Sequence[Camera], candidates: Sequence[Camera]
+) -> Float[Tensor, "c"]:
+    """Measure how far each candidate stands from the nearest target, in scene units."""
+    centers = torch.stack([target.center for target in targets])
+    return torch.stack([(centers - c.center).norm(dim=-1).amin() for c in candidates])
+
+
 def select_greedily(
-    worth: Float[Tensor, "c p"], rays: Float[Tensor, "c p 3"], count: int
+    worth: Float[Tensor, "c p"],
+    rays: Float[Tensor, "c p 3"],
+    distances: Float[Tensor, "c"],
+    count: int,
 ) -> list[int]:
-    """Choose the best pair, then repeatedly the candidate that improves the pair scores most."""
+    """Choose the best pair, then repeatedly the candidate that improves the pair scores most.
+
+    The nearest candidates that show enough follow the first `NUM_SCORED`.
+    """
     count = min(count, len(worth))
     if count < 2:
         return list(range(count))
@@ -83,6 +108,7 @@ def select_greedily(
     first, second = divmod(int(pairs.sum(-1).argmax()), len(worth))
     chosen = [first, second]
     best = pairs[first, second]
+    shows_enough = worth.sum(-1) >= MIN_NEAR_WORTH * worth.sum(-1).amax()
     while len(chosen) < count:
         # The gain of each candidate together with one of the chosen.
         now = (pairs[chosen].amax(0) - best).clamp_min(0).sum(-1)
@@ -92,7 +118,12 @@ def select_greedily(
         # The last term breaks ties by what a photograph shows on its own.
         gains = torch.maximum(now, later) + OUTSIDE_SCORE * worth.sum(-1)
         gains[chosen] = -1.0
-        added = int(gains.argmax())
+        near = shows_enough.clone()
+        near[chosen] = False
+        if NUM_SCORED <= len(chosen) < NUM_SCORED + NUM_NEAREST and near.any():
+            added = int(distances.where(near, math.inf).argmin())
+        else:
+            added = int(gains.argmax())
         best = torch.maximum(best, pairs[chosen, added].amax(0))
         chosen.append(added)
     return chosen

@@ -21,6 +21,8 @@ from gscompleter.types import Camera
 
 NUM_CONTEXT = 3
 """Number of context photographs if targets but no context are named (decision 030)."""
+MAX_TARGET_CONTEXT = 8
+"""Most of them if the scene is fitted jointly, with those near the targets first (decision 143)."""
 NUM_CONTEXT_WITH_SPLAT = 8
 """Number of context photographs with an input splat. It is also the smallest number without one if
 no targets are named either, so that the photographs have to show the whole scene (decision 030)."""
@@ -100,23 +102,26 @@ def _choose_frames(
     # Without targets, medoids of all photographs with a partner each; with targets, photographs
     # that show what the targets see (decision 030).
     if not targets:
-        count = count_overview(candidates) if is_fitted else NUM_CONTEXT_WITH_SPLAT
+        count = NUM_CONTEXT_WITH_SPLAT
+        if is_fitted:
+            count = max(count, limit_fitted_context(candidates, MAX_FITTED_CONTEXT))
         chosen = select_overview(candidates, points, count)
     else:
         count = NUM_CONTEXT_WITH_SPLAT if has_splat else NUM_CONTEXT
+        if is_fitted:
+            count = max(NUM_CONTEXT, limit_fitted_context(candidates, MAX_TARGET_CONTEXT))
         chosen = select_context(target_cameras, candidates, points, count)
     frames = list(cameras)
     return tuple(frames[index] for index in chosen)
 
 
-def count_overview(cameras: Sequence[Camera]) -> int:
-    """Compute how many of the photographs at `cameras` are the context of a fitted scene.
+def limit_fitted_context(cameras: Sequence[Camera], most: int) -> int:
+    """Limit the context of a scene that is fitted to the photographs at `cameras`.
 
     Half of them at most: to some of the others it is fitted, too, and the rest scores it.
     """
     pixels = max(camera.width * camera.height for camera in cameras)
-    most = min(MAX_FITTED_CONTEXT, len(cameras) // 2, MAX_FITTED_PIXELS // pixels)
-    return max(most, NUM_CONTEXT_WITH_SPLAT)
+    return min(most, len(cameras) // 2, MAX_FITTED_PIXELS // pixels)
 
 
 def collect_usable_cameras(
