@@ -21,7 +21,7 @@ from PIL import Image
 
 from gscompleter.data.cameras import has_same_aspect
 from gscompleter.data.file_names import FolderListings, is_photograph_name, list_endings
-from gscompleter.data.frame import FOLDERS, MASKS, Frame
+from gscompleter.data.frame import FOLDERS, MASKS, MAX_NAMED_OWNERS, Frame, assign_masks
 from gscompleter.data.photograph import StoredPhotograph
 from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.image import HALF_OPAQUE, read_mask, turn_upright
@@ -34,8 +34,6 @@ FORMS = tuple(product(("{}_mask", "{}.mask", "{}-mask"), MASK_ENDINGS))
 """Names of masks by those of their photographs, and their endings."""
 INVERTED = "dynamic_mask_"
 """Beginning of the names of instant-ngp's masks, in which white is ignored."""
-MAX_NAMED_OWNERS = 3
-"""Most photographs, or masks without one, that a sentence names."""
 
 
 def attach_masks(frames: Sequence[Frame]) -> tuple[Frame, ...]:
@@ -94,31 +92,7 @@ def find_masks_in(
         masks = (mask for mask in found if mask is not None and os.path.isfile(mask))
         return next((mask for mask in masks if os.path.realpath(mask) not in taken), None)
 
-    # By mask: how many folders of the name it lacks, and the number of the photograph.
-    claims: dict[Path, list[tuple[int, int]]] = {}
-    for number, name in enumerate(names):
-        for lacking, ending in enumerate(list_inner_endings(name)):
-            mask = find_one(ending)
-            if mask is not None:
-                claims.setdefault(mask, []).append((lacking, number))
-                break
-
-    masks: list[Path | None] = [None] * len(names)
-    for mask, claimed in claims.items():
-        # 1.png is of 1.jpg rather than of a/1.jpg.
-        least = min(claimed)[0]
-        owners = [number for lacking, number in claimed if lacking == least]
-        # The frames of a file may name a photograph twice.
-        if len({photographs[number] or names[number] for number in owners}) > 1:
-            several = join_names([names[number] for number in owners], MAX_NAMED_OWNERS)
-            raise InputError(
-                f"{quote_value(mask)} may be the mask of several photographs ({several}); put "
-                "masks into folders as the photographs are in.",
-                option,
-            )
-        for number in owners:
-            masks[number] = mask
-    return masks
+    return assign_masks(names, photographs, list_inner_endings, find_one, option)
 
 
 def list_inner_endings(name: str) -> list[str]:
