@@ -18,7 +18,10 @@ from gscompleter.apps.command_line.failures import explain_failure
         (RuntimeError("libcudart.so: failed to map segment from shared object"), "memory ran out"),
         (torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2 GiB"), "of the GPU"),
         (RuntimeError("CUDA error: out of memory"), "of the GPU"),
-        (RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `create`"), "of the GPU"),
+        (
+            RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED"),
+            "of the GPU",
+        ),
         (RuntimeError("cuDNN error: CUDNN_STATUS_ALLOC_FAILED"), "of the GPU"),
         (RuntimeError("MPS backend out of memory (MPS allocated: 9 GB)"), "of the GPU"),
     ],

@@ -172,7 +172,10 @@ def refused(path: Path, text: str, sentence: str) -> None:
         ("1: 2", "no setting '1'"),
         ("margin: 1\nmargin: 2", "is not YAML: 'margin' is there twice in line 2"),
         ("holes: {kind: all}\nmargin: 1\nholes: {dilation: 2}", "'holes' is there twice in line 3"),
-        ("holes:\n  dilation: 2\n  kind: all\n  'dilation': 3", "'dilation' is there twice in line 4"),
+        (
+            "holes:\n  dilation: 2\n  kind: all\n  'dilation': 3",
+            "'dilation' is there twice in line 4",
+        ),
         ("holes: {dilation: 010}", "is not YAML: 010 is no decimal number in line 1"),
         ("holes: {dilation: 1:30}", "is not YAML: 1:30 is no decimal number"),
         ("margin: 1:30.5", "is not YAML: 1:30.5 is no decimal number"),

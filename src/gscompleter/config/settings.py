@@ -27,7 +27,7 @@ Weight = Annotated[float, Interval(ge=0, le=1e6)]
 Device = Literal["auto", "cpu", "cuda", "mps"]
 """Choice of one device for renderer and networks; with `mps` the renderer stays on the CPU."""
 Seed = Annotated[int, Interval(ge=0, lt=2**62)]
-"""Seed of random numbers. Targets and rounds add to it, and the sum has to stay below 2⁶³."""
+"""Seed of random numbers. Attempts, levels and rounds add to it, and sums stay below 2⁶³."""
 
 COVERED = 0.5
 """Alpha from which a pixel is covered, unless `holes.max_alpha` (τ of Eq. 12) demands more."""

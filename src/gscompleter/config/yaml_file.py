@@ -30,9 +30,10 @@ MISREAD_NUMBER = re.compile(r".*:|[-+]?0[0-9_]")
 class SettingsLoader(yaml.SafeLoader):
     """Reads plain values only, and refuses what would be lost or become another number."""
 
-    def construct_mapping(self, node: yaml.Node, deep: bool = False) -> dict[Any, Any]:
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Construct a mapping; a name that is there twice is refused, as PyYAML keeps the last."""
         names: set[object] = set()
+        # A tag such as !!map may be before anything, which the loader refuses.
         for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
             if isinstance(key, yaml.ScalarNode) and key.value in names:
                 problem = f"'{quote_value(key.value)}' is there twice"
