@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -311,6 +312,11 @@ def test_a_mask_beside_a_scene_of_another_machine_is_of_one_photograph(tmp_path)
     make_files(tmp_path / "images", "cam1/1.jpg")
     with pytest.raises(InputError, match=r"1\.png may be the mask of several photographs"):
         locate_images(frames, [tmp_path])
+    # A name with no more than a drive is one of another machine as well.
+    (other,) = make_files(tmp_path / "images", "2.jpg")
+    (moved,) = locate_images([replace(frames[0], name="D:\\2.jpg")], [tmp_path])
+    assert (moved.name, moved.image, moved.written) == ("2.jpg", other, "D:\\2.jpg")
+
     own = make_files(tmp_path / "masks", "cam0/1.png", "cam1/1.png")
     assert [frame.mask for frame in locate_images(frames, [tmp_path])] == own
 

@@ -23,8 +23,10 @@ FLOAT_TAG = "tag:yaml.org,2002:float"
 INT_TAG = "tag:yaml.org,2002:int"
 EXPONENT = re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+")
 """Numbers that PyYAML takes for texts: YAML 1.1, which it reads, wants a dot and a sign."""
-MISREAD_NUMBER = re.compile(r".*:|[-+]?0[0-9_]")
-"""Beginning of numbers that YAML 1.1 does not read as decimal: 1:30 is 90, and 010 is 8."""
+SIXTIETHS = re.compile(r".*:")
+"""Beginning of numbers that YAML 1.1 reads by hours, minutes and seconds: 1:30 is 90."""
+OCTAL = re.compile(r"[-+]?0[0-9_]")
+"""Beginning of whole numbers that YAML 1.1 reads with the base 8: 010 is 8."""
 
 
 class SettingsLoader(yaml.SafeLoader):
@@ -42,25 +44,27 @@ class SettingsLoader(yaml.SafeLoader):
         return super().construct_mapping(node, deep)
 
     def construct_int(self, node: yaml.ScalarNode) -> int:
-        """Construct a whole number."""
-        self.refuse_misread(node)
+        """Construct a whole number, unless it would be another one than its author meant."""
+        refuse_number(node, SIXTIETHS)
+        refuse_number(node, OCTAL)
         return self.construct_yaml_int(node)
 
     def construct_float(self, node: yaml.ScalarNode) -> float:
-        """Construct a number."""
-        self.refuse_misread(node)
+        """Construct a number, unless it would be another one than its author meant."""
+        refuse_number(node, SIXTIETHS)
         return self.construct_yaml_float(node)
-
-    def refuse_misread(self, node: yaml.ScalarNode) -> None:
-        """Refuse a number that would be read as another one than its author meant."""
-        if MISREAD_NUMBER.match(node.value):
-            problem = f"{quote_value(node.value)} is no decimal number"
-            raise ConstructorError(None, None, problem, node.start_mark)
 
 
 SettingsLoader.add_constructor(INT_TAG, SettingsLoader.construct_int)
 SettingsLoader.add_constructor(FLOAT_TAG, SettingsLoader.construct_float)
 SettingsLoader.add_implicit_resolver(FLOAT_TAG, EXPONENT, list("-+0123456789"))
+
+
+def refuse_number(node: yaml.ScalarNode, form: re.Pattern[str]) -> None:
+    """Refuse a number of a form that is not decimal."""
+    if form.match(node.value):
+        problem = f"{quote_value(node.value)} is no decimal number"
+        raise ConstructorError(None, None, problem, node.start_mark)
 
 
 def read_yaml(path: Path) -> dict[str, Any]:

@@ -342,8 +342,8 @@ def assign_masks(
 def _rename_moved(frame: Frame, folders: Sequence[Path]) -> Frame:
     """Name a frame by the photograph that was found, if its name is a path of another machine."""
     image = frame.image
-    is_absolute = len(list_endings(frame.name)) > 1
-    if not is_absolute or not isinstance(image, Path):
+    is_foreign = list_endings(frame.name) != [frame.name]
+    if not is_foreign or not isinstance(image, Path):
         return frame
     # A path of this machine, which may lack the ending, leads to the photograph as it is.
     if image in [Path(frame.name + ending) for ending in TRIED_ENDINGS]:

@@ -56,9 +56,9 @@ columns."""
 def has_panoramas(files: Sequence[Path]) -> bool:
     """Return True if photographs are panoramas; raise InputError for those of several sizes.
 
-    Only photographs that are exactly twice as wide as high may be panoramas. All of them count as
-    such if the metadata of one say so, or if the borders of more than half of them meet as on a
-    sphere.
+    Only photographs that are upright exactly twice as wide as high may be panoramas. All of them
+    count as such if the metadata of one say so, or if the borders of more than half of them meet as
+    on a sphere.
     """
     sizes = [read_image_size(path) for path in files]
     wide = [
