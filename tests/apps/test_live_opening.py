@@ -380,6 +380,35 @@ def test_a_folder_that_somebody_removed_gets_all_masks_again(begun, tmp_path):
     assert [step.mask for step in read_steps(rows, tmp_path / "out")] == [SPOT, OTHER]
 
 
+@pytest.mark.parametrize(
+    ("values", "said"),
+    [
+        ({"box": [1, 1, 1, 0, 0, 0]}, "is damaged (frames.0: A box needs six numbers"),
+        ({"box_rotation": [0, 0, 0, 0]}, "is damaged (frames.0: A rotation is a quaternion"),
+        ({"box": None, "box_rotation": [0, 1, 0, 0]}, "(frames.0: A step without a box has a rot"),
+        ({"action": "fill"}, "(frames.0: Only Remove takes a box, and fill has one"),
+        ({"mask_path": "images/stroke1.png"}, "(frames.0: A step with a box"),
+        ({"mask_path": "../stroke1.png"}, "only files beside it are read"),
+        ({"mask_path": "C:/stroke1.png"}, "only files beside it are read"),
+        ({"fl_x": -1.0}, "(frames.0: There is no such camera"),
+        ({"w": 0}, "(frames.0: There is no such camera"),
+        ({"transform_matrix": [[2.0, 0, 0, 0]] * 4}, "(frames.0: There is no such camera"),
+    ],
+)
+def test_a_row_that_is_no_step_is_named_before_anything_is_opened(begun, tmp_path, values, said):
+    Journal(tmp_path, NO_START).write(begun.extended(begun.latest, STEPS[0]))
+    path = tmp_path / "strokes.json"
+    content = json.loads(path.read_text())
+    content["frames"][0].update(values)
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError) as told:
+        read_strokes(path)
+    assert said in str(told.value)
+    assert str(told.value).startswith(str(path))
+    # Whoever goes on with a session has no --box to correct.
+    assert told.value.argument is None
+
+
 def test_a_step_without_a_mask_leaves_none_of_the_step_in_its_place(begun, tmp_path):
     journal = Journal(tmp_path, NO_START)
     journal.write(begun.extended(begun.latest, STEPS[1]))

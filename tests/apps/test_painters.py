@@ -14,8 +14,8 @@ from command import run
 from gscompleter import load_cameras, load_splat, load_views
 from gscompleter.apps.commands.batch_rows import parse_batch_row
 from gscompleter.apps.completing.path_video import plan_path
-from gscompleter.apps.inputs.holes_file import HoleRow
-from gscompleter.apps.inputs.paintings import add_exported_photograph
+from gscompleter.apps.inputs.holes_file import HoleRow, PathRow
+from gscompleter.apps.inputs.paintings import add_exported_photograph, find_painted
 from gscompleter.apps.inputs.task import Target
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photograph_names import name_target
@@ -340,6 +340,28 @@ def test_a_camera_keeps_the_photograph_that_it_was_derived_from(scene):
         found = add_exported_photograph(target, replace(row, title=title), photographs, None)
         assert found.derived_from == base
         assert (found.offset is None) == (base is None)
+
+
+def test_a_photograph_without_a_camera_is_not_that_of_a_target(scene):
+    """It took the number of the photograph that the target was at the export."""
+    photographs = open_photographs(scene)
+    target = Target(photographs.camera(1))
+    row = HoleRow("a.png", "", "b.png", SIZE, SIZE, 0.1, frame=1)
+    assert add_exported_photograph(target, row, photographs, None).frame == 1
+    frames = list(photographs.frames)
+    frames[1] = replace(frames[1], lack="COLMAP found no camera for it")
+    photographs = replace(photographs, frames=tuple(frames))
+    assert add_exported_photograph(target, row, photographs, None) is target
+
+
+def test_of_several_repaired_videos_none_is_taken(tmp_path):
+    path = PathRow("path.mp4", "", 5)
+    row = HoleRow("target1.png", "", "b.png", SIZE, SIZE, 0.1, path_frame=2)
+    (tmp_path / "path.mov").write_bytes(b"one")
+    assert find_painted(tmp_path, "target1.png", row, path) == tmp_path / "path.mov"
+    (tmp_path / "path.mkv").write_bytes(b"another")
+    with pytest.raises(InputError, match=r"several repaired videos \(path\.mkv, path\.mov\)"):
+        find_painted(tmp_path, "target1.png", row, path)
 
 
 def test_a_batch_exports_no_holes(tmp_path):

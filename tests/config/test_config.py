@@ -122,6 +122,13 @@ def test_a_whole_number_is_a_float_and_an_empty_file_changes_nothing(tmp_path):
     assert load_config(str(file)) == CompleterConfig()
 
 
+@pytest.mark.parametrize("text", ["1e-3", "1E-3", "+1e-3", "0.1e-2", "1.0e-3", "1_0e-4", "00.001"])
+def test_a_small_number_is_written_in_any_way(tmp_path, text):
+    file = tmp_path / "mine.yaml"
+    file.write_text(f"margin: {text}")
+    assert load_config(str(file)).margin == pytest.approx(0.001)
+
+
 def refused(path: Path, text: str, sentence: str) -> None:
     """Check that the file is refused with one short sentence."""
     path.write_text(text)
@@ -159,10 +166,20 @@ def refused(path: Path, text: str, sentence: str) -> None:
         ("margin: .nan", "margin must be a finite number, got nan"),
         ("margin: .inf", "margin must be a finite number, got inf"),
         ("margin: -0.5", "margin must be greater than or equal to 0, got -0.5"),
-        ("margin: 1e9", "margin must be a valid number, got '1e9'"),  # no number in YAML 1.1
+        ("margin: 1e9", "margin must be less than or equal to 4, got 1000000000.0"),
         ("margin: 1.0e+9", "margin must be less than or equal to 4, got 1000000000.0"),
         ("margin: 2024-01-31", "margin must be a valid number, got '2024-01-31'"),
         ("1: 2", "no setting '1'"),
+        ("margin: 1\nmargin: 2", "is not YAML: 'margin' is there twice in line 2"),
+        ("holes: {kind: all}\nmargin: 1\nholes: {dilation: 2}", "'holes' is there twice in line 3"),
+        (
+            "holes:\n  dilation: 2\n  kind: all\n  'dilation': 3",
+            "'dilation' is there twice in line 4",
+        ),
+        ("holes: {dilation: 010}", "is not YAML: 010 is no decimal number in line 1"),
+        ("holes: {dilation: 1:30}", "is not YAML: 1:30 is no decimal number"),
+        ("margin: 1:30.5", "is not YAML: 1:30.5 is no decimal number"),
+        ('guards: ["\\ud800"]', "A setting has characters that are no Unicode; write it again"),
         ("2024-01-31: 2", "is not YAML"),
         ("margin: 2024-13-45", "is not YAML: month must be in 1..12"),
         ("- 1", "must map settings to values"),

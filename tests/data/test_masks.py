@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,10 @@ from PIL import Image
 
 from exact_room import ExactCamera, make_cameras, write_colmap, write_transforms
 from gscompleter import InputError
+from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.file_names import FolderListings
 from gscompleter.data.formats import open_photographs
+from gscompleter.data.frame import Frame, locate_images
 from gscompleter.data.masks import (
     fill_hidden,
     find_mask,
@@ -23,7 +26,7 @@ from gscompleter.data.masks import (
     load_mask,
 )
 from gscompleter.data.sfm.poses import list_all_photographs, write_upright
-from gscompleter.system.files.image import ORIENTATION, read_mask
+from gscompleter.system.files.image import ORIENTATION, read_mask, read_pixels
 
 WIDTH, HEIGHT = 64, 48
 HIDDEN_ROWS = HEIGHT // 4
@@ -238,6 +241,16 @@ def test_copies_for_colmap_take_their_masks_and_alpha_along(tmp_path):
     assert not write_upright(tmp_path, "whole.png", tmp_path).is_masked
 
 
+def test_copies_for_colmap_scale_grey_of_16_bits(tmp_path):
+    grey = np.arange(HEIGHT * WIDTH, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 21
+    Image.fromarray(grey).save(tmp_path / "grey.png")
+    write_upright(tmp_path, "grey.png", tmp_path)
+    written = read_pixels(tmp_path / "images/grey.png")
+    assert np.array_equal(written, read_pixels(tmp_path / "grey.png"))
+    assert written.min() < 10
+    assert written.max() > 240
+
+
 def test_a_mask_of_a_named_folder_lies_there_by_path_or_by_name(tmp_path):
     for name in ("a/x.png", "y.jpg.png"):
         save(tmp_path / name, np.zeros((4, 4), np.uint8))
@@ -283,6 +296,29 @@ def test_a_mask_of_several_photographs_is_refused(tmp_path):
     photographs += make_files(tmp_path / "images", "1.jpg")
     found = find_masks_in(tmp_path / "masks", names, photographs)
     assert [mask is None for mask in found] == [True, True, False]
+
+
+def test_a_mask_beside_a_scene_of_another_machine_is_of_one_photograph(tmp_path):
+    frames = [
+        Frame(f"/home/a/data/{name}", name, np.eye(4), Intrinsics(None, (1.0, 1.0)), None)
+        for name in ("cam0/1.jpg", "cam1/1.jpg")
+    ]
+    make_files(tmp_path / "images", "cam0/1.jpg")
+    (mask,) = make_files(tmp_path / "masks", "1.png")
+    found = locate_images(frames, [tmp_path])
+    # The other photograph is missing.
+    assert [frame.mask for frame in found] == [mask, None]
+    assert found[0].name == "cam0/1.jpg"
+    make_files(tmp_path / "images", "cam1/1.jpg")
+    with pytest.raises(InputError, match=r"1\.png may be the mask of several photographs"):
+        locate_images(frames, [tmp_path])
+    # A name with no more than a drive is one of another machine as well.
+    (other,) = make_files(tmp_path / "images", "2.jpg")
+    (moved,) = locate_images([replace(frames[0], name="D:\\2.jpg")], [tmp_path])
+    assert (moved.name, moved.image, moved.written) == ("2.jpg", other, "D:\\2.jpg")
+
+    own = make_files(tmp_path / "masks", "cam0/1.png", "cam1/1.png")
+    assert [frame.mask for frame in locate_images(frames, [tmp_path])] == own
 
 
 def test_masks_that_are_named_as_no_photograph_are_said(tmp_path):

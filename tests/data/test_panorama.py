@@ -11,7 +11,7 @@ from command import run
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.panorama import VIEWS, compute_view_rotation, has_panoramas, split_panorama
 from gscompleter.data.sfm.poses import list_photograph_files
-from gscompleter.system.files.image import write_image
+from gscompleter.system.files.image import ORIENTATION, write_image
 from gscompleter.types import Camera
 from mapping_stand_in import similarity_removed
 from panoramas import panorama
@@ -49,6 +49,38 @@ def test_views_are_what_pinhole_cameras_see(tmp_path):
         off = np.abs(pixels / 255 - true.numpy()).mean()
         assert off < 0.02  # where the panorama is seen through another view it is 0.2
     assert all(pitch >= 0 for _, pitch in VIEWS)  # the operator stands below
+
+
+def test_a_panorama_is_read_as_other_photographs_are(tmp_path):
+    """Upright as EXIF says, with its mask; and grey of 16 bits is scaled, not clipped to white."""
+    path = panorama(tmp_path / "a.png", CENTRES[0])
+    image = Image.open(path)
+    hidden = np.zeros((image.height, image.width), dtype=bool)
+    hidden[: image.height // 2] = True
+    exif = image.getexif()
+    exif[ORIENTATION] = 3
+    image.rotate(180).save(tmp_path / "turned.png", exif=exif)
+    upright = split_panorama(path, hidden)
+    turned = split_panorama(tmp_path / "turned.png", hidden)
+    for (pixels, shade), (other, other_shade) in zip(upright, turned, strict=True):
+        assert np.array_equal(pixels, other)
+        assert np.array_equal(shade, other_shade)
+
+    grey = np.asarray(image.convert("L"))
+    Image.fromarray(grey).save(tmp_path / "8.png")
+    Image.fromarray(grey.astype(np.uint16) * 257).save(tmp_path / "16.png")
+    for (pixels, _), (other, _) in zip(
+        split_panorama(tmp_path / "8.png"), split_panorama(tmp_path / "16.png"), strict=True
+    ):
+        assert np.array_equal(pixels, other)
+
+
+def test_a_panorama_on_its_side_is_none(tmp_path):
+    image = Image.open(panorama(tmp_path / "a.png", CENTRES[0]))
+    exif = image.getexif()
+    exif[ORIENTATION] = 6
+    image.save(tmp_path / "a.png", exif=exif)
+    assert not has_panoramas([tmp_path / "a.png"])
 
 
 def test_a_view_that_rises_looks_up():

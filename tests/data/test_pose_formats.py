@@ -223,6 +223,25 @@ def test_an_impossible_camera_of_a_list_is_refused(tmp_path, values, sentence):
         load_cameras(changed_camera(tmp_path, **values))
 
 
+@pytest.mark.parametrize("ending", ["", ".png"])
+def test_a_list_may_name_photographs_that_lie_elsewhere_by_their_whole_path(tmp_path, ending):
+    write_photographs(tmp_path / "camera")
+    scene = write_camera_list(tmp_path / "room" / "cameras.json")
+    content = json.loads(scene.read_text())
+    for entry, name in zip(content, NAMES, strict=True):
+        entry["img_name"] = str(tmp_path / "camera" / name).removesuffix(".png") + ending
+    scene.write_text(json.dumps(content))
+    photographs = open_photographs(scene)
+    check_room(photographs, range(5))
+    assert photographs.notes == ()
+
+    # A mask of one of them lies beside the list, and no photograph is its own.
+    (tmp_path / "room" / "masks").mkdir()
+    Image.new("L", (SIZE, SIZE), 255).save(tmp_path / "room" / "masks" / "1.png")
+    masks = [frame.mask for frame in open_photographs(scene).frames]
+    assert masks == [None, tmp_path / "room" / "masks" / "1.png", None, None, None]
+
+
 def test_photographs_of_a_list_that_are_missing_are_left_out_and_named(tmp_path):
     scene = camera_list(tmp_path / "room")
     (scene / "images" / "1.png").unlink()

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import torch
 
+from command import run
 from gscompleter import load_ply, save_ply
 from gscompleter.apps.inputs.task import InputSplatFile
 from gscompleter.apps.report.scenes import save_completed_splat
@@ -198,6 +199,25 @@ def test_the_only_edit_is_taken_off_by_its_number_as_well(tmp_path):
     again = edit_in_another_degree(completed, tmp_path / "second")
     with pytest.raises(InputError, match="take the file that the first of them was given"):
         strip_edits(again, tmp_path / "out.ply")
+
+
+@pytest.mark.parametrize("name", ["removed.ply", "edits/1_originals.ply", "edits/new.ply"])
+def test_what_edits_left_out_is_not_written_over(states, tmp_path, monkeypatch, capsys, name):
+    folder = Path(shutil.copytree(states[2].parent, tmp_path / "2"))
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    words = ("strip", folder / "completed.ply", "--out", folder / name, "--overwrite")
+    assert run(monkeypatch, *words) == 2
+    assert f"The output {folder / name} " in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+
+
+def test_it_is_said_which_file_came_back(states, tmp_path, monkeypatch, capsys):
+    for number, (words, place) in enumerate([((), "all edits"), (("--last",), "this edit")]):
+        out = tmp_path / f"{number}.ply"
+        assert run(monkeypatch, "strip", states[2], *words, "--out", out) == 0
+        assert capsys.readouterr().out.endswith(
+            f"The file is the one before {place}, byte for byte.\n"
+        )
 
 
 def test_other_splats_of_the_folder_have_no_edits(states, tmp_path):

@@ -17,7 +17,6 @@ from gscompleter.config.settings import (
     Share,
     Weight,
     apply_changes,
-    read_yaml,
 )
 from gscompleter.system.errors import InputError, quote_value, require_path
 from gscompleter.system.plugins import is_in_file
@@ -629,6 +628,9 @@ def load_config(
     if is_given and Path(source).suffix not in {".yaml", ".yml"}:
         return get_named_config(os.fspath(source), is_splat, has_photographs)
     path = require_path(source)
+    # Imported here, so that only a file waits for PyYAML.
+    from gscompleter.config.yaml_file import read_yaml
+
     changes = read_yaml(path)
     base_name = str(changes.pop("base", "default"))
     base = get_named_config(base_name, is_splat, has_photographs)

@@ -38,9 +38,11 @@ FOLDERS = ("images", *(f"images_{n}" for n in DOWNSCALE_FACTORS), ORIGINALS)
 DISTORTED = "distorted"
 """Folder of the model with distortion, beside undistorted photographs (3DGS's scripts)."""
 MASKS = "masks"
-"""Folder of masks beside the photographs or their folder."""
+"""Folder of masks, in the folder of the photographs or beside it."""
 MAX_MISSING_PHOTOGRAPHS = 3
 """Missing photographs that a note names."""
+MAX_NAMED_OWNERS = 3
+"""Most photographs, or masks without one, that a sentence names."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,18 +82,18 @@ class Frame:
 
     @property
     def file_name(self) -> str:
-        """Path of the photograph below the folder of all, as users know it."""
+        """Path of the photograph below the folder of photographs, as users know it."""
         path = PurePosixPath(self.name.replace("\\", "/"))
         # Trainers list photographs without the ending that the file has.
         if path.name and isinstance(self.image, Path) and self.image.stem == path.name:
             path = path.with_name(self.image.name)
-        # "images" in front of a name is the folder of all, which users do not name.
+        # "images" in front of a name is the folder of photographs, which users do not name.
         inside = len(path.parts) > 1 and path.parts[0].casefold() in FOLDERS
         return str(PurePosixPath(*path.parts[1:]) if inside else path)
 
     @cached_property
     def photograph(self) -> Photograph | None:
-        """The photograph, which is looked for once; None if there is none."""
+        """The photograph, or None if there is none; it is looked for once."""
         if not isinstance(self.image, Path):
             return self.image
         path = find_image(self.image)
@@ -112,16 +114,16 @@ class Frame:
     def size(self) -> tuple[int, int]:
         """Return width and height of the upright photograph, or else those of the camera file.
 
-        A photograph inside a container file is not opened if the camera file gives its size.
+        The camera file decides for a photograph inside a container, which is opened only if that
+        file gives no size. Raise InputError if there is neither a photograph nor a size.
         """
         stated = None if self.intrinsics.size == FRACTIONS else self.intrinsics.size
-        # To measure an image inside a container, that has to be opened.
-        is_closed = self.photograph is None or (stated is not None and self.file is None)
-        if self.photograph is not None and not is_closed:
+        # Without a file of its own, the photograph is missing or inside a container.
+        if stated is not None and self.file is None:
+            return stated
+        if self.photograph is not None:
             width, height = self.photograph.measure()
             return (height, width) if self.find_turn() != 1 else (width, height)
-        if stated is not None:
-            return stated
         raise InputError(
             f"The size of {self.title} is not known, because it has no image and no `w` and `h`; "
             "add these, or its image."
@@ -222,8 +224,8 @@ def find_image(path: Path, listings: FolderListings | None = None) -> Path | Non
     """Find the image file at `path`, which may lack its ending; None if there is none.
 
     If folder `images` lacks it, the largest copy in `images_2`, `images_4` or `images_8` is used,
-    as nerfstudio writes and DL3DV publishes them. With `listings`, file and folder may be written
-    in another case.
+    as nerfstudio writes and DL3DV publishes them. With `listings`, the names of the file and of its
+    folder on the disk may differ from `path` in case.
     """
     folders = [path.parent]
     if path.parent.name == "images":
@@ -261,28 +263,90 @@ def list_image_folders(roots: Sequence[Path]) -> list[Path]:
 
 
 def locate_images(frames: Sequence[Frame], roots: Sequence[Path]) -> list[Frame]:
-    """Return the frames with the paths of their photographs and masks, if they exist."""
+    """Return the frames with the paths of their photographs and masks, if they exist.
+
+    Raise InputError if a mask may be of several photographs.
+    """
     folders = list_image_folders(roots)
-    found_masks = [find_path(root, MASKS) for root in roots]
-    masks = [folder for folder in found_masks if folder is not None]
     listings = FolderListings()
     located = []
     for frame in frames:
         # A name may be a path of another machine, or lack its ending.
         names = list(dict.fromkeys([frame.name, *list_endings(frame.name)]))
         images = [name + ending for name in names for ending in TRIED_ENDINGS]
-        stems = [os.path.splitext(name)[0] for name in names]
-        image = find_file(folders, images, listings)
-        mask = find_file(masks, [f"{name}.png" for name in [*names, *stems]], listings)
-        located.append(_rename_moved(replace(frame, image=image, mask=mask), folders))
+        located.append(replace(frame, image=find_file(folders, images, listings)))
+
+    found_masks = [find_path(root, MASKS) for root in roots]
+    mask_folders = [folder for folder in found_masks if folder is not None]
+
+    def find_mask_of(end: str) -> Path | None:
+        names = [f"{name}.png" for name in (end, os.path.splitext(end)[0])]
+        return find_file(mask_folders, names, listings)
+
+    # Frames still have their written names: a folder of masks may keep more folders of these than
+    # the photographs lie in.
+    found = {n: frame.image for n, frame in enumerate(located) if isinstance(frame.image, Path)}
+    written = [located[number].name for number in found]
+    masks = assign_masks(written, list(found.values()), list_endings, find_mask_of)
+    for number, mask in zip(found, masks, strict=True):
+        located[number] = _rename_moved(replace(located[number], mask=mask), folders)
     return located
+
+
+def assign_masks(
+    names: Sequence[str],
+    photographs: Sequence[Path | None],
+    list_ends: Callable[[str], list[str]],
+    find: Callable[[str], Path | None],
+    option: str | None = None,
+) -> list[Path | None]:
+    """Assign to each photograph the mask that is named as it, or as an end of its name.
+
+    Args:
+        names: Paths of the photographs, as written.
+        photographs: Their files; None for one that is not there.
+        list_ends: Lists the ends of a name, the longest first.
+        find: Finds the mask that is named as an end; None if there is none.
+        option: Option that names the masks, for the error.
+
+    Raises:
+        InputError: A mask may be of several photographs.
+    """
+    # By mask: how many folders of the name it lacks, and the number of the photograph.
+    claims: dict[Path, list[tuple[int, int]]] = {}
+    for number, name in enumerate(names):
+        for lacking, end in enumerate(list_ends(name)):
+            mask = find(end)
+            if mask is not None:
+                claims.setdefault(mask, []).append((lacking, number))
+                break
+
+    masks: list[Path | None] = [None] * len(names)
+    for mask, claimed in claims.items():
+        # 1.png is of 1.jpg rather than of a/1.jpg.
+        least = min(claimed)[0]
+        owners = [number for lacking, number in claimed if lacking == least]
+        # The frames of a file may name a photograph twice.
+        if len({photographs[number] or names[number] for number in owners}) > 1:
+            several = join_names([names[number] for number in owners], MAX_NAMED_OWNERS)
+            raise InputError(
+                f"{quote_value(mask)} may be the mask of several photographs ({several}); put "
+                "masks into folders as the photographs are in.",
+                option,
+            )
+        for number in owners:
+            masks[number] = mask
+    return masks
 
 
 def _rename_moved(frame: Frame, folders: Sequence[Path]) -> Frame:
     """Name a frame by the photograph that was found, if its name is a path of another machine."""
     image = frame.image
-    is_foreign = len(list_endings(frame.name)) > 1
-    if not is_foreign or not isinstance(image, Path) or image == Path(frame.name):
+    is_foreign = list_endings(frame.name) != [frame.name]
+    if not is_foreign or not isinstance(image, Path):
+        return frame
+    # A path of this machine, which may lack the ending, leads to the photograph as it is.
+    if image in [Path(frame.name + ending) for ending in TRIED_ENDINGS]:
         return frame
     home = next(folder for folder in folders if folder in image.parents)
     return replace(frame, name=image.relative_to(home).as_posix(), written=frame.name)
@@ -317,9 +381,10 @@ def keep_existing(frames: Sequence[Frame], title: str) -> tuple[tuple[Frame, ...
 
 
 def describe_unposed(frames: Sequence[Frame], title: str) -> tuple[str, ...]:
-    """Say which photographs have no camera; raise InputError if none has one.
+    """Say which cameras have a pose of NaN or infinity; raise InputError if all of them have.
 
-    They stay among the frames, so that the number of each photograph is that of its file.
+    Their photographs stay among the frames, so that the number of each is that of its file. Those
+    that `lack` a camera are told where they are used.
     """
     lost = [frame.name for frame in frames if frame.lack is None and not frame.has_finite_pose]
     if len(lost) == len(frames):

@@ -3,7 +3,7 @@
 Programs put them into a folder `masks` or beside the photographs. COLMAP calls the mask of x.jpg
 x.jpg.png, nerfstudio and others x.png, Metashape x_mask.png and RealityScan x.mask.png. Those that
 instant-ngp calls dynamic_mask_x.png are white where pixels are ignored. An alpha channel is a mask,
-too, unless it is the same everywhere.
+too, unless it is the same everywhere. A photograph without any mask is used as a whole.
 """
 
 from __future__ import annotations
@@ -21,21 +21,19 @@ from PIL import Image
 
 from gscompleter.data.cameras import has_same_aspect
 from gscompleter.data.file_names import FolderListings, is_photograph_name, list_endings
-from gscompleter.data.frame import FOLDERS, MASKS, Frame
+from gscompleter.data.frame import FOLDERS, MASKS, MAX_NAMED_OWNERS, Frame, assign_masks
 from gscompleter.data.photograph import StoredPhotograph
 from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.image import HALF_OPAQUE, read_mask, turn_upright
 
 MASK_FOLDERS = (MASKS, "mask")
-"""Folders of masks, beside the photographs, in their folder or beside it."""
+"""Names of folders of masks, which lie in the folder of the photographs or beside it."""
 MASK_ENDINGS = (".png", ".jpg", ".jpeg")
 """Image file endings of masks."""
 FORMS = tuple(product(("{}_mask", "{}.mask", "{}-mask"), MASK_ENDINGS))
-"""Names of masks by those of their photographs, and their endings."""
+"""Forms of the names of masks, {} being that of the photograph without its ending; and endings."""
 INVERTED = "dynamic_mask_"
 """Beginning of the names of instant-ngp's masks, in which white is ignored."""
-MAX_NAMED_OWNERS = 3
-"""Most photographs, or masks without one, that a sentence names."""
 
 
 def attach_masks(frames: Sequence[Frame]) -> tuple[Frame, ...]:
@@ -52,13 +50,14 @@ def attach_masks(frames: Sequence[Frame]) -> tuple[Frame, ...]:
 
 @dataclass(frozen=True)
 class GivenPhotograph:
-    """A photograph in a folder of new ones, with its mask, for which was looked once."""
+    """A photograph in a folder of new ones, with its mask, which is looked for once."""
 
     name: str
     """Path below the folder."""
     stored: StoredPhotograph
     path: Path
     mask: Path | None
+    """Its mask; None if it has none."""
 
 
 def find_given(
@@ -82,8 +81,8 @@ def find_masks_in(
 ) -> list[Path | None]:
     """Find the mask of each photograph in a folder of masks that the user named by an option.
 
-    `photographs` are the files of these `names`, None for one without a file. None of them is a
-    mask. Raises InputError if a mask may be of several photographs.
+    `photographs` are the files of these `names`, None for one without a file. No photograph is
+    taken for a mask. Raises InputError if a mask may be of several photographs.
     """
     listings = FolderListings()
     taken = {os.path.realpath(path) for path in photographs if path is not None}
@@ -94,43 +93,22 @@ def find_masks_in(
         masks = (mask for mask in found if mask is not None and os.path.isfile(mask))
         return next((mask for mask in masks if os.path.realpath(mask) not in taken), None)
 
-    # By mask: how many folders of the name it lacks, and the number of the photograph.
-    claims: dict[Path, list[tuple[int, int]]] = {}
-    for number, name in enumerate(names):
-        for lacking, ending in enumerate(list_inner_endings(name)):
-            mask = find_one(ending)
-            if mask is not None:
-                claims.setdefault(mask, []).append((lacking, number))
-                break
-
-    masks: list[Path | None] = [None] * len(names)
-    for mask, claimed in claims.items():
-        # 1.png is of 1.jpg rather than of a/1.jpg.
-        least = min(claimed)[0]
-        owners = [number for lacking, number in claimed if lacking == least]
-        # The frames of a file may name a photograph twice.
-        if len({photographs[number] or names[number] for number in owners}) > 1:
-            several = join_names([names[number] for number in owners], MAX_NAMED_OWNERS)
-            raise InputError(
-                f"{quote_value(mask)} may be the mask of several photographs ({several}); put "
-                "masks into folders as the photographs are in.",
-                option,
-            )
-        for number in owners:
-            masks[number] = mask
-    return masks
+    return assign_masks(names, photographs, list_inner_endings, find_one, option)
 
 
 def list_inner_endings(name: str) -> list[str]:
     """List the ends of a name, the longest first, that stay inside of the folder they are in."""
-    # As of another machine: no end of such a name begins at the root.
+    # Every name is taken for one of another machine, of which no end begins at the root.
     return [end for end in list_endings(f"/{name}") if ".." not in PurePosixPath(end).parts]
 
 
 def describe_unnamed_masks(
     folder: Path, masks: Collection[Path | None], photographs: Collection[Path | None]
 ) -> list[str]:
-    """Describe images in a folder of masks that are neither used as `masks` nor `photographs`."""
+    """Describe images in a folder of masks that are neither `masks` in use nor `photographs`.
+
+    Returns one sentence, or none if there are no such images.
+    """
     used = {os.path.realpath(path) for path in (*masks, *photographs) if path is not None}
     # Among photographs, or in a whole scene, most images are meant as something else.
     home = os.path.realpath(folder) + os.sep
@@ -184,20 +162,19 @@ def find_mask(photograph: Path, name: str, listings: FolderListings) -> Path | N
 
     # In folders of masks for any of these paths, then beside the photograph.
     folders = [root / folder for root, folder in product(dict.fromkeys(roots), MASK_FOLDERS)]
-    in_folders = [mask for path in relatives for mask in list_mask_names(path, is_beside=False)]
-    found = (
-        listings.find(folder, mask)
-        for folder, masks in [
-            *((folder, in_folders) for folder in folders if os.path.isdir(folder)),
-            (photograph.parent, list_mask_names(PurePosixPath(photograph.name))),
-        ]
-        for mask in masks
-    )
+    names_there = [mask for path in relatives for mask in list_mask_names(path, is_beside=False)]
+    places = [(folder, mask) for folder in folders if os.path.isdir(folder) for mask in names_there]
+    names_beside = list_mask_names(PurePosixPath(photograph.name))
+    places += [(photograph.parent, mask) for mask in names_beside]
+    found = (listings.find(folder, mask) for folder, mask in places)
     return next((path for path in found if path is not None and os.path.isfile(path)), None)
 
 
 def list_mask_names(photograph: PurePosixPath, is_beside: bool = True) -> list[str]:
-    """List the names that the mask of a photograph may have, in a folder of masks or beside it."""
+    """List the names that the mask of a photograph may have, in a folder of masks or beside it.
+
+    Beside it no name is that of the photograph with another ending, which may be a photograph.
+    """
     stem = str(photograph.with_suffix(""))
     named = [f"{photograph}.png", *(form.format(stem) + end for form, end in FORMS)]
     if is_beside:
@@ -208,18 +185,21 @@ def list_mask_names(photograph: PurePosixPath, is_beside: bool = True) -> list[s
 
 
 def leave_out_masks(names: Collection[str]) -> list[str]:
-    """Leave out the files of a folder, given by name, that are masks of others there."""
+    """Leave out the names of files that are masks of other files of the same folder."""
     masks = {mask.casefold() for name in names for mask in list_mask_names(PurePosixPath(name))}
     return [name for name in names if name.casefold() not in masks]
 
 
 def hides_white(path: Path, is_inverted: bool) -> bool:
-    """Return True if white pixels of a mask are ignored: by its name, or because it is inverted."""
+    """Return True if white pixels of a mask are ignored: by its name, or because it is inverted.
+
+    Of a mask with such a name that is inverted, too, black pixels are ignored.
+    """
     return path.name.casefold().startswith(INVERTED) != is_inverted
 
 
 def read_ignored(path: Path, is_inverted: bool = False) -> Bool[np.ndarray, "h w"]:
-    """Read the pixels of a mask that are ignored in its photograph; `is_inverted` reads others."""
+    """Read the pixels of a mask that are ignored in its photograph, as `hides_white` tells."""
     black = read_mask(path)
     return ~black if hides_white(path, is_inverted) else black
 
@@ -234,8 +214,9 @@ def load_mask(
     """Read the ignored pixels of a mask at the `size` (width, height) of its upright photograph.
 
     A mask of another size is scaled if its aspect ratio is the same. `orientation` is how EXIF
-    turned the photograph: a mask of the stored pixels is turned likewise. `photograph` is for the
-    error of any other mask. An inverted mask is white where pixels are ignored.
+    turned the photograph: a mask of the stored pixels is turned likewise. Any other mask raises an
+    InputError, in which `photograph` names its photograph. An inverted mask is white where pixels
+    are ignored.
     """
     ignored = read_ignored(path, is_inverted)
     # A mask drawn on the upright photograph has its shape; another may be of the stored pixels.
@@ -256,7 +237,10 @@ def load_mask(
 def find_masked(
     frame: Frame, alpha: UInt8[np.ndarray, "h w"] | None, size: tuple[int, int], orientation: int
 ) -> Bool[np.ndarray, "h w"] | None:
-    """Find the pixels of an upright photograph that its mask or its alpha hides; None if none."""
+    """Find the pixels of an upright photograph that its mask or its alpha hides; None if none.
+
+    `alpha` is upright, `size` is (width, height), and `orientation` is that of `load_mask`.
+    """
     masks = []
     if frame.mask is not None:
         masks.append(load_mask(frame.mask, size, frame.title, orientation, frame.has_inverted_mask))
@@ -269,7 +253,10 @@ def find_masked(
 def fill_hidden(
     pixels: UInt8[np.ndarray, "h w 3"], hidden: Bool[np.ndarray, "h w"]
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Replace hidden pixels by the nearest others, so that resampling mixes none into them."""
+    """Replace hidden pixels by the nearest visible ones, so that resampling mixes in none of them.
+
+    Where all are hidden, pixels stay as they are.
+    """
     if hidden.all():
         return pixels
     _, labels = cv2.distanceTransformWithLabels(

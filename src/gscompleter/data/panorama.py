@@ -14,12 +14,19 @@ from pathlib import Path
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, UInt8
-from PIL import Image
+from PIL import Image, ImageOps
 
 from gscompleter.data.cameras import remap
 from gscompleter.data.limits import require
 from gscompleter.system.errors import quote_value
-from gscompleter.system.files.image import open_image, read_brightness, read_image_size
+from gscompleter.system.files.image import (
+    QUARTER_TURNS,
+    open_image,
+    read_brightness,
+    read_image_size,
+    read_orientation,
+    reduce_to_rgb,
+)
 from gscompleter.system.files.reading import read_head
 
 VIEWS = (*((yaw, 0) for yaw in range(0, 360, 60)), *((yaw, 50) for yaw in range(0, 360, 120)))
@@ -27,29 +34,38 @@ VIEWS = (*((yaw, 0) for yaw in range(0, 360, 60)), *((yaw, 50) for yaw in range(
 MAX_VIEW_SIDE = 1600
 """Largest side of a view in pixels."""
 REPEATED_COLUMNS = 4
-"""Columns that are repeated on the other side, in pixels."""
+"""Columns of each border that are repeated beyond the other one, in pixels."""
 GPANO_MARK = b"equirectangular"
-"""Projection in Google's photo sphere metadata (GPano)."""
+"""Value of `ProjectionType` in Google's metadata of photo spheres (GPano), by which they are known.
+"""
 METADATA_BYTES = 1 << 18
 """First bytes of a file that hold the metadata."""
 SMALL_WIDTH = 1024
-"""Width at which borders are compared."""
+"""Width at which borders are compared, in pixels."""
 MAX_SEAM = 3.0
-"""Largest difference of the left and right border, relative to neighbouring columns."""
+"""Largest mean difference of the left and right border of a panorama, relative to the median of
+neighbouring columns."""
 MAX_POLE = 0.5
-"""Largest deviation along the upper and lower border, relative to other rows."""
+"""Largest standard deviation along the upper and lower border of a panorama, relative to the median
+of all rows."""
 MIN_STRUCTURE = 0.3
-"""Smallest deviation along the left border, relative to other columns."""
+"""Smallest standard deviation along the left border of a panorama, relative to the median of all
+columns."""
 
 
 def has_panoramas(files: Sequence[Path]) -> bool:
-    """Check whether photographs are panoramas; panoramas beside other sizes are refused.
+    """Return True if photographs are panoramas; raise InputError for those of several sizes.
 
-    They are if they are exactly twice as wide as high and either the metadata of one of them say
-    so, or the borders of most of them meet as on a sphere.
+    Only photographs that are upright exactly twice as wide as high may be panoramas. All of them
+    count as such if the metadata of one say so, or if the borders of more than half of them meet as
+    on a sphere.
     """
     sizes = [read_image_size(path) for path in files]
-    wide = [path for path, (w, h) in zip(files, sizes, strict=True) if w == 2 * h]
+    wide = [
+        path
+        for path, (width, height) in zip(files, sizes, strict=True)
+        if width == 2 * height and read_orientation(path) not in QUARTER_TURNS
+    ]
     marked = any(GPANO_MARK in read_head(path, METADATA_BYTES) for path in wide)
     if not marked:
         num_closed = sum(_is_closed(path) for path in wide)
@@ -64,7 +80,7 @@ def has_panoramas(files: Sequence[Path]) -> bool:
 
 
 def _is_closed(path: Path) -> bool:
-    """Check whether left and right border continue each other, and each pole is one point."""
+    """Return True if left and right border continue each other, and each pole is one point."""
     pixels = read_brightness(path, SMALL_WIDTH)
     # Differences from each column to the next; the last one is across the seam.
     steps = np.abs(np.diff(pixels, axis=1, append=pixels[:, :1])).mean(axis=0)
@@ -84,43 +100,50 @@ def split_panorama(
 ) -> Iterator[tuple[UInt8[np.ndarray, "s s 3"], Bool[np.ndarray, "s s"] | None]]:
     """Draw the `VIEWS` of a panorama and of its mask, at its resolution or `MAX_VIEW_SIDE`.
 
-    `hidden` are the pixels of the panorama that its mask hides, or None without one.
+    `hidden` are the pixels of the upright panorama that its mask hides, or None without one. Yields
+    the colours of each view, and its hidden pixels or None.
     """
-    # As large as makes a view of 90° `MAX_VIEW_SIDE` wide: its centre has `width` / π pixels per
-    # unit.
+    # At this width of the panorama a view is `MAX_VIEW_SIDE` wide (see `_project_rays`).
     widest = math.ceil(math.pi * MAX_VIEW_SIDE)
     with open_image(path) as image:
+        # A JPEG is decoded at a fraction of its size if that is enough.
         image.draft("RGB", (widest, widest // 2))
-        panorama = image.convert("RGB")
+        panorama = reduce_to_rgb(ImageOps.exif_transpose(image))
     panorama.thumbnail((widest, widest), Image.Resampling.LANCZOS)
     # Repeated columns let the interpolation continue across the seam.
     pixels = np.pad(
         np.asarray(panorama), ((0, 0), (REPEATED_COLUMNS, REPEATED_COLUMNS), (0, 0)), mode="wrap"
     )
-    mask = None
+    padded_mask = None
     if hidden is not None:
         scaled = Image.fromarray(hidden).resize(panorama.size, Image.Resampling.NEAREST)
-        mask = np.pad(
+        padded_mask = np.pad(
             np.asarray(scaled, np.uint8),
             ((0, 0), (REPEATED_COLUMNS, REPEATED_COLUMNS)),
             mode="wrap",
         )
-    for view in VIEWS:
-        places = _project_rays(compute_view_rotation(*view), panorama.width)
-        seen = None if mask is None else remap(mask, places, cv2.INTER_NEAREST) > 0
-        yield remap(pixels, places, cv2.INTER_CUBIC), seen
+    for yaw, pitch in VIEWS:
+        places = _project_rays(compute_view_rotation(yaw, pitch), panorama.width)
+        colors = remap(pixels, places, cv2.INTER_CUBIC)
+        if padded_mask is None:
+            yield colors, None
+        else:
+            yield colors, remap(padded_mask, places, cv2.INTER_NEAREST) > 0
 
 
 def _project_rays(rotation: Float[np.ndarray, "3 3"], width: int) -> Float[np.ndarray, "s s 2"]:
-    """Project the pixels of a view to positions (x, y) in a panorama of this width with borders."""
-    # A 90° view reaches from -1 to 1 at z = 1, and keeps the resolution of the panorama's equator
-    # in its centre.
+    """Project the pixels of a view to positions (x, y) in a panorama with repeated columns.
+
+    `rotation` is that of `compute_view_rotation`, and `width` that of the panorama without them.
+    """
+    # A 90° view reaches from -1 to 1 at z = 1. Its centre keeps the resolution of the panorama's
+    # equator, which has width / 2π pixels per radian: half of the side of the view per unit.
     side = round(width / math.pi)
     places = (np.arange(side) + 0.5) / side * 2 - 1
     rays = np.stack([*np.meshgrid(places, places), np.ones((side, side))], axis=-1) @ rotation.T
     longitude = np.arctan2(rays[..., 0], rays[..., 2])
     latitude = np.arctan2(rays[..., 1], np.hypot(rays[..., 0], rays[..., 2]))
-    # Pixel positions as `remap` counts them: 0 is the centre of the first column without border.
+    # `remap` counts from pixel centres: 0 is the centre of the first repeated column.
     x = (longitude / (2 * np.pi) + 0.5) * width - 0.5 + REPEATED_COLUMNS
     y = (latitude / np.pi + 0.5) * width / 2 - 0.5
     return np.stack([x, y], axis=-1).astype(np.float32)

@@ -30,12 +30,12 @@ from gscompleter.system.files.typed_json import read_typed_json
 from gscompleter.system.files.writing import (
     COMPLETED_FILE,
     EDITS_FILE,
+    EDITS_FOLDER,
     REFINED_POSES_FILE,
     REMOVED_FILE,
 )
 from gscompleter.types import Gaussians
 
-EDITS_FOLDER = "edits"
 EDITS = (EDITS_FILE, f"{EDITS_FOLDER}/*.ply", REFINED_POSES_FILE)
 """Globs of the files that are written, with the poses that the splat was made with."""
 EDITS_ADVICE = "take all files of its folder again, or move it away to do without the record"

@@ -44,11 +44,12 @@ seen, and guards would take as long for them as for many."""
 def displace_camera(
     target: Camera, views: Sequence[View], displacement: float
 ) -> tuple[Camera, ...]:
-    """Move a target camera by a share of the baseline to its nearest photograph, three times.
+    """Return three cameras beside a target, none of which is turned.
 
-    First it moves on, away from that photograph, where the gaps of parallax between the known and
-    the completed part open widest, then to the right and to the left: a gap that one side opens is
-    hidden from the other. The camera is not turned.
+    Each is moved by `displacement`, relative to the baseline of the target and its nearest
+    photograph. The first moves on, away from that photograph, where the gaps of parallax between
+    the known and the completed part open widest. The others move to the right and to the left: a
+    gap that one side opens is hidden from the other.
     """
     nearest = views[find_nearest_view(target, views)].camera
     baseline = target.center - nearest.center
@@ -67,7 +68,8 @@ def view_gaps(
 ) -> TargetView:
     """Render the scene of a completed target at a camera beside it.
 
-    More is a hole there than at a target: gaps at the edges of surfaces are half transparent.
+    Holes begin at a higher alpha there than at a target, since gaps at the edges of surfaces are
+    half transparent.
     """
     holes = replace(state.config.holes, max_alpha=config.max_alpha, dilation=GAP_RIM)
     strict = replace(state, config=replace(state.config, holes=holes))
@@ -80,7 +82,7 @@ def find_gaps(view: TargetView) -> Bool[Tensor, "h w"]:
 
 
 def are_worth_closing(gaps: Bool[Tensor, "h w"]) -> bool:
-    """Return True unless gaps are hardly seen."""
+    """Return True if gaps cover at least MIN_SHARE of the image."""
     return gaps.float().mean().item() >= MIN_SHARE
 
 
@@ -90,14 +92,15 @@ def continue_surfaces(
 ) -> tuple[GeneratedView, Gaussians]:
     """Continue the farther surfaces beside gaps into them.
 
-    Return the image with closed gaps, and a Gaussian for each pixel of a gap and of its rim. There
-    is none if nothing is known beside them.
+    Return the image with closed gaps, and a Gaussian for each pixel of a gap and of its rim. No
+    Gaussian is returned if no pixel of the image is known.
     """
     camera = view.camera.padded
     layers, known = collect_layers(view)
 
-    # Of two surfaces that adjoin a gap the farther one goes on in it. A power and no limit, as most
-    # steps of depth are small, and a slanted surface has its own.
+    # Of two surfaces that adjoin a gap the farther one goes on in it. Nearer pixels weigh less by a
+    # power of their depth. A limit of depth would not do: most steps between two surfaces are small
+    # and a slanted surface has as large ones of its own.
     depths = layers[..., 3].exp().where(known, 0.0)
     side = 2 * GAP_REACH + 1
     farthest = max_pool2d(depths[None, None], side, stride=1, padding=GAP_REACH)[0, 0]
@@ -116,9 +119,10 @@ def continue_surfaces(
 
 
 def collect_layers(view: TargetView) -> tuple[Float[Tensor, "h w 4"], Bool[Tensor, "h w"]]:
-    """Collect the colour and the logarithm of the depth of known pixels, and tell which are known.
+    """Collect the colour and the logarithm of the depth of each pixel, and tell which are known.
 
-    Those beside a hole show a part of what lies behind it, and are not known.
+    Pixels beside a hole show a part of what lies behind it, and are not known. The values of those
+    that are not known mean nothing.
     """
     render = view.render
     max_alpha = view.state.config.holes.max_alpha

@@ -13,6 +13,10 @@ NAME_ERRORS = {errno.ENAMETOOLONG, errno.ELOOP}
 """Numbers of errors of a path that names nothing on any disk."""
 ACCESS_ERRORS = {errno.EACCES, errno.EPERM, errno.EROFS}
 """Numbers of errors of a path that this user may not read or write."""
+DEVICE_ERRORS = {errno.EIO, errno.ESTALE, errno.ENOTCONN, errno.EHOSTDOWN, errno.ETIMEDOUT}
+"""Numbers of errors of a disk that is broken, or on the network and not reached."""
+OPEN_FILE_ERRORS = {errno.EMFILE, errno.ENFILE}
+"""Numbers of errors of more open files than the system allows."""
 MEMORY_WORDS = (
     "can't start new thread",
     "can't allocate memory",
@@ -22,11 +26,26 @@ MEMORY_WORDS = (
     "failed to allocate",
     "failed to map segment",
     "insufficient memory",
+    "_alloc_failed",  # of CUBLAS_STATUS_ALLOC_FAILED and others
 )
 """Words of the messages by which libraries say that memory ran out, in small letters.
 
 Threads need memory, too: of a limit of the address space (`ulimit -v`) each takes its stack.
 """
+GPU_WORDS = ("cuda error", "cuda out of", "cublas_", "cudnn_", "hip error", "mps backend")
+"""Words by which such a message tells that the memory is that of a GPU, in small letters. A library
+called libcuda.so may lack that of the CPU."""
+GPU_MEMORY_SENTENCE = (
+    "The memory of the GPU ran out; choose a smaller --resolution, fewer photographs or "
+    "--generator-offload (diffusion models), or run a part on the CPU: --renderer-device cpu, "
+    "--network-device cpu."
+)
+MEMORY_SENTENCE = (
+    "The memory ran out; choose a smaller --resolution, fewer --threads or fewer photographs, or "
+    "raise the limit (ulimit -v)."
+)
+MAX_FAILED_NAME_LENGTH = 120
+"""Characters of a file name that a sentence shows."""
 
 
 @dataclass(frozen=True)
@@ -41,49 +60,64 @@ def explain_failure(error: BaseException) -> Failure | None:
     """Explain an error of the machine or of a path; None for any other, which is a defect."""
     # Libraries wrap the error of the system in their own, so the causes are searched, too. A chain
     # of causes may lead back to its beginning.
-    seen: list[BaseException] = []
+    seen: set[int] = set()
     cause: BaseException | None = error
-    while cause is not None and cause not in seen:
-        sentence, code = _explain_failure(cause)
-        if sentence:
-            return Failure(sentence, code)
-        seen.append(cause)
+    while cause is not None and id(cause) not in seen:
+        failure = explain_lack_of_memory(cause) or explain_system_error(cause)
+        if failure is not None:
+            return failure
+        seen.add(id(cause))
         cause = cause.__cause__ or cause.__context__
     return None
 
 
-def _explain_failure(error: BaseException) -> tuple[str, int]:
-    """Return the sentence and exit code for an error alone; an empty sentence for a defect."""
+def explain_lack_of_memory(error: BaseException) -> Failure | None:
+    """Explain an error, without its causes, that says that memory ran out; None for any other."""
     # torch has its own error for the memory of a GPU; torch is not imported to name it.
     if type(error).__name__ == "OutOfMemoryError":
-        return (
-            "The memory of the GPU ran out; choose a smaller --resolution, fewer photographs or "
-            "--generator-offload (diffusion models), or run a part on the CPU: --renderer-device "
-            "cpu, --network-device cpu.",
-            ERROR,
-        )
-    # torch and numba raise RuntimeError for a lack of memory, so their words are read, too.
+        return Failure(GPU_MEMORY_SENTENCE, ERROR)
     number = getattr(error, "errno", None)
-    is_memory = isinstance(error, MemoryError) or number == errno.ENOMEM
-    if is_memory or any(words in str(error).lower() for words in MEMORY_WORDS):
-        return (
-            "The memory ran out; choose a smaller --resolution, fewer --threads or fewer "
-            "photographs, or raise the limit (ulimit -v).",
-            ERROR,
-        )
+    if isinstance(error, MemoryError) or number == errno.ENOMEM:
+        return Failure(MEMORY_SENTENCE, ERROR)
 
-    # Without a file name an error of the system names nothing that the user could correct.
-    if not isinstance(error, OSError) or error.filename is None:
-        return "", ERROR
-    name = quote_value(str(error.filename), 120)
+    # torch and numba raise RuntimeError for a lack of memory, so their words are read, too. An
+    # error of the system tells by its number what it is, and its text has names of the user's
+    # files, in which any words may be.
+    text = str(error).lower()
+    if number is not None or not any(words in text for words in MEMORY_WORDS):
+        return None
+    is_of_gpu = any(words in text for words in GPU_WORDS)
+    return Failure(GPU_MEMORY_SENTENCE if is_of_gpu else MEMORY_SENTENCE, ERROR)
+
+
+def explain_system_error(error: BaseException) -> Failure | None:
+    """Explain an error of the system, without its causes, by its number; None for any other."""
+    if not isinstance(error, OSError):
+        return None
+    number = error.errno
     reason = error.strerror
+    # These say enough without the name of a file, which errors of a file that is open lack.
+    if number in OPEN_FILE_ERRORS:
+        return Failure(
+            f"The limit of open files is reached: {reason}; raise it (ulimit -n).", ERROR
+        )
+    if number in FULL_DISK_ERRORS and error.filename is None:
+        return Failure(f"A file cannot be written: {reason}; free some space.", ERROR)
+
+    # Without a file name any other error names nothing that the user could correct: it may be of a
+    # network connection.
+    if error.filename is None:
+        return None
+    name = quote_value(str(error.filename), MAX_FAILED_NAME_LENGTH)
     if number in NAME_ERRORS:
-        return f"{name} is no path: {reason}; correct it.", WRONG_INPUT
+        return Failure(f"{name} is no path: {reason}; correct it.", WRONG_INPUT)
     if number in ACCESS_ERRORS:
-        return (
+        return Failure(
             f"{name} cannot be used: {reason}; change its permissions or name another.",
             WRONG_INPUT,
         )
     if number in FULL_DISK_ERRORS:
-        return f"{name} cannot be written: {reason}; free some space.", ERROR
-    return "", ERROR
+        return Failure(f"{name} cannot be written: {reason}; free some space.", ERROR)
+    if number in DEVICE_ERRORS:
+        return Failure(f"{name} cannot be used: {reason}; check the disk.", ERROR)
+    return None

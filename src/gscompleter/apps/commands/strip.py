@@ -13,7 +13,7 @@ from gscompleter.apps.command_line.answers import print_answer
 from gscompleter.apps.commands.shared_options import WritingOptions, list_inputs
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.overlap import refuse_input_file
-from gscompleter.system.files.writing import EDITS_FILE, REMOVED_FILE
+from gscompleter.system.files.writing import EDITS_FILE, EDITS_FOLDER, REMOVED_FILE
 from gscompleter.system.process import import_without_collection
 
 
@@ -39,15 +39,15 @@ class StripOptions(WritingOptions):
         """Refuse to write over an input."""
         # What lies beside the completed scene is read, too.
         folder = self.completed.parent
-        beside = [folder / name for name in (REMOVED_FILE, EDITS_FILE)]
+        beside = [folder / name for name in (REMOVED_FILE, EDITS_FILE, EDITS_FOLDER)]
         refuse_input_file(self.out, [*list_inputs(self), *beside])
 
 
 def run_strip(options: StripOptions) -> None:
-    """Write the original scene and print the number of Gaussians."""
-    # Imported here, so that help pages do not wait for torch.
+    """Write the scene without the chosen edits, and print the number of its Gaussians."""
     if options.last and options.edit is not None:
         raise InputError("--last and --edit both name an edit; leave one of them out.", "edit")
+    # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
         from gscompleter.splats.edits import read_edits
         from gscompleter.splats.foreign import resolve_splat
@@ -57,7 +57,9 @@ def run_strip(options: StripOptions) -> None:
     with reserve_splat(options.out, options.overwrite):
         numbers = None if options.edit is None else [options.edit]
         if options.last:
-            numbers = [max(len(read_edits(resolve_splat(options.completed)).edits), 1)]
+            count = len(read_edits(resolve_splat(options.completed)).edits)
+            # Without any edit, `strip_edits` refuses the first one with the reason.
+            numbers = [max(count, 1)]
         undone = strip_edits(options.completed, options.out, numbers)
     content = {
         "out": str(options.out),
@@ -66,10 +68,10 @@ def run_strip(options: StripOptions) -> None:
         "is_same_file": undone.is_same_file,
         "missing": undone.missing,
     }
-    line = f"{undone.kept:,} Gaussians, {undone.dropped:,} generated ones removed: {options.out}"
-    lines = [line]
+    lines = [f"{undone.kept:,} Gaussians, {undone.dropped:,} generated ones removed: {options.out}"]
     if undone.is_same_file:
-        lines.append("The file is the one before this edit, byte for byte.")
+        before = "all edits" if numbers is None else "this edit"
+        lines.append(f"The file is the one before {before}, byte for byte.")
     if undone.missing:
         lines.append(
             f"{undone.missing:,} Gaussians that the scene had before its edits are not restored: "

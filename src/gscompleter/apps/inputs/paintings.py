@@ -39,13 +39,13 @@ from gscompleter.types import Camera
 PAINTING_ENDINGS = (".png", ".jpg", ".jpeg", ".webp")
 """Endings of painted images."""
 VIDEO_ENDINGS = (".mp4", ".mov", ".mkv", ".webm")
-"""Endings of repaired videos."""
+"""Endings of videos along the targets, which were repaired in place of their images."""
 
 
 def check_paintings(folder: Path, num_targets: int) -> None:
     """Check a folder of painted images as far as it can be before the scene is opened.
 
-    `num_targets` is the number of those named on the command line. Without any, `holes.json` has
+    `num_targets` is the number of targets named on the command line. Without any, `holes.json` has
     the targets, and all of their images are found and read.
     """
     if not os.path.isdir(folder):
@@ -54,7 +54,7 @@ def check_paintings(folder: Path, num_targets: int) -> None:
         )
     if has_holes(folder):
         holes = read_holes(folder)
-        # Which of them named targets need is known when the cameras are.
+        # Named targets need some of the images: those of their cameras, which are not known yet.
         for row in holes.frames if num_targets == 0 else ():
             source = find_painted(folder, row.image_path, row, holes.path)
             if source.suffix.lower() in PAINTING_ENDINGS:
@@ -73,7 +73,7 @@ def read_paintings(
     """Add its painted image to each target, and the photograph that `holes.json` knows for it.
 
     Cameras of the targets are as they were read, in the frame of the photographs. Without a
-    `holes.json` images are named by the number of the target, from 1.
+    `holes.json` the images are called target1, target2, … in the order of the targets.
     """
     if not has_holes(folder):
         names = [f"target{number}.png" for number in range(1, len(targets) + 1)]
@@ -112,8 +112,8 @@ def read_video_frames(
 ) -> list[UInt8[np.ndarray, "h w 3"] | None]:
     """Read the frame of each target that is painted in the video; None for the others.
 
-    `sources` are the images or the video of the targets, and `path` describes the exported video.
-    Raise InputError if the video has another number of frames than the one that was exported.
+    `sources` are the painted image of each target or the repaired video, and `path` describes the
+    exported video. Raise InputError if the repaired one has another number of frames than that.
     """
     numbers = [
         row.path_frame if source.suffix.lower() in VIDEO_ENDINGS else None
@@ -149,19 +149,23 @@ def find_row(camera: Camera, rows: Sequence[HoleRow], cameras: Sequence[Camera])
 def add_exported_photograph(
     target: Target, row: HoleRow, photographs: Photographs, resolution: Resolution
 ) -> Target:
-    """Add the photograph that a target is, or was derived from, as the export knew it."""
+    """Add the photograph that a target is, or was derived from, as the export knew it.
+
+    A scene that got photographs since the export numbers them in another way, so that the number in
+    the row alone is not believed.
+    """
     if target.frame is not None:
         return target
     frame = row.frame
-    if frame is not None and frame in range(len(photographs)):
-        # A scene that got photographs since the export numbers them in another way: the camera
-        # tells whether the number is still that of the same photograph.
+    # A photograph without a camera is another one than the target was.
+    if frame is not None and frame in photographs.posed:
+        # The camera tells whether the number is still that of the same photograph.
         camera = photographs.camera(frame, resolution)
         if is_same_camera(camera, target.camera):
             return add_photograph(replace(target, frame=frame), photographs, resolution)
     base = row.derived_from
     if base is not None and base in range(len(photographs)):
-        # Here the name tells it, in which the file is.
+        # Here the name of the target tells it, since that holds the name of the file.
         file = photographs.frame(base).file_name
         if name_target(None, file, base, row.offset) == row.title:
             return replace(target, derived_from=base, offset=row.offset)
@@ -171,10 +175,11 @@ def add_exported_photograph(
 def find_painted(
     folder: Path, name: str, row: HoleRow | None = None, path: PathRow | None = None
 ) -> Path:
-    """Find the painted image that is named like `name`, or the repaired video.
+    """Find the painted image that is named like `name`, or else the repaired video.
 
-    The exported image itself, which the checksum of its row tells, is not painted. The painted one
-    may lie beside it, with another ending.
+    The exported image itself, which the checksum of its `row` tells, is not painted. The painted
+    one may lie beside it, with another ending. `path` describes the exported video, which may have
+    been repaired instead; None without one. Raise InputError if there is neither.
     """
     painted = find_by_stem(folder, name, PAINTING_ENDINGS, None if row is None else row.sha256)
     if painted is not None:
@@ -200,16 +205,13 @@ def find_painted(
 def find_by_stem(
     folder: Path, name: str, endings: Sequence[str], exported: str | None = None
 ) -> Path | None:
-    """Find the only file named like `name` with any of the endings, but not the exported one.
-
-    `exported` is the checksum of that; without it every file counts. Raise InputError for several.
-    """
+    """Find the only file that `list_by_stem` lists; None without any, InputError for several."""
     found = list_by_stem(folder, name, endings, exported)
     if len(found) > 1:
         names = join_names([path.name for path in found], len(endings))
+        kind = "images of one target" if endings == PAINTING_ENDINGS else "repaired videos"
         raise InputError(
-            f"{quote_value(folder)} has several images of one target ({names}); keep one of them.",
-            "images",
+            f"{quote_value(folder)} has several {kind} ({names}); keep one of them.", "images"
         )
     return found[0] if found else None
 
@@ -219,7 +221,7 @@ def list_by_stem(
 ) -> list[Path]:
     """List the files that are named like `name` with any of the endings, but not the exported one.
 
-    `exported` is that of `find_by_stem`.
+    `exported` is the SHA-256 of that one; None if every file counts.
     """
     found = sorted(
         path
@@ -237,7 +239,8 @@ def read_painting(
 ) -> Painting:
     """Read a painted image at the size of its camera, with the mask of the export beside it.
 
-    `still` is the frame of the target, if `path` is a video.
+    `still` is the frame of the target, if `path` is a video. Without the mask, as for a layer that
+    lies in another folder, the hole that the scene has now tells what was asked for.
     """
     colors, alpha = (still, None) if still is not None else read_colors_and_alpha(path)
     opaque = np.full(colors.shape[:2], True) if alpha is None else alpha >= HALF_OPAQUE

@@ -11,10 +11,11 @@ mask for that of its camera.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import sha256
-from pathlib import Path, PurePosixPath
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any
 
 import numpy as np
@@ -22,7 +23,7 @@ import torch
 
 from gscompleter import __version__
 from gscompleter.apps.inputs.removal import check_selection
-from gscompleter.apps.live.session import UPRIGHT, Action, Session, SessionStep
+from gscompleter.apps.live.session import UPRIGHT, Action, Session, SessionStep, check_step
 from gscompleter.apps.requests.scene import Size
 from gscompleter.apps.requests.splat import Selection
 from gscompleter.data.scene import describe_camera
@@ -38,6 +39,7 @@ from gscompleter.types import Camera
 STROKES = (STROKES_FILE, f"{STROKES_FOLDER}/stroke*.png")
 """Globs of the files that are written."""
 STROKES_ADVICE = "save the session again"
+"""End of each sentence about a damaged file."""
 SEPARATE_OPTIONS = ("resolution", "near", "far", "context")
 """Options with an entry of their own beside `session`, since `repair --strokes` reads them, too."""
 
@@ -61,6 +63,11 @@ class StrokeRow:
     box: tuple[float, float, float, float, float, float] | None = None
     """Box of a removal, as `remove --box` takes it; None without one."""
     box_rotation: FourNumbers = UPRIGHT
+    """Rotation of the box, as `remove --box-rotation` takes it."""
+
+    def make_step(self, mask: bytes | None) -> SessionStep:
+        """Make the step, with the content of its mask."""
+        return SessionStep(self.action, self.make_camera(), mask, self.box, self.box_rotation)
 
     def make_camera(self) -> Camera:
         """Make the camera in float64, as it was written; InputError if there is no such camera."""
@@ -84,11 +91,12 @@ class StrokesFile:
     """Frames of the photographs of the session, or of the cameras of a file; None if its cameras
     were found."""
     saved: str | None = None
-    """`digest_steps` of those that the completed scene beside the file has; None without one."""
+    """`digest_steps` of the steps that the completed scene beside the file has; None without a
+    scene."""
     session: dict[str, Any] | None = None
     """Options that the session began with; None in files of early versions."""
     scene_sha256: str | None = None
-    """SHA-256 of the splat that it began with."""
+    """SHA-256 of the splat that it began with; None if the scene was reconstructed."""
     undone: tuple[StrokeRow, ...] = ()
     """Steps that were undone, the next to be done again first."""
 
@@ -129,16 +137,17 @@ def write_masks(folder: Path, steps: Sequence[SessionStep], first: int = 0) -> N
 
 
 def name_mask(index: int) -> str:
-    """Name the mask of a step; names are counted from 1."""
+    """Name the mask of the step at this index; the numbers in the names begin with 1."""
     return f"{STROKES_FOLDER}/stroke{index + 1}.png"
 
 
 def encode_strokes(
     session: Session, start: SessionStart, saved: str | None, count: int | None = None
 ) -> bytes:
-    """Encode `strokes.json`, with the first `count` steps of `list_steps` alone or all.
+    """Encode `strokes.json` with the steps of `list_steps`: all of them, or the first `count`.
 
-    `saved` is the digest of the steps that the completed scene in the folder has; None without one.
+    `saved` is the digest of the steps that the completed scene in the folder has; None without a
+    scene.
     """
     steps = list_steps(session)[:count]
     rows = [
@@ -163,7 +172,7 @@ def encode_strokes(
 
 
 def describe_step(step: SessionStep, mask_path: str | None) -> dict[str, Any]:
-    """Describe a step as a row of `strokes.json`."""
+    """Describe a step as a row of `strokes.json`; the inverse of `StrokeRow.make_step`."""
     return {
         "action": step.action,
         "mask_path": mask_path,
@@ -183,35 +192,48 @@ def digest_steps(steps: Sequence[SessionStep]) -> str:
 
 
 def find_strokes_file(path: Path) -> Path:
-    """Find the file that `--strokes` names, or that is in the folder that it names."""
+    """Return the file that `--strokes` names; of a folder, the `strokes.json` in it."""
     return path / STROKES_FILE if path.is_dir() else path
 
 
 def read_strokes(path: Path) -> StrokesFile:
-    """Read and validate a `strokes.json`, without its masks."""
+    """Read and validate a `strokes.json`, without its masks.
+
+    Raises InputError before the scene is opened, which takes longer, if a row is no step.
+    """
     strokes = read_typed_json(StrokesFile, path, STROKES_ADVICE)
-    for row in (*strokes.frames, *strokes.undone):
-        # What is read lies beside the file, whatever it says.
-        if row.mask_path is not None and not is_below_folder(row.mask_path):
-            raise InputError(
-                f"{quote_value(path)} names the mask '{quote_value(row.mask_path)}', and only "
-                f"files beside it are read; {STROKES_ADVICE}."
-            )
-        if row.box is not None:
-            check_selection(Selection(row.box, row.box_rotation))
+    for key, rows in (("frames", strokes.frames), ("undone", strokes.undone)):
+        for number, row in enumerate(rows):
+            # What is read lies beside the file, whatever it says.
+            if row.mask_path is not None and not is_below_folder(row.mask_path):
+                raise InputError(
+                    f"{quote_value(path)} names the mask '{quote_value(row.mask_path)}', and only "
+                    f"files beside it are read; {STROKES_ADVICE}."
+                )
+            with name_row(path, f"{key}.{number}"):
+                if row.box is not None:
+                    check_selection(Selection(row.box, row.box_rotation))
+                # Here only whether there is a mask matters, not its content.
+                check_step(row.make_step(None if row.mask_path is None else b""))
     return strokes
+
+
+@contextmanager
+def name_row(path: Path, place: str) -> Iterator[None]:
+    """Name the file and the place of a row in its InputErrors, in place of any option."""
+    try:
+        yield
+    except InputError as error:
+        reason = str(error).removesuffix(".")
+        raise InputError(
+            f"{quote_value(path)} is damaged ({place}: {reason}); {STROKES_ADVICE}."
+        ) from error
 
 
 def read_steps(rows: Sequence[StrokeRow], folder: Path) -> tuple[SessionStep, ...]:
     """Make the steps of rows, with cameras in the frame of the file; read masks from `folder`."""
     return tuple(
-        SessionStep(
-            row.action,
-            row.make_camera(),
-            None if row.mask_path is None else read_bytes(folder / row.mask_path),
-            row.box,
-            row.box_rotation,
-        )
+        row.make_step(None if row.mask_path is None else read_bytes(folder / row.mask_path))
         for row in rows
     )
 
@@ -219,5 +241,6 @@ def read_steps(rows: Sequence[StrokeRow], folder: Path) -> tuple[SessionStep, ..
 def is_below_folder(name: str) -> bool:
     """Return True if a path is relative and leads to a file below the folder it is relative to."""
     path = PurePosixPath(name)
-    is_plain = "\\" not in name and "\0" not in name and path.parts != ()
-    return is_plain and not path.is_absolute() and ".." not in path.parts
+    # On Windows, C: leads to another disk, and names may be separated by backslashes.
+    is_plain = "\\" not in name and "\0" not in name and PureWindowsPath(name).drive == ""
+    return is_plain and not path.is_absolute() and path.parts != () and ".." not in path.parts

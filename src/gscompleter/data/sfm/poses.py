@@ -55,6 +55,7 @@ from gscompleter.system.files.image import (
     HALF_OPAQUE,
     ORIENTATION,
     open_image,
+    reduce_to_rgb,
     turn_upright,
 )
 from gscompleter.system.files.names import is_hidden_name, make_colmap_name
@@ -493,7 +494,7 @@ def write_upright(
         is_ready = is_known and is_upright and image.mode in ("RGB", "L")
         if not is_ready:  # decodes a JPEG at half or a quarter of its size if that is enough
             image.draft("RGB", (MAX_COPY_SIDE, MAX_COPY_SIDE))
-        copy = ImageOps.exif_transpose(image).convert("RGB")
+        copy = reduce_to_rgb(ImageOps.exif_transpose(image))
         focal = read_focal(exif)
         lens = read_lens(exif)
 

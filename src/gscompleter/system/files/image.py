@@ -287,17 +287,25 @@ def _has_alpha(image: Image.Image) -> bool:
 
 
 def _read_over_black(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
+    if _has_alpha(image):
+        rgba = np.array(image.convert("RGBA"))
+        return composite_over_black(rgba[..., :3], rgba[..., 3])
+    return np.array(reduce_to_rgb(image))
+
+
+def reduce_to_rgb(image: Image.Image) -> Image.Image:
+    """Reduce an opened image to 8-bit colours, as they are below its alpha.
+
+    Pillow would clip grey of 16 bits to 255 instead of scaling it.
+    """
     if image.mode == "F":
         # As any error inside of `open_image`, it becomes the reason in an InputError.
         raise ValueError("it holds floating-point values, not colours")
     if image.mode == "I" or image.mode.startswith("I;16"):
         # 65535 / 257 is 255.
         grey = np.array(image).astype(np.float64) / 257
-        return np.repeat((grey + 0.5).clip(0, 255).astype(np.uint8)[..., None], 3, axis=-1)
-    if _has_alpha(image):
-        rgba = np.array(image.convert("RGBA"))
-        return composite_over_black(rgba[..., :3], rgba[..., 3])
-    return np.array(image.convert("RGB"))
+        image = Image.fromarray((grey + 0.5).clip(0, 255).astype(np.uint8))
+    return image.convert("RGB")
 
 
 def composite_over_black(

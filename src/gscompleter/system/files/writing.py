@@ -37,6 +37,8 @@ REMOVED_FILE = "removed.ply"
 """Originals of changed and removed Gaussians of a given scene, beside the completed one."""
 EDITS_FILE = "edits.json"
 """What commands did to the scene, in their order."""
+EDITS_FOLDER = "edits"
+"""Folder beside it with what earlier commands removed or changed."""
 STROKES_FILE = "strokes.json"
 """Steps of a session of `live`, which is written after each of them, before anything is saved."""
 
