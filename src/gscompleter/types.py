@@ -49,6 +49,8 @@ FOCAL_RANGE = (1e-3, 1e6)
 MAX_CENTER = 100.0
 """Largest distance of the principal point from the corner, in image widths (or heights)."""
 
+BLUR = 0.3
+"""Variance by which 3DGS widens projected Gaussians, in square pixels: a low-pass of a pixel."""
 SH_C0 = 0.28209479177387814
 """Constant spherical harmonic: colour = 0.5 + SH_C0 * sh[:, 0]."""
 
@@ -114,6 +116,9 @@ class Camera(Displayed, TensorDataclass):
     """Pixels, left and right each and above and below each, by which the image is larger than the
     one that it pads. Both show the same Gaussians alike: renderers distort those beside the image
     as in the smaller one."""
+    blur: float = BLUR
+    """Variance by which projected Gaussians are widened, in square pixels. It belongs to the pixels
+    that a scene was made for: a smaller image of it has less (`geometry.sample_image`)."""
 
     owner: ClassVar[str] = "a camera"
     forms: ClassVar[dict[str, Form]] = {"c2w": (FLOATS, (4, 4)), "K": (FLOATS, (3, 3))}
@@ -125,6 +130,7 @@ class Camera(Displayed, TensorDataclass):
             _find_size_defect(self.width, self.height)
             or _find_padding_defect(self.padding, self.width, self.height)
             or _find_planes_defect(self.near, self.far)
+            or _find_blur_defect(self.blur)
             or _find_pose_defect(self.c2w)
             or _find_intrinsics_defect(self.K, self.width, self.height)
         )
@@ -132,7 +138,13 @@ class Camera(Displayed, TensorDataclass):
             raise InputError(f"There is no such camera: {defect}.")
         # NumPy's numbers cannot be written as JSON. Fields of a frozen dataclass are set through
         # `object`.
-        for name, convert in (("width", int), ("height", int), ("near", float), ("far", float)):
+        for name, convert in (
+            ("width", int),
+            ("height", int),
+            ("near", float),
+            ("far", float),
+            ("blur", float),
+        ):
             number = getattr(self, name)
             if number is not None and type(number) is not convert:
                 object.__setattr__(self, name, convert(number))
@@ -222,6 +234,15 @@ def _find_planes_defect(near: float | None, far: float | None) -> str | None:
             return f"its {name} plane is at {plane:g}, and a positive z-depth is needed"
     if near is not None and far is not None and near >= far:
         return f"its near plane at {near:g} is not before its far plane at {far:g}"
+    return None
+
+
+def _find_blur_defect(blur: float) -> str | None:
+    """Return a sentence part about an impossible blur, or None."""
+    if not is_number(blur):
+        return f"its blur is {describe(blur)}, and a number is needed"
+    if not 0 < blur < math.inf:
+        return f"its blur is {blur:g} square pixels, and a positive variance is needed"
     return None
 
 

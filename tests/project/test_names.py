@@ -7,7 +7,7 @@ from sources import parse_package
 REPEATED = {
     # The slow renderer states the numbers of rasterisation for itself, as it is the twin that the
     # kernels are compared with; these have them in float32.
-    *("BLUR", "MAX_ALPHA", "MIN_ALPHA", "MIN_TRANSMITTANCE", "TANGENT_MARGIN"),
+    *("MAX_ALPHA", "MIN_ALPHA", "MIN_TRANSMITTANCE", "TANGENT_MARGIN"),
     # A type variable for anything has the name that it has everywhere in Python.
     "T",
     # A process begins at `main`, in the file that it runs.

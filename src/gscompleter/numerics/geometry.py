@@ -276,6 +276,17 @@ def resize_camera(camera: Camera, width: int, height: int) -> Camera:
     return replace(camera, K=K, width=width, height=height, padding=(left, top))
 
 
+def sample_image(small: Camera, large: Camera) -> Camera:
+    """Let the image of a small camera sample that of a large one, of the same photograph.
+
+    Gaussians are as wide as in the large image, for which the scene was made. Widened by a pixel of
+    the small one instead, those in front would cover what lies beside and behind them (decision
+    144).
+    """
+    focals = [camera.K.diagonal()[:2].double().prod().item() for camera in (small, large)]
+    return replace(small, blur=large.blur * min(focals[0] / focals[1], 1.0))
+
+
 def select_spread_cameras(cameras: Sequence[Camera], count: int) -> list[int]:
     """Select up to `count` cameras that are far apart (farthest point sampling); return indices."""
     where = embed_cameras(cameras)

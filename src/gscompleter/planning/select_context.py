@@ -41,7 +41,7 @@ WIDE_FALLOFF = 20.0
 """Angle above it, in degrees, at which the score of a pair falls to a third."""
 MIN_SHOWING_SCORE = 0.1
 """Pair score below which no pair shows a point."""
-NUM_SCORED = 3
+NUM_SCORED_FIRST = 3
 """Photographs that are chosen by their score before the nearest ones."""
 NUM_NEAREST = 2
 """Nearest photographs that follow them."""
@@ -96,7 +96,7 @@ def select_greedily(
 ) -> list[int]:
     """Choose the best pair, then repeatedly the candidate that improves the pair scores most.
 
-    The nearest candidates that show enough follow the first `NUM_SCORED`.
+    The nearest candidates that show enough follow the first `NUM_SCORED_FIRST`.
     """
     count = min(count, len(worth))
     if count < 2:
@@ -120,7 +120,7 @@ def select_greedily(
         gains[chosen] = -1.0
         near = shows_enough.clone()
         near[chosen] = False
-        if NUM_SCORED <= len(chosen) < NUM_SCORED + NUM_NEAREST and near.any():
+        if NUM_SCORED_FIRST <= len(chosen) < NUM_SCORED_FIRST + NUM_NEAREST and near.any():
             added = int(distances.where(near, math.inf).argmin())
         else:
             added = int(gains.argmax())

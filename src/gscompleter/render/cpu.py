@@ -510,6 +510,7 @@ def make_pinhole(camera: Camera) -> CameraArrays:
         width=camera.width,
         height=camera.height,
         padding=camera.padding,
+        blur=np.float32(camera.blur),
     )
 
 

@@ -22,8 +22,6 @@ from gscompleter.render.redraw import RedrawnScene, make_empty_render, set_color
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.types import Camera, Gaussians, Render, merge, sh_from_rgb
 
-EPS_2D = 0.3
-"""Low-pass of 3DGS: pixels² that are added to the variances of each footprint."""
 MIN_DIVIDING_ALPHA = 1e-10
 """Smallest alpha that gsplat divides a depth by."""
 TILE_SIZE = 16
@@ -113,7 +111,7 @@ def project_with_gsplat(
     Float[Tensor, "c n 3"],
     Float[Tensor, "c n"],
 ]:
-    """Project at least one Gaussian into images of one size, with near planes at one depth.
+    """Project at least one Gaussian into images of one size, with one near plane and one blur.
 
     An image with padding has to be the only one.
 
@@ -137,7 +135,7 @@ def project_with_gsplat(
         torch.stack([camera.K for camera in cameras]).float(),
         cameras[0].width,
         cameras[0].height,
-        eps2d=EPS_2D,
+        eps2d=cameras[0].blur,
         near_plane=cameras[0].near_plane,
         calc_compensations=gaussians.is_antialiased,
         opacities=gaussians.opacities.float(),
@@ -158,7 +156,7 @@ def project_and_bin(
     from gsplat import isect_offset_encode, isect_tiles
 
     # Not as parts of a larger image: how much a Gaussian outside is distorted depends on the size.
-    forms = {(camera.width, camera.height, camera.near_plane, camera.padding) for camera in cameras}
+    forms = {(c.width, c.height, c.near_plane, c.padding, c.blur) for c in cameras}
     are_alike = len(forms) == 1 and cameras[0].padding == (0, 0)
     groups = [cameras] if are_alike else [[camera] for camera in cameras]
     projected = [project_with_gsplat(gaussians, group) for group in groups]

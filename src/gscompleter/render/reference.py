@@ -16,8 +16,6 @@ from gscompleter.render.redraw import RedrawnScene
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.types import Camera, Gaussians, Render
 
-BLUR = 0.3
-"""Low-pass of about a pixel, added to the 2D variances, in px²."""
 MIN_ALPHA = 1 / 255
 MAX_ALPHA = 0.999
 MIN_TRANSMITTANCE = 1e-4
@@ -89,7 +87,9 @@ def project_gaussians(gaussians: Gaussians, camera: Camera) -> ProjectedSplats:
     # J W R S Sᵀ Rᵀ Wᵀ Jᵀ, and `flat` is its factor J W R S [n, 2, 3].
     axes = quats_to_rotations(gaussians.quats) * gaussians.scales[:, None, :]
     flat = compute_jacobians(points, camera) @ camera_from_world @ axes
-    covariances = flat @ flat.transpose(1, 2) + BLUR * torch.eye(2, dtype=dtype, device=device)
+    covariances = flat @ flat.transpose(1, 2) + camera.blur * torch.eye(
+        2, dtype=dtype, device=device
+    )
     opacities = gaussians.opacities
     if gaussians.is_antialiased:
         opacities = opacities * compute_compensations(flat, covariances)
@@ -167,5 +167,5 @@ def adapt_to_mode(scene: Gaussians, gaussians: Gaussians, camera: Camera) -> Gau
     if gaussians.is_antialiased or not scene.is_antialiased:
         return gaussians
     pixel = compute_z_depths(gaussians.means, camera) * 2 / (camera.K[0, 0] + camera.K[1, 1])
-    scales = torch.hypot(gaussians.scales, math.sqrt(BLUR) * pixel[:, None])
+    scales = torch.hypot(gaussians.scales, math.sqrt(camera.blur) * pixel[:, None])
     return replace(gaussians, scales=scales, encoded=None, is_antialiased=True)

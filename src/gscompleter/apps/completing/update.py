@@ -26,7 +26,7 @@ from gscompleter.apps.inputs.describing import print_lines
 from gscompleter.apps.inputs.named_photographs import find_context
 from gscompleter.apps.inputs.reading import make_task
 from gscompleter.apps.inputs.selection import choose_check_size, collect_usable_cameras
-from gscompleter.apps.inputs.splat import add_check_views
+from gscompleter.apps.inputs.splat import add_check_views, read_check_view
 from gscompleter.apps.inputs.taken_out import hide_taken_out
 from gscompleter.apps.inputs.task import Opened
 from gscompleter.apps.requests.completion import (
@@ -201,12 +201,10 @@ def measure_lacks(loaded: Loaded) -> dict[int, float]:
         if frame in opened.held_out or opened.photographs.is_hidden(frame):
             continue
         # Check views have this size, and are in memory.
-        if frame in checks:
-            view = checks[frame]
-        else:
-            (view,) = opened.photographs.views([frame], size)
+        view = checks[frame] if frame in checks else read_check_view(loaded.opened, frame)
         # A view refuses an image and a camera on two devices, and cameras are on that of the task.
-        view = replace(view.to(task.device), camera=cameras[frame])
+        camera = replace(cameras[frame], blur=view.camera.blur)
+        view = replace(view.to(task.device), camera=camera)
         if task.taken_out is not None:
             view = task.taken_out.hide(view)
         frames.append(frame)

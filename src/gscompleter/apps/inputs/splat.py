@@ -23,6 +23,7 @@ from gscompleter.data.local_origin import (
     compute_frame_from_photographs,
     shift_to_origin,
 )
+from gscompleter.numerics.geometry import sample_image
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.alignment.estimate import align_splat
@@ -34,7 +35,7 @@ from gscompleter.splats.ply import find_finite_rows
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.mapping import move_to_file
 from gscompleter.system.process import give_large_arrays_own_pages
-from gscompleter.types import Camera, Gaussians
+from gscompleter.types import Camera, Gaussians, View
 
 MAX_CHECK_VIEWS = 40
 """Most photographs that check a splat."""
@@ -146,6 +147,17 @@ def move_to_splat(
     )
 
 
+def read_check_view(opened: Opened, frame: int) -> View:
+    """Read a photograph at the size of check views.
+
+    Gaussians are drawn there as wide as in photographs of the context.
+    """
+    resolution = opened.request.resolution
+    (view,) = opened.photographs.views([frame], choose_check_size(resolution))
+    large = opened.photographs.camera(frame, resolution)
+    return replace(view, camera=sample_image(view.camera, large))
+
+
 def add_check_views(task: CompletionTask, opened: Opened) -> CompletionTask:
     """Add check views: unused photographs near the targets and all around (decision 020)."""
     photographs = opened.photographs
@@ -157,5 +169,5 @@ def add_check_views(task: CompletionTask, opened: Opened) -> CompletionTask:
     for frame in select_near_and_far(task.goals, cameras, MAX_CHECK_VIEWS):
         # One that is damaged or hidden by a mask checks nothing, and many others do.
         with suppress(InputError):
-            views += photographs.views([frame], size)
+            views.append(read_check_view(opened, frame))
     return replace(task, check_views=[view.to(task.device) for view in views])

@@ -11,7 +11,8 @@ that bring R(p) nearest to I over O by least squares, the pose that is searched 
 where rho is quadratic up to `ROBUST` and grows linearly beyond it. Steps are those of Lucas and
 Kanade: how an image changes with the pose follows from its gradient and its depth, so that a step
 needs one render and not seven. It is taken only where it lowers the mean square, too, since the
-score is a PSNR: that of g(p) R(p).
+score is a PSNR: that of g(p) R(p). The search is in a small image that samples the whole one, which
+has to gain by the pose that is found.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from torch import Tensor
 
 from gscompleter.evaluation.metrics.image import compute_masked_psnr
 from gscompleter.evaluation.metrics.unused_photographs import shrink_view
+from gscompleter.numerics.geometry import sample_image
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.render.protocols import Renderer
 from gscompleter.types import Camera, Gaussians, Render, View
@@ -103,6 +105,7 @@ def measure_fitted(
     # The pose is fitted in a small image, since each step renders one; what counts there is what
     # holes, their margin and masks leave of the photograph.
     small = shrink_view(replace(target, ignore_mask=~observed), FIT_SIDE)
+    small = replace(small, camera=sample_image(small.camera, target.camera))
     counted = small.valid_mask.cpu().numpy()
     if counted.sum() < MIN_POSE_PIXELS:
         return None
@@ -125,8 +128,17 @@ def measure_fitted(
     first = read_picture(start)
     move = fit_move(draw, first, small.image.cpu().numpy(), counted, median_depth, focal)
     pose = move_camera_by(small.camera, move, median_depth / focal).c2w
+
+    truth = target.image.cpu().numpy()
+    shown = observed.cpu().numpy()
     image = clamp_image(renderer.render(scene, replace(target.camera, c2w=pose)))
-    gains = fit_gains(image, target.image.cpu().numpy(), observed.cpu().numpy())
+    # A small image does not show all that the whole one does.
+    if move.any():
+        unmoved = clamp_image(renderer.render(scene, target.camera))
+        if measure_loss(unmoved, truth, shown) <= measure_loss(image, truth, shown):
+            image = unmoved
+            move = np.zeros(6)
+    gains = fit_gains(image, truth, shown)
     fitted = torch.from_numpy(np.clip(image * gains, 0, 1)).to(target.image)
     whole = compute_masked_psnr(fitted, target.image, target.valid_mask)
     outside = compute_masked_psnr(fitted, target.image, ~holes & target.valid_mask)

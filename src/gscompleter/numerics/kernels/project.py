@@ -8,7 +8,6 @@ import numpy as np
 from gscompleter.numerics.kernels.cache import njit
 from gscompleter.numerics.kernels.simd import MIN_ALPHA
 
-BLUR = np.float32(0.3)
 TANGENT_MARGIN = np.float32(0.15)
 """Border at which the Jacobian is clamped, relative to the image size."""
 
@@ -36,6 +35,8 @@ class CameraArrays(NamedTuple):
     height: int
     padding: tuple[int, int]
     """See `gscompleter.types.Camera`."""
+    blur: np.float32
+    """Variance by which splats are widened, in square pixels."""
 
 
 class GaussianArrays(NamedTuple):
@@ -257,6 +258,7 @@ def project_splats(begin, end, gaussians, pinhole, splats, boxes, factors):
     view = pinhole.rotation
     center = pinhole.center
     near = pinhole.near
+    blur = pinhole.blur
     fx, fy, cx, cy = pinhole.intrinsics
     limits = _compute_tangent_limits(pinhole)
     width, height = np.float32(pinhole.width), np.float32(pinhole.height)
@@ -288,11 +290,11 @@ def project_splats(begin, end, gaussians, pinhole, splats, boxes, factors):
         bb = b0 * b0 + b1 * b1 + b2 * b2
         ab = a0 * b0 + a1 * b1 + a2 * b2
         c0, c1, c2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
-        determinant = c0 * c0 + c1 * c1 + c2 * c2 + BLUR * (aa + bb) + BLUR * BLUR
+        determinant = c0 * c0 + c1 * c1 + c2 * c2 + blur * (aa + bb) + blur * blur
         if not determinant < np.inf:
             continue
-        deviation_x = np.float32(math.sqrt(aa + BLUR))
-        deviation_y = np.float32(math.sqrt(bb + BLUR))
+        deviation_x = np.float32(math.sqrt(aa + blur))
+        deviation_y = np.float32(math.sqrt(bb + blur))
         opacity = opacities[i]
         if factors is not None:
             factors[i] = math.sqrt((c0 * c0 + c1 * c1 + c2 * c2) / determinant)
@@ -318,7 +320,7 @@ def project_splats(begin, end, gaussians, pinhole, splats, boxes, factors):
         u = root_half * deviation_y / np.float32(math.sqrt(determinant))
         splats[i, X], splats[i, Y] = center_x, center_y
         splats[i, U] = u
-        splats[i, V] = -u * np.float32(ab / (bb + BLUR))
+        splats[i, V] = -u * np.float32(ab / (bb + blur))
         splats[i, W] = root_half / deviation_y
         splats[i, DEPTH] = z
 
@@ -332,7 +334,7 @@ def project_splats(begin, end, gaussians, pinhole, splats, boxes, factors):
 
 
 @njit(fastmath={"contract"}, error_model="numpy")
-def _compensation_backward(flat, q):
+def _compensation_backward(flat, blur, q):
     """Compute the gradient of the flattened axes from that of log sqrt(P / D).
 
     P is the squared area that they span, D the determinant with the blur.
@@ -342,9 +344,9 @@ def _compensation_backward(flat, q):
     c0, c1, c2 = a1 * b2 - a2 * b1, a2 * b0 - a0 * b2, a0 * b1 - a1 * b0
     squares = a0 * a0 + a1 * a1 + a2 * a2 + b0 * b0 + b1 * b1 + b2 * b2
     area = c0 * c0 + c1 * c1 + c2 * c2
-    added = BLUR * squares + BLUR * BLUR
+    added = blur * squares + blur * blur
     of_area = q * added / (area * (area + added))
-    of_squares = q * BLUR / (area + added)
+    of_squares = q * blur / (area + added)
     return (
         np.float32(of_area * (b1 * c2 - b2 * c1) - of_squares * a0),
         np.float32(of_area * (b2 * c0 - b0 * c2) - of_squares * a1),
@@ -425,7 +427,7 @@ def project_backward(
         d_y1 = four * (v * a1 + w * b1)
         d_y2 = four * (v * a2 + w * b2)
         if factors is not None:
-            more = _compensation_backward(flat, sums[SUM])
+            more = _compensation_backward(flat, pinhole.blur, sums[SUM])
             d_x0, d_x1, d_x2 = d_x0 + more[0], d_x1 + more[1], d_x2 + more[2]
             d_y0, d_y1, d_y2 = d_y0 + more[3], d_y1 + more[4], d_y2 + more[5]
 
