@@ -541,7 +541,12 @@ def test_a_page_that_is_saved_is_served_nowhere(packed, tmp_path, monkeypatch, c
 
 def test_a_page_that_is_served_replaces_no_file(packed, tmp_path, monkeypatch, capsys):
     save_ply(tmp_path / "a.ply", room_from(LEFT, 0))
-    assert run(monkeypatch, "view", tmp_path / "a.ply", "--overwrite", "--no-open") == 2
+
+    def stop(_: str) -> None:  # else a page that is served would never end
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("webbrowser.open", stop)
+    assert run(monkeypatch, "view", tmp_path / "a.ply", "--overwrite") == 2
     assert "name the file of the page with --save" in capsys.readouterr().err
 
 

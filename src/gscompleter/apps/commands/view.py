@@ -73,10 +73,7 @@ def decide_view(options: ViewOptions) -> ViewRequest:
         )
     for name in SERVING_OPTIONS:
         if options.save is not None and getattr(options, name) != getattr(ViewOptions, name):
-            raise InputError(
-                "The page is saved and not served; leave this out, or --save.",
-                name,
-            )
+            raise InputError("The page is saved and not served; leave this out, or --save.", name)
     if options.save is not None and options.save.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{quote_value(options.save)} is no .html file; name it *.html.", "save")
     refuse_size_alone(options.resolution, options.cameras)

@@ -74,14 +74,13 @@ class KeyframeFormat:
 
     def open(self, path: Path) -> Iterator[Photographs]:
         """Open a folder or an archive; frames are numbered by their sorted names."""
-        cameras, *files = self.find_frames(path)
+        cameras, photographs, *maps = self.find_frames(path)
         parsed = {}
-        for name in sorted(cameras.keys() & files[0]):
+        for name in sorted(cameras.keys() & photographs.keys()):
             title = f"frame {quote_value(name)} of {quote_value(path)}"
-            parsed[name] = self.parse(
-                parse_json(cameras[name](), title, PHONE_EXPORT_ADVICE), title
-            )
-        yield build_recording(path, parsed, files)
+            content = parse_json(cameras[name](), title, PHONE_EXPORT_ADVICE)
+            parsed[name] = self.parse(content, title)
+        yield build_recording(path, parsed, [photographs, *maps])
 
 
 def parse_polycam(entry: Any, title: str) -> PoseAndLens:
@@ -103,8 +102,10 @@ def parse_scanner_app(entry: Any, title: str) -> PoseAndLens:
 DEPTH_GLOBS = (f"{HOME}/depth/*.png", f"{HOME}/confidence/*.png")
 CORRECTED = (f"{HOME}/corrected_cameras/*.json", f"{HOME}/corrected_images/*.*", *DEPTH_GLOBS)
 ORIGINAL = (f"{HOME}/cameras/*.json", f"{HOME}/images/*.*", *DEPTH_GLOBS)
+"""Patterns of Polycam's files; those of depth serve both kinds of photographs."""
 POLYCAM = KeyframeFormat(b'"t_00"', parse_polycam, (CORRECTED, ORIGINAL))
 SCANNED = ("frame_*.json", "frame_*.jpg", "depth_*.png", "conf_*.png")
+"""Patterns of the files of 3d Scanner App."""
 SCANNER_APP = KeyframeFormat(b'"cameraPoseARFrame"', parse_scanner_app, (SCANNED,))
 
 
@@ -140,14 +141,16 @@ def _parse_recorded(content: Any, size: tuple[int, int], title: str) -> dict[str
         lenses = get_array(content, LENSES, title, (count, 4))
     else:
         # fx, fy, cx and cy of a matrix that is stored column by column.
-        lens = get_array(content, "K", title, (9,))[[0, 4, 6, 7]]
-        lenses = np.tile(lens, (count, 1))
+        common = get_array(content, "K", title, (9,))[[0, 4, 6, 7]]
+        lenses = np.tile(common, (count, 1))
     cameras: dict[str, PoseAndLens] = {}
-    for (x, y, z, w, *center), (fx, fy, cx, cy) in zip(poses, lenses.tolist(), strict=True):
+    for number, (pose, lens) in enumerate(zip(poses, lenses.tolist(), strict=True)):
+        x, y, z, w, *center = pose
+        fx, fy, cx, cy = lens
         c2w = np.eye(4)
         c2w[:3, :3] = compute_rotation((w, x, y, z))
         c2w[:3, 3] = center
-        cameras[str(len(cameras))] = c2w, Intrinsics(size, (fx, fy), (cx, cy))
+        cameras[str(number)] = c2w, Intrinsics(size, (fx, fy), (cx, cy))
     return cameras
 
 

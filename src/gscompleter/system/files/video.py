@@ -113,7 +113,7 @@ def _read_images(stream: IO[bytes]) -> Iterator[UInt8[np.ndarray, "h w *c"]]:
 
 
 def _choose_reason(messages: str) -> str:
-    """Choose the first line that ffmpeg said, without the part of it that said so."""
+    """Choose the first line that ffmpeg said, without the name of its part that said so."""
     # As in `[out#0/mp4 @ 0x55ab9d184700] Error opening output`; the place in memory tells nothing.
     line = re.sub(r"\[[^]]* @ \w*\] ", "", messages).partition("\n")[0]
     return quote_value(line.rstrip("."), 80)
