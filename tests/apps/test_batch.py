@@ -393,6 +393,17 @@ def test_cells_set_what_stands_in_groups_of_options(tmp_path):
     ).synthesis.generator_offload
 
 
+@pytest.mark.parametrize(
+    ("option", "example"), [("--slurm", "partition=gpu"), ("--each", "resolution=256")]
+)
+def test_a_word_that_is_no_pair_is_refused_with_an_example(
+    option, example, tmp_path, monkeypatch, capsys
+):
+    words = ("batch", tmp_path, "--out", tmp_path / "out", "--engine", "submitit", option, "cpu")
+    assert run(monkeypatch, *words) == 2
+    assert f"'cpu' is not NAME=VALUE, as in {example} ({option})" in capsys.readouterr().err
+
+
 def test_rows_of_one_scene_need_names(tmp_path):
     manifest = tmp_path / "m.jsonl"
     rows = [{"folder": "room"}, {"folder": "room", "seed": 1, "name": "a/b"}]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 import torch
 
 from command import run
+from full_disk import limit_file_size
 from gscompleter.apps.report.film import (
     FRAMES_PER_SECOND,
     GAP_PIXELS,
@@ -28,8 +30,8 @@ from gscompleter.numerics.geometry import measure_baseline, measure_rotation, re
 from gscompleter.parts import PartOrigin, make_part
 from gscompleter.render.loading import load_renderer
 from gscompleter.state import Completion, Photo
-from gscompleter.system.errors import InputError
-from gscompleter.system.files.video import find_ffmpeg, write_video
+from gscompleter.system.errors import FullDiskError, InputError
+from gscompleter.system.files.video import find_ffmpeg, make_video_error, write_video
 from gscompleter.system.progress import show_progress
 from gscompleter.target_result import TargetResult
 from gscompleter.types import Camera
@@ -210,6 +212,50 @@ def test_a_film_that_cannot_be_written_says_so(tmp_path):
     picture = np.zeros((16, 16, 3), np.uint8)
     with pytest.raises(InputError, match="ffmpeg could not write"):
         write_video(tmp_path / "no such folder" / "a.mp4", [picture] * 200, FRAMES_PER_SECOND)
+
+
+@pytest.mark.parametrize("name", ["a:b.mp4", "-y.mp4"])
+def test_a_film_has_the_name_that_it_is_given(tmp_path, monkeypatch, name):
+    """One is the address of a protocol `a` to ffmpeg, and the other an option."""
+    monkeypatch.chdir(tmp_path)
+    write_video(Path(name), [np.zeros((16, 16, 3), np.uint8)] * 3, FRAMES_PER_SECOND)
+    assert len(decoded(tmp_path / name)[1]) == 3
+
+
+def test_no_frame_is_drawn_for_a_film_that_cannot_be_written(tmp_path):
+    drawn = 0
+
+    def draw() -> Iterator[np.ndarray]:
+        nonlocal drawn
+        for _ in range(5000):
+            drawn += 1
+            yield np.zeros((128, 128, 3), np.uint8)
+
+    with pytest.raises(InputError, match="ffmpeg could not write"):
+        write_video(tmp_path / "no such folder" / "a.mp4", draw(), FRAMES_PER_SECOND)
+    assert drawn < 5000
+
+
+@pytest.mark.linux
+def test_a_full_disk_is_no_fault_of_the_film(tmp_path):
+    noise = np.random.default_rng(0).integers(0, 255, (20, 128, 128, 3), np.uint8)
+    with limit_file_size(50_000), pytest.raises(FullDiskError, match="free some space") as error:
+        write_video(tmp_path / "a.mp4", list(noise) * 5, FRAMES_PER_SECOND)
+    assert "()" not in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("messages", "kind"),
+    [
+        ("[vost#0:0/libx264 @ 0x561075765540] Error muxing: No space left on device\nMore.", True),
+        ("[out#0/mp4 @ 0x561075764700] Error opening output x: Permission denied\nMore.", False),
+    ],
+)
+def test_what_ffmpeg_says_is_told_in_one_sentence(messages, kind):
+    error = make_video_error(Path("a.mp4"), messages, 1)
+    assert isinstance(error, FullDiskError) == kind
+    assert "0x" not in str(error)
+    assert "More" not in str(error)
 
 
 def test_whoever_stops_it_leaves_no_ffmpeg_behind(tmp_path, monkeypatch):

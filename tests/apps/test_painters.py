@@ -3,6 +3,7 @@
 import json
 import shutil
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -13,10 +14,11 @@ from PIL import Image
 from command import run
 from gscompleter import load_cameras, load_splat, load_views
 from gscompleter.apps.commands.batch_rows import parse_batch_row
-from gscompleter.apps.completing.path_video import plan_path
+from gscompleter.apps.completing.path_video import FRAME_STEP, plan_path
 from gscompleter.apps.inputs.holes_file import HoleRow, PathRow
 from gscompleter.apps.inputs.paintings import add_exported_photograph, find_painted
 from gscompleter.apps.inputs.task import Target
+from gscompleter.apps.report.film import FRAMES_PER_SECOND, MIN_LEG_SECONDS
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photograph_names import name_target
 from gscompleter.numerics.geometry import is_same_camera
@@ -473,3 +475,12 @@ def test_targets_of_another_lens_are_not_in_the_video():
     assert frames[-1] == len(planned.cameras) - 1
     assert {(camera.width, camera.height) for camera in planned.cameras} == {(SIZE, SIZE)}
     assert plan_path(context, [wide], []).cameras[-1].K.allclose(wide.K)
+
+
+def test_no_leg_to_a_target_is_shorter_than_a_film_allows():
+    targets = [camera_at(0.1 * number, size=SIZE) for number in range(1, 8)]
+    stops = (0, *plan_path([camera_at(size=SIZE)], targets, []).target_frames)
+    legs = {after - before for before, after in pairwise(stops)}
+    (leg,) = legs
+    assert leg >= FRAMES_PER_SECOND * MIN_LEG_SECONDS
+    assert leg % FRAME_STEP == 0

@@ -528,6 +528,28 @@ def test_a_page_has_to_be_named_as_one(packed, tmp_path, monkeypatch, capsys):
     assert "*.html" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "words", [("--save", "page.html", "--port", 8080), ("--save", "page.html", "--no-open")]
+)
+def test_a_page_that_is_saved_is_served_nowhere(packed, tmp_path, monkeypatch, capsys, words):
+    save_ply(tmp_path / "a.ply", room_from(LEFT, 0))
+    monkeypatch.chdir(tmp_path)
+    assert run(monkeypatch, "view", "a.ply", *words) == 2
+    assert f"not served; leave this out, or --save ({words[2]})" in capsys.readouterr().err
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_page_that_is_served_replaces_no_file(packed, tmp_path, monkeypatch, capsys):
+    save_ply(tmp_path / "a.ply", room_from(LEFT, 0))
+
+    def stop(_: str) -> None:  # else a page that is served would never end
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("webbrowser.open", stop)
+    assert run(monkeypatch, "view", tmp_path / "a.ply", "--overwrite") == 2
+    assert "name the file of the page with --save" in capsys.readouterr().err
+
+
 def test_without_a_file_to_save_to_the_page_is_served_and_opened(
     packed, tmp_path, monkeypatch, capsys
 ):

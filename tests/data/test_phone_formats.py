@@ -176,6 +176,20 @@ def test_photographs_without_any_camera_are_refused(tmp_path):
         open_photographs(write_folder(tmp_path / "room", files))
 
 
+def test_photographs_without_a_camera_are_told(tmp_path):
+    """Also in archives; a camera without a photograph is usual in 3d Scanner App."""
+    camera = "keyframes/corrected_cameras/1660000000001.json"
+    few = changed(record3d(), "metadata", poses=POSES[:3], perFrameIntrinsicCoeffs=[])
+    for name, files, lost in (
+        ("room.zip", without(polycam(), camera), "1660000000001"),
+        ("room.r3d", few, "3"),
+    ):
+        photographs = open_photographs(write_archive(tmp_path / name, files))
+        assert len(photographs) == 3
+        told = f"Left out of {tmp_path / name}: 1 photograph without a camera ({lost})."
+        assert told in photographs.notes
+
+
 def test_other_files_beside_photographs_are_no_cameras(tmp_path):
     files = {f"frame_{number}.jpg": photograph(0, WIDE) for number in (1, 2)}
     files["frame_1.json"] = b'{"shapes": []}'
@@ -270,13 +284,21 @@ def test_without_the_decoder_depth_is_left_out_with_a_note(tmp_path, monkeypatch
     assert open_photographs(bare).notes == ()
 
 
+def test_a_lens_for_each_photograph_needs_no_other(tmp_path):
+    """Also one of the recording that is no matrix is not asked then."""
+    for number, K in enumerate((None, [1])):
+        files = changed(record3d(), "metadata", K=K)
+        path = write_archive(tmp_path / str(number) / "room.r3d", files)
+        check_room(open_photographs(path), UPRIGHT)
+
+
 POSES = json.loads(record3d()["metadata"])["poses"]
 RECORDINGS = {
     "no metadata": (without(record3d(), "metadata"), "no `metadata` in"),
     "no poses": (changed(record3d(), "metadata", poses=[]), "has no poses; record with the LiDAR"),
     "short": (changed(record3d(), "metadata", poses=[[0] * 6] * 4), "`poses` of .* 4 × 7"),
     "lenses": (changed(record3d(), "metadata", perFrameIntrinsicCoeffs=[1]), "4 × 4 numbers"),
-    "K": (changed(record3d(), "metadata", K=[1]), "`K` of .* 9 numbers"),
+    "K": (changed(record3d(own_lenses=False), "metadata", K=[1]), "`K` of .* 9 numbers"),
     "depth": ({**record3d(), "rgbd/1.depth": b"bvx2" + b"\xff" * 40}, "depth of frame 1"),
     "odd depth": ({**record3d(), "rgbd/1.depth": pack(b"\0" * 28)}, "depth of frame 1"),
     "no depth": ({**record3d(), "rgbd/1.depth": pack(b"")}, "depth of frame 1"),

@@ -190,6 +190,17 @@ def test_what_cannot_be_used_is_refused_with_a_sentence(video, tmp_path, monkeyp
         assert not out.exists()
 
 
+@pytest.mark.linux
+@pytest.mark.parametrize("said", ["P6", "P6\\n16 1", "P6\\n16 16\\n25", "P6\\n16 16\\n255\\nab"])
+def test_a_decoder_that_ends_within_a_frame_is_a_sentence(video, tmp_path, monkeypatch, said):
+    program = tmp_path / "ffmpeg"
+    program.write_text(f"#!/bin/sh\nprintf '{said}'\necho 'cut off' >&2\nexit 1\n")
+    program.chmod(0o755)
+    monkeypatch.setattr("gscompleter.system.files.video.find_ffmpeg", lambda: str(program))
+    with pytest.raises(InputError, match=r"no video that can be read to its end \(cut off\)"):
+        list(read_video(video, "null", is_grey=False))
+
+
 @pytest.mark.parametrize("count", [2, 5000])
 def test_too_few_or_too_many_frames_are_refused(video, tmp_path, monkeypatch, capsys, count):
     words = ("poses", video, "--out", tmp_path / "out", "--frames", count)

@@ -3,7 +3,8 @@
 import json
 import math
 import statistics
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import get_args
@@ -22,10 +23,14 @@ from gscompleter.apps.commands.evaluate import (
     assign_weights,
     decide_evaluation,
 )
+from gscompleter.apps.evaluating import reproduction
 from gscompleter.apps.evaluating.reproduction import (
     choose_protocols,
+    find_unused_protocols,
     make_run,
 )
+from gscompleter.apps.evaluating.scoring import Scored
+from gscompleter.apps.requests.answer import AnswerRequest
 from gscompleter.apps.requests.evaluation import EvaluationRequest, ReproductionRequest
 from gscompleter.data.formats import open_photographs
 from gscompleter.evaluation.baselines.reggs import RegGSConfig
@@ -37,7 +42,7 @@ from gscompleter.evaluation.paper_tables import compare_cases, estimate_mean
 from gscompleter.evaluation.runner import RunConfig
 from gscompleter.models.feed_forward import MVSplat
 from gscompleter.models.weights.published import PUBLISHED
-from gscompleter.system.errors import InputError
+from gscompleter.system.errors import InputError, OutputError, WorkerError
 from gscompleter.system.files.image import read_pixels
 from scenes import Room, camera_at, view_of
 
@@ -167,6 +172,70 @@ def test_a_table_takes_the_given_protocols_of_its_kind():
     assert choose_protocols(given, PAPER.tables["sequence"]) == ("sequence-10",)
     assert choose_protocols(decide(preset="re10k").run.cases, PAPER.tables["models"]) == ("n-30",)
     assert choose_protocols(decide().cases, PAPER.tables["models"]) == ("",)
+
+
+def test_a_figure_shows_one_protocol():
+    given = decide(preset="re10k", protocol=("sequence-4", "sequence-2-steps-2")).run.cases
+    assert choose_protocols(given, PAPER.tables["sequence"]) == given.protocol
+    assert choose_protocols(given, PAPER.figures["sequence"]) == ("sequence-4",)
+
+
+def test_protocols_that_nothing_takes_are_told():
+    given = decide(table=("models",), protocol=("n-2", "n-3", "stress-2-7")).run.cases
+    alone = [PAPER.tables["models"]]
+    assert find_unused_protocols(given, alone) == ["n-3", "stress-2-7"]
+    assert find_unused_protocols(given, [*alone, PAPER.tables["spans"]]) == ["stress-2-7"]
+
+
+FAILURES = (InputError("no frames"), OutputError("no space"), WorkerError("no process"))
+
+
+@pytest.fixture
+def written(monkeypatch, tmp_path) -> Callable[..., list[str]]:
+    """Return a function that reproduces with tables that fail, and lists those that were tried."""
+
+    def reproduce_with(failing: Mapping[str, InputError], **given: object) -> list[str]:
+        tried: list[str] = []
+
+        def write(request, name, spec, scored):
+            tried.append(name)
+            if name in failing:
+                raise failing[name]
+            scored.append(Scored(1, 1, []))
+
+        monkeypatch.setattr(reproduction, "write_output", write)
+        request = decide(reconstructor=("plane-sweep",), **given)
+        run = replace(request.run, out=tmp_path, answer=AnswerRequest(quiet=True))
+        assert reproduction.reproduce(replace(request, run=run)) == 0
+        return tried
+
+    return reproduce_with
+
+
+def test_all_goes_on_without_what_cannot_be_made(written):
+    tried = written({"stress": FAILURES[0]}, table=("all",))
+    assert tried == list(select_names(["all"], PAPER.tables, "warp-inpaint"))
+
+
+@pytest.mark.parametrize(
+    ("named", "error"),
+    [
+        ({"table": ("all", "stress")}, FAILURES[0]),
+        ({"table": ("stress",), "figure": ("all",)}, FAILURES[0]),
+        # Without a place or a process all of them fail.
+        ({"table": ("all",)}, FAILURES[1]),
+        ({"table": ("all",)}, FAILURES[2]),
+    ],
+)
+def test_what_is_named_beside_all_has_to_succeed(written, named, error):
+    with pytest.raises(InputError, match=str(error)):
+        written({"stress": error}, **named)
+
+
+def test_that_nothing_could_be_made_has_its_reason_also_if_quiet(written):
+    failing = dict.fromkeys(PAPER.tables, FAILURES[0])
+    with pytest.raises(InputError, match=r"None of the tables and figures .* no frames"):
+        written(failing, table=("all",))
 
 
 def test_all_leaves_out_what_another_generator_is_needed_for():

@@ -136,6 +136,29 @@ def test_what_the_package_refuses_is_one_sentence(package):
         load_reconstructor(f"ffgs:{VARIANT}", "some/where")
 
 
+def test_weights_that_cannot_be_loaded_are_no_fault_of_the_name(package, tmp_path):
+    for weights, option in ((tmp_path, "weights"), (None, "reconstructor")):
+        with pytest.raises(InputError, match="did not load") as error:
+            load_reconstructor("ffgs:none/such", weights)
+        assert error.value.argument == option
+
+
+def test_a_gaussian_that_no_scene_can_have_is_left_out(package, monkeypatch):
+    """A rotation of length 0 and a huge harmonic, as NaN; the others are a scene."""
+    to_world = Output.to_world
+
+    def spoil(output):
+        found = to_world(output)
+        found.gaussians.quats[:, 10] = 0
+        found.gaussians.sh()[:, 11] = 1e30
+        return found
+
+    psi = load_reconstructor(f"ffgs:{VARIANT}")
+    whole = len(run_reconstructor(psi, VIEWS).gaussians)
+    monkeypatch.setattr(Output, "to_world", spoil)
+    assert len(run_reconstructor(psi, VIEWS).gaussians) == whole - 2
+
+
 def test_without_the_package_its_command_is_named(monkeypatch, capsys, room, tmp_path):
     monkeypatch.setitem(sys.modules, "ffgs", None)
     words = ("complete", room, "--out", tmp_path / "o", "--reconstructor", f"ffgs:{VARIANT}")

@@ -11,17 +11,21 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 from torch.nn.functional import normalize
 
 from gscompleter.models.feed_forward.inputs import compute_central_crops
 from gscompleter.models.feed_forward.reconstructor import MAX_COEFFICIENTS
 from gscompleter.models.packages import choose_weights, import_authors_module
+from gscompleter.numerics.value_checks import find_finite
 from gscompleter.render.loading import load_renderer
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.types import Gaussians, Reconstruction, View, make_observed
 
 INSTALL = "pip install --pre ffgs"
+"""Command that installs the package, which has pre-releases only."""
 PREFIX = "ffgs:"
+"""Beginning of the names of its models among the reconstructors."""
 
 
 @dataclass(frozen=True)
@@ -40,18 +44,21 @@ class PipelineGaussians:
         Raises:
             InputError: Too few views, or poses that the model cannot place.
         """
-        # A padded target is cropped to what all images have. Its rays stay those of the view, as
-        # the principal point moves with the crop.
+        # A padded target is cropped to what all images have.
         crops = compute_central_crops([view.camera for view in views], patch=1)
-        pairs = list(zip(views, crops, strict=True))
-        # Channels first, and K in pixels of these images.
-        images = torch.stack([v.image[c.rows, c.columns].permute(2, 0, 1) for v, c in pairs])
-        offsets = torch.tensor([[float(c.left), float(c.top)] for c in crops])
-        Ks = torch.stack([view.camera.K for view in views]).float()
-        Ks[:, :2, 2] -= offsets.to(Ks)
-        c2w = torch.stack([view.camera.c2w for view in views]).float()
+        images = []
+        intrinsics = []
+        for view, crop in zip(views, crops, strict=True):
+            images.append(view.image[crop.rows, crop.columns].permute(2, 0, 1))  # channels first
+            # In pixels of the crop: its rays stay those of the view.
+            K = view.camera.K.clone()
+            K[0, 2] -= crop.left
+            K[1, 2] -= crop.top
+            intrinsics.append(K)
         given = self.make_views(
-            images.float().to(self.device), Ks.to(self.device), c2w.to(self.device)
+            torch.stack(images).float().to(self.device),
+            torch.stack(intrinsics).float().to(self.device),
+            torch.stack([view.camera.c2w for view in views]).float().to(self.device),
         )
         try:
             with torch.no_grad():
@@ -70,23 +77,29 @@ class PipelineGaussians:
 
 
 def convert_gaussians(predicted: Any) -> Gaussians:
-    """Convert the Gaussians of the first scene of a batch [1, n, ...]; padding is left out."""
-    # `sh` is [1, n, k, 3] in the 3DGS basis. Degree 4 has coefficients that no renderer takes.
-    sh = predicted.sh()[0, :, :MAX_COEFFICIENTS]
-    parts = [predicted.means[0], predicted.quats[0], predicted.scales[0], predicted.opacities[0]]
-    means, quats, scales, opacities = (part.detach().float() for part in parts)
-    finite = [part.isfinite().flatten(1).all(dim=1) for part in (means, quats, scales, sh)]
-    # Opacity 0 marks the padding of a batch.
-    kept = torch.stack(finite).all(dim=0) & (opacities > 0)
+    """Convert the Gaussians of the only scene of a batch [1, n, ...].
+
+    The package has our conventions: linear scales, opacities up to 1, quaternions wxyz of any
+    length, and `sh()` [1, n, k, 3] in the 3DGS basis. Left out are the padding of the batch, and
+    what has NaN, infinity or no rotation.
+    """
+
+    def take_scene(values: Tensor) -> Tensor:
+        return values[0].detach().float().contiguous()
+
+    whole = make_observed(
+        take_scene(predicted.means),
+        normalize(take_scene(predicted.quats), dim=1),
+        take_scene(predicted.scales),
+        take_scene(predicted.opacities).clamp(max=1),
+        # Degree 4 has coefficients that no renderer takes.
+        take_scene(predicted.sh()[:, :, :MAX_COEFFICIENTS]),
+    )
+    # Opacity 0 marks the padding.
+    kept = find_finite(whole) & (whole.opacities > 0)
     if not bool(kept.any()):
         raise InputError("The model of ffgs returned no visible Gaussian; choose another one.")
-    return make_observed(
-        means[kept].contiguous(),
-        normalize(quats[kept], dim=1),
-        scales[kept].contiguous(),
-        opacities[kept].clamp(0, 1).contiguous(),
-        sh.detach().float()[kept].contiguous(),
-    )
+    return whole[kept]
 
 
 def load_ffgs(variant: str, weights: Path | None = None, device: str = "cpu") -> PipelineGaussians:
@@ -104,6 +117,6 @@ def load_ffgs(variant: str, weights: Path | None = None, device: str = "cpu") ->
         raise InputError(
             f"ffgs did not load {quote_value(place)} ({type(error).__name__}: "
             f"{quote_value(str(error), 100)}); name FAMILY/VARIANT of its model zoo, or a folder.",
-            "reconstructor",
+            "reconstructor" if weights is None else "weights",
         ) from error
     return PipelineGaussians(pipeline, ffgs.Views, device)

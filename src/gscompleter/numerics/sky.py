@@ -21,7 +21,7 @@ SKY_EXTENSION = 0.125
 """Extension of the sky behind surfaces, as a fraction of the shorter image side.
 Without it, parallax would open gaps along roofs and trees."""
 SKY_OPACITY = 0.98
-"""Opacity of the extended sky."""
+"""Opacity of the extended sky, that of the discs of plane-sweep."""
 
 
 def is_sky(depth: Float[Tensor, "*n"], camera: Camera) -> Bool[Tensor, "*n"]:
@@ -36,7 +36,8 @@ def compute_sky_depth(camera: Camera) -> float:
 
 
 def is_sky_visible(renders: Sequence[Render], cameras: Sequence[Camera]) -> bool:
-    """Return True if any of the renders shows sky."""
+    """Return True if any of one or more renders shows sky."""
+    # All flags are stacked, so that the host waits for a GPU once and not for each render.
     shown = []
     for render, camera in zip(renders, cameras, strict=True):
         depth = render.depth_map()
@@ -60,6 +61,7 @@ def extend_sky(
     reach = round(SKY_EXTENSION * min(camera.width, camera.height))
     where = dilate(sky, reach) & ~sky
     pixels = torch.nonzero(where.flatten())[:, 0]
+    # Without a far plane nothing is sky, and there is no pixel to place.
     depth = compute_sky_depth(camera) if len(pixels) else 0.0
     size = sigma * depth * 2 / (camera.K[0, 0] + camera.K[1, 1])
     gaussians = make_observed(
@@ -78,6 +80,8 @@ def restore_sky_colors(made: Gaussians, fitted: Gaussians, camera: Camera) -> Ga
     Fitting compensates for blur, which makes a bright line of sky along roofs; parallax would
     reveal it. `camera` is any of those that see the Gaussians.
     """
+    # Distances and not z-depths, as a Gaussian may lie beside the view of this one camera. Surfaces
+    # end at the far plane, and the sky is so much farther away that both tell the same.
     in_sky = is_sky((made.means - camera.center).norm(dim=-1), camera)
     if not in_sky.any():
         return fitted

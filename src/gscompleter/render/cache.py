@@ -64,10 +64,11 @@ class SceneRenderer:
     def _update(
         self, parts: Parts, camera: Camera, known: Parts, frozen: FrozenScene | None
     ) -> FrozenScene:
-        """Extend a frozen scene if the new one begins with its parts, else freeze anew.
+        """Extend what was `frozen` of the parts `known` to `parts`, or freeze these anew.
 
         Parts are immutable, so that an identical object is an equal part. A first one that was only
         recoloured is repainted, and one of which some were hidden is drawn again where it showed.
+        In `known` it is replaced then.
         """
         if frozen is not None and known[0] is not parts[0] and differ_in_color(known[0], parts[0]):
             rows = find_changed_rows(known[0].sh, parts[0].sh).nonzero()[:, 0]
@@ -76,10 +77,12 @@ class SceneRenderer:
         if (
             isinstance(frozen, HidingScene)
             and known[0] is not parts[0]
+            # Else all is frozen anew below, and hiding would be in vain.
             and has_first_parts(parts[1:], known[1:])
             and (hidden := find_hidden(known[0], parts[0])) is not None
         ):
             known = (parts[0], *known[1:])
+            # Of the later parts nothing is hidden.
             hidden = pad(hidden, (0, sum(map(len, known[1:]))))
             frozen = frozen.hide(hidden, known)
         shared = 0
@@ -119,7 +122,7 @@ def find_hidden(one: Gaussians, other: Gaussians) -> Bool[Tensor, "n"] | None:
 
 
 def has_first_parts(parts: Parts, first: Parts) -> bool:
-    """Check whether parts begin with others."""
+    """Check whether `parts` begin with all of `first`, the same objects."""
     return len(parts) >= len(first) and all(
         part is other for part, other in zip(parts, first, strict=False)
     )
@@ -127,7 +130,7 @@ def has_first_parts(parts: Parts, first: Parts) -> bool:
 
 def make_camera_key(camera: Camera) -> Hashable:
     """Make a key that is equal for cameras with equal images."""
-    # Not the far plane, which no renderer uses.
+    # Not the far plane, which no renderer uses, and of the near one what renderers make of it.
     camera = camera.on_cpu
     numbers = (*camera.c2w.flatten().tolist(), *camera.K.flatten().tolist())
     return (*numbers, camera.width, camera.height, *camera.padding, camera.near_plane)

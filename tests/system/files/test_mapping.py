@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from full_disk import limit_file_size
-from gscompleter.system.errors import FullDiskError
+from gscompleter.system.errors import FullDiskError, OutputError
 from gscompleter.system.files.mapping import (
     change_rows,
     file_array_beside,
@@ -132,6 +132,20 @@ def test_rows_are_selected_in_any_order_with_few_pages(tmp_path, count):
     assert not is_mapped(selected)
     # The system reads some pages around each one.
     assert read_resident(mapped) < 0.2 * values.nbytes
+
+
+def test_a_disk_whose_files_cannot_be_mapped_is_one_sentence(tmp_path, monkeypatch):
+    """Some network and shared folders; there is none to test with, so that torch stands in."""
+
+    def refuse(*_, **__):
+        raise RuntimeError(
+            "unable to mmap 24 bytes from file </proc/self/fd/3>: No such device (19)"
+        )
+
+    monkeypatch.setattr(torch, "from_file", refuse)
+    with pytest.raises(OutputError, match="cannot be mapped .*No such device.*; choose") as error:
+        move_to_file(make_values(), tmp_path / "out")
+    assert str(tmp_path / "out") in str(error.value)
 
 
 def test_a_full_disk_is_one_sentence(tmp_path):

@@ -57,7 +57,7 @@ def decide_batch(options: BatchOptions) -> BatchRequest:
     return BatchRequest(
         manifest=options.manifest,
         out=options.out,
-        common=parse_pairs(options.each, "each"),
+        common=parse_pairs(options.each, "each", "resolution=256"),
         engine=decide_engine(options),
         retries=options.retries,
         repeats_failures=options.rerun == "failures",

@@ -1,4 +1,4 @@
-"""Decisions of the commands that run many cases."""
+"""The engine of commands that run many cases, and words of the form NAME=VALUE."""
 
 from __future__ import annotations
 
@@ -38,20 +38,18 @@ def decide_engine(options: EngineOptions) -> EngineRequest:
         threads=options.threads,
         address=options.address,
         gpus=options.gpus,
-        slurm=parse_pairs(options.slurm, "slurm"),
+        slurm=parse_pairs(options.slurm, "slurm", "partition=gpu"),
         share=parse_shard(options.shard, os.environ),
     )
 
 
-def parse_pairs(words: Sequence[str], option: str) -> dict[str, str]:
-    """Parse `NAME=VALUE` words; `option`, which has them, is for errors."""
+def parse_pairs(words: Sequence[str], option: str, example: str) -> dict[str, str]:
+    """Parse `NAME=VALUE` words; `option`, which has them, and an `example` are for errors."""
     pairs = {}
     for word in words:
         name, sign, value = word.partition("=")
         if not name or not sign:
-            raise InputError(
-                f"'{quote_value(word)}' is not NAME=VALUE, as in resolution=256.", option
-            )
+            raise InputError(f"'{quote_value(word)}' is not NAME=VALUE, as in {example}.", option)
         if name in pairs:
             raise InputError(f"{quote_value(name)} is given twice; give it once.", option)
         pairs[name] = value

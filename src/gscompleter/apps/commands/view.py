@@ -19,6 +19,9 @@ from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.overlap import refuse_input_file
 from gscompleter.system.process import import_without_collection
 
+SERVING_OPTIONS = ("port", "no_open")
+"""Options of a page that is served, which one that is saved cannot follow."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ViewOptions(WritingOptions):
@@ -41,9 +44,9 @@ class ViewOptions(WritingOptions):
     """Size of images in pixels. Height and width, at `--cameras`; those of its file if not
     given."""
     up: tuple[float, float, float] | None = None
-    """Upward direction of the splat: x, y and z in its file (in the axes of a .ply). That of A,
-    which the page takes. If not given, that of most cameras; without any, what the file says, else
-    its floor, else -y."""
+    """Upward direction of the splat: x, y and z in its file (in the axes of a .ply). That of A;
+    the page shows B in the same way. If not given, that of most cameras; without any, what the file
+    says, else its floor, else -y."""
     save: Path | None = None
     """Write the page to this file instead of serving it."""
     port: Port = 0
@@ -62,7 +65,15 @@ class ViewOptions(WritingOptions):
 
 
 def decide_view(options: ViewOptions) -> ViewRequest:
-    """Decide what is shown, and where."""
+    """Decide what is shown, and where; raise InputError for options that nothing would follow."""
+    if options.save is None and options.overwrite:
+        raise InputError(
+            "Nothing is written; name the file of the page with --save, or leave this out.",
+            "overwrite",
+        )
+    for name in SERVING_OPTIONS:
+        if options.save is not None and getattr(options, name) != getattr(ViewOptions, name):
+            raise InputError("The page is saved and not served; leave this out, or --save.", name)
     if options.save is not None and options.save.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{quote_value(options.save)} is no .html file; name it *.html.", "save")
     refuse_size_alone(options.resolution, options.cameras)

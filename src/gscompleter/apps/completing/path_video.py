@@ -6,6 +6,7 @@ frames at which it stands at a target, a repaired video shows what was painted f
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -38,7 +39,9 @@ from gscompleter.system.progress import track
 from gscompleter.types import Camera
 
 PATH_VIDEO = "path.mp4"
+"""Renders of the scene along the path, which a video model is to repair."""
 PATH_MASK = "path_mask.mp4"
+"""White where to repair, frame by frame as in `PATH_VIDEO`."""
 FRAME_STEP = 4
 """Video models take 4 n + 1 frames, since their encoders join four frames."""
 
@@ -61,12 +64,13 @@ def plan_path(
     video encoders need.
     """
     first = targets[0]
+    # Resizing scales the intrinsics, too, so that an odd side becomes even without a crop.
     lens = resize_camera(first, first.width + first.width % 2, first.height + first.height % 2)
     nearest = min(context, key=lambda camera: measure_baseline(camera, first))
     stops = [replace(lens, c2w=camera.c2w.to(lens.c2w)) for camera in (nearest, *targets)]
     # One leg leads to each target, in a multiple of `FRAME_STEP` frames; the last camera is added.
     seconds = max(ONE_WAY_SECONDS / len(targets), MIN_LEG_SECONDS)
-    leg_frames = FRAME_STEP * round(FRAMES_PER_SECOND * seconds / FRAME_STEP)
+    leg_frames = FRAME_STEP * math.ceil(FRAMES_PER_SECOND * seconds / FRAME_STEP)
     cameras = plan_camera_path(stops, thin_evenly(photographs, MAX_PHOTOGRAPHS), leg_frames)
     target_frames = [
         leg_frames * number if has_same_lens(target, first) else None
@@ -84,11 +88,14 @@ def write_path(
     folder: Path, ready: Prepared, begun: Completion, path: CameraPath
 ) -> dict[str, Any]:
     """Write the video and its mask, and return their entry in `holes.json`."""
-    masks: list[UInt8[np.ndarray, "h w 3"]] = []
-    write_video(
-        folder / PATH_VIDEO, render_path(ready, begun, path.cameras, masks), FRAMES_PER_SECOND
-    )
-    write_video(folder / PATH_MASK, masks, FRAMES_PER_SECOND)
+    # ffmpeg writes one video at a time: frames are written while they are rendered, and the masks,
+    # which come with them, are kept until then.
+    masks: list[UInt8[np.ndarray, "h w"]] = []
+    frames = render_path(ready, begun, path.cameras, masks)
+    write_video(folder / PATH_VIDEO, frames, FRAMES_PER_SECOND)
+    # Three equal channels only here, since all masks lie in memory.
+    grey = (np.repeat(mask[..., None], 3, axis=-1) for mask in masks)
+    write_video(folder / PATH_MASK, grey, FRAMES_PER_SECOND)
     row = PathRow(
         video_path=PATH_VIDEO,
         sha256=hash_file(folder / PATH_VIDEO),
@@ -111,16 +118,14 @@ def render_path(
     ready: Prepared,
     begun: Completion,
     cameras: Sequence[Camera],
-    masks: list[UInt8[np.ndarray, "h w 3"]],
+    masks: list[UInt8[np.ndarray, "h w"]],
 ) -> Iterator[UInt8[np.ndarray, "h w 3"]]:
     """Render the scene along a path, and append the mask of each frame to `masks`.
 
-    Frames are written while they are rendered, and the masks, a video of their own, after them.
-    What a hole is, is decided as at a target: marked, enclosed by an object, or empty.
+    Holes are found as at a target, and widened as in its mask (`draw_hole`).
     """
     for camera in track(cameras, "video"):
         placed = begun.with_depth_range(camera.to(ready.task.device))
         view = render_target(begun, pad_camera(placed, 0.0), ready.completer.scenes)
-        mask = dilate(view.holes, BORDER_WIDTH)
-        masks.append(np.repeat(convert_to_pixels(mask)[..., None], 3, axis=-1))
+        masks.append(convert_to_pixels(dilate(view.holes, BORDER_WIDTH)))
         yield convert_to_pixels(view.render.image)

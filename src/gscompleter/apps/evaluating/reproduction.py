@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -37,10 +36,10 @@ from gscompleter.evaluation.paper_tables import (
     write_paper_table,
 )
 from gscompleter.evaluation.protocols import list_indices
-from gscompleter.evaluation.store import make_file_name
+from gscompleter.evaluation.store import make_file_name, read_run_file
 from gscompleter.evaluation.tables import format_markdown, write_tables
 from gscompleter.system.console import make_console
-from gscompleter.system.errors import InputError, NoCaseError, OutputError
+from gscompleter.system.errors import InputError, NoCaseError, OutputError, WorkerError
 from gscompleter.system.files.writing import encode_text, replace_file
 from gscompleter.system.jobs.jobs import make_folder
 from gscompleter.system.machine import describe_machine
@@ -53,15 +52,11 @@ FIGURES = "figures"
 """Folder of the figures in OUT."""
 RUNS = "runs"
 """Folder in OUT with the scores of each run, as `evaluate` writes them."""
+COMMON_COLUMNS = ("psnr", "hole_psnr", "neighbours", "context_change")
+"""Columns of every table that compares models."""
 COMPARED_COLUMNS = {
-    "depth": (
-        *("psnr", "hole_psnr", "neighbours", "context_change"),
-        *("depth_observed", "depth_hole", "depth_hole_median"),
-    ),
-    "generator": (
-        *("psnr", "hole_psnr", "neighbours", "context_change"),
-        *("st_lpips", "hole_flip", "hole_haarpsi", "hole_gradients"),
-    ),
+    "depth": (*COMMON_COLUMNS, "depth_observed", "depth_hole", "depth_hole_median"),
+    "generator": (*COMMON_COLUMNS, "st_lpips", "hole_flip", "hole_haarpsi", "hole_gradients"),
 }
 """Columns of the table that compares models of a kind."""
 COMPARED_TITLES = {"depth": "depth", "generator": "Φ"}
@@ -102,6 +97,11 @@ def compare_runs(request: ComparisonRequest) -> int:
         print_json(collect_outputs(shared.out))
     elif not shared.answer.quiet:
         print(format_paper_markdown(table))
+    return choose_common_exit_code(scored)
+
+
+def choose_common_exit_code(scored: Sequence[Scored]) -> int:
+    """Return the exit code of several runs, which counts the rows of each."""
     failed = sum(len(run.failures) for run in scored)
     return choose_exit_code(failed, sum(run.num_own_rows for run in scored))
 
@@ -122,20 +122,32 @@ def reproduce(request: ReproductionRequest) -> int:
         names = ("models",)
     tables = select_names(names, paper.tables, generator)
     figures = select_names(request.figures, paper.figures, generator)
+    unused = find_unused_protocols(request.run.cases, [*tables.values(), *figures.values()])
+    if unused:
+        console.print(
+            f"Not used: --protocol {' '.join(unused)}, which none of these tables and figures "
+            "takes.",
+            soft_wrap=True,
+        )
 
     scored: list[Scored] = []
-    for name, spec in [*tables.items(), *figures.items()]:
-        console.print(f"{name}: {spec.title}")
-        try:
-            write_output(request, name, spec, scored)
-        except InputError as error:
-            # Of `all`, those are left out whose data or models are not here. One that is named has
-            # to succeed.
-            if "all" not in (*request.tables, *request.figures):
+    reasons: list[str] = []
+    for given, specs in ((names, tables), (request.figures, figures)):
+        for name, spec in specs.items():
+            console.print(f"{name}: {spec.title}")
+            try:
+                write_output(request, name, spec, scored)
+            except (OutputError, WorkerError):  # InputErrors, too, that no other table would escape
                 raise
-            console.print(f"Left out {name}: {error}", soft_wrap=True)
+            except InputError as error:
+                # Of `all`, those are left out whose data or models are not here. One that is named
+                # has to succeed.
+                if name in given:
+                    raise
+                reasons.append(f"Left out {name}: {error}")
+                console.print(reasons[-1], soft_wrap=True)
     if not scored:
-        raise InputError("None of the tables and figures could be begun; the lines above say why.")
+        raise InputError(f"None of the tables and figures could be begun. {reasons[0]}")
 
     out = request.run.out
     text = write_results(out, request.run.models.device)
@@ -143,8 +155,7 @@ def reproduce(request: ReproductionRequest) -> int:
         print_json(collect_outputs(out))
     elif not answer.quiet:
         make_console().print(text, soft_wrap=True)
-    failed = sum(len(run.failures) for run in scored)
-    return choose_exit_code(failed, sum(run.num_own_rows for run in scored))
+    return choose_common_exit_code(scored)
 
 
 def collect_outputs(out: Path) -> dict[str, Any]:
@@ -152,7 +163,7 @@ def collect_outputs(out: Path) -> dict[str, Any]:
     tables = sorted((out / TABLES).glob("*.json"))
     return {
         "results": str(out / RESULTS_PAGE),
-        "tables": {path.stem: json.loads(path.read_bytes()) for path in tables},
+        "tables": {path.stem: read_run_file(path) for path in tables},
         "figures": [str(path) for path in sorted((out / FIGURES).glob("*"))],
     }
 
@@ -186,18 +197,19 @@ def write_from_runs(
             raise InputError(f"No case of the table was completed. {reason}")
         make_folder(out / TABLES)
         write_paper_table(out / TABLES / name, table)
-    if isinstance(spec, FigureSpec):
-        # A figure compares models on one protocol.
-        by_model = {model: folder for (model, _), folder in runs.items()}
-        make_folder(out / FIGURES)
-        draw_figure(
-            out / FIGURES / name,
-            spec,
-            by_model,
-            request.figure_cases,
-            request.has_outlines,
-            request.has_crops,
-        )
+        return
+    assert isinstance(spec, FigureSpec), "what is no table is a figure"
+    # It has one protocol (`choose_protocols`).
+    by_model = {model: folder for (model, _), folder in runs.items()}
+    make_folder(out / FIGURES)
+    draw_figure(
+        out / FIGURES / name,
+        spec,
+        by_model,
+        request.figure_cases,
+        request.has_outlines,
+        request.has_crops,
+    )
 
 
 def run_all(
@@ -221,20 +233,32 @@ def run_all(
 def choose_protocols(cases: CasesRequest, spec: Requirements) -> tuple[str, ...]:
     """Choose the given protocols of the kind that a table needs, or else those of the paper.
 
-    A file of cases, which needs no protocol, has an empty one.
+    A figure, which compares models on one protocol, takes the first of them. A file of cases, which
+    needs no protocol, has an empty one.
     """
     kinds = {get_kind(name) for name in spec.protocol}
     if kinds:
         suitable = tuple(name for name in cases.protocol if get_kind(name) in kinds)
-        return suitable or spec.protocol
+        chosen = suitable or spec.protocol
+        return chosen[:1] if isinstance(spec, FigureSpec) else chosen
 
-    # A table without a kind of its own takes a given protocol, or that of the data set.
+    # One without a kind of its own takes the first given protocol, or that of the data set.
     usual = [name for name in cases.protocol if get_kind(name) not in SEPARATE_KINDS]
     return tuple(usual[:1]) or get_data_set(cases.preset).protocol or ("",)
 
 
+def find_unused_protocols(cases: CasesRequest, specs: Iterable[Requirements]) -> list[str]:
+    """Find the given protocols that no table or figure takes."""
+    taken = {name for spec in specs for name in choose_protocols(cases, spec)}
+    return [name for name in cases.protocol if name not in taken]
+
+
 def get_kind(protocol: str) -> str:
-    """Return the kind of a protocol: `n` of n-10 and of our index dl3dv-n-10, `stress`, ...."""
+    """Return the kind of a protocol: what its name begins with, such as `n`, `stress`, `sequence`.
+
+    In the names of our indices it comes second: `n` in dl3dv-n-10. An index of the user is given by
+    its path, which has no kind that a table asks for.
+    """
     parts = protocol.split("-")
     return parts[1] if protocol in list_indices() else parts[0]
 
@@ -269,10 +293,11 @@ def make_run(
 def write_results(out: Path, device: str) -> str:
     """Write all tables, claims and figures in OUT as one page, and return its text."""
     paper = load_paper()
+    facts = [f"{key} {value}" for key, value in describe_machine(device).items()]
     commit = find_commit()
-    machine = {**describe_machine(device), **({} if commit is None else {"commit": commit})}
-    facts = ", ".join(f"{key} {value}" for key, value in machine.items())
-    parts = [f"# Results\n\n{facts}.\n"]
+    if commit is not None:
+        facts.append(f"commit {commit}")
+    parts = [f"# Results\n\n{', '.join(facts)}.\n"]
 
     # Tables and figures of earlier calls in the same folder are on the page, too.
     tables = [out / TABLES / f"{name}.md" for name in paper.tables]

@@ -1,9 +1,10 @@
 """Exports of Polycam, 3d Scanner App and Record3D.
 
 * Polycam's raw data and all data of 3d Scanner App have a JSON file for each photograph. Polycam's
-  corrected photographs have no distortion and their poses less drift; depth belongs to the others.
+  corrected photographs have no distortion and their poses less drift. Depth was recorded with the
+  original ones, and serves both, as in nerfstudio: there is no other.
 * A recording of Record3D is a zip archive. Its `metadata` has the size `w` and `h` of photographs,
-  `K` column by column, or fx, fy, cx and cy of each, and `poses`: a quaternion with the real part
+  `K` column by column or fx, fy, cx and cy of each, and `poses`: a quaternion with the real part
   last, and the centre. `rgbd/N.depth` and `rgbd/N.conf` are compressed with LZFSE.
 """
 
@@ -38,14 +39,17 @@ from gscompleter.system.files.reading import parse_json
 from gscompleter.types import MAX_COORDINATE
 
 HOME = "keyframes"
+"""Folder of all frames in an export of Polycam."""
 METADATA = "metadata"
+"""File of the cameras in a recording of Record3D."""
 LENSES = "perFrameIntrinsicCoeffs"
-NOTE = "Depth is left out; `pip install 'gscompleter[phones]'` makes it readable."
+"""Entry of that file with fx, fy, cx and cy of each photograph."""
+UNREAD_DEPTH_NOTE = "Depth is left out; `pip install 'gscompleter[phones]'` makes it readable."
 
 
 @dataclass(frozen=True)
 class KeyframeFormat:
-    """Files of frames and their cameras."""
+    """Names of the files of frames, and how their cameras are read."""
 
     mark: bytes
     """Part of each camera's JSON file."""
@@ -55,27 +59,28 @@ class KeyframeFormat:
     """Patterns of cameras, photographs, depth maps and confidences, in order of preference."""
 
     def find_frames(self, path: Path) -> list[Files]:
-        """Find the files of the first patterns with photographs; none if there are none."""
+        """Find the files of the first patterns that have photographs and cameras; or none."""
         root = path.parent if path.name == HOME else path
         for group in self.patterns:
             files = [find_files(root, pattern) for pattern in group]
             cameras, photographs, *_ = files
+            if not photographs or not cameras:
+                continue
             # Other exports have JSON files of these names, too.
-            first_camera = next(iter(cameras.values()), bytes)
-            if photographs and self.mark in first_camera():
+            read_first_camera = next(iter(cameras.values()))
+            if self.mark in read_first_camera():
                 return files
         return []
 
     def open(self, path: Path) -> Iterator[Photographs]:
         """Open a folder or an archive; frames are numbered by their sorted names."""
-        cameras, *files = self.find_frames(path)
+        cameras, photographs, *maps = self.find_frames(path)
         parsed = {}
-        for name in sorted(cameras.keys() & files[0]):
+        for name in sorted(cameras.keys() & photographs.keys()):
             title = f"frame {quote_value(name)} of {quote_value(path)}"
-            parsed[name] = self.parse(
-                parse_json(cameras[name](), title, PHONE_EXPORT_ADVICE), title
-            )
-        yield build_recording(path, parsed, files)
+            content = parse_json(cameras[name](), title, PHONE_EXPORT_ADVICE)
+            parsed[name] = self.parse(content, title)
+        yield build_recording(path, parsed, [photographs, *maps])
 
 
 def parse_polycam(entry: Any, title: str) -> PoseAndLens:
@@ -97,8 +102,10 @@ def parse_scanner_app(entry: Any, title: str) -> PoseAndLens:
 DEPTH_GLOBS = (f"{HOME}/depth/*.png", f"{HOME}/confidence/*.png")
 CORRECTED = (f"{HOME}/corrected_cameras/*.json", f"{HOME}/corrected_images/*.*", *DEPTH_GLOBS)
 ORIGINAL = (f"{HOME}/cameras/*.json", f"{HOME}/images/*.*", *DEPTH_GLOBS)
+"""Patterns of Polycam's files; those of depth serve both kinds of photographs."""
 POLYCAM = KeyframeFormat(b'"t_00"', parse_polycam, (CORRECTED, ORIGINAL))
 SCANNED = ("frame_*.json", "frame_*.jpg", "depth_*.png", "conf_*.png")
+"""Patterns of the files of 3d Scanner App."""
 SCANNER_APP = KeyframeFormat(b'"cameraPoseARFrame"', parse_scanner_app, (SCANNED,))
 
 
@@ -116,38 +123,49 @@ def open_recording(path: Path) -> Iterator[Photographs]:
     size = get_size(content, title, "w", "h")
     depths = find_files(path, "rgbd/*.depth")
     confidences = find_files(path, "rgbd/*.conf")
-    notes = (NOTE,) if depths and find_spec("liblzfse") is None else ()
-    files = find_recording(path), {} if notes else depths, confidences
-    decoders = partial(_unpack_map, "<f4", size), partial(_unpack_map, "u1", size)
-    scene = build_recording(path, _parse_recorded(content, size, title), files, decoders)
-    yield replace(scene, notes=notes)
+    is_unread = bool(depths) and find_spec("liblzfse") is None
+    files = [find_recording(path), {} if is_unread else depths, confidences]
+    unpack_depth = partial(_unpack_map, "<f4", size)
+    unpack_confidence = partial(_unpack_map, "u1", size)
+    cameras = _parse_recorded(content, size, title)
+    scene = build_recording(path, cameras, files, (unpack_depth, unpack_confidence))
+    yield replace(scene, notes=(*scene.notes, UNREAD_DEPTH_NOTE)) if is_unread else scene
 
 
 def _parse_recorded(content: Any, size: tuple[int, int], title: str) -> dict[str, PoseAndLens]:
+    """Parse the cameras of a recording, by the names of its frames: their numbers from 0."""
     count = len(get_part(content, "poses", list))
     require(count, f"{title} has no poses; record with the LiDAR.")
     poses = get_array(content, "poses", title, (count, 7))
-    # fx, fy, cx and cy of a matrix that is stored column by column.
-    lenses = np.tile(get_array(content, "K", title, (9,))[[0, 4, 6, 7]], (count, 1))
     if get_part(content, LENSES, list):
         lenses = get_array(content, LENSES, title, (count, 4))
+    else:
+        # fx, fy, cx and cy of a matrix that is stored column by column.
+        common = get_array(content, "K", title, (9,))[[0, 4, 6, 7]]
+        lenses = np.tile(common, (count, 1))
     cameras: dict[str, PoseAndLens] = {}
-    for (x, y, z, w, *center), (fx, fy, cx, cy) in zip(poses, lenses.tolist(), strict=True):
+    for number, (pose, lens) in enumerate(zip(poses, lenses.tolist(), strict=True)):
+        x, y, z, w, *center = pose
+        fx, fy, cx, cy = lens
         c2w = np.eye(4)
         c2w[:3, :3] = compute_rotation((w, x, y, z))
         c2w[:3, 3] = center
-        cameras[str(len(cameras))] = c2w, Intrinsics(size, (fx, fy), (cx, cy))
+        cameras[str(number)] = c2w, Intrinsics(size, (fx, fy), (cx, cy))
     return cameras
 
 
 def _unpack_map(
     kind: str, size: tuple[int, int], data: bytes, title: str
 ) -> Shaped[np.ndarray, "h w"]:
-    """Unpack a map with the aspect ratio of the photographs, and at most as many pixels."""
+    """Unpack a map with the aspect ratio of the photographs of `size`, width and height.
+
+    `kind` is the type of its numbers. Raises InputError for damaged data, or too many.
+    """
     from liblzfse import decompress
 
     try:
-        # Four bytes a pixel or one; checked before anything is unpacked.
+        # A map has a fraction of the pixels, of four bytes or one. Twice four for each pixel is
+        # more than any has, and is checked before anything is unpacked.
         limit = 8 * math.prod(size)
         if len(data) > limit or measure_unpacked(data) > limit:
             raise DamagedError("it is larger than the photograph")

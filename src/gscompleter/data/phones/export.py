@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -18,13 +19,13 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from gscompleter.data.cameras import Intrinsics
-from gscompleter.data.frame import Frame, capitalize
+from gscompleter.data.frame import MAX_MISSING_PHOTOGRAPHS, Frame, capitalize
 from gscompleter.data.limits import require
 from gscompleter.data.photograph import StoredPhotograph
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
 from gscompleter.system.damage import describe_damage
-from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.image import open_image
 from gscompleter.system.files.names import is_hidden_name
 from gscompleter.system.files.reading import check_file, read_bytes, read_zip_entry
@@ -99,7 +100,9 @@ def build_recording(
 ) -> Photographs:
     """Build photographs from cameras by frame name, and the files of images, depth and confidence.
 
-    `decoders` are those of depth and of confidence, either of which a frame may lack.
+    `decoders` are those of depth and of confidence, either of which a frame may lack. A camera
+    without a photograph is usual: 3d Scanner App keeps poses of every frame. The other way round, a
+    note tells it.
     """
     frames = []
     images, depths, confidences = files
@@ -114,7 +117,14 @@ def build_recording(
         frame = Frame(name, title, c2w @ OPENCV_FROM_OPENGL, lens, stored, depth)
         frames.append(frame.with_rigid_pose())
     require(frames, f"No photograph of {quote_value(path)} has a camera; {PHONE_EXPORT_ADVICE}.")
-    return build_photographs(path.resolve().stem, quote_value(path), frames)
+    photographs = build_photographs(path.resolve().stem, quote_value(path), frames)
+    lost = sorted(images.keys() - cameras.keys())
+    if not lost:
+        return photographs
+    noun = "photograph" if len(lost) == 1 else "photographs"
+    names = join_names(lost, MAX_MISSING_PHOTOGRAPHS)
+    note = f"Left out of {quote_value(path)}: {len(lost):,} {noun} without a camera ({names})."
+    return replace(photographs, notes=(note,))
 
 
 def _read_depth(

@@ -12,6 +12,7 @@ import os
 import sys
 import tempfile
 from collections.abc import Iterable, Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -20,14 +21,18 @@ import torch
 from jaxtyping import Bool, Int64
 from torch import Tensor
 
+from gscompleter.system.errors import OutputError, quote_value
 from gscompleter.system.files.writing import convert_write_errors
 
 OPEN_FILES = "/proc/self/fd"
 """Folder of Linux in which open files have names, also those that have none elsewhere."""
-SELECTED_BLOCK = 8192
-"""Rows that are selected at a time, before their pages are released."""
+MAPPED_BLOCK = 8192
+"""Rows that are read or written at a time, before their pages are released."""
 _FOLDERS: dict[int, Path] = {}
-"""What the file of mapped values lies beside, by their address; of those that are gone, too."""
+"""What the file of mapped values lies beside, by their address.
+
+Entries of values that are gone stay: they are small, and the next values there replace them.
+"""
 
 
 def move_to_file(values: Tensor, beside: Path) -> Tensor:
@@ -64,12 +69,14 @@ def change_rows(values: Tensor, rows: Int64[Tensor, "m"], changed: Tensor) -> Te
         return values.index_copy(0, rows, changed)
 
     def make_blocks() -> Iterator[Tensor]:
-        starts = range(0, len(values), SELECTED_BLOCK)
-        ends = torch.searchsorted(rows, torch.tensor([*starts, len(values)]))
-        for start, first, last in zip(starts, ends.tolist(), ends[1:].tolist(), strict=False):
-            block = values[start : start + SELECTED_BLOCK].clone()
+        starts = range(0, len(values), MAPPED_BLOCK)
+        # Of the sorted rows, those from one bound to the next lie in a block.
+        bounds = torch.searchsorted(rows, torch.tensor([*starts, len(values)])).tolist()
+        for start, (first, last) in zip(starts, pairwise(bounds), strict=True):
+            stored = values[start : start + MAPPED_BLOCK]
+            block = stored.clone()
             block[rows[first:last] - start] = changed[first:last]
-            release_pages(values[start : start + SELECTED_BLOCK])
+            release_pages(stored)
             yield block
 
     return _map_blocks(make_blocks(), tuple(values.shape), values.dtype, _find_folder(values))
@@ -86,7 +93,7 @@ def join_rows(parts: Sequence[Tensor]) -> Tensor:
 
     def make_blocks() -> Iterator[Tensor]:
         for part in parts:
-            for block in part.split(SELECTED_BLOCK):
+            for block in part.split(MAPPED_BLOCK):
                 yield block.to(first.dtype)
                 release_pages(block)
 
@@ -102,7 +109,10 @@ def _find_folder(mapped: Tensor) -> Path:
 def _map_blocks(
     blocks: Iterable[Tensor], shape: tuple[int, ...], dtype: torch.dtype, beside: Path
 ) -> Tensor:
-    """Write blocks of rows to a temporary file, and map it."""
+    """Write blocks of rows to a temporary file, and map it.
+
+    Raises OutputError as `move_to_file`.
+    """
     folder = next(each for each in (beside, *beside.absolute().parents) if each.is_dir())
     with (
         convert_write_errors(beside),
@@ -113,7 +123,14 @@ def _map_blocks(
             file.write(block.contiguous().numpy().data)
         file.flush()
         name = f"{OPEN_FILES}/{file.fileno()}"
-        mapped = torch.from_file(name, shared=True, size=math.prod(shape), dtype=dtype)
+        try:
+            mapped = torch.from_file(name, shared=True, size=math.prod(shape), dtype=dtype)
+        except RuntimeError as error:  # torch has no OSError for what the system refuses
+            reason = str(error).partition(": ")[2] or str(error)
+            raise OutputError(
+                f"Files beside {quote_value(beside)} cannot be mapped into memory "
+                f"({quote_value(reason)}); choose a place on another disk."
+            ) from error
     _FOLDERS[mapped.data_ptr()] = beside
     return mapped.view(shape)
 
@@ -124,7 +141,9 @@ def select_rows(values: Tensor, rows: Int64[Tensor, "m"]) -> Tensor:
         # It copies rows as they are, in a quarter of the time of `values[rows]`.
         return values.index_select(0, rows)
     selected = values.new_empty((len(rows), *values.shape[1:]))
-    for part, places in zip(*(each.split(SELECTED_BLOCK) for each in rows.sort()), strict=True):
+    in_order, order = rows.sort()
+    blocks = zip(in_order.split(MAPPED_BLOCK), order.split(MAPPED_BLOCK), strict=True)
+    for part, places in blocks:
         selected.index_copy_(0, places, values.index_select(0, part))
         release_pages(values[part[0] : part[-1] + 1])
     return selected
@@ -135,8 +154,8 @@ def find_changed_rows(before: Tensor, after: Tensor) -> Bool[Tensor, "n"]:
     if not is_mapped(before) and not is_mapped(after):
         return (before != after).flatten(1).any(dim=1)
     parts = []
-    blocks = (each.split(SELECTED_BLOCK) for each in (before, after))
-    for one, other in zip(*blocks, strict=True):
+    blocks = zip(before.split(MAPPED_BLOCK), after.split(MAPPED_BLOCK), strict=True)
+    for one, other in blocks:
         parts.append((one != other).flatten(1).any(dim=1))
         release_pages(one)
         release_pages(other)
@@ -158,7 +177,8 @@ def is_mapped(values: Tensor) -> bool:
 def release_pages(rows: np.ndarray | Tensor) -> None:
     """Release the memory of consecutive rows of a mapped file; they are read again if needed.
 
-    Rows that are not mapped, or on a system without this advice to its kernel, stay as they are.
+    Rows that are not mapped, or on a system without this advice to its kernel, stay as they are. An
+    array over `mmap.mmap` must be read-only, as those of a .ply are: changes would be lost.
     """
     if isinstance(rows, Tensor):
         if not is_mapped(rows):
