@@ -18,7 +18,7 @@ from gscompleter.stages.align_paper import (
     MIN_INLIER_SHARE,
     ComparedDepths,
     compare_at_anchor,
-    compare_depths,
+    compare_depth_maps,
     fit_affine,
 )
 from gscompleter.stages.select_anchor import Anchor
@@ -41,7 +41,7 @@ def align_depth(lift: Lift, anchor: Anchor, view: TargetView, rng: torch.Generat
     if config.align_at == "none":
         return DepthAffine()
 
-    at_target = compare_depths(lift.reference_depth, view.render.depth_map())
+    at_target = compare_depth_maps(lift.reference_depth, view.render.depth_map())
     if config.align_at == "target":
         affine = fit_affine(at_target, rng)
         return replace(affine, pairs=sample_depth_pairs("target", at_target, affine))

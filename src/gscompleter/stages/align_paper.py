@@ -56,7 +56,7 @@ def compare_at_anchor(lift: Lift, anchor: Anchor) -> ComparedDepths:
     The anchor bridges both depths: Ψ predicts its depth with that of the target, and the context is
     rendered there, which has holes at the target.
     """
-    return compare_depths(lift.anchor_depth, anchor.render.depth_map())
+    return compare_depth_maps(lift.anchor_depth, anchor.render.depth_map())
 
 
 def fit_affine(depths: ComparedDepths, rng: torch.Generator) -> DepthAffine:
@@ -85,7 +85,7 @@ def fit_affine(depths: ComparedDepths, rng: torch.Generator) -> DepthAffine:
     return DepthAffine(scale, 0.0, inliers, "median")
 
 
-def compare_depths(predicted: DepthMap, context: DepthMap) -> ComparedDepths:
+def compare_depth_maps(predicted: DepthMap, context: DepthMap) -> ComparedDepths:
     """Take the depths of two maps of one image where both are valid."""
     comparable = predicted.valid & context.valid & (predicted.depth > 0) & (context.depth > 0)
     depths = torch.stack([predicted.depth, context.depth]).where(comparable, 0.0).cpu()
