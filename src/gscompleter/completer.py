@@ -22,7 +22,7 @@ from gscompleter.generators import (
     load_generator,
 )
 from gscompleter.guards import accept_at, prepare_guards
-from gscompleter.numerics.geometry import is_inside, pad_camera, pad_like, project
+from gscompleter.numerics.geometry import pad_camera, pad_like
 from gscompleter.numerics.given_geometry import GivenGeometry
 from gscompleter.numerics.image_ops import is_enclosed
 from gscompleter.numerics.value_checks import (
@@ -48,27 +48,23 @@ from gscompleter.stages.close_gaps import (
     view_gaps,
 )
 from gscompleter.stages.context import InitialContext, choose_config, init_context
+from gscompleter.stages.context_geometry import init_with_geometry
 from gscompleter.stages.fade_border import fade_border
 from gscompleter.stages.filter_holes import filter_holes
 from gscompleter.stages.find_unfilled import find_unfilled
 from gscompleter.stages.given_geometry import (
-    ContradictedError,
     add_geometry_depth,
     check_geometry,
     count_on_geometry,
-    give_depth_before_scene,
-    give_photographs_depth,
-    require_uncontradicted,
 )
 from gscompleter.stages.lift import lift
 from gscompleter.stages.new_photos import find_new_photos, recolor_to_photos
-from gscompleter.stages.place_geometry import place_geometry
 from gscompleter.stages.recolor import recolor
 from gscompleter.stages.refine import keep_as_it_is, refine
 from gscompleter.stages.refusals import explain_skip
 from gscompleter.stages.register import register_along_rays
 from gscompleter.stages.register_paper import register_as_paper
-from gscompleter.stages.result import make_unchanged_result
+from gscompleter.stages.result import count_outside, make_unchanged_result
 from gscompleter.stages.select_anchor import choose_anchor
 from gscompleter.stages.synthesize import GeneratedView, make_generator_input, synthesize
 from gscompleter.stages.target_view import TargetView, render_target
@@ -80,7 +76,7 @@ from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.trust import Trust
 from gscompleter.trust.photometric import load_trust
-from gscompleter.types import Camera, DepthAffine, Gaussians, PaddedCamera, Render, View, merge
+from gscompleter.types import Camera, DepthAffine, Gaussians, PaddedCamera, View, merge
 
 MAX_SEED = 2**62
 """Levels and rounds add to the seed, which has 64 bits."""
@@ -217,10 +213,27 @@ class GSCompleter:
         config = choose_config(self.config, scene, check_views)
         if geometry is not None:
             check_geometry(geometry, config)
+
+        # The authors' Ψ makes the same scene for all targets.
+        favored = () if config.registration_method == "paper" else targets
+
+        def init(photographs: Sequence[View]) -> InitialContext:
+            return init_context(
+                self.reconstructor,
+                photographs,
+                scene,
+                check_views or (),
+                targets,
+                favored,
+                self.renderer,
+            )
+
         with record_seconds() as seconds, timed_stage("context"):
-            # The authors' Ψ makes the same scene for all targets.
-            favored = () if config.registration_method == "paper" else targets
-            context = self.make_context(views, scene, check_views or (), targets, favored, geometry)
+            context = (
+                init(views)
+                if geometry is None
+                else init_with_geometry(geometry, views, scene is not None, init, self.scenes)
+            )
             photos = tuple(Photo(view) for view in context.views)
             state = Completion(
                 config,
@@ -258,69 +271,6 @@ class GSCompleter:
             state = replace(state, trust=trust)
             state = recolor_to_photos(state, [context.views[i] for i in new], self.scenes)
         return replace(state, exposure_gains=context.exposure_gains, seconds=seconds)
-
-    def make_context(
-        self,
-        views: Sequence[View],
-        scene: Gaussians | None,
-        check_views: Sequence[View],
-        targets: Sequence[Camera],
-        favored: Sequence[Camera],
-        geometry: GivenGeometry | None,
-    ) -> InitialContext:
-        """Initialize the context, whose photographs get the depth of geometry if there is any.
-
-        Ψ fits a scene of its own most closely to the photographs near `favored` targets.
-
-        Before Ψ makes the scene of them, so that it uses it; a scene that is given tells first
-        where the geometry belongs.
-        """
-
-        def init(photographs: Sequence[View]) -> InitialContext:
-            return init_context(
-                self.reconstructor,
-                photographs,
-                scene,
-                check_views,
-                targets,
-                favored,
-                self.renderer,
-            )
-
-        if geometry is None:
-            return init(views)
-        if scene is not None:
-            context = init(views)
-            placed, renders = self.place(geometry, context)
-            given = give_photographs_depth(placed, context.views, renders)
-            return replace(context, views=given, geometry=placed)
-
-        def init_with(placed: GivenGeometry) -> InitialContext:
-            given, notes = give_depth_before_scene(placed, views)
-            context = init(given)
-            require_uncontradicted(placed, given, context.views)
-            return replace(context, notes=(*notes, *context.notes), geometry=placed)
-
-        try:
-            return init_with(geometry)
-        except ContradictedError:
-            # It may be in a frame of its own, which the scene that Ψ makes without it tells.
-            placed, _ = self.place(geometry, init(views))
-            if placed is geometry:
-                raise
-            return init_with(placed)
-
-    def place(
-        self, geometry: GivenGeometry, context: InitialContext
-    ) -> tuple[GivenGeometry, list[Render]]:
-        """Move geometry to where the photographs of a context show it; return their renders, too.
-
-        Raises InputError if they show something else.
-        """
-        cameras = [view.camera for view in context.views]
-        frozen = self.scenes.freeze_at((context.source.rendered,), cameras)
-        renders = [scene.render for scene in frozen]
-        return place_geometry(geometry, context.views, renders), renders
 
     def name_models(self) -> dict[str, str]:
         """Name Ψ, the depth that helps it, and Φ, for the record of what is invented."""
@@ -453,14 +403,15 @@ class GSCompleter:
         """
         check_state(state)
         check_camera(target, "The target")
-        camera = self.pad_target(state, target)
         if reference:
-            return render_target(state, pad_like(camera.target, reference.camera), self.scenes)
+            ranged = state.with_depth_range(target)
+            return render_target(state, pad_like(ranged, reference.camera), self.scenes)
 
         # A camera that moves on from the target meets the next hole at the border of its image
         # (decision 001). Holes that do not reach it need no padding.
+        camera = self.pad_target(state, target)
         view = render_target(state, camera, self.scenes)
-        if is_enclosed(view.camera.crop(view.holes)):
+        if camera.is_padded and is_enclosed(camera.crop(view.holes)):
             view = render_target(state, pad_camera(camera.target, 0.0), self.scenes)
         return view
 
@@ -479,11 +430,6 @@ class GSCompleter:
             return []
         inputs = [(view.camera.padded, make_generator_input(view)) for view in views]
         return synthesize(self.generator, inputs, views[0].state.config.synthesis)
-
-
-def count_outside(added: Gaussians, target: Camera) -> int:
-    """Count the Gaussians outside of the image of a target, in its padding."""
-    return len(added) - int(is_inside(*project(added.means, target), target).sum())
 
 
 def name_model(model: object) -> str:

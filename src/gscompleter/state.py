@@ -232,7 +232,7 @@ class Completion(Displayed):
         gone = self.source.gone_mask
         return self.recolored_context[~gone] if gone.any() else self.recolored_context
 
-    @property
+    @cached_property
     def next_target_id(self) -> int:
         """Value of `generated` for the next target; ids of a given scene are continued."""
         return find_last_target_id(self.context) + len(self.targets) + 1

@@ -301,6 +301,11 @@ class PaddedCamera:
     """Padding in pixels on the left and on the right each; `top` likewise."""
     top: int
 
+    @property
+    def is_padded(self) -> bool:
+        """True if there is padding on any side."""
+        return self.left > 0 or self.top > 0
+
     def crop(self, image: Shaped[Tensor, "wide_h wide_w *c"]) -> Shaped[Tensor, "h w *c"]:
         """Cut the padding off an image [h, w, ...] of the padded camera."""
         return image[self._inside]

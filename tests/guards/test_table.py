@@ -1,13 +1,21 @@
 """Each guard of the table has its tests, explains its losses, and stands in the reference page."""
 
 import re
+from dataclasses import replace
 from importlib import import_module
 
 import pytest
 
-from gscompleter.config import GUARDS
-from gscompleter.guards import Guard
+from gscompleter.config import GUARDS, CompleterConfig
+from gscompleter.guards import Guard, accept_at
+from gscompleter.parts import PartOrigin
+from gscompleter.stages.additions import Additions
+from gscompleter.stages.refine import keep_as_it_is
+from gscompleter.stages.synthesize import GeneratedView
+from gscompleter.types import DepthAffine
 from paths import ROOT
+from scenes import Room, camera_at, gaussians_of, random_gaussians, view_of
+from target_views import observe
 
 METHOD = (ROOT / "docs" / "method.md").read_text("utf-8")
 
@@ -44,3 +52,34 @@ def test_a_guard_has_a_line_in_the_reference_page(name):
     hooks = ["begin", "place", "verify"]
     own = [hook for hook in hooks if getattr(load(name), hook) is not getattr(Guard, hook)]
     assert re.search(rf"^\| `{name}` \| {', '.join(own)} \|", table, re.M)
+
+
+REMEMBERING = """
+import gscompleter as gsc
+
+
+class Remembering(gsc.Guard):
+    name = "remembering"
+    loss = "it was dropped"
+
+    def place(self, candidates, view):
+        self.count = len(candidates)
+        return candidates
+
+    def verify(self, added, attempt):
+        return added[: self.count - 1]
+"""
+
+
+def test_the_guard_that_places_verifies(tmp_path):
+    """Both hooks are asked of one object, so that the second knows what the first one saw."""
+    file = tmp_path / "remembering.py"
+    file.write_text(REMEMBERING)
+    config = replace(CompleterConfig(), guards=(f"{file}:Remembering",))
+    camera = camera_at(size=16)
+    seen = view_of(Room(), camera)
+    view = observe(gaussians_of(seen), [seen], camera, config)
+    candidates = Additions.begin(PartOrigin("target", 1), "lift", random_gaussians(4))
+    image = GeneratedView(seen.image, camera)
+    accepted = accept_at(view, candidates, image, DepthAffine(), keep_as_it_is)
+    assert len(accepted.gaussians) == 3

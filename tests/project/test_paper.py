@@ -26,7 +26,7 @@ EQUATIONS = {
     7: (r"\Psi(\mathcal{V}_{\text{pair}}; \Theta)", [lift.lift_pair]),
     8: (
         r"(s \cdot D_{\text{pred}}^{\text{anc}}",
-        [align_paper.align_as_paper, align_paper.fit_affine, DepthAffine],
+        [align_paper.compare_at_anchor, align_paper.fit_affine, DepthAffine],
     ),
     9: (r"d_i^{\text{init}} = \frac", [register_paper.initialize_distances, register.apply_affine]),
     10: (

@@ -10,7 +10,7 @@ from gscompleter.guards import Attempt
 from gscompleter.guards.agreement import DepthAgreement
 from gscompleter.stages.additions import Refined
 from gscompleter.stages.align_depth import align_depth, refit_at_target
-from gscompleter.stages.align_paper import fit_affine
+from gscompleter.stages.align_paper import compare_depth_maps, fit_affine
 from gscompleter.stages.select_anchor import choose_anchor
 from gscompleter.stages.synthesize import GeneratedView
 from gscompleter.types import DepthAffine, DepthMap, Lift, View, merge
@@ -30,7 +30,7 @@ def everywhere(depth: torch.Tensor) -> DepthMap:
 
 
 def fit(predicted: DepthMap, context: DepthMap):
-    return fit_affine(predicted, context, torch.Generator().manual_seed(0))
+    return fit_affine(compare_depth_maps(predicted, context), torch.Generator().manual_seed(0))
 
 
 @pytest.mark.parametrize(("scale", "shift"), [(1.3, -0.4), (0.7, 0.9), (1.0, 0.0)])
@@ -101,9 +101,8 @@ def checked(
     """Check an affine that fits the anchor at a target with the depths `context`."""
     random = torch.Generator().manual_seed(0)
     through_anchor = DepthAffine(scale, 0.0, 0.9, "ransac")
-    return refit_at_target(
-        through_anchor, everywhere(depths()), everywhere(context), random, config
-    )
+    at_target = compare_depth_maps(everywhere(depths()), everywhere(context))
+    return refit_at_target(through_anchor, at_target, random, config)
 
 
 def test_an_affine_that_the_target_contradicts_is_fitted_there():
@@ -117,8 +116,8 @@ def test_an_affine_that_the_target_confirms_or_cannot_judge_stays():
     assert checked(1.0, depths() * 1.02) == DepthAffine(1.0, 0.0, 0.9, "ransac", 1.0, coverage=1.0)
     none = DepthMap(depths(), torch.zeros(64, 64, dtype=torch.bool))
     affine = DepthAffine(3.0, 0.0, 0.9, "ransac")
-    random = torch.Generator()
-    assert refit_at_target(affine, everywhere(depths()), none, random, CONFIG) == affine
+    at_target = compare_depth_maps(everywhere(depths()), none)
+    assert refit_at_target(affine, at_target, torch.Generator(), CONFIG) == affine
 
 
 def unlike() -> torch.Tensor:
@@ -156,7 +155,8 @@ def test_what_is_seen_of_little_refutes_nothing():
     through_anchor = DepthAffine(1.0, 0.0, 0.9, "ransac")
     for share, refuted in ((seen, False), (torch.ones_like(seen), True)):
         context = DepthMap(unlike().repeat(2, 2), share)
-        affine = refit_at_target(through_anchor, predicted, context, random, config)
+        at_target = compare_depth_maps(predicted, context)
+        affine = refit_at_target(through_anchor, at_target, random, config)
         assert is_rejected(affine) == refuted
         assert affine.agreement < 0.1
 

@@ -7,11 +7,12 @@ import torch
 
 from gscompleter import GSCompleter
 from gscompleter.config import LIFTED_MARGIN, CompleterConfig
-from gscompleter.numerics.geometry import pad_pixels
+from gscompleter.numerics.geometry import pad_pixels, project
+from gscompleter.render.protocols import FrozenScene
 from gscompleter.stages.context import choose_config
 from gscompleter.stages.hole_masks import mark_beside_holes
 from gscompleter.target_result import TargetResult
-from gscompleter.types import Gaussians, Render
+from gscompleter.types import Camera, Gaussians, Render
 from gscompleter.virtual_capture.render_views import render_views
 from scenes import Room, camera_at, gaussians_of, view_of
 
@@ -71,6 +72,30 @@ def test_one_pixel_of_a_hole_at_the_border_does_not_open_all_of_the_padding(trai
         right = view.holes[:, -view.camera.left :]
         assert right.float().mean() > 0.5
         assert bool(left.float().mean() > 0.5) is is_open
+
+
+@pytest.mark.parametrize(("margin", "count"), [(0.0, 1), (0.25, 2)])
+def test_a_target_is_rendered_again_only_to_take_its_padding_off(
+    trained, monkeypatch, margin, count
+):
+    x, y = project(trained.means, camera_at(size=SIZE))[0].unbind(-1)
+    scene = trained[((x - SIZE / 2).abs() > 6) | ((y - SIZE / 2).abs() > 6)]
+    cameras = [replace(camera_at(x, size=SIZE), near=None, far=None) for x in (0.0, 0.2)]
+    completer = GSCompleter(config=replace(CompleterConfig.bare(), margin=margin))
+    state = completer.begin(render_views(scene, cameras), scene)
+    seen = []
+    freeze = completer.scenes.freeze
+
+    def record(parts: tuple[Gaussians, ...], camera: Camera) -> FrozenScene:
+        seen.append(camera)
+        return freeze(parts, camera)
+
+    monkeypatch.setattr(completer.scenes, "freeze", record)
+    view = completer.observe(state, camera_at(0.02, size=SIZE))
+    # The hole is enclosed by the image.
+    assert view.holes.any()
+    assert view.camera.left == 0
+    assert len(seen) == count
 
 
 def test_a_line_says_that_most_of_the_additions_are_outside_of_the_image(trained):

@@ -16,8 +16,7 @@ from jaxtyping import Float, UInt8
 from PIL import Image
 
 from gscompleter.data.limits import require
-from gscompleter.data.sfm import NUM_VIDEO_FRAMES
-from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.errors import quote_value
 from gscompleter.system.files.video import read_video
 from gscompleter.system.progress import stage
 
@@ -46,18 +45,6 @@ FRAME_JPEG_QUALITY = 95
 def is_video(path: Path) -> bool:
     """Check whether `path` is a file with the name of a video."""
     return path.suffix.lower() in SOURCE_VIDEO_ENDINGS and path.is_file()
-
-
-def refuse_frames_of_no_video(path: Path, num_frames: int) -> None:
-    """Raise InputError if the user limits the frames of what is there and no video.
-
-    The default that is typed all the same cannot be told from one that is not.
-    """
-    if num_frames != NUM_VIDEO_FRAMES and path.exists() and not is_video(path):
-        raise InputError(
-            f"--frames chooses from a video, and {quote_value(path, 80)} is none; leave it out.",
-            "frames",
-        )
 
 
 def extract_frames(video: Path, folder: Path, count: int) -> None:

@@ -6,6 +6,7 @@ A new guard is a class that overrides one of three hooks and explains its losses
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib import import_module
 from typing import ClassVar
@@ -67,9 +68,9 @@ def prepare_guards(state: Completion, scenes: SceneRenderer) -> Completion:
 
 
 @timed_stage("integrate")
-def place(candidates: Additions, view: TargetView) -> Additions:
+def place(candidates: Additions, view: TargetView, guards: Sequence[Guard]) -> Additions:
     """Let guards move or drop candidates, before they are refined."""
-    for guard in load_guards(view.state.config):
+    for guard in guards:
         candidates = candidates.then(
             guard.name, guard.place(candidates.gaussians, view), guard.loss
         )
@@ -77,9 +78,9 @@ def place(candidates: Additions, view: TargetView) -> Additions:
 
 
 @timed_stage("integrate")
-def verify(added: Additions, attempt: Attempt) -> Additions:
+def verify(added: Additions, attempt: Attempt, guards: Sequence[Guard]) -> Additions:
     """Let guards fade or drop what was refined; after a rejection no further guard is asked."""
-    for guard in load_guards(attempt.view.state.config):
+    for guard in guards:
         before = added.gaussians
         added = added.then(guard.name, guard.verify(before, attempt), guard.loss)
         if len(before) > 0 and len(added.gaussians) == 0:
@@ -95,11 +96,12 @@ def accept_at(
     refine: RefineAtTarget,
 ) -> Additions:
     """Accept candidates at a target, where guards place and verify them."""
+    guards = load_guards(view.state.config)
     return accept(
         candidates,
-        place=lambda candidates: place(candidates, view),
+        place=lambda candidates: place(candidates, view, guards),
         refine=lambda placed: refine(placed, image, view),
-        verify=lambda added, refined: verify(added, Attempt(view, image, affine, refined)),
+        verify=lambda added, refined: verify(added, Attempt(view, image, affine, refined), guards),
     )
 
 

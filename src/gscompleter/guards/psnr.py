@@ -6,7 +6,7 @@ from dataclasses import replace
 
 from gscompleter.guards import Attempt, Guard
 from gscompleter.numerics.geometry import look_up
-from gscompleter.numerics.image_ops import dilate, label_regions
+from gscompleter.numerics.image_ops import label_regions
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.fit_colors import RELAXATION, fit_colors
 from gscompleter.stages.error_budgets import (
@@ -78,8 +78,7 @@ class PsnrGuard(Guard):
         added = fit_colors(added, frozen, wanted, [RELAXATION] * WORSE_COLOR_ROUNDS)
         plans = [scene.vary_opacities(added) for scene in view.frozen_photos]
 
-        hole = dilate(view.empty, state.config.holes.dilation)
-        labels, _ = label_regions(hole)
+        labels, _ = label_regions(view.addition_mask)
         regions = look_up(labels, added, view.camera.padded)
         settings = state.config.psnr_guard
         return meet_error_budgets(added, view.frozen_photos, budgets, plans, settings, regions)

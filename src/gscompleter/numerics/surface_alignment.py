@@ -69,6 +69,11 @@ SAME_PLACE = 0.025
 """The same for refined similarities."""
 NUM_PLACES = 6
 """Most refined similarities that are worth a comparison."""
+MAX_SAME = 0.1
+"""Largest distance of a surface in two places that count as one, relative to the size of what is
+seen."""
+MAX_ELSEWHERE = 0.05
+"""Largest share of a surface that is farther away in two places that count as one."""
 
 # How they are refined.
 GATES = (*np.geomspace(0.3, 0.05, 12), *[0.05] * 12)
@@ -338,6 +343,22 @@ def keep_distinct(
     return kept
 
 
+def are_same_place(
+    first: SurfaceSimilarity, second: SurfaceSimilarity, surface: SurfacePoints, seen: SeenPoints
+) -> bool:
+    """Return True if two similarities bring nearly all of a surface to the same place.
+
+    As those of a symmetric surface do.
+    """
+    # Where the second brings the surface, seen from the frame of the surface that the first brings
+    # there. Distances along the normals do not depend on how dense its points are.
+    points = move_points(np.linalg.inv(first) @ second, surface.points)
+    closest = surface.tree.query(points)[1]
+    gaps = np.einsum("ni,ni->n", points - surface.points[closest], surface.normals[closest])
+    limit = MAX_SAME * seen.size / get_similarity_scale(first)
+    return float((np.abs(gaps) > limit).mean()) <= MAX_ELSEWHERE
+
+
 def fit_closest_points(
     similarity: SurfaceSimilarity, surface: SurfacePoints, seen: SeenPoints
 ) -> tuple[SurfaceSimilarity, float]:
@@ -413,6 +434,17 @@ def find_least_determined_move(
     Along one plane it changes none.
     """
     return make_gap_equations(similarity, surface, seen, GATES[-1]).decompose()[1][:, 0]
+
+
+def move_least_determined(
+    similarity: SurfaceSimilarity, surface: SurfacePoints, seen: SeenPoints, length: float
+) -> tuple[SurfaceSimilarity, SurfaceSimilarity]:
+    """Move a surface both ways by the move that is least determined.
+
+    `length` is that of the move, relative to the size of what is seen.
+    """
+    move = length * find_least_determined_move(similarity, surface, seen)
+    return make_move(move, seen) @ similarity, make_move(-move, seen) @ similarity
 
 
 def find_closest(

@@ -6,8 +6,10 @@ open; comments here say "our reading" at these places.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
-from jaxtyping import Float
+from jaxtyping import Float64
 from torch import Tensor
 
 from gscompleter.numerics.robust import find_affine_inliers, fit_line_ransac
@@ -27,21 +29,42 @@ MIN_DEPTH_SPREAD = 0.05
 Below, only a scale is fitted."""
 
 
-def align_as_paper(lift: Lift, anchor: Anchor, rng: torch.Generator) -> DepthAffine:
-    """Minimize `Σ ρ(|D_ctx^anc - (s D_pred^anc + t)|)` over s and t at the anchor (Eq. 8).
+@dataclass(frozen=True)
+class ComparedDepths:
+    """Two z-depths at the pixels of one image where both are valid, on the CPU.
+
+    A fit reads so many numbers that the host would wait for a GPU dozens of times. So it gets both
+    maps in one copy, and gives back what takes a GPU (the scores of hypotheses).
+    """
+
+    predicted: Float64[Tensor, "n"]
+    """D_pred, as Ψ lifted it."""
+    context: Float64[Tensor, "n"]
+    """D_ctx, as the scene is rendered."""
+    num_pixels: int
+    """Of the whole image."""
+    device: torch.device
+    """Where the maps lie."""
+
+    def __len__(self) -> int:
+        return len(self.predicted)
+
+
+def compare_at_anchor(lift: Lift, anchor: Anchor) -> ComparedDepths:
+    """Compare D_pred^anc and D_ctx^anc, the depths that Eq. 8 aligns.
 
     The anchor bridges both depths: Ψ predicts its depth with that of the target, and the context is
     rendered there, which has holes at the target.
     """
-    return fit_affine(lift.anchor_depth, anchor.render.depth_map(), rng)
+    return compare_depth_maps(lift.anchor_depth, anchor.render.depth_map())
 
 
-def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> DepthAffine:
-    """Fit `context ≈ scale * predicted + shift` by RANSAC over valid pixels (paper, Eq. 8).
+def fit_affine(depths: ComparedDepths, rng: torch.Generator) -> DepthAffine:
+    """Minimize `Σ ρ(|D_ctx - (s D_pred + t)|)` over s and t by RANSAC (paper, Eq. 8).
 
     The fallback is the median ratio with shift 0, and the identity if nothing can be compared.
     """
-    x, y = pair_depths(predicted, context)
+    x, y = depths.predicted, depths.context
     if len(x) < MIN_FIT_PIXELS:
         return DepthAffine()
     if len(x) > MAX_SCORED_PIXELS:
@@ -52,7 +75,7 @@ def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> 
     low, median, high = x.quantile(x.new_tensor([0.05, 0.5, 0.95])).tolist()
     if (high - low) / median >= MIN_DEPTH_SPREAD:
         # Our reading: ρ counts pixels whose error, relative to their depth, is small.
-        scale, shift = fit_line_ransac(x, y, rng, predicted.depth.device)
+        scale, shift = fit_line_ransac(x, y, rng, depths.device)
         inliers = find_affine_inliers(x, y, scale, shift).double().mean().item()
         if scale > 0 and inliers >= MIN_INLIER_SHARE:
             return DepthAffine(scale, shift, inliers, "ransac")
@@ -62,15 +85,9 @@ def fit_affine(predicted: DepthMap, context: DepthMap, rng: torch.Generator) -> 
     return DepthAffine(scale, 0.0, inliers, "median")
 
 
-def pair_depths(
-    predicted: DepthMap, context: DepthMap
-) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"]]:
-    """Return both z-depths at the pixels where both are valid, on the CPU.
-
-    A fit reads so many numbers that the host would wait for a GPU dozens of times. So it gets both
-    maps in one copy, and gives back what takes a GPU (the scores of hypotheses).
-    """
+def compare_depth_maps(predicted: DepthMap, context: DepthMap) -> ComparedDepths:
+    """Take the depths of two maps of one image where both are valid."""
     comparable = predicted.valid & context.valid & (predicted.depth > 0) & (context.depth > 0)
     depths = torch.stack([predicted.depth, context.depth]).where(comparable, 0.0).cpu()
     x, y = depths[:, depths[0] > 0].double()
-    return x, y
+    return ComparedDepths(x, y, comparable.numel(), predicted.depth.device)

@@ -15,7 +15,7 @@ from gscompleter.stages.align_paper import (
     MAX_SCORED_PIXELS,
     MIN_DEPTH_SPREAD,
     MIN_FIT_PIXELS,
-    pair_depths,
+    compare_depth_maps,
 )
 from gscompleter.types import DepthAffine, DepthMap
 
@@ -47,8 +47,9 @@ def align_photographs(
 
     `scene` is the depth of the scene at these photographs, valid where it is to be compared.
     """
-    pairs = [pair_depths(*maps) for maps in zip(predicted, scene, strict=True)]
-    x, y = (torch.cat(depths) for depths in zip(*pairs, strict=True))
+    compared = [compare_depth_maps(*maps) for maps in zip(predicted, scene, strict=True)]
+    x = torch.cat([depths.predicted for depths in compared])
+    y = torch.cat([depths.context for depths in compared])
     if len(x) < MIN_FIT_PIXELS:
         return DepthAffine()
     if len(x) > MAX_SCORED_PIXELS:

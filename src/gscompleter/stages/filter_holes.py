@@ -6,7 +6,6 @@ from jaxtyping import Bool, Int
 from torch import Tensor
 
 from gscompleter.numerics.geometry import project_mask
-from gscompleter.numerics.image_ops import dilate
 from gscompleter.parts import PartOrigin, label_gaussians
 from gscompleter.stages.target_view import TargetView
 from gscompleter.system.timing import timed_stage
@@ -16,9 +15,9 @@ from gscompleter.types import Camera, Gaussians, Registration
 @timed_stage("integrate")
 def filter_holes(moved: Registration, view: TargetView) -> Gaussians:
     """Keep registered Gaussians inside the dilated hole mask, labelled with the target's id."""
-    # Beyond Eq. 12 the mask is dilated, since a hard border leaves seams (decision 037).
-    mask = dilate(view.empty, view.state.config.holes.dilation)
-    kept = select_in_mask(moved.gaussians, moved.pixel_index, mask, view.camera.padded)
+    kept = select_in_mask(
+        moved.gaussians, moved.pixel_index, view.addition_mask, view.camera.padded
+    )
     return label_gaussians(kept, PartOrigin("target", view.state.next_target_id))
 
 

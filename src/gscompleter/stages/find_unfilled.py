@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from gscompleter.numerics.image_ops import dilate, find_largest_regions
+from gscompleter.numerics.image_ops import find_largest_regions
 from gscompleter.stages.additions import Step
 from gscompleter.stages.fade_border import find_fading_border
 from gscompleter.stages.hole_masks import compute_hole_mask
@@ -29,7 +29,7 @@ def find_unfilled(after: Render, steps: Sequence[Step], view: TargetView) -> Unf
     """
     holes = view.state.config.holes
     # Towards the end of the padding additions fade on purpose.
-    mask = dilate(view.empty, holes.dilation) & ~find_fading_border(view)
+    mask = view.addition_mask & ~find_fading_border(view)
     empty = mask & compute_hole_mask(after.alpha, holes)
     total = max(int(mask.sum()), 1)
     share = int(empty.sum()) / total

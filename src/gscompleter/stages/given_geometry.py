@@ -175,8 +175,7 @@ def add_geometry_depth(image: GeneratedView, view: TargetView) -> tuple[Generate
     if geometry is None:
         return image, GeometryUse()
     camera = view.camera.padded
-    surface = mask_out_sky(view.render, camera)
-    seen = replace(surface, valid=surface.valid & ~view.holes)
+    seen = replace(view.surfaces, valid=view.surfaces.valid & ~view.holes)
     fit = fit_to_surface(geometry.draw_depth(camera), seen)
     num_holes = int(view.holes.sum().clamp_min(1))
     use = GeometryUse(

@@ -16,22 +16,18 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.numerics.geometry import unproject
-from gscompleter.numerics.given_geometry import (
-    GeometryPlacement,
-    GivenGeometry,
-    move_points,
-)
+from gscompleter.numerics.given_geometry import GeometryPlacement, GivenGeometry
 from gscompleter.numerics.sky import mask_out_sky
 from gscompleter.numerics.surface_alignment import (
     SeenPoints,
     SurfacePoints,
     SurfaceSimilarity,
     align_surface,
-    find_least_determined_move,
+    are_same_place,
     fit_closest_points,
     get_similarity_scale,
-    make_move,
     make_seen_points,
+    move_least_determined,
     sample_surface,
 )
 from gscompleter.stages.given_geometry import ADVICE, MAX_DEVIATION, MIN_COMPARED
@@ -57,10 +53,6 @@ MIN_SEEN_SHARE = 0.25
 """Smallest share of what is seen that has to be compared there."""
 MIN_LEAD = 0.03
 """Share of the compared pixels by which one place has to be better than another."""
-MAX_SAME = 0.1
-"""Largest distance of two places that count as one, relative to the size of what is seen."""
-MAX_ELSEWHERE = 0.05
-"""Largest share of a surface that is farther away in two places that count as one."""
 LONG_MOVE = 0.4
 """Length of the move that tests whether anything determines a place, relative to the size of what
 is seen. Places that are right then agree by a tenth less, those along a wall as before."""
@@ -166,7 +158,7 @@ def place_geometry(
     similarity, _ = fit_closest_points(np.eye(4), surface, seen)
     after = scene.compare(geometry.transform(similarity))
     is_better = after.is_placed and MIN_GAIN * after.deviation <= before.deviation
-    if is_better and is_determined(geometry, similarity, scene, surface, seen):
+    if is_better and is_determined(geometry, similarity, after, scene, surface, seen):
         return move_to(geometry, similarity, after)
     return geometry
 
@@ -196,7 +188,7 @@ def search_place(
     best = min(alike, key=lambda number: compared[number].deviation)
     if not (
         all(are_same_place(places[best], places[i], surface, seen) for i in alike)
-        and is_determined(geometry, places[best], scene, surface, seen)
+        and is_determined(geometry, places[best], compared[best], scene, surface, seen)
     ):
         raise InputError(
             f"{geometry.name} fits the scene in several places alike, as in a symmetric room, "
@@ -210,6 +202,7 @@ def search_place(
 def is_determined(
     geometry: GivenGeometry,
     place: SurfaceSimilarity,
+    compared: SurfaceComparison,
     scene: SeenScene,
     surface: SurfacePoints,
     seen: SeenPoints,
@@ -217,31 +210,15 @@ def is_determined(
     """Return True if geometry fits worse when the move that is least determined goes on.
 
     One wall does not tell where along it the geometry is, and no single corner how large.
+    `compared` is the geometry at `place` itself.
     """
-    move = LONG_MOVE * find_least_determined_move(place, surface, seen)
-    fit, *others = (
-        scene.compare(geometry.transform(similarity))
-        for similarity in (place, make_move(move, seen) @ place, make_move(-move, seen) @ place)
-    )
+    others = [
+        scene.compare(geometry.transform(moved))
+        for moved in move_least_determined(place, surface, seen, LONG_MOVE)
+    ]
     return not any(
-        other.is_compared and other.agreement > fit.agreement - MIN_LEAD for other in others
+        other.is_compared and other.agreement > compared.agreement - MIN_LEAD for other in others
     )
-
-
-def are_same_place(
-    first: SurfaceSimilarity, second: SurfaceSimilarity, surface: SurfacePoints, seen: SeenPoints
-) -> bool:
-    """Return True if two similarities bring nearly all of a surface to the same place.
-
-    As those of a symmetric surface do.
-    """
-    # Where the second brings the surface, seen from the frame of the surface that the first brings
-    # there. Distances along the normals do not depend on how dense its points are.
-    points = move_points(np.linalg.inv(first) @ second, surface.points)
-    closest = surface.tree.query(points)[1]
-    gaps = np.einsum("ni,ni->n", points - surface.points[closest], surface.normals[closest])
-    limit = MAX_SAME * seen.size / get_similarity_scale(first)
-    return float((np.abs(gaps) > limit).mean()) <= MAX_ELSEWHERE
 
 
 def move_to(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from gscompleter.config import HoleConfig
 from gscompleter.numerics.geometry import is_same_camera
-from gscompleter.numerics.sky import mask_out_sky
 from gscompleter.stages.target_view import TargetView
 
 NOTHING_TO_COMPLETE = ": nothing to complete."
@@ -14,16 +13,17 @@ NOTHING_TO_COMPLETE = ": nothing to complete."
 def explain_refusal(view: TargetView) -> str | None:
     """Explain why a target cannot be completed; None if it can."""
     # The sky is no surface that anything could be registered to.
-    before = view.render.crop(view.camera)
-    covered = mask_out_sky(before, view.camera.target).valid.float().mean().item()
+    covered = view.camera.crop(view.surfaces.valid).float().mean().item()
     return explain_little_covered(covered, view.state.config.holes)
 
 
 def explain_skip(view: TargetView) -> str:
     """Explain why nothing is completed at a target, refusals included; empty if it can be."""
-    refusal = explain_refusal(view)
-    if refusal:
-        return refusal
+    return explain_refusal(view) or explain_no_need(view)
+
+
+def explain_no_need(view: TargetView) -> str:
+    """Explain why nothing has to be completed at a target; empty if it sees a hole."""
     unsure = view.camera.crop(view.holes | (view.distrust > 0))
     # At a context view, which of a splat alone is a render, Φ could only return its image. That is
     # no reason where its pixels are ignored, since nothing is known of them.

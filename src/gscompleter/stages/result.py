@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from gscompleter.stages.refusals import explain_refusal, explain_skip
+from gscompleter.numerics.geometry import is_inside, project
+from gscompleter.stages.refusals import explain_no_need, explain_refusal
 from gscompleter.stages.select_anchor import Anchor
 from gscompleter.stages.target_view import TargetView
 from gscompleter.target_result import TargetResult
+from gscompleter.types import Camera, Gaussians
 
 
 def make_unchanged_result(view: TargetView, anchor: Anchor) -> TargetResult:
     """Make the result of a target at which nothing was changed."""
     before = view.render.crop(view.camera)
+    refusal = explain_refusal(view)
     return TargetResult(
         target=view.camera.target,
         before=before,
@@ -20,7 +23,12 @@ def make_unchanged_result(view: TargetView, anchor: Anchor) -> TargetResult:
         anchor=anchor.index,
         anchor_fallback=anchor.is_fallback,
         added=view.state.rendered_context[:0],
-        refusal=explain_refusal(view),
-        skip_reason=explain_skip(view),
+        refusal=refusal,
+        skip_reason=refusal or explain_no_need(view),
         target_id=view.state.next_target_id,
     )
+
+
+def count_outside(added: Gaussians, target: Camera) -> int:
+    """Count the Gaussians outside of the image of a target, in its padding."""
+    return len(added) - int(is_inside(*project(added.means, target), target).sum())

@@ -11,6 +11,7 @@ from torch import Tensor
 
 from gscompleter.config.settings import COVERED
 from gscompleter.numerics.image_ops import blur_gaussian, dilate
+from gscompleter.numerics.sky import mask_out_sky
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.protocols import FrozenScene
 from gscompleter.render.removed import add_border, find_removed
@@ -22,7 +23,7 @@ from gscompleter.stages.hole_masks import (
     find_hole_masks,
 )
 from gscompleter.state import Completion
-from gscompleter.types import Camera, ErrorBudget, PaddedCamera, Render, View, merge
+from gscompleter.types import Camera, DepthMap, ErrorBudget, PaddedCamera, Render, View, merge
 
 FULL_TRUST = 1.0
 """Mean trust of what a pixel shows at which it keeps its colour."""
@@ -55,6 +56,11 @@ class TargetView:
         """Render of the scene at the padded camera."""
         return self.frozen.render
 
+    @cached_property
+    def surfaces(self) -> DepthMap:
+        """z-depth of the render, valid on surfaces: not in the sky, whose depth is our choice."""
+        return mask_out_sky(self.render, self.camera.padded)
+
     @property
     def holes(self) -> Bool[Tensor, "h w"]:
         """Pixels that Φ fills: empty or not trusted."""
@@ -76,6 +82,14 @@ class TargetView:
         sigma = DISTRUST_BLUR * max(weight.shape)
         weight = blur_gaussian(weight.where(covered, 0.0), sigma)
         return weight.where(covered, 0.0)
+
+    @cached_property
+    def addition_mask(self) -> Bool[Tensor, "h w"]:
+        """Pixels of the target in which additions are kept: empty ones and those beside them.
+
+        Beyond Eq. 12 the hole mask is dilated, since a hard border leaves seams (decision 037).
+        """
+        return dilate(self.empty, self.state.config.holes.dilation)
 
     @property
     def candidate_mask(self) -> Bool[Tensor, "h w"] | None:

@@ -28,9 +28,10 @@ from gscompleter.data.sfm.poses import (
     has_photographs,
     list_all_photographs,
     list_given_masks,
+    refuse_frames_of_no_video,
 )
 from gscompleter.data.unused_files import list_unused
-from gscompleter.data.video import is_video, refuse_frames_of_no_video
+from gscompleter.data.video import is_video
 from gscompleter.splats.alignment.training_size import find_training_size
 from gscompleter.splats.foreign import holds_splat_alone
 from gscompleter.splats.formats import has_splat_extension

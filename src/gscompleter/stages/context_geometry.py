@@ -1,0 +1,76 @@
+"""Stage 1 with geometry from elsewhere: photographs get its depth (not in the paper).
+
+Before Ψ makes a scene of them, so that it uses the depth. A scene that is given tells first where
+the geometry belongs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+from gscompleter.numerics.given_geometry import GivenGeometry
+from gscompleter.render.cache import SceneRenderer
+from gscompleter.stages.context import InitialContext
+from gscompleter.stages.given_geometry import (
+    ContradictedError,
+    give_depth_before_scene,
+    give_photographs_depth,
+    require_uncontradicted,
+)
+from gscompleter.stages.place_geometry import place_geometry
+from gscompleter.types import Render, View
+
+InitFrom = Callable[[Sequence[View]], InitialContext]
+"""Initializes the context from photographs."""
+
+
+def init_with_geometry(
+    geometry: GivenGeometry,
+    views: Sequence[View],
+    has_scene: bool,
+    init: InitFrom,
+    scenes: SceneRenderer,
+) -> InitialContext:
+    """Initialize the context, whose photographs get the depth of geometry.
+
+    `has_scene` is True if a scene is given, which Ψ does not make. Raises InputError if the scene,
+    or what photographs measure, contradicts the geometry.
+    """
+    if has_scene:
+        context = init(views)
+        placed, renders = place_in_context(geometry, context, scenes)
+        given = give_photographs_depth(placed, context.views, renders)
+        return replace(context, views=given, geometry=placed)
+    try:
+        return init_from_depth(geometry, views, init)
+    except ContradictedError:
+        # It may be in a frame of its own, which the scene that Ψ makes without it tells.
+        placed, _ = place_in_context(geometry, init(views), scenes)
+        if placed is geometry:
+            raise
+        return init_from_depth(placed, views, init)
+
+
+def init_from_depth(placed: GivenGeometry, views: Sequence[View], init: InitFrom) -> InitialContext:
+    """Let Ψ make the context of photographs that have the depth of geometry.
+
+    Raises ContradictedError if they measure something else.
+    """
+    given, notes = give_depth_before_scene(placed, views)
+    context = init(given)
+    require_uncontradicted(placed, given, context.views)
+    return replace(context, notes=(*notes, *context.notes), geometry=placed)
+
+
+def place_in_context(
+    geometry: GivenGeometry, context: InitialContext, scenes: SceneRenderer
+) -> tuple[GivenGeometry, list[Render]]:
+    """Move geometry to where the photographs of a context show it; return their renders, too.
+
+    Raises InputError if they show something else.
+    """
+    cameras = [view.camera for view in context.views]
+    frozen = scenes.freeze_at((context.source.rendered,), cameras)
+    renders = [scene.render for scene in frozen]
+    return place_geometry(geometry, context.views, renders), renders
