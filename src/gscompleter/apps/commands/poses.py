@@ -43,8 +43,9 @@ def run_poses(options: PosesOptions) -> None:
     """Find and write the cameras, and print their number and error."""
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
+        from gscompleter.apps.inputs.opening import refuse_frames_of_no_video
         from gscompleter.data.given_poses import has_cameras
-        from gscompleter.data.sfm.poses import find_poses, refuse_frames_of_no_video
+        from gscompleter.data.sfm.poses import find_poses
         from gscompleter.system.console import make_console
         from gscompleter.system.progress import show_progress
 

@@ -23,12 +23,12 @@ from gscompleter.data.mask_checks import read_masks_as_asked, refuse_nothing_to_
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.masks import describe_unnamed_masks, make_no_mask_error
 from gscompleter.data.photographs import check_resolution
+from gscompleter.data.sfm import NUM_VIDEO_FRAMES
 from gscompleter.data.sfm.poses import (
     find_poses,
     has_photographs,
     list_all_photographs,
     list_given_masks,
-    refuse_frames_of_no_video,
 )
 from gscompleter.data.unused_files import list_unused
 from gscompleter.data.video import is_video
@@ -198,3 +198,15 @@ def describe_cameras_above(folder: Path) -> list[str]:
         f"{quote_value(above)} has cameras of these photographs ({format}); name that folder to "
         "use them. Here they are found anew."
     ]
+
+
+def refuse_frames_of_no_video(path: Path, num_frames: int) -> None:
+    """Raise InputError if the user limits the frames of what is there and no video.
+
+    The default that is typed all the same cannot be told from one that is not.
+    """
+    if num_frames != NUM_VIDEO_FRAMES and path.exists() and not is_video(path):
+        raise InputError(
+            f"--frames chooses from a video, and {quote_value(path, 80)} is none; leave it out.",
+            "frames",
+        )

@@ -229,18 +229,6 @@ def find_poses(
     return replace(poses, kept=" ".join(output.describe_others()))
 
 
-def refuse_frames_of_no_video(path: Path, num_frames: int) -> None:
-    """Raise InputError if the user limits the frames of what is there and no video.
-
-    The default that is typed all the same cannot be told from one that is not.
-    """
-    if num_frames != NUM_VIDEO_FRAMES and path.exists() and not is_video(path):
-        raise InputError(
-            f"--frames chooses from a video, and {quote_value(path, 80)} is none; leave it out.",
-            "frames",
-        )
-
-
 def list_given_masks(folder: Path, names: Sequence[str], named: Path | None = None) -> list[Path]:
     """List the masks of photographs in a folder; `named` is as in `find_given`."""
     return [given.mask for given in find_given(folder, names, named) if given.mask is not None]
