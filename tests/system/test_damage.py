@@ -53,6 +53,8 @@ def test_what_an_error_tells_is_said():
     archive = zipfile.ZipFile(io.BytesIO(b"PK\5\6" + bytes(18)))
     missing = catch(lambda: archive.getinfo("depth/0.png"))
     assert describe_damage(missing) == "it lacks the entry 'depth/0.png'"
+    # A number is a place in a table of the decoder.
+    assert describe_damage(KeyError(17)) == "its content is damaged"
     cut = catch(lambda: zlib.decompress(zlib.compress(bytes(99))[:-5]))
     assert "too early" in describe_damage(cut)
     wrong = catch(lambda: zlib.decompress(b"hello"))

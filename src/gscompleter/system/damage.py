@@ -37,8 +37,7 @@ def describe_damage(error: BaseException) -> str:
         return "it is no text in UTF-8"
     if isinstance(error, EOFError):
         return TOO_SHORT
-    # Not said to be damaged: the file may be whole, and the machine small. It may also be damaged
-    # and claim more than it has, so that a reader goes on to say what to do with the file.
+    # The file may be whole, or be damaged and claim more than it has: either way this is true.
     if isinstance(error, MemoryError):
         return "it needs more memory than there is"
     if isinstance(error, zlib.error):
@@ -60,7 +59,9 @@ def describe_damage(error: BaseException) -> str:
 
 
 def _describe_missing_entry(error: KeyError) -> str:
-    key = str(error.args[0]) if error.args else ""
+    key = error.args[0] if error.args else None
+    if not isinstance(key, str):
+        return GENERAL
     in_archive = _ARCHIVE_ENTRY.fullmatch(key)
     name = key if in_archive is None else in_archive[1]
     return f"it lacks the entry '{name}'" if _ENTRY_NAME.fullmatch(name) else GENERAL

@@ -3,7 +3,7 @@
 Photographs do not determine the colours of many more Gaussians than pixels: fitted to them alone,
 colours cancel errors of depth, pose and exposure there and look wrong from everywhere else. Virtual
 photographs say what the scene should look like elsewhere. They show the finest detail only as far
-as two photographs agree about its place: detail that is a pixel off is a larger error than none.
+as two photographs agree about its place: detail a pixel beside it is a larger error than a blur.
 """
 
 from __future__ import annotations
@@ -135,8 +135,8 @@ def blend(
     warped: Float[Tensor, "h w 3"], share: Float[Tensor, "h w"], shown: Render
 ) -> Float[Tensor, "h w 3"]:
     """Blend a warped photograph with the render, whose colours stay where it shows nothing."""
-    # Where the scene ends it is half transparent, and a completion adds what is behind. The
-    # photograph shows both: asked for as a whole, it would be too bright with what is added
-    # (decision 043).
+    # Where the scene ends it is half transparent, and a completion adds what is behind. Gaussians
+    # that had to show all of the photograph's colour alone would be too bright with it (decision
+    # 043).
     wanted = shown.alpha[..., None] * warped
     return (shown.image + share[..., None] * (wanted - shown.image)).clamp(0, 1)
