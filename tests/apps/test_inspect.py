@@ -161,6 +161,16 @@ def test_models_are_named_with_their_licences(tmp_path):
     assert record_model("my_package:load", None) == ModelRecord("my_package:load")
 
 
+@pytest.mark.parametrize("weights", ["{}/flux.1", "~/flux.1", ".", "../flux.1"])
+def test_paths_of_models_are_recorded_without_their_folders(tmp_path, monkeypatch, weights):
+    (tmp_path / "flux.1").mkdir()
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    monkeypatch.chdir(tmp_path / "flux.1")
+    own = record_model(f"{tmp_path}/own.py:paint", weights.format(tmp_path))
+    assert own == ModelRecord("own.py:paint", "flux.1")
+
+
 def my_painter(nearest, target, context):
     """Return the least of generators."""
     return torch.full((target.height, target.width, 3), 0.5)

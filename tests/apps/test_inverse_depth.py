@@ -10,6 +10,8 @@ from exact_room import make_cameras, write_colmap
 from gscompleter.apps.inputs.given_depth import MAX_DEPTH_DEVIATION, read_with_depth
 from gscompleter.apps.report.schema import read_summary
 from gscompleter.data.formats import open_photographs
+from gscompleter.splats.formats import read_provenance
+from gscompleter.splats.provenance import ModelRecord
 from inverse_depth import write_inverse_depth
 
 CAMERAS = make_cameras(4, width=96, height=72, focal=78.0)
@@ -69,5 +71,8 @@ def test_the_command_uses_the_maps_or_says_why_not(scene, tmp_path, monkeypatch,
     assert any("predicted depth is" in note for note in notes)
     rows = read_summary(tmp_path / "out").context
     assert rows[0].given_depth > 0.8
+    # The record names maps that supported stereo, which no option does.
+    (made,) = read_provenance(tmp_path / "out" / "completed.ply").runs
+    assert made.depth == ModelRecord("StoredDepth")
     assert run(monkeypatch, *words, "--no-given-depth", "--out", tmp_path / "without") == 0
     assert [row.given_depth for row in read_summary(tmp_path / "without").context] == [0, 0]

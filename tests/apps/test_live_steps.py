@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -13,9 +13,11 @@ from torch import Tensor
 
 from gscompleter import GSCompleter
 from gscompleter.apps.live.session import Action, Session, SessionStep, apply_step, save_camera
+from gscompleter.apps.live.steps import fill_region, find_holes
 from gscompleter.config import CompleterConfig
 from gscompleter.numerics.geometry import project
 from gscompleter.parts import Part, PartOrigin
+from gscompleter.state import Completion
 from gscompleter.system.progress import notify_of_stages
 from gscompleter.trust import Trust
 from gscompleter.trust.photometric import PhotometricTrust
@@ -160,6 +162,26 @@ def test_an_addition_before_a_surface_is_repaired_by_what_it_hid(begun):
     assert len(repaired.latest.added) < 0.7 * len(blob)
     assert not repaired.latest.source.gone_mask.any()
     assert repaired.latest.targets == ()
+
+
+@dataclass(frozen=True)
+class FillingNothing(GSCompleter):
+    """A completer of whose Gaussians no guard accepts any."""
+
+    def advance(self, state: Completion, target: Camera, reference=None) -> Completion:
+        (result,) = super().advance(state, target, reference).targets
+        return replace(state, targets=(replace(result, added=result.added[:0]),))
+
+
+def test_a_region_that_stays_empty_is_reported_as_that_region(begun):
+    completer = FillingNothing(config=begun.completer.config)
+    region = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    region[: SIZE // 4] = True
+    holes, _ = find_holes(completer, begun.latest, RIGHT)
+    assert (holes & region).any()
+    assert (holes & ~region).any()
+    completed = fill_region(completer, begun.latest, RIGHT, region)
+    assert torch.equal(completed.targets[-1].hole_mask, holes & region)
 
 
 def test_marks_beside_every_hole_are_told_before_anything_is_generated(begun, removed):

@@ -38,6 +38,11 @@ def folder(tmp_path_factory) -> Path:
         mask[SPOT[0], columns] = 1.0
         write_image(folder / f"{name}.png", mask)
     write_image(folder / "nothing.png", torch.zeros(SIZE, SIZE, 3))
+    # The splat ends within the image of a camera that is turned away from it.
+    write_cameras(folder / "turned.json", [replace(camera_at(yaw=30, size=SIZE), near=None)])
+    beside = torch.zeros(SIZE, SIZE, 3)
+    beside[:, -8:] = 1.0
+    write_image(folder / "beside.png", beside)
     return folder
 
 
@@ -215,3 +220,16 @@ def test_wrong_masks_are_refused_with_a_sentence(
     assert run(monkeypatch, *given, "--out", out, "--quiet") == 2
     assert sentence in capsys.readouterr().err
     assert not out.exists()
+
+
+def test_a_mask_where_nothing_is_seen_is_refused_with_what_fills_holes(
+    folder, tmp_path, monkeypatch, capsys
+):
+    words = ("repair", folder / "photographs", "--scene", folder / "splat.ply", "--quiet")
+    marks = ("--target", folder / "turned.json", "--mask", folder / "beside.png")
+    out = tmp_path / "out"
+    assert run(monkeypatch, *words, *marks, "--out", out) == 2
+    said = capsys.readouterr().err
+    assert "show no Gaussian of the splat" in said
+    # `repair` itself takes no target without a mask.
+    assert "`gscompleter complete` without --mask" in said

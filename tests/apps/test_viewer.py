@@ -522,6 +522,27 @@ def test_what_cannot_be_shown_gets_a_sentence(packed, tmp_path, monkeypatch, cap
     assert not (tmp_path / "page.html").exists()
 
 
+def test_a_direction_that_is_none_is_refused_before_anything_is_read(monkeypatch, tmp_path, capsys):
+    def load() -> None:
+        pytest.fail("The libraries are loaded.")
+
+    monkeypatch.setattr("gscompleter.apps.viewer.packages.load_libraries", load)
+    asked = ("view", tmp_path / "gone.ply", "--up", 0, 0, 0)
+    assert run(monkeypatch, *asked) == 2
+    assert "not all zero" in capsys.readouterr().err
+    page = tmp_path / "page.html"
+    assert run(monkeypatch, *asked, "--save", page) == 2
+    assert not page.exists()
+
+
+def test_a_page_that_is_saved_takes_no_port(packed, tmp_path, monkeypatch, capsys):
+    save_ply(tmp_path / "a.ply", room_from(LEFT, 0))
+    page = tmp_path / "page.html"
+    assert run(monkeypatch, "view", tmp_path / "a.ply", "--save", page, "--port", 8000) == 2
+    assert "leave --port out" in capsys.readouterr().err
+    assert not page.exists()
+
+
 def test_a_page_has_to_be_named_as_one(packed, tmp_path, monkeypatch, capsys):
     save_ply(tmp_path / "a.ply", room_from(LEFT, 0))
     assert run(monkeypatch, "view", tmp_path / "a.ply", "--save", tmp_path / "page.ply") == 2

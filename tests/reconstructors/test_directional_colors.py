@@ -16,6 +16,7 @@ from gscompleter.reconstructors.plane_sweep.virtual_views import (
     WarpedPhotograph,
     confirm_detail,
     extrapolate_camera,
+    find_nearest_camera,
     make_virtual_views,
 )
 from gscompleter.render.loading import load_renderer
@@ -66,6 +67,16 @@ def test_a_camera_is_extrapolated_in_place_and_rotation():
     twice = axis_angle_to_matrix(torch.tensor([0.0, 1.0, 0.0]), 0.2) @ before.c2w[:3, :3]
     assert torch.allclose(beyond.c2w[:3, :3], twice, atol=1e-5)
     assert torch.allclose(beyond.center, 2 * camera.center - before.center, atol=1e-6)
+
+
+@pytest.mark.parametrize("offset", [0.0, 3e-8])
+def test_the_nearest_camera_is_none_that_looks_elsewhere_from_the_same_place(offset):
+    """Views of a panorama have one place, up to the rounding of their poses."""
+    cameras = [camera_at(0.1, yaw=yaw, size=SIZE) for yaw in (0, 90)] + [camera_at(0.5, size=SIZE)]
+    moved = cameras[1].c2w.clone()
+    moved[0, 3] += offset
+    cameras[1] = replace(cameras[1], c2w=moved)
+    assert [find_nearest_camera(camera, cameras) for camera in cameras[:2]] == [2, 2]
 
 
 def test_virtual_photographs_show_what_the_nearer_photograph_does():

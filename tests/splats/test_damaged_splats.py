@@ -40,6 +40,26 @@ def cut(path: Path, count: int) -> Path:
 
 
 @pytest.mark.parametrize(
+    ("was", "becomes", "clause"),
+    [
+        ("float min_x", "float low_x", "it lacks the property 'min_x'"),
+        # A file has all bounds of colours, or is an early one without any.
+        ("float max_b", "float high_b", "it lacks the property 'max_b'"),
+        ("uint packed_scale", "uint packed", "it lacks the property 'packed_scale'"),
+        ("uint packed_scale", "float packed_scale", "its property 'packed_scale' is no integer"),
+        ("uchar f_rest_23", "uchar rest_23", "it lacks the property 'f_rest_23'"),
+        ("property uchar f_rest_23\n", "", "it has 23 properties of spherical harmonics"),
+    ],
+)
+def test_a_compressed_ply_names_the_property_that_is_wrong(tmp_path, was, becomes, clause):
+    path = made(tmp_path, "scene.compressed.ply", plausible(COUNT, 2))
+    data = path.read_bytes()
+    assert data.count(was.encode()) == 1
+    path.write_bytes(data.replace(was.encode(), becomes.encode()))
+    assert f"cannot be read: {clause}" in refuse(path)
+
+
+@pytest.mark.parametrize(
     ("name", "count", "sentence"),
     [
         ("scene.ply", 5, "ends after 59 of 60 Gaussians"),

@@ -3,6 +3,7 @@
 import io
 import json
 import zipfile
+import zlib
 
 import numpy as np
 import pytest
@@ -46,6 +47,20 @@ def test_a_reader_has_the_last_word():
     assert describe_damage(KeyError("focal")) == "it lacks the entry 'focal'"
 
 
+def test_what_an_error_tells_is_said():
+    """A lack of memory is no damage, and an archive names what it lacks."""
+    assert describe_damage(MemoryError()) == "it needs more memory than there is"
+    archive = zipfile.ZipFile(io.BytesIO(b"PK\5\6" + bytes(18)))
+    missing = catch(lambda: archive.getinfo("depth/0.png"))
+    assert describe_damage(missing) == "it lacks the entry 'depth/0.png'"
+    # A number is a place in a table of the decoder.
+    assert describe_damage(KeyError(17)) == "its content is damaged"
+    cut = catch(lambda: zlib.decompress(zlib.compress(bytes(99))[:-5]))
+    assert "too early" in describe_damage(cut)
+    wrong = catch(lambda: zlib.decompress(b"hello"))
+    assert describe_damage(wrong) == "its content is damaged"
+
+
 def test_rows_that_are_missing_are_counted():
     check_rows(60, 6, 10)
     with pytest.raises(DamagedError, match="^it ends after 9 of 10 Gaussians$"):
@@ -62,6 +77,9 @@ def test_json_that_was_cut_is_told_from_json_that_is_wrong():
     for length in (5, len(whole) - 1, len(whole) - 5):
         with pytest.raises(InputError, match="ends too early.*; copy it again"):
             parse_json(whole[:length].encode(), "a.json", "copy it again")
+    for nothing in (b"", b" \n"):
+        with pytest.raises(InputError, match=r"\(it is empty\)"):
+            parse_json(nothing, "a.json", "copy it again")
     with pytest.raises(InputError, match=r"\(line 2, column 3\)"):
         parse_json(b"{\n  wrong: 1}", "a.json", "copy it again")
 

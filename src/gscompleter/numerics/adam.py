@@ -15,7 +15,8 @@ from torch.optim.adam import adam
 class Adam:
     """The Adam optimiser with one step size per variable.
 
-    `betas` are the decay of the running means of gradients and squared gradients.
+    `rates` are pairs of a variable, a leaf that requires a gradient, and its step size. `betas` are
+    the decay of the running means of gradients and squared gradients.
     """
 
     def __init__(
@@ -28,12 +29,16 @@ class Adam:
         self._counts = [torch.zeros(()) for _ in rates]
 
     def step(self, loss: Tensor, factor: float = 1.0) -> None:
-        """Descend one step along the gradient of `loss`, with step sizes multiplied by `factor`."""
+        """Move the variables one step down the gradient of `loss`, in place.
+
+        `loss` depends on all variables. Step sizes are multiplied by `factor`.
+        """
         variables = [variable for variable, _ in self._rates]
         gradients = torch.autograd.grad(loss, variables)
         states = zip(self._rates, gradients, self._means, self._squares, self._counts, strict=True)
         beta1, beta2 = self._betas
         with torch.no_grad():
+            # One variable at a time: torch's function has one step size for all that it is given.
             for (variable, rate), gradient, mean, square, count in states:
                 adam(
                     [variable],

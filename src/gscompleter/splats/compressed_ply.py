@@ -1,9 +1,10 @@
 """The compressed .ply of SuperSplat: 16 bytes per Gaussian, and one per SH coefficient.
 
 256 Gaussians form a chunk, which stores the bounds of its positions, log-scales and colours.
-Relative to them, a Gaussian has 11, 10 and 11 bits of position and of scale and 8 bits per
-channel and opacity; its rotation has 2 + 3 x 10 bits. SH of degree 1 and above are a separate
-element of bytes over [-4, 4].
+Relative to them, a Gaussian has 11, 10 and 11 bits each for x, y and z of its position and of its
+scale, and 8 bits each for red, green and blue; relative to [0, 1], it has 8 bits for its opacity.
+Its rotation has 2 + 3 x 10 bits. SH of degree 1 and above are a separate element of bytes over
+[-4, 4].
 """
 
 from __future__ import annotations
@@ -14,11 +15,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32
+from jaxtyping import Float, Float32, UInt32
 from numpy import ndarray
 
 from gscompleter.splats.packing import (
     MAX_LOG_SCALE,
+    NUM_SH_REST,
     assemble_sh,
     build_gaussians,
     drop_largest,
@@ -42,19 +44,22 @@ from gscompleter.system.files.writing import replace_file
 from gscompleter.types import SH_C0, Gaussians
 
 CHUNK_SIZE = 256
-CHUNK_PROPERTIES = (
-    *("min_x", "min_y", "min_z", "max_x", "max_y", "max_z"),
-    *("min_scale_x", "min_scale_y", "min_scale_z", "max_scale_x", "max_scale_y", "max_scale_z"),
-    *("min_r", "min_g", "min_b", "max_r", "max_g", "max_b"),
+POSITION_BOUNDS = ("min_x", "min_y", "min_z", "max_x", "max_y", "max_z")
+SCALE_BOUNDS = (
+    *("min_scale_x", "min_scale_y", "min_scale_z"),
+    *("max_scale_x", "max_scale_y", "max_scale_z"),
 )
-"""Properties of a chunk. Early files lack the bounds of colours, which are then [0, 1]."""
+"""Bounds of log-scales."""
+COLOR_BOUNDS = ("min_r", "min_g", "min_b", "max_r", "max_g", "max_b")
+"""Bounds of colours. Early files lack all of them, which are then [0, 1]."""
 PACKED_PROPERTIES = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
 VECTOR_BITS = (11, 10, 11)
 """Bits of positions and log-scales."""
 QUAT_BITS = (10, 10, 10)
-"""Bits of three components of a rotation; the number of the fourth has the upper two."""
+"""Bits of the three smaller components of a rotation. The upper two of its 32 bits are the number
+of the largest component, which is not stored."""
 COLOR_BITS = (8, 8, 8, 8)
-"""Bits of colour and opacity."""
+"""Bits of red, green, blue and opacity."""
 
 
 def tabulate_rest() -> Float32[ndarray, "256"]:
@@ -76,22 +81,20 @@ def read_compressed_ply(path: Path) -> Gaussians:
     header, tables = _read_tables(path)
     chunk = tables["chunk"]
     vertex = tables["vertex"]
-    # One chunk has 256 Gaussians, the last one fewer.
+    # The last chunk may have fewer Gaussians than the others.
     if len(chunk) * CHUNK_SIZE < len(vertex):
         raise DamagedError(
             f"its {len(chunk):,} chunks have too few bounds for its {len(vertex):,} Gaussians"
         )
-    position, rotation, scale, color = [
-        vertex[name].astype(np.uint32) for name in PACKED_PROPERTIES
-    ]
-    means = _map_to_chunk(chunk, CHUNK_PROPERTIES[:6], unpack_fractions(position, VECTOR_BITS))
-    log_scales = _map_to_chunk(chunk, CHUNK_PROPERTIES[6:12], unpack_fractions(scale, VECTOR_BITS))
+    position, rotation, scale, color = [_get_packed(vertex, name) for name in PACKED_PROPERTIES]
+    means = _map_to_chunk(chunk, POSITION_BOUNDS, unpack_fractions(position, VECTOR_BITS))
+    log_scales = _map_to_chunk(chunk, SCALE_BOUNDS, unpack_fractions(scale, VECTOR_BITS))
 
     rgba = unpack_fractions(color, COLOR_BITS)
     rgb = rgba[:, :3]
-    has_color_bounds = set(CHUNK_PROPERTIES) <= set(chunk.dtype.names or ())
-    if has_color_bounds:
-        rgb = _map_to_chunk(chunk, CHUNK_PROPERTIES[12:], rgb)
+    # A file with some of these bounds is refused for those that it lacks.
+    if set(COLOR_BOUNDS) & set(chunk.dtype.names or ()):
+        rgb = _map_to_chunk(chunk, COLOR_BOUNDS, rgb)
 
     # The three smaller components of a unit quaternion are at most sqrt(1/2) in size.
     smaller = (unpack_fractions(rotation, QUAT_BITS) - 0.5) * np.float32(np.sqrt(2))
@@ -109,10 +112,27 @@ def list_compressed_names(path: Path) -> list[str]:
     return [name for name in vertex.dtype.names or () if name not in PACKED_PROPERTIES]
 
 
+def _get_packed(vertex: ndarray, name: str) -> UInt32[ndarray, "n"]:
+    """Return a property of the Gaussians as 32 bits; raise DamagedError if it is none."""
+    _require_properties(vertex, [name])
+    kind = vertex.dtype[name]
+    if kind.kind not in "iu" or kind.itemsize != 4:
+        raise DamagedError(f"its property '{name}' is no integer of 32 bits")
+    return vertex[name].astype(np.uint32)
+
+
+def _require_properties(table: ndarray, names: Sequence[str]) -> None:
+    """Raise DamagedError if the rows of an element lack a property."""
+    missing = [name for name in names if name not in (table.dtype.names or ())]
+    if missing:
+        raise DamagedError(f"it lacks the property '{missing[0]}'")
+
+
 def _map_to_chunk(
     chunk: ndarray, bounds: Sequence[str], fractions: Float[ndarray, "n 3"]
 ) -> Float[ndarray, "n 3"]:
     """Map fractions to the bounds of each Gaussian's chunk: three minima, then three maxima."""
+    _require_properties(chunk, bounds)
     of_chunk = np.arange(len(fractions)) // CHUNK_SIZE
     limits = np.stack([chunk[name] for name in bounds], axis=1)[of_chunk]
     return limits[:, :3] * (1 - fractions) + limits[:, 3:] * fractions
@@ -140,8 +160,14 @@ def _read_tables(path: Path) -> tuple[bytes, dict[str, ndarray]]:
 def _unpack_sh_rest(table: ndarray) -> Float[ndarray, "n k 3"]:
     """Unpack SH of degree 1 and above."""
     fields: Mapping[str, Any] = table.dtype.fields or {}
+    if len(fields) not in [3 * k for k in NUM_SH_REST]:
+        raise DamagedError(
+            f"it has {len(fields)} properties of spherical harmonics, and 9, 24 or 45 are those of "
+            "degree 1 to 3"
+        )
     # The file has one channel after the other.
     names = [f"f_rest_{i}" for i in range(len(fields))]
+    _require_properties(table, names)
     if any(fields[name][0] != np.uint8 for name in names):
         raise DamagedError("its spherical harmonics are no bytes")
     columns = np.array([fields[name][1] for name in names]).reshape(3, -1).T
@@ -194,11 +220,13 @@ def write_compressed_ply(
             file.write(np.clip(places, 0, 255).astype(np.uint8).tobytes())
 
 
-def _make_header(gaussians: Gaussians, chunks: int, num_rest: int) -> bytes:
+def _make_header(gaussians: Gaussians, num_chunks: int, num_rest: int) -> bytes:
+    """Make the header of a file, with `num_rest` SH coefficients of degree 1 and above."""
     count = len(gaussians)
+    bounds = (*POSITION_BOUNDS, *SCALE_BOUNDS, *COLOR_BOUNDS)
     rest = [(f"f_rest_{i}", "u1") for i in range(num_rest)]
     elements = {
-        "chunk": (chunks, np.dtype([(name, "<f4") for name in CHUNK_PROPERTIES])),
+        "chunk": (num_chunks, np.dtype([(name, "<f4") for name in bounds])),
         "vertex": (count, np.dtype([(name, "<u4") for name in PACKED_PROPERTIES])),
     }
     if rest:

@@ -9,15 +9,18 @@ from __future__ import annotations
 import json
 import re
 import zipfile
+import zlib
 
 from gscompleter.system.errors import InputError, quote_value
 
 GENERAL = "its content is damaged"
 TOO_SHORT = "it ends too early, as a download that was cut does"
-_KEY = re.compile(r"[\w.:-]{1,60}")
-"""Names of entries that are worth quoting."""
-_SHORT_IMAGE = re.compile(r"truncated|end of (?:file|data)", re.IGNORECASE)
-"""Words of Pillow for an image that ends too early."""
+_ENTRY_NAME = re.compile(r"[\w./:-]{1,60}")
+"""Keys that name an entry of a file; others are sentences, or damaged themselves."""
+_ARCHIVE_ENTRY = re.compile(r"There is no item named '(.+)' in the archive")
+"""Key of the error of `zipfile` for an entry that is missing: a sentence around its name."""
+_ENDS_EARLY = re.compile(r"truncated|end of (?:file|data)", re.IGNORECASE)
+"""Words of Pillow and zlib for data that end too early."""
 
 
 class DamagedError(ValueError):
@@ -34,6 +37,11 @@ def describe_damage(error: BaseException) -> str:
         return "it is no text in UTF-8"
     if isinstance(error, EOFError):
         return TOO_SHORT
+    # The file may be whole, or be damaged and claim more than it has: either way this is true.
+    if isinstance(error, MemoryError):
+        return "it needs more memory than there is"
+    if isinstance(error, zlib.error):
+        return TOO_SHORT if _ENDS_EARLY.search(str(error)) else GENERAL
     if isinstance(error, zipfile.BadZipFile):
         return "its archive is damaged, or was cut before the list of its files"
     # Pillow is not imported for its errors, which nobody raises without it.
@@ -46,19 +54,25 @@ def describe_damage(error: BaseException) -> str:
     if isinstance(error, OSError):
         if error.errno is not None and error.strerror:
             return error.strerror
-        return TOO_SHORT if _SHORT_IMAGE.search(str(error)) else GENERAL
-    key = error.args[0] if isinstance(error, KeyError) and error.args else None
-    if isinstance(key, str) and _KEY.fullmatch(key):
-        return f"it lacks the entry '{key}'"
-    return GENERAL
+        return TOO_SHORT if _ENDS_EARLY.search(str(error)) else GENERAL
+    return _describe_missing_entry(error) if isinstance(error, KeyError) else GENERAL
+
+
+def _describe_missing_entry(error: KeyError) -> str:
+    key = error.args[0] if error.args else None
+    if not isinstance(key, str):
+        return GENERAL
+    in_archive = _ARCHIVE_ENTRY.fullmatch(key)
+    name = key if in_archive is None else in_archive[1]
+    return f"it lacks the entry '{name}'" if _ENTRY_NAME.fullmatch(name) else GENERAL
 
 
 def _describe_json_error(error: json.JSONDecodeError) -> str:
+    if not error.doc.strip():
+        return "it is empty"
     # A file that was cut is wrong at its very end, or in a text whose quotation mark is missing.
     is_cut = error.pos >= len(error.doc.rstrip()) or error.msg.startswith("Unterminated")
-    if is_cut and error.doc.strip():
-        return TOO_SHORT
-    return f"line {error.lineno}, column {error.colno}"
+    return TOO_SHORT if is_cut else f"line {error.lineno}, column {error.colno}"
 
 
 def check_rows(num_bytes: int, width: int, count: int, what: str = "Gaussians") -> None:

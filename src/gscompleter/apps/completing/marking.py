@@ -55,17 +55,21 @@ def choose_marked(request: RepairRequest, ready: Prepared) -> Gone:
     task = ready.task
     scene = task.scene
     assert scene is not None
-    # All photographs share one depth range.
-    known = task.views[0].camera
-    cameras = [replace(c, near=known.near, far=known.far) for c in task.target_cameras]
+    # Targets are seen with the depth range of the photographs, which share one.
+    photographed = task.views[0].camera
+    cameras = [
+        replace(camera, near=photographed.near, far=photographed.far)
+        for camera in task.target_cameras
+    ]
     pairs = pair_masks(request.masks, cameras)
     marks = [read_marks(path, camera, request.reading) for path, camera in pairs]
     chosen = find_marked(scene, cameras, marks, ready.completer.renderer)
     check_selected_share(chosen.float().mean().item(), request.reading)
     if not chosen.any():
         raise InputError(
-            "The masks show no Gaussian of the splat; mark what the images of the targets show, or "
-            "leave --mask out where nothing is to be seen.",
+            "The masks show no Gaussian of the splat; mark what the images of the targets show. "
+            "Places where nothing is to be seen need no mask: `gscompleter complete` without "
+            "--mask fills them.",
             "mask",
         )
     return Gone(chosen, contain_nothing)

@@ -40,8 +40,11 @@ HOST_NAMES = (LOCAL_ADDRESS, "localhost")
 
 def show_scenes(request: ViewRequest) -> None:
     """Make the page, and write it or serve it until Ctrl-C."""
+    # What is wrong with the request is told before scenes are read.
+    if request.up is not None:
+        require_direction(request.up)
     if request.save is not None:
-        # Reserved first: a file that may not be replaced ends the command before scenes are read.
+        # Reserved first, to refuse a file that may not be replaced.
         with reserve_file(request.save, request.overwrite):
             parts, notes = load_page(request)
             with replace_file(request.save) as file:
@@ -57,12 +60,9 @@ def show_scenes(request: ViewRequest) -> None:
         if request.answer.json:
             print_json({"url": address, "notes": list(notes)})
         else:
-            print(
-                *(() if request.answer.quiet else notes),
-                f"{address} (Ctrl-C ends it)",
-                sep="\n",
-                flush=True,
-            )
+            # The address is needed even if nothing else is to be said.
+            shown = [] if request.answer.quiet else notes
+            print(*shown, f"{address} (Ctrl-C ends it)", sep="\n", flush=True)
         if request.opens_browser:
             webbrowser.open(address)
         server.serve_forever()
@@ -78,8 +78,8 @@ def load_page(request: ViewRequest) -> tuple[Iterator[bytes], Sequence[str]]:
 
 def load_content(request: ViewRequest) -> ViewerContent:
     """Read the scenes and cameras of the request."""
-    # A folder is that of a completion, of a trainer's model, or an unpacked .sog. The second is
-    # replaced by its newest splat.
+    # A folder is that of a completion, of a trainer's model, or an unpacked .sog. That of a model
+    # stands for its newest splat.
     scene = request.scene
     is_completion = (scene / SUMMARY_FILE).is_file()
     if not is_completion:
@@ -90,7 +90,7 @@ def load_content(request: ViewRequest) -> ViewerContent:
         # B is the scene after, A the one before.
         content = load_viewer_files(request.other, scene, *reading)
     elif os.path.isdir(scene) and not os.path.isfile(scene / META):
-        # Also a folder of something else, which is refused there for its missing summary.
+        # A completion, or a folder of something else, which is refused for its missing summary.
         content = load_viewer_completion(scene, request.drop_nonfinite)
     else:
         content = load_viewer_files(scene, None, *reading)
@@ -104,10 +104,10 @@ def load_content(request: ViewRequest) -> ViewerContent:
 def set_upward(content: ViewerContent, up: Direction | None, splat_file: Path) -> ViewerContent:
     """Set the upward direction of the page: `up`, or if there are no cameras, that of the splat.
 
-    The page itself derives it from cameras that it shows. A note says how one was found.
+    The page itself derives it from cameras that it shows. A note says how that of the splat was
+    found. `splat_file` is the file of the splat, whose header and neighbours may tell it.
     """
     if up is not None:
-        require_direction(up)
         return replace(content, up=up)
     if content.cameras:
         return content

@@ -9,12 +9,8 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from torch import Tensor
 
+from gscompleter.models.feed_forward.cnn import normalize_images
 from gscompleter.models.feed_forward.dino import PATCH
-
-MEAN = (0.485, 0.456, 0.406)
-"""Mean colour of the training images."""
-DEVIATION = (0.229, 0.224, 0.225)
-"""Standard deviation of the training colours."""
 
 Image = UInt8[np.ndarray, "_ _ 3"]
 Side = Literal["longer", "shorter"]
@@ -24,14 +20,12 @@ Fit = Literal["resized", "cropped"]
 
 
 def normalize_colors(images: UInt8[Tensor, "*n h w 3"]) -> Float[Tensor, "*n 3 h w"]:
-    """Normalise colours and move channels first."""
-    colours = images.float() / 255
-    normalized = (colours - colours.new_tensor(MEAN)) / colours.new_tensor(DEVIATION)
-    return normalized.movedim(-1, -3)
+    """Move channels first, and normalise colours as for networks trained on ImageNet."""
+    return normalize_images(images.movedim(-1, -3).float() / 255)
 
 
 def scale_side(image: Image, resolution: int, side: Side) -> Image:
-    """Scale the longer or shorter side of `image` to `resolution` pixels."""
+    """Scale an image as a whole, so that its longer or shorter side has `resolution` pixels."""
     h, w = image.shape[:2]
     factor = resolution / (max(h, w) if side == "longer" else min(h, w))
     return resize_photograph(image, max(1, round(h * factor)), max(1, round(w * factor)))
@@ -44,7 +38,7 @@ def round_to_patches(side: int, fit: Fit) -> int:
 
 
 def resize_photograph(image: Image, height: int, width: int) -> Image:
-    """Resize an image, bicubically if a side grows, else by area averaging."""
+    """Resize an image: bicubically if a side grows, and else by averages over areas."""
     h, w = image.shape[:2]
     if (h, w) == (height, width):
         return image

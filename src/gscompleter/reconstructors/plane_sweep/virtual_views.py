@@ -2,8 +2,8 @@
 
 Photographs do not determine the colours of many more Gaussians than pixels: fitted to them alone,
 colours cancel errors of depth, pose and exposure there and look wrong from everywhere else. Virtual
-photographs say what the scene should look like elsewhere. They show the finest detail as far as two
-photographs have it in the same place: a pixel beside its place it would be an error.
+photographs say what the scene should look like elsewhere. They show the finest detail only as far
+as two photographs agree about its place: detail a pixel beside it is a larger error than a blur.
 """
 
 from __future__ import annotations
@@ -34,6 +34,9 @@ UNCONFIRMED_DETAIL = 0.6
 bilinear sampling keeps of the finest octave."""
 LEAST_DETAIL = 1e-5
 """Sum of squared colour differences in a window up to which there is no detail."""
+ONE_PLACE = 2.0**-16
+"""Distance of cameras up to which they stand in one place, relative to the most distant camera.
+Stereo rounds places to as much of the widest baseline."""
 
 
 @dataclass(frozen=True)
@@ -51,7 +54,8 @@ def make_virtual_views(
     """Warp each photograph to a camera beyond it, through the depth of `scene` there.
 
     The camera continues the way from the nearest other photograph, which has to confirm the detail.
-    `depths` are those of the scene at the photographs.
+    `depths` are those of the scene at the photographs, of which two or more stand apart. Their
+    masks are not read: ignored pixels are those of a render already.
     """
     cameras = [view.camera for view in views]
     virtual = []
@@ -70,8 +74,10 @@ def make_virtual_views(
 def find_nearest_camera(camera: Camera, cameras: Sequence[Camera]) -> int:
     """Find the index of the nearest of `cameras` that stands in another place."""
     distances = torch.stack([(camera.center - other.center).norm() for other in cameras])
-    # Cameras in one place give no direction to go on in.
-    return int(torch.where(distances > 0, distances, torch.inf).argmin())
+    # Cameras in one place, such as those of a panorama, give no direction to go on in. Their
+    # centres may differ by rounding.
+    is_apart = distances > ONE_PLACE * distances.max()
+    return int(torch.where(is_apart, distances, torch.inf).argmin())
 
 
 def extrapolate_camera(before: Camera, camera: Camera) -> Camera:
@@ -85,10 +91,10 @@ def extrapolate_camera(before: Camera, camera: Camera) -> Camera:
 
 
 def warp(view: View, own: DepthMap, shown: Render, camera: Camera) -> WarpedPhotograph:
-    """Warp a photograph with depth `own` to the camera of a render, through the depth of that."""
+    """Warp a photograph with depth `own` to `camera`, through the depth of its render `shown`."""
     pixels, z = project(unproject(shown.depth, camera), view.camera)
-    # Outside of the photograph its border goes on. Bicubic weights of points that lie there without
-    # a bound, as those of a camera plane do, are not finite.
+    # Places outside of the photograph are moved to its border. Points beside the camera project to
+    # places without a bound, at which bicubic weights are not finite.
     x, y = pixels.unbind(dim=-1)
     near = torch.stack([x.clamp(0, view.camera.width), y.clamp(0, view.camera.height)], dim=-1)
     # Bilinear samples would lose a third of the finest octave.
@@ -96,7 +102,7 @@ def warp(view: View, own: DepthMap, shown: Render, camera: Camera) -> WarpedPhot
     layers = torch.stack([own.depth, own.valid.to(own.depth)], dim=-1)
     depth, valid = sample(layers, pixels).unbind(dim=-1)
 
-    # A surface that another one hides in the photograph is not sampled: the two depths differ.
+    # Where another surface hides this one in the photograph, the two depths differ.
     error = (z - depth) / (COLOR_DEPTH_TOLERANCE * z.abs().clamp_min(1e-12))
     seen = (shown.alpha >= COVERED) & is_inside(pixels, z, view.camera) & (valid >= 0.5)
     return WarpedPhotograph(image, torch.exp(-error.square()) * seen)
@@ -105,14 +111,14 @@ def warp(view: View, own: DepthMap, shown: Render, camera: Camera) -> WarpedPhot
 def confirm_detail(own: WarpedPhotograph, other: WarpedPhotograph) -> Float[Tensor, "h w 3"]:
     """Return the image of `own`, with its detail weakened where `other` does not have it.
 
-    Detail counts by its correlation with that of the other photograph, which estimates the share of
-    it that stands in its place.
+    Detail counts by its correlation with that of the other photograph: an estimate of the share of
+    the detail that both have in the same place.
     """
     smooth = blur_gaussian(own.image, DETAIL_SIGMA)
     detail = own.image - smooth
     other_detail = other.image - blur_gaussian(other.image, DETAIL_SIGMA)
 
-    # Both sums of squares, their product and what both photographs show, in one blur.
+    # Both sums of squares, the sum of products and what both photographs show, in one blur.
     shared = own.share * other.share
     products = (detail.square(), other_detail.square(), detail * other_detail)
     sums = [shared * product.sum(dim=-1) for product in products]
@@ -129,7 +135,8 @@ def blend(
     warped: Float[Tensor, "h w 3"], share: Float[Tensor, "h w"], shown: Render
 ) -> Float[Tensor, "h w 3"]:
     """Blend a warped photograph with the render, whose colours stay where it shows nothing."""
-    # Where the scene ends it is half transparent, and a completion adds what is behind. Colours
-    # divided by alpha would be too bright then (decision 043).
+    # Where the scene ends it is half transparent, and a completion adds what is behind. Gaussians
+    # that had to show all of the photograph's colour alone would be too bright with it (decision
+    # 043).
     wanted = shown.alpha[..., None] * warped
     return (shown.image + share[..., None] * (wanted - shown.image)).clamp(0, 1)
