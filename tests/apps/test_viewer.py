@@ -535,14 +535,6 @@ def test_a_direction_that_is_none_is_refused_before_anything_is_read(monkeypatch
     assert not page.exists()
 
 
-def test_a_page_that_is_saved_takes_no_port(packed, tmp_path, monkeypatch, capsys):
-    save_ply(tmp_path / "a.ply", room_from(LEFT, 0))
-    page = tmp_path / "page.html"
-    assert run(monkeypatch, "view", tmp_path / "a.ply", "--save", page, "--port", 8000) == 2
-    assert "leave --port out" in capsys.readouterr().err
-    assert not page.exists()
-
-
 def test_a_page_has_to_be_named_as_one(packed, tmp_path, monkeypatch, capsys):
     save_ply(tmp_path / "a.ply", room_from(LEFT, 0))
     assert run(monkeypatch, "view", tmp_path / "a.ply", "--save", tmp_path / "page.ply") == 2

@@ -76,8 +76,6 @@ def decide_view(options: ViewOptions) -> ViewRequest:
             raise InputError("The page is saved and not served; leave this out, or --save.", name)
     if options.save is not None and options.save.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{quote_value(options.save)} is no .html file; name it *.html.", "save")
-    if options.save is not None and options.port != 0:
-        raise InputError("A page that is saved is not served; leave --port out, or --save.", "port")
     refuse_size_alone(options.resolution, options.cameras)
     return ViewRequest(
         scene=options.scene,
