@@ -52,6 +52,19 @@ def test_a_camera_that_was_shifted_on_purpose_costs_nothing(scene, target, move)
     assert fitted.gain == pytest.approx(1, abs=0.02)
 
 
+def test_a_large_image_does_not_get_worse(scene):
+    """The pose is searched for in a small image, where the scene has to look the same."""
+    room = Room()
+    large = view_of(room, camera_at(size=640))
+    lifted = gaussians_of(large)
+    renderer = load_renderer("cpu")
+    target = view_of(room, camera_at(0.05, size=640))
+    plain = compute_view_psnr(renderer.render(lifted, target.camera).image, target)
+    fitted = measure_fitted(lifted, target, torch.zeros(640, 640, dtype=torch.bool), renderer)
+    assert fitted is not None
+    assert fitted.psnr > plain - 0.01
+
+
 def test_derivatives_are_how_colours_change_with_the_camera(scene, target):
     renderer, camera = load_renderer("cpu"), target.camera
     median, focal = 3.5, float(camera.K[0, 0])

@@ -5,11 +5,12 @@ from dataclasses import replace
 
 import pytest
 import torch
+from torch.nn.functional import avg_pool2d
 
 from fake_gsplat import find_package
 from gscompleter import CompleterConfig, GSCompleter, InputError, load_renderer
 from gscompleter.config import GapConfig
-from gscompleter.numerics.geometry import pad_camera
+from gscompleter.numerics.geometry import pad_camera, sample_image, shrink_camera
 from gscompleter.render.metal import MetalRenderer, explain_missing_metal
 from parity import assert_close
 from render_scenes import (
@@ -73,6 +74,20 @@ def test_the_twin_has_the_gradients_of_the_reference(twin, name):
     found = compute_gradients(twin, SCENES[name], covered)
     for parameter, expected in truth.items():
         assert_close(found[parameter], expected, f"gradient of {parameter}", ROUNDING)
+
+
+def test_the_twin_averages_the_large_image_that_a_small_one_samples(twin):
+    large = camera_at(size=64)
+    photograph = view_of(Room(), large)
+    scene = gaussians_of(photograph)
+    small = sample_image(shrink_camera(large, 16), large)
+    drawn = twin.render(scene, small)
+    truth = avg_pool2d(twin.render(scene, large).image.permute(2, 0, 1), 4).permute(1, 2, 0)
+    assert drawn.image.shape == (16, 16, 3)
+    assert_close(drawn.image, truth, "image", ROUNDING)
+    at_true = drawn.depth / avg_pool2d(photograph.depth[None], 4)[0] - 1
+    # Discs of a coarse photograph bring depths nearer by 2 %.
+    assert at_true.abs().median() < 0.03
 
 
 def test_nothing_is_black(twin):

@@ -8,18 +8,20 @@ twin in plain PyTorch that runs anywhere, which its kernels and this adapter are
 from __future__ import annotations
 
 import importlib.util
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
+from torch.nn.functional import adaptive_avg_pool2d
 
-from gscompleter.numerics.geometry import compute_z_depths, remove_padding
+from gscompleter.numerics.geometry import compute_z_depths, remove_padding, resize_camera
 from gscompleter.render.redraw import RedrawnScene, make_empty_render
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.system.errors import InputError
-from gscompleter.types import Camera, Gaussians, Render
+from gscompleter.types import BLUR, Camera, Gaussians, Render
 
 METAL_PACKAGE = "metal_gauss"
 
@@ -43,6 +45,8 @@ class MetalRenderer:
 
     def render(self, gaussians: Gaussians, camera: Camera) -> Render:
         """Render `gaussians` from `camera`."""
+        if camera.blur != BLUR:
+            return self._draw_larger(gaussians, camera)
         drawn = self._draw(gaussians, camera)
         if camera.padding == (0, 0):
             return drawn
@@ -73,6 +77,23 @@ class MetalRenderer:
         is_seen = alpha > 0
         depth = torch.where(is_seen, sums[..., 0] / torch.where(is_seen, alpha, 1.0), 0.0)
         return Render(image.to(home), depth.to(home), alpha.to(home))
+
+    def _draw_larger(self, gaussians: Gaussians, camera: Camera) -> Render:
+        """Render the larger image that the pixels of `camera` are parts of, and average these.
+
+        metal-gauss widens Gaussians by `BLUR` in any image.
+        """
+        factor = math.sqrt(BLUR / camera.blur)
+        sides = [max(round(factor * side), 1) for side in (camera.width, camera.height)]
+        large = self.render(gaussians, replace(resize_camera(camera, *sides), blur=BLUR))
+        size = camera.height, camera.width
+        # Depths count by alpha, as they are composited.
+        maps = [large.image, (large.depth * large.alpha)[..., None], large.alpha[..., None]]
+        means = adaptive_avg_pool2d(torch.cat(maps, dim=-1).permute(2, 0, 1), size).permute(1, 2, 0)
+        image, depths, alpha = means[..., :3], means[..., 3], means[..., 4]
+        is_seen = alpha > 0
+        depth = torch.where(is_seen, depths / torch.where(is_seen, alpha, 1.0), 0.0)
+        return Render(image, depth, alpha)
 
     def freeze(self, context: Gaussians, camera: Camera) -> RedrawnScene:
         """Prepare `context` for many renders from `camera`."""
