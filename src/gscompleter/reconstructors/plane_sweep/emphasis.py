@@ -31,9 +31,8 @@ class Emphasis:
     """Cameras from which the scene will be looked at; without any, all photographs are alike."""
 
     def find_refined(self, views: Sequence[View]) -> list[int]:
-        """Find the views that get further steps, in ascending order; none if all are as near."""
-        nearest = find_nearest_views(self.targets, views, NUM_REFINED)
-        return nearest if len(nearest) < len(views) else []
+        """Find the views that get further steps, in ascending order."""
+        return find_nearest_views(self.targets, views, NUM_REFINED)
 
     def weigh_colors(self, views: Sequence[View]) -> list[float]:
         """Weigh the colours of each view."""
