@@ -262,8 +262,13 @@ def context_row(before: float | None, after: float | None) -> ScoreRow:
 def test_a_splat_gains_at_its_photographs_where_no_other_one_tests_it():
     """Photographs that stay as they were do not dilute it, and renders gain nothing."""
     context = [context_row(20.0, 26.0), context_row(21.0, 25.0), context_row(30.0, 30.1)]
-    assert describe_gain("Done", [], context) == "Done: 2 photographs gain 5.0 dB"
-    assert describe_gain("Done", [], context[:1]) == "Done: 1 photograph gains 6.0 dB"
+    assert describe_gain("Done", [], context) == "Done: 2 photographs gain 5.0 dB, to 25.5 dB"
+    assert describe_gain("Done", [], context[:1]) == "Done: 1 photograph gains 6.0 dB, to 26.0 dB"
+    other = describe_gain("Done", [], [context_row(11.0, 18.0)])
+    assert other == (
+        "Done: 1 photograph gains 7.0 dB, to 18.0 dB only, as the splat shows something else there "
+        "and what was given stays"
+    )
     renders = [context_row(float("inf"), 40.0), context_row(None, None), context_row(50.0, 45.0)]
     assert describe_gain("Done", [], renders) == "Done"
     checked = replace(held_out(3.0, 5.0), psnr_before=20.0, psnr_after=20.0, is_check=True)

@@ -50,9 +50,13 @@ MIN_DECIDING_MATCHES = 20
 """Fewest matched features that decide: by chance, few wrong ones may fit."""
 MIN_BETTER_GAIN = 0.5
 """Gain of PSNR in dB from which a photograph of the context counts as better than before."""
+MIN_ALIKE = 20.0
+"""PSNR in dB of photographs that gained, below which the scene still shows something else. Shards of
+a splat before a fox that its photographs do not show leave 15 to 21 dB, the fox itself has 30."""
 MIN_LOSS = 0.05
 """Loss of PSNR in dB from which the headline mentions it; smaller ones cannot be seen."""
 
+STILL_OTHER = "only, as the splat shows something else there and what was given stays"
 WORSE_ADVICE = (
     "Usual reasons: wrong poses or focal lengths of the cameras, things that moved, or photographs "
     "with too little in common."
@@ -212,7 +216,9 @@ def describe_gain(
             return f"{work}; no unused photograph could test it" if held_out else work
         gains = format_number(average(compute_psnr_gain(row) for row in better), 1)
         gain = "1 photograph gains" if len(better) == 1 else f"{len(better)} photographs gain"
-        return f"{work}: {gain} {gains} dB"
+        after = average(row.psnr_after for row in better) or 0.0
+        reached = f"{work}: {gain} {gains} dB, to {format_number(after, 1)} dB"
+        return f"{reached} {STILL_OTHER}" if after < MIN_ALIKE else reached
 
     rows = select_testing(scored)
     before = average(row.psnr_before for row in rows) or 0.0
