@@ -51,8 +51,8 @@ MIN_DECIDING_MATCHES = 20
 MIN_BETTER_GAIN = 0.5
 """Gain of PSNR in dB from which a photograph of the context counts as better than before."""
 MIN_ALIKE = 20.0
-"""PSNR in dB of photographs that gained, below which the scene still shows something else. Shards of
-a splat before a fox that its photographs do not show leave 15 to 21 dB, the fox itself has 30."""
+"""PSNR in dB of photographs that gained, below which the scene still shows something else. Shards
+of a splat before a fox, which its photographs do not show, leave 15 to 21 dB; the fox has 30."""
 MIN_LOSS = 0.05
 """Loss of PSNR in dB from which the headline mentions it; smaller ones cannot be seen."""
 
