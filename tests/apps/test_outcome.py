@@ -26,10 +26,17 @@ from gscompleter.apps.report.schema import read_summary
 from gscompleter.apps.requests.completion import ResultsRequest
 from gscompleter.apps.requests.scene import SceneRequest
 from gscompleter.data.formats import open_photographs
-from gscompleter.evaluation.verdict.outcome import describe_gain, is_like, make_clause, round_count
+from gscompleter.evaluation.verdict.outcome import (
+    describe_gain,
+    is_like,
+    judge_completion,
+    make_clause,
+    round_count,
+)
 from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow, ScoreRow
 from gscompleter.system.errors import InputError
 from gscompleter.system.jobs.jobs import Job
+from knowing_models import KnowingReconstructor
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 
 PLACES = [(-0.9 + 0.3 * number, -12 + 4 * number) for number in range(7)]
@@ -170,6 +177,17 @@ def test_without_unused_photographs_shared_features_decide(scene, tmp_path, monk
         assert json.loads((out / "summary.json").read_text())["held_out"] == []
 
 
+def test_photographs_that_show_all_are_no_failure():
+    views = [view_of(Room(), camera_at(x, size=32)) for x in (-0.3, 0.3)]
+    done = gsc.GSCompleter(KnowingReconstructor())(views, views[0].camera)
+    assert judge_completion(done, []).headline == (
+        "Nothing had to be invented, because the scene is known at this camera already."
+    )
+    scene = done.scene
+    given = gsc.GSCompleter(KnowingReconstructor())(views, views[0].camera, scene)
+    assert judge_completion(given, []).headline.startswith("Nothing was gained, because the scene")
+
+
 @pytest.mark.slow
 def test_the_reason_for_no_gain_is_the_first_line_and_is_said_once(
     scene, tmp_path, monkeypatch, capsys
@@ -180,7 +198,7 @@ def test_the_reason_for_no_gain_is_the_first_line_and_is_said_once(
     assert outcome == {
         "status": "nothing-gained",
         "headline": (
-            "Nothing was gained, because the scene is known at this camera already "
+            "Nothing had to be invented, because the scene is known at this camera already "
             "(3 of 3 targets)."
         ),
     }

@@ -151,12 +151,21 @@ def explain_no_gain(completion: Completion) -> str:
     if not results:
         is_object = completion.config.holes.kind == "enclosed"
         return f"Nothing was gained{place}, because {NOTHING_ENCLOSED if is_object else NO_TARGET}."
+    outcome = f"Nothing was gained{place}"
+    # Photographs that show all that the targets see are what a user hopes for.
+    if not completion.is_given and all(needs_nothing(result) for result in results):
+        outcome = "Nothing had to be invented"
     # Several targets may have failed for one reason, which is said once.
     causes = Counter(make_clause(find_cause(result)) for result in results)
     if len(results) == 1:
-        return f"Nothing was gained{place}, because {next(iter(causes))}."
+        return f"{outcome}, because {next(iter(causes))}."
     counted = [f"{cause} ({count} of {len(results)} targets)" for cause, count in causes.items()]
-    return f"Nothing was gained{place}, because {'; '.join(counted)}."
+    return f"{outcome}, because {'; '.join(counted)}."
+
+
+def needs_nothing(result: TargetResult) -> bool:
+    """Return True if a target has no hole."""
+    return (result.skip_reason or "").endswith(NOTHING_TO_COMPLETE)
 
 
 def find_cause(result: TargetResult) -> str:
