@@ -45,8 +45,9 @@ class Emphasis:
 def find_nearest_views(targets: Sequence[Camera], views: Sequence[View], count: int) -> list[int]:
     """Find the numbers of the `count` views nearest to each target; in ascending order."""
     nearest: set[int] = set()
+    # Numbers of a camera on a GPU are copied once.
+    centers = torch.stack([view.camera.on_cpu.center for view in views])
     for target in targets:
-        centers = torch.stack([view.camera.center for view in views])
-        distances = (centers - target.center.to(centers)).norm(dim=-1)
+        distances = (centers - target.on_cpu.center.to(centers)).norm(dim=-1)
         nearest.update(distances.argsort(stable=True)[:count].tolist())
     return sorted(nearest)
