@@ -9,10 +9,10 @@ import torch
 from gscompleter.evaluation.metrics.image import compute_gradient_energy_ratio
 from gscompleter.numerics.kernels import stereo
 from gscompleter.numerics.kernels.stereo import TILE_COLUMNS, TILE_ROWS
-from gscompleter.reconstructors.plane_sweep import PlaneSweep, sweep
+from gscompleter.reconstructors.plane_sweep import PlaneSweep, matching, sweep
+from gscompleter.reconstructors.plane_sweep.matching import compute_costs
 from gscompleter.reconstructors.plane_sweep.rig import build_rig
 from gscompleter.reconstructors.plane_sweep.sweep import (
-    compute_costs,
     compute_plane_index,
     compute_tile_grid,
     make_bands,
@@ -153,7 +153,7 @@ def test_coarse_images_say_first_where_to_look_down_to_the_smallest(rig, monkeyp
         seen.append((reference.size, bands.start[-1]))
         return compute_costs(reference, sources, planes, bands)
 
-    monkeypatch.setattr(sweep, "compute_costs", counted)
+    monkeypatch.setattr(matching, "compute_costs", counted)
     monkeypatch.setattr(sweep, "MIN_GUIDED_SIDE", SIZE // 2)
     guided = sweep.sweep_views(stereo_rig, *depths)
     assert [size for size, _ in seen] == [

@@ -24,6 +24,7 @@ from gscompleter.reconstructors.depth_predictors import (
 )
 from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.reconstructors.features.stereo_image import StereoImage
+from gscompleter.reconstructors.plane_sweep.depth_devices import get_depth_device
 from gscompleter.reconstructors.plane_sweep.fusion import DepthLayer
 from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
 from gscompleter.reconstructors.plane_sweep.given_depth import (
@@ -71,6 +72,12 @@ class PlaneSweep(Splatter):
 
     predict_depth: DepthPredictor = predict_nothing
     """Monocular depth, used where stereo measures nothing and confirms it elsewhere."""
+    device: str = "cpu"
+    """Device that matches photographs and fits surfaces, by the names of torch."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError for a device that plane-sweep does not know."""
+        get_depth_device(self.device)
 
     @run_in_plain_torch
     def __call__(self, views: Sequence[View]) -> Reconstruction:
@@ -101,7 +108,7 @@ class PlaneSweep(Splatter):
         """Reconstruct everything, or what any view shows in its mask, and fit it to all views."""
         check_given_views(views)
         views = set_depth_range(views, *get_depth_range(views))
-        rig = build_rig(views)
+        rig = build_rig(views, self.device)
         contradicted = find_contradicted(rig, views)
         rig = rig.drop_given(contradicted)
         name = partial(name_photographs, views)
@@ -143,7 +150,7 @@ class PlaneSweep(Splatter):
 
     def find_near_plane(self, views: Sequence[View], near: float, far: float) -> float:
         """Find a near plane that no surface of the photographs stands before; at most `near`."""
-        return near if len(views) == 1 else find_near_plane(views, near, far)
+        return near if len(views) == 1 else find_near_plane(views, near, far, self.device)
 
     @run_in_plain_torch
     def lift(self, views: Sequence[View], pixel_mask: Bool[Tensor, "h w"]) -> Reconstruction:
@@ -157,7 +164,7 @@ class PlaneSweep(Splatter):
         views = set_depth_range(views, *get_depth_range(views))
         if len(views[1].known_depths) and measure_baseline(*(v.camera for v in views)) == 0:
             return self.lift_in_place(views[0], views[1], pixel_mask)
-        rig = build_rig(views)
+        rig = build_rig(views, self.device)
         first, second = match_views(rig, views, MIN_HALVED_LIFT)
         first = add_given(first, rig.images[0])
 
@@ -193,7 +200,7 @@ class PlaneSweep(Splatter):
     def estimate_depths(self, views: Sequence[View]) -> list[DepthMap]:
         """Estimate z-depth and confidence of every pixel, in scene units."""
         views = set_depth_range(views, *get_depth_range(views))
-        rig = build_rig(views)
+        rig = build_rig(views, self.device)
         return make_depth_maps(self.compute_layers(rig, views), rig.unit, views)
 
     def compute_layers(self, rig: Rig, views: Sequence[View]) -> list[DepthLayer]:

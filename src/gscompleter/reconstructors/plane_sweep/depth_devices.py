@@ -1,0 +1,68 @@
+"""What a device computes of the depths of plane-sweep.
+
+The CPU has compiled loops, whose bytes never change; a GPU has the same as operations on tensors.
+Everything else of stereo stays on the CPU: it takes a tenth of the time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol, runtime_checkable
+
+from gscompleter.reconstructors.plane_sweep.matching import (
+    PixelMap,
+    PlaneSearch,
+    search_with_kernels,
+    search_with_tensors,
+)
+from gscompleter.system.errors import InputError, quote_value
+
+
+@runtime_checkable
+class DepthDevice(Protocol):
+    """The steps of plane-sweep that a device implements; arrays lie on the CPU."""
+
+    def find_planes(self, search: PlaneSearch) -> tuple[PixelMap, PixelMap]:
+        """Find the best plane of each pixel, to a fraction, and the cost gap to the second best."""
+
+
+@dataclass(frozen=True)
+class CpuDepth:
+    """Steps in compiled loops."""
+
+    def find_planes(self, search: PlaneSearch) -> tuple[PixelMap, PixelMap]:
+        """Find the planes with the kernels."""
+        return search_with_kernels(search)
+
+
+@dataclass(frozen=True)
+class TensorDepth:
+    """Steps as operations of torch."""
+
+    device: str
+
+    def find_planes(self, search: PlaneSearch) -> tuple[PixelMap, PixelMap]:
+        """Find the planes on the device."""
+        return search_with_tensors(search, self.device)
+
+
+DEPTH_DEVICES: dict[str, Callable[[str], DepthDevice]] = {
+    "cpu": lambda _: CpuDepth(),
+    "cuda": TensorDepth,
+    # No Mac was at hand to compare the results with, and it shares its memory with its CPU.
+    "mps": lambda _: CpuDepth(),
+}
+"""Makers of the steps by the type of the device, from its name."""
+
+
+def get_depth_device(name: str) -> DepthDevice:
+    """Return the steps of a device such as `cuda` or `cuda:1`; InputError for an unknown one."""
+    kind = name.partition(":")[0]
+    if kind not in DEPTH_DEVICES:
+        raise InputError(
+            f"There is no device '{quote_value(name)}' for plane-sweep; choose one of "
+            f"{', '.join(DEPTH_DEVICES)}.",
+            "device",
+        )
+    return DEPTH_DEVICES[kind](name)
