@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 import pytest
 import torch
@@ -9,7 +11,7 @@ import torch
 from fake_cuda import BETWEEN_STAGES, fake_cuda, get_device
 from gscompleter import InputError, load_reconstructor
 from gscompleter.numerics import tensor_stereo
-from gscompleter.numerics.kernels import stereo
+from gscompleter.numerics.kernels import stereo, tgv
 from gscompleter.numerics.tensor_stereo import (
     OUTSIDE,
     JumpPenalties,
@@ -20,6 +22,7 @@ from gscompleter.numerics.tensor_stereo import (
     prefer_given_planes,
     select_volume_planes,
 )
+from gscompleter.numerics.tensor_tgv import LAUNCHES_PER_ITERATION, fit_on_device
 from gscompleter.reconstructors.features.stereo_image import StereoImage
 from gscompleter.reconstructors.plane_sweep import PlaneSweep, depth_devices
 from gscompleter.reconstructors.plane_sweep.depth_devices import TensorDepth
@@ -33,6 +36,7 @@ from gscompleter.reconstructors.plane_sweep.matching import (
     search_with_tensors,
     spread_over_tiles,
 )
+from gscompleter.reconstructors.plane_sweep.surfaces import FitHeights, fit_surfaces
 from gscompleter.reconstructors.plane_sweep.sweep import make_bands, make_full_bands
 from scenes import Room, camera_at, view_of
 
@@ -184,6 +188,7 @@ def test_a_reconstruction_on_tensors_is_that_of_the_kernels(monkeypatch):
         return TensorDepth(name)
 
     monkeypatch.setitem(depth_devices.DEPTH_DEVICES, "cpu", make_device)
+    monkeypatch.setattr(depth_devices, "MIN_DEVICE_PIXELS", 0)
     for ours, truth in zip(PlaneSweep().estimate_depths(views), expected, strict=True):
         difference = ((ours.depth - truth.depth).abs() / truth.depth)[truth.valid]
         assert len(difference) > 2000
@@ -227,6 +232,57 @@ def test_a_large_image_with_all_planes_takes_less_than_two_gibibytes(monkeypatch
         peak = max(get_device().memory.peaks.values())
     estimate = estimate_most_bytes(size, planes, part)
     assert 0.5 * estimate < peak < estimate
+
+
+def fit_level(fit: FitHeights, iterations: int) -> tuple[np.ndarray, np.ndarray]:
+    """Fit heights with noise to random measurements, of which half are missing."""
+    random, shape = np.random.default_rng(0), SIZE
+    data, weight, across, down = (random.random(shape, np.float32) * k for k in (60, 1, 3, 3))
+    weight[random.random(shape) < 0.5] = 0
+    heights, gradients = np.zeros(shape, np.float32), np.zeros((2, *shape), np.float32)
+    step = np.float32(12), np.float32(0.15)
+    fit(heights, gradients, data, weight, across, down, *step, iterations)
+    return heights, gradients
+
+
+@pytest.mark.parametrize("iterations", [3, 300])
+def test_surfaces_are_those_of_the_kernel(iterations):
+    found = fit_level(partial(fit_on_device, "cpu"), iterations)
+    for ours, truth in zip(found, fit_level(tgv.fit, iterations), strict=True):
+        assert np.abs(truth).max() > 0.01
+        assert np.abs(ours - truth).max() < 1e-4 * np.abs(truth).max()
+
+
+def test_an_iteration_of_surfaces_has_a_fixed_number_of_launches():
+    found = {}
+    for iterations in (1, 11):
+        with fake_cuda() as counts:
+            fit_level(partial(fit_on_device, "cuda"), iterations)
+        assert counts.waits.total() == 1, counts.list_waits(BETWEEN_STAGES)
+        found[iterations] = counts.launches.total()
+    assert found[11] - found[1] == 10 * LAUNCHES_PER_ITERATION
+    assert found[1] < 2 * LAUNCHES_PER_ITERATION
+
+
+def test_only_large_levels_of_surfaces_go_to_a_gpu(monkeypatch):
+    """The finest of five is large; what follows is from the same numbers."""
+    heights = make_search().given.clip(0)
+    image = make_image(4).image
+    weight = np.ones_like(heights)
+    expected = fit_surfaces(heights, weight, image, 20)
+    monkeypatch.setattr(depth_devices, "MIN_DEVICE_PIXELS", heights.size)
+    sizes = []
+
+    def choose_fit(num_pixels: int) -> FitHeights:
+        chosen = TensorDepth("cpu").choose_fit(num_pixels)
+        sizes.append((num_pixels, chosen is tgv.fit))
+        return chosen
+
+    found = fit_surfaces(heights, weight, image, 20, choose_fit)
+    assert [is_kernel for _, is_kernel in sizes] == [True] * 4 + [False]
+    assert sizes[-1][0] == heights.size
+    assert np.abs(found - expected).max() < 1e-4 * expected.max()
+    assert np.abs(expected - heights).max() > 1
 
 
 def test_the_device_of_networks_is_that_of_the_sweep():

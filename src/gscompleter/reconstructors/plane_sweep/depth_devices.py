@@ -8,15 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol, runtime_checkable
 
+from gscompleter.numerics.kernels import tgv
+from gscompleter.numerics.tensor_tgv import fit_on_device
 from gscompleter.reconstructors.plane_sweep.matching import (
     PixelMap,
     PlaneSearch,
     search_with_kernels,
     search_with_tensors,
 )
+from gscompleter.reconstructors.plane_sweep.surfaces import FitHeights
 from gscompleter.system.errors import InputError, quote_value
+
+MIN_DEVICE_PIXELS = 2**17
+"""Pixels from which a level of the surfaces is fitted on a GPU. A coarser level has twice as many
+iterations, each of `LAUNCHES_PER_ITERATION` launches, for a quarter of the pixels: of 2 million the
+finest two are three quarters of the work, and a tenth of the launches."""
 
 
 @runtime_checkable
@@ -26,6 +35,9 @@ class DepthDevice(Protocol):
     def find_planes(self, search: PlaneSearch) -> tuple[PixelMap, PixelMap]:
         """Find the best plane of each pixel, to a fraction, and the cost gap to the second best."""
 
+    def choose_fit(self, num_pixels: int) -> FitHeights:
+        """Choose the fit of a level of the surfaces with so many pixels."""
+
 
 @dataclass(frozen=True)
 class CpuDepth:
@@ -34,6 +46,10 @@ class CpuDepth:
     def find_planes(self, search: PlaneSearch) -> tuple[PixelMap, PixelMap]:
         """Find the planes with the kernels."""
         return search_with_kernels(search)
+
+    def choose_fit(self, num_pixels: int) -> FitHeights:
+        """Choose the kernel."""
+        return tgv.fit
 
 
 @dataclass(frozen=True)
@@ -45,6 +61,10 @@ class TensorDepth:
     def find_planes(self, search: PlaneSearch) -> tuple[PixelMap, PixelMap]:
         """Find the planes on the device."""
         return search_with_tensors(search, self.device)
+
+    def choose_fit(self, num_pixels: int) -> FitHeights:
+        """Choose tensors for a large level, and the kernel for a small one."""
+        return tgv.fit if num_pixels < MIN_DEVICE_PIXELS else partial(fit_on_device, self.device)
 
 
 DEPTH_DEVICES: dict[str, Callable[[str], DepthDevice]] = {

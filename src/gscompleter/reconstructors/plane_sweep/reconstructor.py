@@ -49,6 +49,7 @@ from gscompleter.reconstructors.plane_sweep.sweep import (
     compute_inverse_depth,
     measure_depths,
 )
+from gscompleter.render.loading import load_renderer
 from gscompleter.system.errors import join_names
 from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import ChooseMasks, DepthMap, Reconstruction, View
@@ -73,7 +74,8 @@ class PlaneSweep(Splatter):
     predict_depth: DepthPredictor = predict_nothing
     """Monocular depth, used where stereo measures nothing and confirms it elsewhere."""
     device: str = "cpu"
-    """Device that matches photographs and fits surfaces, by the names of torch."""
+    """Device that matches photographs and fits surfaces, by the names of torch. Where the
+    photographs lie on a GPU and this is one, Gaussians are fitted there as well."""
 
     def __post_init__(self) -> None:
         """Raise InputError for a device that plane-sweep does not know."""
@@ -82,7 +84,7 @@ class PlaneSweep(Splatter):
     @run_in_plain_torch
     def __call__(self, views: Sequence[View]) -> Reconstruction:
         """Reconstruct the scene and the depth of every pixel."""
-        return self.reconstruct(views)
+        return self.fit_at(views).reconstruct(views)
 
     @run_in_plain_torch
     def reconstruct_part(self, views: Sequence[View], choose_masks: ChooseMasks) -> Reconstruction:
@@ -90,14 +92,24 @@ class PlaneSweep(Splatter):
 
         Half of the time is that of the fit to the photographs, which grows with what is fitted.
         """
-        return self.reconstruct(views, choose_masks)
+        return self.fit_at(views).reconstruct(views, choose_masks)
 
     @run_in_plain_torch
     def reconstruct_and_fit(
         self, views: Sequence[View], check_views: Sequence[View]
     ) -> Reconstruction:
         """Reconstruct the scene of `views`, from three of them on fitted to `check_views`, too."""
-        return self.reconstruct(views, None, check_views)
+        return self.fit_at(views).reconstruct(views, None, check_views)
+
+    def fit_at(self, views: Sequence[View]) -> PlaneSweep:
+        """Fit Gaussians on the GPU of the photographs, if they lie on one and it is to be used.
+
+        They lie there only if its renderer is used.
+        """
+        here = views[0].image.device
+        if here.type == "cpu" or self.device.partition(":")[0] != here.type:
+            return self
+        return replace(self, renderer=load_renderer(here.type), fit_device=str(here))
 
     def reconstruct(
         self,
@@ -163,7 +175,7 @@ class PlaneSweep(Splatter):
         """
         views = set_depth_range(views, *get_depth_range(views))
         if len(views[1].known_depths) and measure_baseline(*(v.camera for v in views)) == 0:
-            return self.lift_in_place(views[0], views[1], pixel_mask)
+            return self.fit_at(views).lift_in_place(views[0], views[1], pixel_mask)
         rig = build_rig(views, self.device)
         first, second = match_views(rig, views, MIN_HALVED_LIFT)
         first = add_given(first, rig.images[0])
@@ -175,10 +187,13 @@ class PlaneSweep(Splatter):
         # What the additions do to the photographs is the business of the guards.
         (part,) = self.support(rig, views[:1], [first], [sky_of_first])
         layers = [
-            make_layer(rig.images[0], part.measured.exclude(sky_of_first), LIFT_ITERATIONS),
-            make_layer(rig.images[1], second.exclude(sky_of_second), 0),
+            make_layer(
+                rig.images[0], part.measured.exclude(sky_of_first), rig.device, LIFT_ITERATIONS
+            ),
+            make_layer(rig.images[1], second.exclude(sky_of_second), rig.device, 0),
         ]
-        lifted = self.lift_pixels(views, make_depth_maps(layers, rig.unit, views), pixel_mask)
+        depths = make_depth_maps(layers, rig.unit, views)
+        lifted = self.fit_at(views).lift_pixels(views, depths, pixel_mask)
         return replace(lifted, notes=describe_support([part], lambda _: "the synthesized image"))
 
     def lift_in_place(
@@ -251,10 +266,10 @@ class PlaneSweep(Splatter):
 
     def measure_error(self, view: View, scene: Reconstruction, number: int) -> float:
         """Measure the mean squared colour error of a photograph, apart from ignored pixels."""
-        seen = view.to("cpu")
-        image = self.renderer.render(scene.gaussians.to("cpu"), seen.camera).image
+        seen = view.to(self.fit_device)
+        image = self.renderer.render(scene.gaussians.to(self.fit_device), seen.camera).image
         if scene.exposure_gains is not None:
-            image = image * scene.exposure_gains[number].cpu()
+            image = image * scene.exposure_gains[number].to(image)
         error = (image - seen.image)[seen.valid_mask].double().square()
         return float(error.mean()) if error.numel() else 0.0
 
@@ -300,7 +315,8 @@ def complete_layers(
     They are fitted without the sky, as its matches are arbitrary, and it gets its depth afterwards.
     """
     without_sky = [part.exclude(sky) for part, sky in zip(observed, skies, strict=True)]
-    surfaces = map_in_parallel(make_layer, rig.images, without_sky)
+    devices = [rig.device] * len(rig.images)
+    surfaces = map_in_parallel(make_layer, rig.images, without_sky, devices)
     return [
         add_sky(surface, measurement, sky)
         for surface, measurement, sky in zip(surfaces, measured, skies, strict=True)
@@ -335,11 +351,15 @@ def match_views(
 
 
 def make_layer(
-    image: StereoImage, measured: Measurement, iterations: int = SMOOTHING_ITERATIONS
+    image: StereoImage,
+    measured: Measurement,
+    device: str,
+    iterations: int = SMOOTHING_ITERATIONS,
 ) -> DepthLayer:
     """Convert the measured depths of a view to a layer, by surfaces after so many iterations."""
     full = measured.resize_to(image.size)
-    index = fit_surfaces(full.index, full.weight, image.image, iterations)
+    choose_fit = get_depth_device(device).choose_fit
+    index = fit_surfaces(full.index, full.weight, image.image, iterations, choose_fit)
     return DepthLayer(image, compute_inverse_depth(full.planes, index), full.confidence)
 
 
