@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -17,14 +18,14 @@ from gscompleter.numerics.tensor_stereo import (
     JumpPenalties,
     MatchedSource,
     TilePlanes,
-    aggregate_volume,
+    aggregate_volumes,
     compute_cost_volume,
     prefer_given_planes,
     select_volume_planes,
 )
 from gscompleter.numerics.tensor_tgv import LAUNCHES_PER_ITERATION, fit_on_device
 from gscompleter.reconstructors.features.stereo_image import StereoImage
-from gscompleter.reconstructors.plane_sweep import PlaneSweep, depth_devices
+from gscompleter.reconstructors.plane_sweep import PlaneSweep, depth_devices, matching
 from gscompleter.reconstructors.plane_sweep.depth_devices import TensorDepth
 from gscompleter.reconstructors.plane_sweep.matching import (
     COST_RULE,
@@ -32,6 +33,7 @@ from gscompleter.reconstructors.plane_sweep.matching import (
     aggregate,
     compute_costs,
     compute_jumps,
+    group_searches,
     list_tile_planes,
     search_with_tensors,
     spread_over_tiles,
@@ -107,6 +109,7 @@ def match(search: PlaneSearch) -> torch.Tensor:
         sources,
         upload(search.planes),
         TilePlanes(*map(upload, list_tile_planes(search.bands))),
+        len(search.planes),
         COST_RULE,
     )
 
@@ -128,10 +131,27 @@ def test_matching_costs_are_those_of_the_kernel():
 
 def test_parts_of_a_search_make_no_difference(monkeypatch):
     search = make_search()
-    whole = search_with_tensors(search, "cpu")
+    whole = search_with_tensors([search], "cpu")
     monkeypatch.setattr(tensor_stereo, "PART_BYTES", 20_000)
-    for ours, truth in zip(search_with_tensors(search, "cpu"), whole, strict=True):
-        assert np.array_equal(ours, truth)
+    assert np.array_equal(search_with_tensors([search], "cpu"), whole)
+
+
+@pytest.mark.parametrize("cells", [0, 2 * 40 * 76 * 17, 2**27])
+def test_views_that_are_searched_together_find_what_each_finds_alone(monkeypatch, cells):
+    """Of several numbers of planes, of which one has an image of another size."""
+    monkeypatch.setattr(matching, "GROUP_CELLS", cells)
+    searches = [
+        make_search(),
+        make_search((32, 65)),
+        make_search(planes=17),
+        replace(make_search(), reference=make_image(5)),
+    ]
+    sizes = {0: [1, 1, 1, 1], 2**27: [1, 3]}.get(cells, [1, 1, 2])
+    assert sorted(map(len, group_searches(searches))) == sizes
+    together = search_with_tensors(searches, "cpu")
+    for search, found in zip(searches, together, strict=True):
+        (alone,) = search_with_tensors([search], "cpu")
+        assert np.array_equal(found, alone)
 
 
 def test_given_depth_is_preferred_as_by_the_kernel():
@@ -152,9 +172,8 @@ def test_paths_and_the_chosen_planes_are_exactly_those_of_the_kernel(seed):
     # Few values, so that there are ties.
     costs = random.choice(np.array([0, 20, 90, 254], np.uint8), search.bands.start[-1])
     volume = to_volume(costs, search)
-    totals = aggregate_volume(
-        volume, JumpPenalties(*map(upload, compute_jumps(search.reference))), 25
-    )
+    jumps = [upload(part[None]) for part in compute_jumps(search.reference)]
+    (totals,) = aggregate_volumes(volume[None], JumpPenalties(*jumps), 25)
     bands = [spread_over_tiles(band, SIZE) for band in (search.bands.low, search.bands.high)]
     index, margin = select_volume_planes(totals, volume, *map(upload, bands)).numpy()
     of_kernel = aggregate(costs, search.bands, search.reference)
@@ -199,13 +218,14 @@ def test_a_reconstruction_on_tensors_is_that_of_the_kernels(monkeypatch):
 
 
 def test_launches_grow_with_rows_and_columns_and_the_host_waits_once():
-    search = make_search()
+    searches = [make_search(), make_search(planes=17)]
     with fake_cuda() as counts:
-        index, _ = search_with_tensors(search, "cuda")
+        (index, _), _ = search_with_tensors(searches, "cuda")
     assert index.shape == SIZE
     assert counts.waits.total() == 1, counts.list_waits(BETWEEN_STAGES)
-    # Eight for each row and column, and a fixed number for each source and each part.
-    assert counts.launches.total() <= 8 * sum(SIZE) + 250 * len(search.sources) + 150
+    # Eight for each row and column of all, and a fixed number for each source and each view.
+    sources = sum(len(search.sources) for search in searches)
+    assert counts.launches.total() <= 8 * sum(SIZE) + 250 * sources + 150 * len(searches)
 
 
 def estimate_most_bytes(size: tuple[int, int], planes: int, part: int) -> int:
@@ -228,7 +248,7 @@ def test_a_large_image_with_all_planes_takes_less_than_two_gibibytes(monkeypatch
     size, planes = (32, 128), 40
     monkeypatch.setattr(tensor_stereo, "PART_BYTES", part)
     with fake_cuda():
-        search_with_tensors(make_search(size, planes), "cuda")
+        search_with_tensors([make_search(size, planes)], "cuda")
         peak = max(get_device().memory.peaks.values())
     estimate = estimate_most_bytes(size, planes, part)
     assert 0.5 * estimate < peak < estimate

@@ -64,15 +64,15 @@ class CostRule:
 
 
 class JumpPenalties(NamedTuple):
-    """Penalties of a jump between neighbouring pixels, int16."""
+    """Penalties of a jump between neighbouring pixels of several views, int16."""
 
-    right: Int16[Tensor, "h w-1"]
+    right: Int16[Tensor, "views h w-1"]
     """To the right neighbour."""
-    down: Int16[Tensor, "h-1 w"]
+    down: Int16[Tensor, "views h-1 w"]
     """To the lower neighbour."""
-    down_right: Int16[Tensor, "h-1 w-1"]
+    down_right: Int16[Tensor, "views h-1 w-1"]
     """To the lower right neighbour."""
-    down_left: Int16[Tensor, "h-1 w-1"]
+    down_left: Int16[Tensor, "views h-1 w-1"]
     """From the right neighbour of a pixel to the one below the pixel."""
 
 
@@ -121,9 +121,10 @@ def compute_cost_volume(
     sources: Sequence[MatchedSource],
     inverse_depths: Float32[Tensor, "planes"],
     pairs: TilePlanes,
+    num_planes: int,
     rule: CostRule,
-) -> Volume:
-    """Compute the matching costs of the tiles of an image at their planes.
+) -> UInt8[Tensor, "h w {num_planes}"]:
+    """Compute the matching costs of the tiles of an image at their planes, in a volume of so many.
 
     Equal to `compute_matching_costs` of the kernels, and to what the sweep makes of several
     sources. Where a compiler rounds otherwise, few costs differ, by one.
@@ -132,7 +133,7 @@ def compute_cost_volume(
     tiled = tile_image(reference, rule.radius)
     rows, columns = -(-h // TILE_ROWS), -(-w // TILE_COLUMNS)
     volume = reference.new_full(
-        (rows, TILE_ROWS, columns, TILE_COLUMNS, len(inverse_depths)), OUTSIDE, dtype=torch.uint8
+        (rows, TILE_ROWS, columns, TILE_COLUMNS, num_planes), OUTSIDE, dtype=torch.uint8
     )
     pixels = tiled.colors[0, 0].numel()
     for part in split_length(len(pairs.plane), 8 * PART_BYTES // (CELL_BYTES * pixels)):
@@ -323,33 +324,36 @@ def prefer_given_planes(
         volume[rows] = dearer.where(is_given, costs)
 
 
-def aggregate_volume(volume: Volume, jumps: JumpPenalties, small: int) -> Sums:
+def aggregate_volumes(
+    volumes: UInt8[Tensor, "views h w planes"], jumps: JumpPenalties, small: int
+) -> Int16[Tensor, "views h w planes"]:
     """Sum costs along eight paths (Hirschmüller 2008), exactly as the kernels do.
 
     Every step of a path waits for the one before, so that there are eight launches for each row and
-    for each column. `small` is the penalty of one plane. Sums outside the bands mean nothing.
+    for each column, of all views at once. `small` is the penalty of one plane. Sums outside the
+    bands mean nothing.
     """
-    totals = torch.zeros(volume.shape, dtype=torch.int16, device=volume.device)
+    totals = torch.zeros(volumes.shape, dtype=torch.int16, device=volumes.device)
     right, down, down_right, down_left = jumps
-    # Penalties [rows, paths, columns] on the way to a row from the row before: from the left, from
-    # above and from the right. Where nothing is before, at the sides, they are not used.
+    # Penalties [views, paths, rows, columns] on the way to a row from the row before: from the
+    # left, from above and from the right. Where nothing is before, at the sides, they are not used.
     downwards = torch.stack([pad(down_right, (1, 0)), down, pad(down_left, (0, 1))], dim=1)
     upwards = torch.stack([pad(down_left, (1, 0)), down, pad(down_right, (0, 1))], dim=1)
-    add_paths(volume, totals, torch.stack([downwards, upwards.flip(0)], dim=1), small)
-    along = right.T[:, None]
+    add_paths(volumes, totals, torch.stack([downwards, upwards.flip(2)]), small)
+    along = right.transpose(1, 2)[:, None]
     add_paths(
-        volume.transpose(0, 1),
-        totals.transpose(0, 1),
-        torch.stack([along, along.flip(0)], dim=1),
+        volumes.transpose(1, 2),
+        totals.transpose(1, 2),
+        torch.stack([along, along.flip(2)]),
         small,
     )
     return totals
 
 
 def add_paths(
-    volume: UInt8[Tensor, "rows lanes planes"],
-    totals: Int16[Tensor, "rows lanes planes"],
-    penalties: Int16[Tensor, "rows-1 2 paths lanes"],
+    volumes: UInt8[Tensor, "views rows lanes planes"],
+    totals: Int16[Tensor, "views rows lanes planes"],
+    penalties: Int16[Tensor, "2 views paths rows-1 lanes"],
     small: int,
 ) -> None:
     """Add to totals the sums along paths from row to row, down and up at once, in place.
@@ -358,25 +362,30 @@ def add_paths(
     too. `penalties` are those of jumps to row 1, 2, ... on the way down, and to the last row but
     one, ... on the way up.
     """
-    rows, lanes, count = volume.shape
+    views, rows, lanes, count = volumes.shape
     paths = penalties.shape[2]
     side = paths // 2
-    shape = 2, paths, lanes + 2 * side, count + 2
+    shape = 2, views, paths, lanes + 2 * side, count + 2
     # Costs of the row before and of this one, which take turns, less the lowest cost of each pixel.
     # Beyond the sides no path comes from anywhere, and beyond the planes nothing can be.
     states = [totals.new_zeros(shape) for _ in range(2)]
-    inner = [state[:, :, side : lanes + side, 1:-1] for state in states]
+    inner = [state[..., side : lanes + side, 1:-1] for state in states]
     # Path k at lane x reads lane x + k of the padded row before, which is lane x + k - side.
-    a, b, c, d = states[0].stride()
-    before = [state.as_strided((2, paths, lanes, count + 2), (a, b + c, c, d)) for state in states]
+    before = [
+        state.as_strided(
+            (2, views, paths, lanes, count + 2),
+            (*state.stride()[:2], state.stride(2) + state.stride(3), *state.stride()[3:]),
+        )
+        for state in states
+    ]
     neighbours = [(all_of[..., :-2], all_of[..., 2:], all_of[..., 1:-1]) for all_of in before]
-    ceilings = penalties[..., None]
-    lowest = totals.new_empty((2, paths, lanes, 1))
-    for part in split_length(rows, PART_BYTES // (2 * lanes * count * 2)):
+    ceilings = penalties.movedim(3, 0)[..., None]
+    lowest = totals.new_empty((2, views, paths, lanes, 1))
+    for part in split_length(rows, PART_BYTES // (2 * views * lanes * count * 2)):
         mirrored = slice(rows - part.stop, rows - part.start)
-        costs = torch.stack([volume[part], volume[mirrored].flip(0)], dim=1).to(torch.int16)
-        costs = costs.masked_fill_(costs == OUTSIDE, int(INFEASIBLE))[:, :, None]
-        sums = totals.new_empty((len(costs), 2, lanes, count))
+        costs = torch.stack([volumes[:, part], volumes[:, mirrored].flip(1)]).to(torch.int16)
+        costs = costs.masked_fill_(costs == OUTSIDE, int(INFEASIBLE)).movedim(2, 0)[:, :, :, None]
+        sums = totals.new_empty((len(costs), 2, views, lanes, count))
         for number in range(len(costs)):
             row = part.start + number
             now = row % 2
@@ -393,12 +402,12 @@ def add_paths(
                 reached.copy_(costs[number].expand_as(reached))
             if row < 2:
                 for beyond in (0, -1):
-                    states[now][:, :, side : lanes + side, beyond] = int(INFEASIBLE)
-            torch.sum(reached, dim=1, dtype=torch.int16, out=sums[number])
+                    states[now][..., side : lanes + side, beyond] = int(INFEASIBLE)
+            torch.sum(reached, dim=2, dtype=torch.int16, out=sums[number])
             torch.amin(reached, dim=-1, keepdim=True, out=lowest)
             reached -= lowest
-        totals[part].add_(sums[:, 0])
-        totals[mirrored].add_(sums[:, 1].flip(0))
+        totals[:, part].add_(sums[:, 0].transpose(0, 1))
+        totals[:, mirrored].add_(sums[:, 1].transpose(0, 1).flip(1))
 
 
 def select_volume_planes(

@@ -6,7 +6,7 @@ Everything else of stereo stays on the CPU: it takes a tenth of the time.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Protocol, runtime_checkable
@@ -32,7 +32,7 @@ finest two are three quarters of the work, and a tenth of the launches."""
 class DepthDevice(Protocol):
     """The steps of plane-sweep that a device implements; arrays lie on the CPU."""
 
-    def find_planes(self, search: PlaneSearch) -> tuple[PixelMap, PixelMap]:
+    def find_planes(self, searches: Sequence[PlaneSearch]) -> list[tuple[PixelMap, PixelMap]]:
         """Find the best plane of each pixel, to a fraction, and the cost gap to the second best."""
 
     def choose_fit(self, num_pixels: int) -> FitHeights:
@@ -43,9 +43,9 @@ class DepthDevice(Protocol):
 class CpuDepth:
     """Steps in compiled loops."""
 
-    def find_planes(self, search: PlaneSearch) -> tuple[PixelMap, PixelMap]:
-        """Find the planes with the kernels."""
-        return search_with_kernels(search)
+    def find_planes(self, searches: Sequence[PlaneSearch]) -> list[tuple[PixelMap, PixelMap]]:
+        """Find the planes of one view after the other with the kernels."""
+        return [search_with_kernels(search) for search in searches]
 
     def choose_fit(self, num_pixels: int) -> FitHeights:
         """Choose the kernel."""
@@ -58,9 +58,9 @@ class TensorDepth:
 
     device: str
 
-    def find_planes(self, search: PlaneSearch) -> tuple[PixelMap, PixelMap]:
-        """Find the planes on the device."""
-        return search_with_tensors(search, self.device)
+    def find_planes(self, searches: Sequence[PlaneSearch]) -> list[tuple[PixelMap, PixelMap]]:
+        """Find the planes of all views on the device."""
+        return search_with_tensors(searches, self.device)
 
     def choose_fit(self, num_pixels: int) -> FitHeights:
         """Choose tensors for a large level, and the kernel for a small one."""

@@ -20,7 +20,7 @@ from gscompleter.numerics.tensor_stereo import (
     JumpPenalties,
     MatchedSource,
     TilePlanes,
-    aggregate_volume,
+    aggregate_volumes,
     compute_cost_volume,
     prefer_given_planes,
     select_volume_planes,
@@ -60,6 +60,8 @@ SMALL_PENALTY = 25
 """Cost of a change by one plane between neighbouring pixels."""
 LARGE_PENALTY = 300
 """Cost of a larger jump between neighbouring pixels of the same colour."""
+GROUP_CELLS = 2**27
+"""Most costs of views that a device searches at once, so that these take less than a large view."""
 JUMP_CONTRAST = np.float32(0.06)
 """Colour difference at which the penalty of a jump is halved."""
 COST_RULE = CostRule(
@@ -93,37 +95,72 @@ def search_with_kernels(search: PlaneSearch) -> tuple[PixelMap, PixelMap]:
     return stereo.select_planes(totals, search.bands, *search.reference.size)
 
 
-def search_with_tensors(search: PlaneSearch, device: str) -> tuple[PixelMap, PixelMap]:
-    """Find the same on a device; the host waits once, for the result.
+def search_with_tensors(
+    searches: Sequence[PlaneSearch], device: str
+) -> list[tuple[PixelMap, PixelMap]]:
+    """Find the same for several views on a device; the host waits once for each group of them.
 
     Costs differ by one in 254 where a rounding falls on the other side; all that follows is exact.
     """
+    found: dict[int, tuple[PixelMap, PixelMap]] = {}
+    for numbers in group_searches(searches):
+        group = [searches[number] for number in numbers]
+        found.update(zip(numbers, search_group(group, device), strict=True))
+    return [found[number] for number in range(len(searches))]
+
+
+def group_searches(searches: Sequence[PlaneSearch]) -> list[list[int]]:
+    """Group the numbers of searches in images of one size, as far as their costs take little."""
+    of_size: dict[tuple[int, int], list[int]] = {}
+    for number, search in enumerate(searches):
+        of_size.setdefault(search.reference.size, []).append(number)
+    groups = []
+    for (height, width), numbers in of_size.items():
+        most_planes = max(len(searches[number].planes) for number in numbers)
+        most = max(1, GROUP_CELLS // (height * width * most_planes))
+        groups += [numbers[begin : begin + most] for begin in range(0, len(numbers), most)]
+    return groups
+
+
+def search_group(group: Sequence[PlaneSearch], device: str) -> list[tuple[PixelMap, PixelMap]]:
+    """Find the best planes of views of one size on a device."""
 
     def upload(array: np.ndarray) -> Tensor:
         return torch.from_numpy(np.ascontiguousarray(array)).to(device, non_blocking=True)
 
-    size = search.reference.size
-    rows, columns, planes = list_tile_planes(search.bands)
-    volume = compute_cost_volume(
-        upload(search.reference.image),
-        [
-            MatchedSource(
-                upload(source.image).permute(2, 0, 1).flatten(1), source.size, upload(transform)
-            )
-            for source, transform in search.sources
-        ],
-        upload(search.planes),
-        TilePlanes(upload(rows), upload(columns), upload(planes)),
-        COST_RULE,
-    )
-    if (search.given >= 0).any():
-        prefer_given_planes(volume, upload(search.given), float(GIVEN_SHARE), float(GIVEN_COST))
-    jumps = JumpPenalties(*map(upload, compute_jumps(search.reference)))
-    totals = aggregate_volume(volume, jumps, SMALL_PENALTY)
-    low = upload(spread_over_tiles(search.bands.low, size))
-    high = upload(spread_over_tiles(search.bands.high, size))
-    index, margin = select_volume_planes(totals, volume, low, high).cpu().numpy()
-    return index, margin
+    size = group[0].reference.size
+    num_planes = max(len(search.planes) for search in group)
+    volumes = []
+    for search in group:
+        volume = compute_cost_volume(
+            upload(search.reference.image),
+            [
+                MatchedSource(
+                    upload(source.image).permute(2, 0, 1).flatten(1), source.size, upload(transform)
+                )
+                for source, transform in search.sources
+            ],
+            upload(search.planes),
+            TilePlanes(*map(upload, list_tile_planes(search.bands))),
+            num_planes,
+            COST_RULE,
+        )
+        if (search.given >= 0).any():
+            given = upload(search.given)
+            prefer_given_planes(volume, given, float(GIVEN_SHARE), float(GIVEN_COST))
+        volumes.append(volume)
+
+    # A single volume, which may be large, is not copied.
+    stacked = volumes[0][None] if len(group) == 1 else torch.stack(volumes)
+    jumps = [compute_jumps(search.reference) for search in group]
+    of_views = [upload(np.stack(maps)) for maps in zip(*jumps, strict=True)]
+    totals = aggregate_volumes(stacked, JumpPenalties(*of_views), SMALL_PENALTY)
+    selected = []
+    for volume, total, search in zip(stacked, totals, group, strict=True):
+        low = upload(spread_over_tiles(search.bands.low, size))
+        high = upload(spread_over_tiles(search.bands.high, size))
+        selected.append(select_volume_planes(total, volume, low, high))
+    return [(index, margin) for index, margin in torch.stack(selected).cpu().numpy()]
 
 
 def list_tile_planes(bands: Bands) -> Int64[np.ndarray, "3 pairs"]:

@@ -197,15 +197,25 @@ def find_hidden_pixels(background: Map, neighbours: Sequence[Neighbour]) -> Mask
 def sweep_views(rig: Rig, near: float, far: float) -> list[Sweep]:
     """Sweep all views, coarse to fine; `near` and `far` are in widest baselines."""
     numbers = range(len(rig.images))
-    shortest_side = min(min(image.size) for image in rig.images)
-    if shortest_side < MIN_GUIDED_SIDE:
-        return [sweep_view(i, rig, near, far) for i in numbers]
-    guesses = sweep_views(rig.halve(), near, far)
-    return [sweep_view(i, rig, near, far, guesses[i]) for i in numbers]
+    guesses: list[Sweep | None] = [None] * len(rig.images)
+    if min(min(image.size) for image in rig.images) >= MIN_GUIDED_SIDE:
+        guesses = [*sweep_views(rig.halve(), near, far)]
+    searches = [
+        plan_search(number, rig, near, far, guess)
+        for number, guess in zip(numbers, guesses, strict=True)
+    ]
+    found = get_depth_device(rig.device).find_planes(searches)
+    sweeps = []
+    for search, guess, (index, margin) in zip(searches, guesses, found, strict=True):
+        if guess is not None:
+            # A narrow band leaves out rivals of the best plane; the half-size sweep has seen them.
+            margin = np.minimum(margin, repeat_pixels(guess.margin, search.reference.size))
+        sweeps.append(Sweep(search.planes, index, margin))
+    return sweeps
 
 
-def sweep_view(number: int, rig: Rig, near: float, far: float, guess: Sweep | None = None) -> Sweep:
-    """Find the best planes of one view, near the half-size `guess` if there is one."""
+def plan_search(number: int, rig: Rig, near: float, far: float, guess: Sweep | None) -> PlaneSearch:
+    """Plan which planes of one view are matched: near the half-size `guess` if there is one."""
     image = rig.images[number]
     others = rig.neighbours.neighbours_of[number]
     sources = [(rig.images[i], rig.transforms[number, i]) for i in others]
@@ -219,12 +229,7 @@ def sweep_view(number: int, rig: Rig, near: float, far: float, guess: Sweep | No
     # around it (decision 046).
     given = compute_plane_index(planes, image.given).clip(0, len(planes) - 1)
     given = np.where(image.given > 0, given, np.float32(-1))
-    search = PlaneSearch(image, sources, planes, bands, given)
-    index, margin = get_depth_device(rig.device).find_planes(search)
-    if guess is not None:
-        # A narrow band leaves out rivals of the best plane; the half-size sweep has seen them.
-        margin = np.minimum(margin, repeat_pixels(guess.margin, image.size))
-    return Sweep(planes, index, margin)
+    return PlaneSearch(image, sources, planes, bands, given)
 
 
 def place_planes(
