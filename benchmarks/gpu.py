@@ -212,7 +212,9 @@ def measure_stages(bench: Bench) -> Iterator[Row]:
     0.53 s for integration at 256x448 (Table VI).
     """
     for name, config in CONFIGS.items():
-        complete = GSCompleter(renderer=bench.renderer, config=config)
+        complete = GSCompleter(
+            PlaneSweep(device=bench.device), renderer=bench.renderer, config=config
+        )
         for size in bench.sizes:
             views = bench.make_views(size)
             target = bench.make_target(size)
@@ -232,7 +234,9 @@ def measure_profile(bench: Bench) -> Iterator[Row]:
     if bench.device == "cuda":
         activities.append(torch.profiler.ProfilerActivity.CUDA)
     for name, config in CONFIGS.items():
-        complete = GSCompleter(renderer=bench.renderer, config=config)
+        complete = GSCompleter(
+            PlaneSweep(device=bench.device), renderer=bench.renderer, config=config
+        )
         complete(views, target)
         with torch.profiler.profile(activities=activities) as profile:
             complete(views, target)
