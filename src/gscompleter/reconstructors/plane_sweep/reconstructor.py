@@ -107,9 +107,10 @@ class PlaneSweep(Splatter):
         They lie there only if its renderer is used.
         """
         here = views[0].image.device
-        if here.type == "cpu" or self.device.partition(":")[0] != here.type:
+        is_chosen = self.device.partition(":")[0] == "cuda"
+        if here.type != "cuda" or not is_chosen:
             return self
-        return replace(self, renderer=load_renderer(here.type), fit_device=str(here))
+        return replace(self, renderer=load_renderer("cuda"), fit_device=str(here))
 
     def reconstruct(
         self,
