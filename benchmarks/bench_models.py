@@ -57,7 +57,7 @@ def load_model(
 ) -> tuple[Reconstructor, int]:
     """Load a reconstructor, with random weights if it has any, and their number."""
     if name not in PUBLISHED:
-        return load_reconstructor(name), 0
+        return load_reconstructor(name, device=device), 0
     from gscompleter.models.feed_forward.build import create_network, wrap_network
 
     torch.manual_seed(0)

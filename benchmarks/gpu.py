@@ -21,6 +21,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -37,6 +38,7 @@ from gpu_report import Part, Row, main, shorten, try_rows
 from gscompleter import CompleterConfig, Gaussians, GSCompleter, View, load_renderer
 from gscompleter.evaluation.baselines.optimization import OptimizationConfig, optimize
 from gscompleter.evaluation.baselines.reggs import RegGSConfig, register_by_similarity
+from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.generators import GeneratorRequest, load_generator
 from gscompleter.models.diffusion.inpaint import DiffusersInpaint, Editor, get_size_rules
 from gscompleter.models.diffusion.pe_field import PEField
@@ -45,10 +47,11 @@ from gscompleter.models.tables import DEPTH_PREDICTORS
 from gscompleter.models.weights.fetching import find_cached
 from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.reconstructors.depth_predictors import load_depth_predictor
+from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.render.protocols import FrozenScene, Renderer
 from gscompleter.render.redraw import RedrawnScene
 from gscompleter.system.timing import STAGE_PREFIX, STAGES
-from gscompleter.types import Camera, GeneratorInput, merge
+from gscompleter.types import Camera, GeneratorInput, Reconstruction, merge
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -209,7 +212,9 @@ def measure_stages(bench: Bench) -> Iterator[Row]:
     0.53 s for integration at 256x448 (Table VI).
     """
     for name, config in CONFIGS.items():
-        complete = GSCompleter(renderer=bench.renderer, config=config)
+        complete = GSCompleter(
+            PlaneSweep(device=bench.device), renderer=bench.renderer, config=config
+        )
         for size in bench.sizes:
             views = bench.make_views(size)
             target = bench.make_target(size)
@@ -229,7 +234,9 @@ def measure_profile(bench: Bench) -> Iterator[Row]:
     if bench.device == "cuda":
         activities.append(torch.profiler.ProfilerActivity.CUDA)
     for name, config in CONFIGS.items():
-        complete = GSCompleter(renderer=bench.renderer, config=config)
+        complete = GSCompleter(
+            PlaneSweep(device=bench.device), renderer=bench.renderer, config=config
+        )
         complete(views, target)
         with torch.profiler.profile(activities=activities) as profile:
             complete(views, target)
@@ -268,6 +275,49 @@ def summarize_stage(what: str, events: Sequence[Any], spans: Sequence[Any]) -> I
 def shorten_kernel(name: str) -> str:
     """Shorten the name of a kernel: without its return type, namespaces and arguments."""
     return re.sub(r"^void |\(.*|<.*", "", name).split("::")[-1][:60] or name[:60]
+
+
+def measure_plane_sweep(bench: Bench) -> Iterator[Row]:
+    """Measure plane-sweep with its kernels and on the device, and how far both agree.
+
+    The last size is four times the usual one, about that of a photograph.
+    """
+    height, width = bench.sizes[-1]
+    for size in (*bench.sizes, (4 * height, 4 * width)):
+        views = bench.make_views(size)
+        reconstructions = []
+        for device in ("cpu", bench.device):
+            shown = f"{size[0]}x{size[1]}, {'kernels' if device == 'cpu' else device}"
+            reconstructor = PlaneSweep(device=device)
+            for name, step in (
+                ("depths", reconstructor.estimate_depths),
+                ("context", reconstructor),
+            ):
+                seconds = measure_median_seconds(partial(step, views), bench.repetitions)
+                yield Row(f"{shown}: {name}", seconds, "s")
+            reconstructions.append(reconstructor(views))
+        yield from compare_reconstructions(bench, f"{size[0]}x{size[1]}", views, *reconstructions)
+
+
+def compare_reconstructions(
+    bench: Bench, shown: str, views: list[View], expected: Reconstruction, found: Reconstruction
+) -> Iterator[Row]:
+    """Compare the depths of two reconstructions, and how well both reproduce the photographs."""
+    differences = [
+        ((ours.depth - truth.depth).abs() / truth.depth)[truth.valid]
+        for ours, truth in zip(found.depths, expected.depths, strict=True)
+    ]
+    difference = torch.cat(differences)
+    share = (difference > 1e-4).float().mean().item()
+    note = f"largest {difference.max().item():.2g}"
+    yield Row(f"{shown}: measured pixels whose depth differs by more than 1e-4", share, "", note)
+    for number, view in enumerate(views):
+        before, after = (
+            psnr(bench.renderer.render(part.gaussians, view.camera).image, view.image)
+            for part in (expected, found)
+        )
+        what = f"{shown}: photograph {number}, better on the device by"
+        yield Row(what, after - before, "dB", f"kernels: {before:.2f} dB")
 
 
 def measure_completions(bench: Bench) -> Iterator[Row]:
@@ -524,6 +574,9 @@ PARTS = {
         "Stages, embedded models (medians)", 120, lambda: measure_stages(BENCH), needs="build"
     ),
     "profile": Part("Profile of a completion", 90, lambda: measure_profile(BENCH), needs="build"),
+    "plane-sweep": Part(
+        "Plane-sweep, kernels and device", 120, lambda: measure_plane_sweep(BENCH), needs="build"
+    ),
     "tests": Part("Tests", 90, lambda: run_tests(GPU_TESTS, "-m", "gpu"), needs="build"),
     "completions": Part(
         "A completion with every Ψ", 120, lambda: measure_completions(BENCH), needs="build"

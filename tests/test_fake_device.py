@@ -19,7 +19,10 @@ from fake_gsplat import WHEEL, fake_gsplat, find_gsplat
 from gscompleter import CompleterConfig, GSCompleter, load_renderer
 from gscompleter.apps.inputs.memory import estimate_gpu_memory
 from gscompleter.config import GapConfig
+from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.numerics.geometry import pad_camera
+from gscompleter.reconstructors import load_reconstructor
+from gscompleter.reconstructors.plane_sweep import PlaneSweep
 from gscompleter.render.device import Devices, choose_devices
 from gscompleter.render.gsplat import TILE_SIZE, CudaRenderer
 from gscompleter.system.timing import STAGES
@@ -274,6 +277,60 @@ def test_a_completion_stays_on_the_device_and_waits_no_more_than_it_has_to(devic
     memory = get_device().memory
     stage, peak = memory.peaks.most_common(1)[0]
     assert peak <= MOST_BYTES[name] * len(done.scene), f"{stage}:\n{memory.largest[stage]}"
+
+
+MOST_WAITS_OF_PLANE_SWEEP = {2: 66, 3: 152}
+"""Waits of a reconstruction of so many photographs that the device matches and fits."""
+
+
+@pytest.mark.parametrize("count", MOST_WAITS_OF_PLANE_SWEEP)
+def test_plane_sweep_matches_and_fits_on_the_device(device, count):
+    views = make_views((-0.3, 0.1, 0.2)[:count])
+    there = [view.to("cuda") for view in views]
+    before = device.waits.total()
+    found = load_reconstructor("plane-sweep", device="cuda")(there)
+    waits = device.waits.total() - before
+    assert waits <= MOST_WAITS_OF_PLANE_SWEEP[count], device.list_waits("between stages")
+    expected = PlaneSweep()(views)
+    assert isinstance(found.gaussians.means, FakeCudaTensor)
+    assert len(found.gaussians) == len(expected.gaussians) > 100
+    assert torch.equal(found.pixel_index.cpu(), expected.pixel_index)
+    for ours, truth in zip(found.depths, expected.depths, strict=True):
+        assert_close(ours.depth.cpu(), truth.depth, "depth", 1e-4)
+    # Rounding grows in the fits, so that only what they are for is compared.
+    for view in views:
+        scores = [
+            psnr(
+                load_renderer("cpu").render(part.gaussians.to("cpu"), view.camera).image, view.image
+            )
+            for part in (found, expected)
+        ]
+        assert abs(scores[0] - scores[1]) < 0.1
+        assert scores[1] > 20
+
+
+def test_plane_sweep_stays_on_the_cpu_unless_the_device_is_chosen(device):
+    there = [view.to("cuda") for view in make_views()]
+    found = PlaneSweep()(there)
+    assert isinstance(found.gaussians.means, FakeCudaTensor)
+    here = [view.to("cpu") for view in there]
+    matched = load_reconstructor("plane-sweep", device="cuda")(here)
+    assert not isinstance(matched.gaussians.means, FakeCudaTensor)
+    for name in ("means", "opacities", "sh"):
+        ours, fitted = (getattr(part.gaussians, name).cpu() for part in (found, matched))
+        assert_close(ours, fitted, name, 1e-3)
+
+
+def test_a_synthesized_image_is_lifted_on_the_device(device):
+    views = [view.to("cuda") for view in make_views()]
+    mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    mask[:, :7] = True
+    found = load_reconstructor("plane-sweep", device="cuda").lift(views, mask.to("cuda"))
+    expected = PlaneSweep().lift([view.to("cpu") for view in views], mask)
+    assert isinstance(found.gaussians.means, FakeCudaTensor)
+    for name in ("means", "sh"):
+        ours = getattr(found.gaussians, name).cpu()
+        assert_close(ours, getattr(expected.gaussians, name), name, 1e-3)
 
 
 # `test_commands_on_a_device.py` updates a splat.

@@ -9,17 +9,17 @@ import torch
 from gscompleter.evaluation.metrics.image import compute_gradient_energy_ratio
 from gscompleter.numerics.kernels import stereo
 from gscompleter.numerics.kernels.stereo import TILE_COLUMNS, TILE_ROWS
-from gscompleter.reconstructors.plane_sweep import PlaneSweep, sweep
+from gscompleter.reconstructors.plane_sweep import PlaneSweep, matching, sweep
+from gscompleter.reconstructors.plane_sweep.matching import compute_costs
 from gscompleter.reconstructors.plane_sweep.rig import build_rig
 from gscompleter.reconstructors.plane_sweep.sweep import (
-    compute_costs,
     compute_plane_index,
     compute_tile_grid,
     make_bands,
     make_full_bands,
     make_guided_bands,
     place_planes,
-    sweep_view,
+    sweep_views,
 )
 from gscompleter.render.loading import load_renderer
 from gscompleter.types import sh_from_rgb
@@ -118,7 +118,7 @@ def test_paths_cross_from_band_to_band():
 
 def test_bands_around_a_guess_hold_the_truth_at_a_fraction_of_the_planes(rig):
     stereo_rig, views = rig
-    guess = sweep_view(0, stereo_rig.halve(), NEAR / stereo_rig.unit, FAR / stereo_rig.unit)
+    guess, _ = sweep_views(stereo_rig.halve(), NEAR / stereo_rig.unit, FAR / stereo_rig.unit)
     image = stereo_rig.images[0]
     sources = [(stereo_rig.images[1], stereo_rig.transforms[0, 1])]
     planes = place_planes(image, sources, NEAR / stereo_rig.unit, FAR / stereo_rig.unit)
@@ -153,16 +153,16 @@ def test_coarse_images_say_first_where_to_look_down_to_the_smallest(rig, monkeyp
         seen.append((reference.size, bands.start[-1]))
         return compute_costs(reference, sources, planes, bands)
 
-    monkeypatch.setattr(sweep, "compute_costs", counted)
+    monkeypatch.setattr(matching, "compute_costs", counted)
     monkeypatch.setattr(sweep, "MIN_GUIDED_SIDE", SIZE // 2)
-    guided = sweep.sweep_views(stereo_rig, *depths)
+    guided = sweep_views(stereo_rig, *depths)
     assert [size for size, _ in seen] == [
         (s, s) for s in (SIZE // 4, SIZE // 2, SIZE) for _ in "ab"
     ]
     work = sum(cells for _, cells in seen)
     seen.clear()
     monkeypatch.setattr(sweep, "MIN_GUIDED_SIDE", SIZE + 1)
-    plain = sweep.sweep_views(stereo_rig, *depths)
+    plain = sweep_views(stereo_rig, *depths)
     assert work < 0.6 * sum(cells for _, cells in seen)
     truth = stereo_rig.unit / views[0].depth.numpy()
     errors = [np.abs(sweeps[0].inverse - truth) / truth for sweeps in (guided, plain)]

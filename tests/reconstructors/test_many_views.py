@@ -46,8 +46,9 @@ from gscompleter.reconstructors.plane_sweep.fusion import (
     find_finest_pixels,
     find_free_pixels,
 )
+from gscompleter.reconstructors.plane_sweep.matching import UNSEEN_COST, compute_costs
 from gscompleter.reconstructors.plane_sweep.rig import build_rig, halve_image, halve_transform
-from gscompleter.reconstructors.plane_sweep.sweep import UNSEEN_COST, compute_costs, make_bands
+from gscompleter.reconstructors.plane_sweep.sweep import make_bands
 from gscompleter.types import merge
 from scenes import Room, camera_at, gaussians_of, view_of
 

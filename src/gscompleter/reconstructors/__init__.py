@@ -178,7 +178,7 @@ def _load_plane_sweep(weights: Path | None, device: str) -> Reconstructor:
 
     if weights is not None:
         raise InputError(f"plane-sweep takes no weights; leave out {quote_value(weights)}.")
-    return PlaneSweep()
+    return PlaneSweep(device=device)
 
 
 RECONSTRUCTORS: dict[str, Callable[[Path | None, str], Reconstructor]] = {
@@ -241,8 +241,8 @@ def load_reconstructor(
 
     The named ones have published weights unless others are given.
 
-    Published weights are downloaded if needed. `device` is that of the networks; `plane-sweep`
-    itself runs on the CPU. `depth` names the monocular depth that supports it.
+    Published weights are downloaded if needed. `device` is that of the networks, on which
+    `plane-sweep` matches photographs, too. `depth` names the monocular depth that supports it.
     """
     if is_in_file(name):
         reconstructor = load_own(name, weights)

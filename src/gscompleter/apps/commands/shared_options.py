@@ -97,8 +97,8 @@ class DepthOptions(RunOptions):
     renderer_device: Literal["cpu", "cuda"] | None = None
     """Device of the renderer and the photographs; as `--device` if not given."""
     network_device: Literal["cpu", "cuda", "mps"] | None = None
-    """Device of the networks alone: cuda for GPUs of NVIDIA and AMD, mps for those of a Mac; as
-    `--device` if not given."""
+    """Device of the networks and of plane-sweep alone: cuda for GPUs of NVIDIA and AMD, mps for
+    those of a Mac, which run networks only; as `--device` if not given."""
 
 
 @dataclass(frozen=True, kw_only=True)

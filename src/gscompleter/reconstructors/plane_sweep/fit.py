@@ -94,9 +94,9 @@ def fit_jointly(
     """
     check_views = emphasis.check_views
     order = shuffle_views(len(views), len(check_views), emphasis.find_refined(views))
-    backdrops = torch.rand(len(order), 3, generator=torch.Generator().manual_seed(0))
+    backdrops = torch.rand(len(order), 3, generator=torch.Generator().manual_seed(0)).to(gains)
     views = [*views, *check_views]
-    gains = torch.cat([gains, torch.ones(len(check_views), 3)])
+    gains = torch.cat([gains, gains.new_ones(len(check_views), 3)])
     unknown = init_parameters(gaussians)
     optimizer = Adam([(unknown[name], rate) for name, rate in FIT_RATES.items()], BETAS)
     for step, number in enumerate(order):

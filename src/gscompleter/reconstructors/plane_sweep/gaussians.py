@@ -69,6 +69,9 @@ class Splatter:
     disc_sigma: float = DISC_SIGMA
     """Standard deviation of a Gaussian across the viewing ray, in pixels."""
     renderer: Renderer = field(default_factory=lambda: load_renderer("cpu"))
+    """Renderer that Gaussians are fitted with."""
+    fit_device: str = "cpu"
+    """Device that it draws on."""
 
     def build_scene(
         self,
@@ -101,38 +104,43 @@ class Splatter:
             none = torch.zeros(0, dtype=torch.long, device=device)
             return Reconstruction(empty, tuple(depths), none, none)
 
-        on_cpu = [view.to("cpu") for view in views]
+        fitted_views = [view.to(self.fit_device) for view in views]
+        gains = gains.to(self.fit_device)
         candidates, kept, depths = self.fuse(normalized, depths, layers, transforms)
         # Nothing is reconstructed from masked pixels.
-        kept &= flatten_masks([view.valid_mask for view in on_cpu])
+        kept &= flatten_masks([view.valid_mask for view in fitted_views])
         if masks is not None:
             of_scene = candidates[kept]
-            on_cpu = ignore_elsewhere(of_scene, on_cpu, depths, masks)
-            kept = kept.masked_scatter(kept, find_in_valid(of_scene, on_cpu))
-        skies = self.extend_skies(normalized, depths)
-        scene = merge([candidates[kept], *(gaussians.to("cpu") for _, gaussians, _ in skies)])
+            fitted_views = ignore_elsewhere(of_scene, fitted_views, depths, masks)
+            kept = kept.masked_scatter(kept, find_in_valid(of_scene, fitted_views))
+        skies = [
+            (number, gaussians.to(self.fit_device), pixels.to(self.fit_device))
+            for number, gaussians, pixels in self.extend_skies(normalized, depths)
+        ]
+        scene = merge([candidates[kept], *(gaussians for _, gaussians, _ in skies)])
 
         photographs = [
             self.replace_ignored(scene, view, gain)
-            for view, gain in zip(on_cpu, gains, strict=True)
+            for view, gain in zip(fitted_views, gains, strict=True)
         ]
         # One or two views are not fitted jointly, and check views take no part in their fits.
         used = emphasis.check_views if len(views) > 2 else ()
-        checks = [self.prepare_check(scene, view.to("cpu"), gains) for view in used]
+        checks = [self.prepare_check(scene, view.to(self.fit_device), gains) for view in used]
         emphasis = replace(emphasis, check_views=checks)
         fitted = self.fit_gaussians(scene, photographs, gains, emphasis)
-        fitted = restore_sky_colors(scene, fitted, on_cpu[0].camera)
+        fitted = restore_sky_colors(scene, fitted, fitted_views[0].camera)
 
         # View and pixel of each Gaussian, in the order of the scene.
         sizes = [view.valid_mask.numel() for view in views]
-        pixels = torch.cat([torch.arange(size) for size in sizes])[kept]
-        numbers = torch.cat([torch.full((size,), i) for i, size in enumerate(sizes)])[kept]
-        sky_numbers = [torch.full((len(sky_pixels),), i) for i, _, sky_pixels in skies]
+        pixels = torch.cat([torch.arange(size) for size in sizes]).to(kept.device)[kept]
+        numbers = torch.cat([torch.full((size,), i) for i, size in enumerate(sizes)])
+        numbers = numbers.to(kept.device)[kept]
+        sky_numbers = [torch.full_like(sky_pixels, i) for i, _, sky_pixels in skies]
         return Reconstruction(
             fitted.to(device),
             tuple(depths),
             torch.cat([numbers, *sky_numbers]).to(device),
-            torch.cat([pixels, *(sky_pixels.cpu() for _, _, sky_pixels in skies)]).to(device),
+            torch.cat([pixels, *(sky_pixels for _, _, sky_pixels in skies)]).to(device),
             None if (gains == 1).all() else gains.to(device),
         )
 
@@ -142,8 +150,8 @@ class Splatter:
         """Lift the pixels of `pixel_mask` in the first view and fit their colours to it."""
         pixels = torch.nonzero(pixel_mask.reshape(-1))[:, 0]
         # Discs overlap, so that colours of the pixels alone would draw a blurred image.
-        blurred = self.splat(views[0], depths[0])[pixels].to("cpu")
-        lifted = self.fit_to_image(blurred, views[0].to("cpu")).to(pixels.device)
+        blurred = self.splat(views[0], depths[0])[pixels].to(self.fit_device)
+        lifted = self.fit_to_image(blurred, views[0].to(self.fit_device)).to(pixels.device)
         return Reconstruction(lifted, tuple(depths), torch.zeros_like(pixels), pixels)
 
     def fit_to_image(self, gaussians: Gaussians, view: View) -> Gaussians:
@@ -161,16 +169,16 @@ class Splatter:
     ) -> Bool[Tensor, "n"]:
         """Select the pixels that form the scene: a mask over the pixels of all views in turn."""
         if len(views) <= 2:
-            return torch.ones(len(gaussians), dtype=torch.bool)
+            return torch.ones_like(gaussians.opacities, dtype=torch.bool)
         # `free` marks pixels without contradiction: other views do not see through their points.
         free = find_free_pixels(layers, transforms)
-        kept = flatten_masks(find_finest_pixels(layers, free, transforms))
+        kept = flatten_masks(find_finest_pixels(layers, free, transforms)).to(self.fit_device)
         # Where the finer views do not close a surface, a view gets its own pixels back. Each view
         # sees what those before it restored.
         start = 0
         for view, mask in zip(views, free, strict=True):
             alpha = self.renderer.render(gaussians[kept], view.camera).alpha
-            gap = torch.from_numpy(mask) & (alpha < CLOSED_ALPHA)
+            gap = torch.from_numpy(mask).to(alpha.device) & (alpha < CLOSED_ALPHA)
             kept[start : start + gap.numel()] |= gap.reshape(-1)
             start += gap.numel()
         return kept
@@ -184,17 +192,16 @@ class Splatter:
     ) -> tuple[Gaussians, Bool[Tensor, "n"], Sequence[DepthMap]]:
         """Create a disc for every pixel of every view, and mark those that form the scene.
 
-        Return them on the CPU, with the depths that they stand at: what only one of several
-        photographs shows leaves the free space of the others.
+        Return them where they are fitted, with the depths that they stand at: what only one of
+        several photographs shows leaves the free space of the others.
         """
-        on_cpu = [view.to("cpu") for view in views]
+        fitted_views = [view.to(self.fit_device) for view in views]
         candidates = self.splat_all(views, depths)
-        kept = self.select_pixels(candidates, on_cpu, layers, transforms)
+        kept = self.select_pixels(candidates, fitted_views, layers, transforms)
         if len(views) <= 2:
             return candidates, kept, depths
-        moved = leave_free_space(
-            layers, self.find_open_pixels(candidates[kept], on_cpu), transforms
-        )
+        open_pixels = self.find_open_pixels(candidates[kept], fitted_views)
+        moved = leave_free_space(layers, open_pixels, transforms)
         if all(after is before for after, before in zip(moved, layers, strict=True)):
             return candidates, kept, depths
         depths = [
@@ -202,22 +209,21 @@ class Splatter:
             for depth, before, after in zip(depths, layers, moved, strict=True)
         ]
         candidates = self.splat_all(views, depths)
-        return candidates, self.select_pixels(candidates, on_cpu, moved, transforms), depths
+        return candidates, self.select_pixels(candidates, fitted_views, moved, transforms), depths
 
     def find_open_pixels(self, gaussians: Gaussians, views: Sequence[View]) -> list[Mask]:
         """Find the pixels of each view that Gaussians do not cover, apart from ignored ones."""
         return [
-            (
-                (self.renderer.render(gaussians, view.camera).alpha < CLOSED_ALPHA)
-                & view.valid_mask
-            ).numpy()
+            ((self.renderer.render(gaussians, view.camera).alpha < CLOSED_ALPHA) & view.valid_mask)
+            .cpu()
+            .numpy()
             for view in views
         ]
 
     def splat_all(self, views: Sequence[View], depths: Sequence[DepthMap]) -> Gaussians:
-        """Create the discs of all pixels of all views in turn, on the CPU."""
+        """Create the discs of all pixels of all views in turn, where they are fitted."""
         parts = [self.splat(view, depth) for view, depth in zip(views, depths, strict=True)]
-        return merge(parts).to("cpu")
+        return merge(parts).to(self.fit_device)
 
     def replace_ignored(self, scene: Gaussians, view: View, gain: Float[Tensor, "3"]) -> View:
         """Replace ignored pixels by the render, so that nothing is fitted to them."""
@@ -234,7 +240,7 @@ class Splatter:
         if (gains != 1).any() and not is_open.all():
             shown = ~is_open
             log, _ = measure_ratio(
-                view.image[shown].numpy(), render.image[shown].numpy(), is_open.numel()
+                view.image[shown].cpu().numpy(), render.image[shown].cpu().numpy(), is_open.numel()
             )
             view = view.normalize_exposure(torch.from_numpy(log).exp().to(view.image))
         return self.replace_ignored(
@@ -295,15 +301,17 @@ def ignore_elsewhere(
 ) -> list[View]:
     """Ignore the pixels of each view that show nothing of what the masks of all views show.
 
-    `gaussians` are those of the pixels, of which a surface has one for all views; all on the CPU.
+    `gaussians` are those of the pixels, of which a surface has one for all views; the views are on
+    their device.
     """
-    maps = [depth.depth.cpu() for depth in depths]
-    masks = [mask.cpu() for mask in masks]
+    device = gaussians.means.device
+    maps = [depth.depth.to(device) for depth in depths]
+    masks = [mask.to(device) for mask in masks]
     visible = [
         find_at_depth(gaussians, depth, view.camera)
         for depth, view in zip(maps, views, strict=True)
     ]
-    shown = torch.zeros(len(gaussians), dtype=torch.bool)
+    shown = torch.zeros_like(gaussians.opacities, dtype=torch.bool)
     for is_visible, mask, view in zip(visible, masks, views, strict=True):
         shown |= is_visible & look_up(mask, gaussians, view.camera)
 
@@ -317,7 +325,7 @@ def ignore_elsewhere(
 
 def find_in_valid(gaussians: Gaussians, views: Sequence[View]) -> Bool[Tensor, "n"]:
     """Find the Gaussians whose means project onto a valid pixel of any view, hidden or not."""
-    found = torch.zeros(len(gaussians), dtype=torch.bool)
+    found = torch.zeros_like(gaussians.opacities, dtype=torch.bool)
     for view in views:
         found |= look_up(view.valid_mask, gaussians, view.camera)
     return found

@@ -184,7 +184,7 @@ class ColorEquations:
     def build(moments: Moments, spread: Float[Tensor, "n 3 3"]) -> ColorEquations:
         """Build the equations; a colour change as wide as the rays of the photographs costs."""
         total = moments.total.clamp_min(DAMPED_BLEND_WEIGHT)
-        smallest = LINEAR_ANGLE**2 * torch.eye(3)
+        smallest = LINEAR_ANGLE**2 * torch.eye(3, device=total.device)
         damping = LINEAR_PENALTY * total[..., None] * (spread + smallest)
         square = moments.second + damping
         complement = square - multiply_outer(moments.first, moments.first / total)

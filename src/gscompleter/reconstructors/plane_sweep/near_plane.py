@@ -24,12 +24,12 @@ MAX_STEPS = 3
 """Most times that the distance of the near plane is halved."""
 
 
-def find_near_plane(views: Sequence[View], near: float, far: float) -> float:
+def find_near_plane(views: Sequence[View], near: float, far: float, device: str = "cpu") -> float:
     """Halve the distance of the near plane, in scene units, while surfaces stand before it.
 
     Small images tell it in the time of a few percent of a reconstruction.
     """
-    rig = build_rig(views)
+    rig = build_rig(views, device)
     while min(min(image.size) for image in rig.images) >= MIN_GUIDED_SIDE:
         rig = rig.halve()
     for _ in range(MAX_STEPS):

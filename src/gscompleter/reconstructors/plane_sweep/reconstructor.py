@@ -24,6 +24,7 @@ from gscompleter.reconstructors.depth_predictors import (
 )
 from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.reconstructors.features.stereo_image import StereoImage
+from gscompleter.reconstructors.plane_sweep.depth_devices import get_depth_device
 from gscompleter.reconstructors.plane_sweep.emphasis import Emphasis
 from gscompleter.reconstructors.plane_sweep.fusion import DepthLayer
 from gscompleter.reconstructors.plane_sweep.gaussians import Splatter
@@ -49,6 +50,7 @@ from gscompleter.reconstructors.plane_sweep.sweep import (
     compute_inverse_depth,
     measure_depths,
 )
+from gscompleter.render.loading import load_renderer
 from gscompleter.system.errors import join_names
 from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import Camera, ChooseMasks, DepthMap, Reconstruction, View
@@ -72,11 +74,18 @@ class PlaneSweep(Splatter):
 
     predict_depth: DepthPredictor = predict_nothing
     """Monocular depth, used where stereo measures nothing and confirms it elsewhere."""
+    device: str = "cpu"
+    """Device that matches photographs and fits surfaces, by the names of torch. Where the
+    photographs lie on a GPU and this is one, Gaussians are fitted there as well."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError for a device that plane-sweep does not know."""
+        get_depth_device(self.device)
 
     @run_in_plain_torch
     def __call__(self, views: Sequence[View]) -> Reconstruction:
         """Reconstruct the scene and the depth of every pixel."""
-        return self.reconstruct(views)
+        return self.fit_at(views).reconstruct(views)
 
     @run_in_plain_torch
     def reconstruct_part(self, views: Sequence[View], choose_masks: ChooseMasks) -> Reconstruction:
@@ -84,7 +93,7 @@ class PlaneSweep(Splatter):
 
         Half of the time is that of the fit to the photographs, which grows with what is fitted.
         """
-        return self.reconstruct(views, choose_masks)
+        return self.fit_at(views).reconstruct(views, choose_masks)
 
     @run_in_plain_torch
     def reconstruct_and_fit(
@@ -94,7 +103,18 @@ class PlaneSweep(Splatter):
 
         From three of them on it is fitted to `check_views`, too, and to those near `targets` most.
         """
-        return self.reconstruct(views, None, Emphasis(check_views, targets))
+        return self.fit_at(views).reconstruct(views, None, Emphasis(check_views, targets))
+
+    def fit_at(self, views: Sequence[View]) -> PlaneSweep:
+        """Fit Gaussians on the GPU of the photographs, if they lie on one and it is to be used.
+
+        They lie there only if its renderer is used.
+        """
+        here = views[0].image.device
+        is_chosen = self.device.partition(":")[0] == "cuda"
+        if here.type != "cuda" or not is_chosen:
+            return self
+        return replace(self, renderer=load_renderer("cuda"), fit_device=str(here))
 
     def reconstruct(
         self,
@@ -105,7 +125,7 @@ class PlaneSweep(Splatter):
         """Reconstruct everything, or what any view shows in its mask, and fit it to all views."""
         check_given_views(views)
         views = set_depth_range(views, *get_depth_range(views))
-        rig = build_rig(views)
+        rig = build_rig(views, self.device)
         contradicted = find_contradicted(rig, views)
         rig = rig.drop_given(contradicted)
         name = partial(name_photographs, views)
@@ -147,7 +167,7 @@ class PlaneSweep(Splatter):
 
     def find_near_plane(self, views: Sequence[View], near: float, far: float) -> float:
         """Find a near plane that no surface of the photographs stands before; at most `near`."""
-        return near if len(views) == 1 else find_near_plane(views, near, far)
+        return near if len(views) == 1 else find_near_plane(views, near, far, self.device)
 
     @run_in_plain_torch
     def lift(self, views: Sequence[View], pixel_mask: Bool[Tensor, "h w"]) -> Reconstruction:
@@ -160,8 +180,8 @@ class PlaneSweep(Splatter):
         """
         views = set_depth_range(views, *get_depth_range(views))
         if len(views[1].known_depths) and measure_baseline(*(v.camera for v in views)) == 0:
-            return self.lift_in_place(views[0], views[1], pixel_mask)
-        rig = build_rig(views)
+            return self.fit_at(views).lift_in_place(views[0], views[1], pixel_mask)
+        rig = build_rig(views, self.device)
         first, second = match_views(rig, views, MIN_HALVED_LIFT)
         first = add_given(first, rig.images[0])
 
@@ -172,10 +192,13 @@ class PlaneSweep(Splatter):
         # What the additions do to the photographs is the business of the guards.
         (part,) = self.support(rig, views[:1], [first], [sky_of_first])
         layers = [
-            make_layer(rig.images[0], part.measured.exclude(sky_of_first), LIFT_ITERATIONS),
-            make_layer(rig.images[1], second.exclude(sky_of_second), 0),
+            make_layer(
+                rig.images[0], part.measured.exclude(sky_of_first), rig.device, LIFT_ITERATIONS
+            ),
+            make_layer(rig.images[1], second.exclude(sky_of_second), rig.device, 0),
         ]
-        lifted = self.lift_pixels(views, make_depth_maps(layers, rig.unit, views), pixel_mask)
+        depths = make_depth_maps(layers, rig.unit, views)
+        lifted = self.fit_at(views).lift_pixels(views, depths, pixel_mask)
         return replace(lifted, notes=describe_support([part], lambda _: "the synthesized image"))
 
     def lift_in_place(
@@ -197,7 +220,7 @@ class PlaneSweep(Splatter):
     def estimate_depths(self, views: Sequence[View]) -> list[DepthMap]:
         """Estimate z-depth and confidence of every pixel, in scene units."""
         views = set_depth_range(views, *get_depth_range(views))
-        rig = build_rig(views)
+        rig = build_rig(views, self.device)
         return make_depth_maps(self.compute_layers(rig, views), rig.unit, views)
 
     def compute_layers(self, rig: Rig, views: Sequence[View]) -> list[DepthLayer]:
@@ -248,10 +271,10 @@ class PlaneSweep(Splatter):
 
     def measure_error(self, view: View, scene: Reconstruction, number: int) -> float:
         """Measure the mean squared colour error of a photograph, apart from ignored pixels."""
-        seen = view.to("cpu")
-        image = self.renderer.render(scene.gaussians.to("cpu"), seen.camera).image
+        seen = view.to(self.fit_device)
+        image = self.renderer.render(scene.gaussians.to(self.fit_device), seen.camera).image
         if scene.exposure_gains is not None:
-            image = image * scene.exposure_gains[number].cpu()
+            image = image * scene.exposure_gains[number].to(image)
         error = (image - seen.image)[seen.valid_mask].double().square()
         return float(error.mean()) if error.numel() else 0.0
 
@@ -297,7 +320,8 @@ def complete_layers(
     They are fitted without the sky, as its matches are arbitrary, and it gets its depth afterwards.
     """
     without_sky = [part.exclude(sky) for part, sky in zip(observed, skies, strict=True)]
-    surfaces = map_in_parallel(make_layer, rig.images, without_sky)
+    devices = [rig.device] * len(rig.images)
+    surfaces = map_in_parallel(make_layer, rig.images, without_sky, devices)
     return [
         add_sky(surface, measurement, sky)
         for surface, measurement, sky in zip(surfaces, measured, skies, strict=True)
@@ -332,11 +356,15 @@ def match_views(
 
 
 def make_layer(
-    image: StereoImage, measured: Measurement, iterations: int = SMOOTHING_ITERATIONS
+    image: StereoImage,
+    measured: Measurement,
+    device: str,
+    iterations: int = SMOOTHING_ITERATIONS,
 ) -> DepthLayer:
     """Convert the measured depths of a view to a layer, by surfaces after so many iterations."""
     full = measured.resize_to(image.size)
-    index = fit_surfaces(full.index, full.weight, image.image, iterations)
+    choose_fit = get_depth_device(device).choose_fit
+    index = fit_surfaces(full.index, full.weight, image.image, iterations, choose_fit)
     return DepthLayer(image, compute_inverse_depth(full.planes, index), full.confidence)
 
 

@@ -45,6 +45,8 @@ class Rig:
     """Widest baseline in scene units; stereo lengths are multiples of it."""
     neighbours: Neighbours
     transforms: Transforms
+    device: str = "cpu"
+    """Device that matches the images and fits surfaces (`depth_devices`)."""
 
     def halve(self) -> Rig:
         """Halve the size of all images."""
@@ -62,7 +64,7 @@ class Rig:
         )
 
 
-def build_rig(views: Sequence[View]) -> Rig:
+def build_rig(views: Sequence[View], device: str = "cpu") -> Rig:
     """Relate the views by their poses, corrected to fit the feature matches."""
     images, unit = make_stereo_images(views)
     neighbours = find_neighbours(images) if len(images) > 1 else Neighbours(((),), {})
@@ -74,7 +76,7 @@ def build_rig(views: Sequence[View]) -> Rig:
             source = rotate_to_matches(images[i], source, *neighbours.matches[i, j])
         transforms[i, j] = compute_source_from_reference(images[i], source)
         transforms[j, i] = compute_source_from_reference(source, images[i])
-    return Rig(images, unit, neighbours, transforms)
+    return Rig(images, unit, neighbours, transforms, device)
 
 
 def halve_image(image: StereoImage) -> StereoImage:

@@ -6,6 +6,9 @@ on a plane, so a map with little bending consists of planes, which continue into
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Protocol, runtime_checkable
+
 import cv2
 import numpy as np
 import torch
@@ -37,15 +40,36 @@ SMOOTHING_ITERATIONS = 100
 """Iterations on the finest level, doubled on each coarser one."""
 
 
+@runtime_checkable
+class FitHeights(Protocol):
+    """A fit of heights and their gradients, in place, as `fit` of the kernel `tgv`."""
+
+    def __call__(
+        self,
+        heights: AnyMap,
+        gradients: Float32[np.ndarray, "2 _ _"],
+        data: AnyMap,
+        weight: AnyMap,
+        across: AnyMap,
+        down: AnyMap,
+        bend: np.float32,
+        tolerance: np.float32,
+        iterations: int,
+    ) -> None:
+        """Run the iterations of one level."""
+
+
 def fit_surfaces(
     measured: LevelMap,
     confidence: LevelMap,
     image: ColorImage,
     iterations: int = SMOOTHING_ITERATIONS,
+    choose_fit: Callable[[int], FitHeights] = lambda _: tgv.fit,
 ) -> LevelMap:
     """Fit inverse depths to measurements with weights in [0, 1].
 
-    Without a positive weight or an iteration they stay as measured.
+    Without a positive weight or an iteration they stay as measured. `choose_fit` returns
+    the fit of a level with so many pixels.
     """
     if iterations == 0 or not (confidence > 0).any():
         return measured
@@ -69,7 +93,7 @@ def fit_surfaces(
         # So costs per pixel shrink, those of steps by 2 ** number, those of bends by its square.
         scale = 2.0**number
         step_right, step_down = compute_step_costs(colours)
-        tgv.fit(
+        choose_fit(data.size)(
             heights,
             gradients,
             data,

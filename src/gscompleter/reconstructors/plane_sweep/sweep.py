@@ -15,22 +15,19 @@ from functools import cached_property
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float32, Int, Int16, UInt8
+from jaxtyping import Bool, Float32, Int
 
 from gscompleter.numerics.kernels import stereo
 from gscompleter.numerics.kernels.stereo import TILE_COLUMNS, TILE_ROWS, Bands
-from gscompleter.reconstructors.features.neighbours import NUM_SOURCES
-from gscompleter.reconstructors.features.stereo_image import StereoImage, compute_contrast
+from gscompleter.reconstructors.features.stereo_image import StereoImage
+from gscompleter.reconstructors.plane_sweep.depth_devices import get_depth_device
+from gscompleter.reconstructors.plane_sweep.matching import Planes, PlaneSearch, Source
 from gscompleter.reconstructors.plane_sweep.rig import Rig, Transform
 
 Map = Float32[np.ndarray, "_ _"]
 Mask = Bool[np.ndarray, "_ _"]
 Neighbour = tuple[Map, Transform, Transform]
 """Inverse depths of another view, and the transforms to its pixels and back."""
-Planes = Float32[np.ndarray, "d"]
-"""Inverse depths from far to near, evenly spaced."""
-Source = tuple[StereoImage, Transform]
-"""Another view, and the transform from reference pixels to its pixels."""
 
 MAX_RETURN_ERROR = 1.5
 """Largest error, in pixels, of a match that is reprojected to the other view and back."""
@@ -59,33 +56,6 @@ GUESS_MARGIN = 1
 """Margin in pixels of the first guess by which a band includes surrounding depths."""
 EXTRA_PLANES = 3
 """Extra planes on both sides of the guessed range."""
-
-CORRELATION_RADIUS = 2
-"""Radius of the correlation window, in pixels."""
-IMAGE_NOISE = np.float32(0.015)
-"""Standard deviation of the image noise; weaker texture does not correlate."""
-PIXEL_WEIGHT = np.float32(0.4)
-"""Weight of the per-pixel difference in the cost; the rest is window correlation."""
-GIVEN_SHARE = np.float32(1 / 8)
-"""Weight of the matching cost at pixels with given depth."""
-GIVEN_COST = np.float32(60)
-"""Cost of each plane between a pixel's given depth and the plane it is matched at."""
-UNSEEN_COST = np.uint8(140)
-"""Cost, from 0 to 254, of a plane at which no other view observes the pixel."""
-
-MAX_COST = np.uint8(254)
-"""Largest cost of a plane that a source sees."""
-COVERING_PENALTY = np.uint8(16)
-"""Additional cost in a source that was chosen for what it covers. It often stands so near that all
-planes look alike in it: without, depth gets coarser, and if it counts only where no other source
-sees the plane, near things at the side of a photograph are lost."""
-
-SMALL_PENALTY = 25
-"""Cost of a change by one plane between neighbouring pixels."""
-LARGE_PENALTY = 300
-"""Cost of a larger jump between neighbouring pixels of the same colour."""
-JUMP_CONTRAST = np.float32(0.06)
-"""Colour difference at which the penalty of a jump is halved."""
 
 
 @dataclass(frozen=True)
@@ -227,15 +197,25 @@ def find_hidden_pixels(background: Map, neighbours: Sequence[Neighbour]) -> Mask
 def sweep_views(rig: Rig, near: float, far: float) -> list[Sweep]:
     """Sweep all views, coarse to fine; `near` and `far` are in widest baselines."""
     numbers = range(len(rig.images))
-    shortest_side = min(min(image.size) for image in rig.images)
-    if shortest_side < MIN_GUIDED_SIDE:
-        return [sweep_view(i, rig, near, far) for i in numbers]
-    guesses = sweep_views(rig.halve(), near, far)
-    return [sweep_view(i, rig, near, far, guesses[i]) for i in numbers]
+    guesses: list[Sweep | None] = [None] * len(rig.images)
+    if min(min(image.size) for image in rig.images) >= MIN_GUIDED_SIDE:
+        guesses = [*sweep_views(rig.halve(), near, far)]
+    searches = [
+        plan_search(number, rig, near, far, guess)
+        for number, guess in zip(numbers, guesses, strict=True)
+    ]
+    found = get_depth_device(rig.device).find_planes(searches)
+    sweeps = []
+    for search, guess, (index, margin) in zip(searches, guesses, found, strict=True):
+        if guess is not None:
+            # A narrow band leaves out rivals of the best plane; the half-size sweep has seen them.
+            margin = np.minimum(margin, repeat_pixels(guess.margin, search.reference.size))
+        sweeps.append(Sweep(search.planes, index, margin))
+    return sweeps
 
 
-def sweep_view(number: int, rig: Rig, near: float, far: float, guess: Sweep | None = None) -> Sweep:
-    """Find the best planes of one view, near the half-size `guess` if there is one."""
+def plan_search(number: int, rig: Rig, near: float, far: float, guess: Sweep | None) -> PlaneSearch:
+    """Plan which planes of one view are matched: near the half-size `guess` if there is one."""
     image = rig.images[number]
     others = rig.neighbours.neighbours_of[number]
     sources = [(rig.images[i], rig.transforms[number, i]) for i in others]
@@ -244,19 +224,12 @@ def sweep_view(number: int, rig: Rig, near: float, far: float, guess: Sweep | No
     if guess is not None:
         likely = compute_plane_index(planes, guess.inverse)
         bands = make_guided_bands(likely, 2, image.size, len(planes))
-    costs = compute_costs(image, sources, planes, bands)
 
     # A given depth enters the costs before they are aggregated, so that it spreads to the pixels
-    # around it (decision 046). The kernel takes -1 as unknown.
+    # around it (decision 046).
     given = compute_plane_index(planes, image.given).clip(0, len(planes) - 1)
-    stereo.prefer_given(costs, bands, np.where(image.given > 0, given, -1), GIVEN_SHARE, GIVEN_COST)
-
-    totals = aggregate(costs, bands, image)
-    index, margin = stereo.select_planes(totals, bands, *image.size)
-    if guess is not None:
-        # A narrow band leaves out rivals of the best plane; the half-size sweep has seen them.
-        margin = np.minimum(margin, repeat_pixels(guess.margin, image.size))
-    return Sweep(planes, index, margin)
+    given = np.where(image.given > 0, given, np.float32(-1))
+    return PlaneSearch(image, sources, planes, bands, given)
 
 
 def place_planes(
@@ -345,60 +318,6 @@ def make_bands(
     costs = heights[:, None] * widths * (high - low)
     start = np.append(0, np.cumsum(costs, dtype=np.int64))
     return Bands(low.astype(np.int32), high.astype(np.int32), start)
-
-
-def compute_costs(
-    reference: StereoImage, sources: Sequence[Source], planes: Planes, bands: Bands
-) -> UInt8[np.ndarray, "cells"]:
-    """Compute costs (0 to 254) of the planes in `bands`; the best source view counts.
-
-    The best, rather than the mean: a surface that one source sees may be occluded in the others.
-    Those from `NUM_SOURCES` on cover what the first ones leave out, and cost more where these see a
-    plane.
-    """
-    costs = [
-        stereo.compute_matching_costs(
-            reference.image,
-            source.image,
-            transform,
-            planes,
-            bands,
-            CORRELATION_RADIUS,
-            IMAGE_NOISE,
-            PIXEL_WEIGHT,
-        )
-        for source, transform in sources
-    ]
-    best = np.minimum.reduce(costs[:NUM_SOURCES])
-    for covering in costs[NUM_SOURCES:]:
-        dearer = np.minimum(covering, MAX_COST - COVERING_PENALTY) + COVERING_PENALTY
-        best = np.where(best == stereo.UNSEEN, covering, np.minimum(best, dearer))
-    return np.where(best == stereo.UNSEEN, UNSEEN_COST, best)
-
-
-def aggregate(
-    costs: UInt8[np.ndarray, "cells"], bands: Bands, reference: StereoImage
-) -> Int16[np.ndarray, "cells"]:
-    """Sum the costs along eight paths through the image; jumps are cheap at image edges."""
-    image = reference.image
-
-    def jump(
-        a: Float32[np.ndarray, "r c 3"], b: Float32[np.ndarray, "r c 3"]
-    ) -> Int16[np.ndarray, "r c"]:
-        penalty = LARGE_PENALTY / (1 + compute_contrast(a, b) / JUMP_CONTRAST)
-        # Even at the strongest edge a jump is dearer than a change by one plane (P2 > P1).
-        return np.rint(np.maximum(penalty, 1.5 * SMALL_PENALTY)).astype(np.int16)
-
-    # Neighbours along rows, columns and both diagonals; each pair serves two opposite paths.
-    return stereo.aggregate_semi_globally(
-        costs,
-        bands,
-        jump(image[:, 1:], image[:, :-1]),
-        jump(image[1:], image[:-1]),
-        jump(image[1:, 1:], image[:-1, :-1]),
-        jump(image[:-1, 1:], image[1:, :-1]),
-        np.int16(SMALL_PENALTY),
-    )
 
 
 def compute_inverse_depth(planes: Planes, index: Map) -> Map:
