@@ -42,9 +42,7 @@ def test_another_exposure_counts_for_neither():
     far = [shift(view, 0.1) for view in PHOTOS]
     near = [shift(view, 0.05) for view in PHOTOS]
     expected = compare_poses(SPLAT, far, near, RENDERER)
-    far, near = (
-        [replace(view, image=0.8 * view.image) for view in views] for views in (far, near)
-    )
+    far, near = ([replace(view, image=0.8 * view.image) for view in views] for views in (far, near))
     compared = compare_poses(SPLAT, far, near, RENDERER)
     # A gain scales the errors of both alike.
     margin = expected.refined - expected.given

@@ -82,7 +82,7 @@ class ConvertOptions(WritingOptions):
     `generated` in a .ply, no file beside other formats), nor who made them."""
 
     def check_overlap(self) -> None:
-        """Refuse to write over an input, or over a file that the index of a streamed scene names."""
+        """Refuse to write over an input, and over what the index of a streamed scene names."""
         # Imported here, so that help pages do not wait for torch.
         with import_without_collection():
             from gscompleter.splats.streamed import is_streamed, list_streamed_files

@@ -33,8 +33,8 @@ def compare_poses(
     `given` and `refined` are the same photographs. Pixels count where the splat is opaque from both
     cameras, after the exposure is matched for each. None if no photograph has enough of them.
     """
-    given_psnrs = []
-    refined_psnrs = []
+    given_psnrs: list[float] = []
+    refined_psnrs: list[float] = []
     for photograph, at_refined in zip(given, refined, strict=True):
         given_render = render_from(scene, photograph.camera, renderer)
         refined_render = render_from(scene, at_refined.camera, renderer)
