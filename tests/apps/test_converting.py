@@ -190,11 +190,39 @@ def test_a_level_and_three_bands_have_to_be_asked_for(tmp_path, monkeypatch, cap
 
     wide = tmp_path / "wide.ply"
     write_degree_4_ply(wide, random_gaussians(20, sh_degree=3))
-    assert run(monkeypatch, "convert", wide, tmp_path / "b.ply", "--quiet") == 2
-    assert "left out: 3 (--bands)" in capsys.readouterr().err
-    for name in ("b.ply", "b.spz"):
-        assert run(monkeypatch, "convert", wide, tmp_path / name, "--bands", 3, "--quiet") == 0
-        assert load_splat(tmp_path / name).sh_degree == 3
+    # Both ways, through memory and through the file, and whether it is edited on the way or not.
+    edits = ((), ("--crop-sphere", 0, 0, 0, 1000), ("--translate", 1, 0, 0), ("--decimate", "50%"))
+    for number, edit in enumerate(edits):
+        for ending in (".ply", ".spz"):
+            out = tmp_path / f"b{number}{ending}"
+            words = ("convert", wide, out, *edit, "--quiet")
+            assert run(monkeypatch, *words) == 2
+            assert "left out: 3 (--bands)" in capsys.readouterr().err
+            assert not out.exists()
+            assert run(monkeypatch, *words, "--bands", 3) == 0
+            assert load_splat(out).sh_degree == 3
+
+
+def test_a_file_of_a_streamed_scene_is_not_written_over(tmp_path, monkeypatch, capsys):
+    """The index is the input that was named, and its files are read as well."""
+    write_sog(tmp_path / "fine.sog", sog_files(plausible(40)))
+    given = (tmp_path / "fine.sog").read_bytes()
+    index = {"lodLevels": 1, "filenames": ["fine.sog"]}
+    index["tree"] = {"lods": {"0": {"file": 0, "offset": 0, "count": 30}}}
+    path = tmp_path / "lod-meta.json"
+    path.write_text(json.dumps(index))
+    words = ("convert", path, tmp_path / "fine.sog", "--level", 0, "--overwrite", "--quiet")
+    assert run(monkeypatch, *words) == 2
+    assert "fine.sog is the input" in capsys.readouterr().err
+    assert (tmp_path / "fine.sog").read_bytes() == given
+    # Beside them there is room.
+    assert run(monkeypatch, "convert", path, tmp_path / "30.ply", "--level", 0, "--quiet") == 0
+    assert len(load_splat(tmp_path / "30.ply")) == 30
+
+    for content in ("[]", '{"filenames": 3}'):
+        path.write_text(content)
+        assert run(monkeypatch, "convert", path, tmp_path / "b.ply", "--level", 0) == 2
+        assert "is no index of levels" in capsys.readouterr().err
 
 
 def test_a_plain_ply_of_another_name_is_named(tmp_path, monkeypatch, capsys):

@@ -242,7 +242,7 @@ def test_a_page_names_nothing_outside_of_itself():
 
 def test_a_large_scene_is_held_in_parts(tmp_path, monkeypatch):
     whole, _ = make_page(room_exhibit(), NONE)
-    monkeypatch.setattr(pages, "PART", 20_000)
+    monkeypatch.setattr(pages, "MAX_SCRIPT_BYTES", 20_000)
     page, _ = make_page(room_exhibit(), NONE)
     assert page.count(b'gscPart("') > 2
     for layer in ("observed", "generated"):
@@ -269,6 +269,20 @@ def test_a_scene_without_cameras_has_one_that_sees_it():
     # It looks along -z of the page at its origin, which is the middle of the scene.
     assert np.array_equal(pose[:3, :3], np.eye(3))
     assert abs(pose[2, 3] - shot["focus"]) < 0.5 * shot["focus"]
+
+
+@pytest.mark.parametrize("size", [1e-4, 1.0, 300.0])
+def test_gaussians_in_one_place_are_seen_from_outside(size):
+    """Their distances do not tell how large they are, in whatever unit."""
+    one = room_exhibit().after[:1]
+    one = replace(one, means=one.means + 5, scales=torch.full_like(one.scales, size))
+    for count in (1, 3):
+        exhibit = ViewerContent("one", one[torch.zeros(count, dtype=torch.long)], None)
+        content = content_of(make_page(exhibit, NONE)[0])
+        pose = np.array(content["shots"][0]["pose"]).reshape(4, 4)
+        shown = size / content["frame"]["unit"]
+        assert pose[2, 3] > 4 * shown
+        assert 1 < shown < 8
 
 
 def test_a_camera_looks_as_far_as_what_it_sees():

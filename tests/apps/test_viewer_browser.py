@@ -355,7 +355,7 @@ def test_a_link_plays_the_path_until_it_is_paused(saved, played_browser):
 def test_the_parts_of_a_large_scene_are_put_together(
     browser, exhibit, libraries, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(pages, "PART", 100_000)
+    monkeypatch.setattr(pages, "MAX_SCRIPT_BYTES", 100_000)
     (tmp_path / "page.html").write_bytes(make_page(exhibit, libraries)[0])
     tab = Window(browser, tmp_path / "page.html", 320, 240)
     assert tab.do("gsc.stats()")["frames"] > 0

@@ -9,7 +9,13 @@ import torch
 
 from gscompleter import GSCompleter, load_renderer
 from gscompleter.config import CompleterConfig
-from gscompleter.editing.replacing import fade_before_returned, find_contested
+from gscompleter.editing.replacing import (
+    Contested,
+    fade_before_returned,
+    find_contested,
+    let_step_aside,
+    return_needed,
+)
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.parts import OBSERVED, PartOrigin, make_part
 from gscompleter.render.cache import SceneRenderer
@@ -162,6 +168,42 @@ def test_additions_before_what_returned_fade():
     # Renders are exact, so that no error at all is allowed.
     for error, limit in zip(limit_errors(renders, views, 0.0), limits, strict=True):
         assert error <= limit + 1e-7
+
+
+def hide_columns(view: View, columns: slice) -> View:
+    hidden = torch.zeros(SIZE, SIZE, dtype=torch.bool)
+    hidden[:, columns] = True
+    return replace(view, ignore_mask=hidden)
+
+
+def test_what_gave_way_returns_where_all_that_photographs_added_fades():
+    """Additions are right at the front box, and mostly wrong boards before the one beside it.
+
+    One photograph shows the first alone, which gave way; the other shows the boards alone, by
+    which all additions go.
+    """
+    low, high = (torch.tensor(corner) for corner in ROOM.boxes[2])
+    is_beside = ((WHOLE.means > low - 0.05) & (WHOLE.means < high + 0.05)).all(dim=1)
+    is_crate = find_crate(WHOLE)
+    # A little before its true place, in front of the additions.
+    crate = replace(WHOLE[is_crate], means=0.97 * WHOLE.means[is_crate])
+    rest = WHOLE[~is_crate & ~is_beside]
+    scene = merge([rest, crate, WHOLE[is_beside]])
+    photos = [hide_columns(PHOTOS[2], slice(0, 28)), hide_columns(PHOTOS[3], slice(22, None))]
+    given = begin(scene, marks=False, config=replace(SPLAT, add_observed=False), photos=photos)
+    contested = Contested(given, torch.arange(len(scene)) >= len(rest))
+    boards = [make_observed_again(make_board(2.3 + 0.04 * step, x=0.9)) for step in range(10)]
+    added = make_part(PartOrigin("photographs"), merge([WHOLE[is_crate], *boards]))
+    state = replace(let_step_aside(given, contested), added_parts=(added,))
+
+    returned = return_needed(state, contested, SCENES)
+    assert returned.added_parts == ()
+    for view in photos:
+        before, after = (
+            psnr(view.fill_ignored(RENDERER.render(s, view.camera).image.clamp(0, 1)), view.image)
+            for s in (scene, returned.scene)
+        )
+        assert after > before - 0.02
 
 
 def test_what_photographs_confirm_is_still_there():

@@ -159,6 +159,16 @@ def test_optimisation_fits_the_repaired_view(rounds):
     assert torch.equal(again.means, first.means)
 
 
+def test_an_optimised_scene_has_no_gradient():
+    """What measures it would keep the history of every render."""
+    views, scene, target = repaired_room()
+    config = OptimizationConfig(iterations=1, density_rounds=0)
+    fitted = optimize(scene, [*views, target], load_renderer("cpu"), config=config)
+    for name in ("means", "quats", "scales", "opacities", "sh"):
+        assert not getattr(fitted, name).requires_grad, name
+    assert not torch.equal(fitted.means, scene.means)
+
+
 def test_density_control_clones_splits_and_prunes():
     scene = random_gaussians(6)
     scales = torch.full((6, 3), 0.001)

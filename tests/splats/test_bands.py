@@ -45,5 +45,8 @@ def test_the_fourth_band_is_named_and_left_out_on_request(tmp_path, name, write)
 
 def test_rows_of_degree_4_are_copied_without_the_fourth_band(tmp_path):
     write_degree_4_ply(tmp_path / "wide.ply", SCENE)
-    copy_ply(tmp_path / "wide.ply", tmp_path / "narrow.ply", edit=lambda gaussians: gaussians)
+    narrow = tmp_path / "narrow.ply"
+    with pytest.raises(InputError, match="harmonics of SH degree 4"):
+        copy_ply(tmp_path / "wide.ply", narrow, edit=lambda gaussians: gaussians)
+    copy_ply(tmp_path / "wide.ply", narrow, leaves_out_band_4=True)
     assert (tmp_path / "narrow.ply").read_bytes() == (tmp_path / "plain.ply").read_bytes()

@@ -47,6 +47,22 @@ def test_a_level_is_read_from_all_its_places(streamed):
     assert torch.allclose(coarse.means, plausible(30, degree=0).means[10:], atol=1e-2)
 
 
+def test_what_is_not_finite_is_refused_or_dropped_from_a_level(streamed):
+    """A size of e^1000 is infinite; Gaussians of the file before a part do not count."""
+    meta = streamed / "1_0" / "meta.json"
+    table = json.loads(meta.read_text())
+    codebook = table["scales"]["codebook"]
+    sizes = load_level(streamed, 1).scales.log().flatten()
+    middle = sizes.median().item()
+    table["scales"]["codebook"] = [1000.0 if size > middle else size for size in codebook]
+    meta.write_text(json.dumps(table))
+    with pytest.raises(InputError, match=r"lod-meta\.json has \d+ of 20 Gaussians with NaN"):
+        load_level(streamed, 1)
+    left = load_level(streamed, 1, drop_nonfinite=True)
+    assert 0 < len(left) < 20
+    assert left.scales.isfinite().all()
+
+
 def test_a_level_that_is_not_there_is_refused(streamed):
     with pytest.raises(InputError, match="has levels 0 to 1"):
         load_level(streamed, 2)

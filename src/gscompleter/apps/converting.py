@@ -100,6 +100,7 @@ def convert_sources(
             keep_labels,
             request.ignore_properties,
             edit if operations.changes else None,
+            leaves_out_band_4=request.bands is not None,
         )
         return replace(done, notes=notes)
 
@@ -139,10 +140,11 @@ def can_be_streamed(
     if len(sources) > 1 or request.level is not None or not operations.is_by_rows:
         return False
     # The origin of a moved splat is chosen by all of its Gaussians.
-    if operations.similarity is not None and (
-        max(map(abs, operations.translate)) > MAX_EXACT_SHIFT or find_origin(sources[0]) is not None
-    ):
-        return False
+    if operations.similarity is not None:
+        if max(map(abs, operations.translate)) > MAX_EXACT_SHIFT:
+            return False
+        if find_origin(sources[0], leaves_out_band_4=request.bands is not None) is not None:
+            return False
     return is_ply_to_ply(sources[0], request.out)
 
 

@@ -10,7 +10,7 @@ show. Gaussians of a user never step aside.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import torch
@@ -29,7 +29,7 @@ from gscompleter.stages.add_observed import (
     find_usable,
     keep_large_regions,
 )
-from gscompleter.stages.error_budgets import meet_error_budgets
+from gscompleter.stages.error_budgets import MIN_PSNR_LOSS, add_psnr_loss, meet_error_budgets
 from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.stages.superfluous import (
     FADED_OPACITY,
@@ -42,7 +42,7 @@ from gscompleter.trust.photometric import sum_weights
 from gscompleter.types import ContextScene, ErrorBudget, Gaussians, Render, View, merge
 
 MAX_ROUNDS = 8
-"""Layers of Gaussians that step aside behind each other."""
+"""Most layers of Gaussians that step aside, one behind the other."""
 MIN_LAYER = 0.01
 """Smallest layer, as a share of those that stepped aside before, behind which a further one is
 looked for. Of a fountain and a room five rounds after the third found 0.1 %."""
@@ -54,6 +54,8 @@ MIN_VISIBLE = 0.5
 """Share of an invented Gaussian that is not hidden by others, from which on it is in their way."""
 ERROR_RADIUS = 2
 """Radius in pixels over which errors with and without invented Gaussians are compared."""
+ROUNDING_ERROR = 1e-7
+"""Mean squared error that may come of rounding alone (70 dB)."""
 
 
 @dataclass(frozen=True)
@@ -64,16 +66,20 @@ class Contested:
     rows: Bool[Tensor, "m"]
     """Those among the rendered Gaussians of `given`."""
 
+    def place(self, values: Bool[Tensor, "c"]) -> Bool[Tensor, "m"]:
+        """Place values of the contested Gaussians at their rows; all other rows are False."""
+        return self.rows.masked_scatter(self.rows, values)
+
 
 @dataclass(frozen=True)
 class ContestedPixels:
     """The pixels of a photograph in which it contests what earlier commands made."""
 
     of_invented: Bool[Tensor, "h w"]
-    """The scene is empty without what was invented, or fits the photograph better, or the
-    photograph shows something else."""
+    """Without what was invented the scene is empty or fits the photograph better; or the photograph
+    shows something else than the scene."""
     of_lifted: Bool[Tensor, "h w"]
-    """The photograph shows something else, in regions that are large enough."""
+    """The photograph shows something else than the scene, in regions that are large enough."""
 
 
 def find_contested(
@@ -85,7 +91,8 @@ def find_contested(
     """Find Gaussians of a begun scene that stand where photographs show something else.
 
     The masks mark those of the context that Φ invented, and that Ψ lifted from photographs. Returns
-    None if none are contested, as in the paper.
+    None if none are contested, and without `add_observed`, as in the paper: nothing that
+    photographs show would take their place.
     """
     if not state.config.add_observed or (invented is None and lifted is None):
         return None
@@ -137,7 +144,8 @@ def find_contested_pixels(
         is_usable = find_usable(view)
         is_other = (difference > limit) & is_usable
         return ContestedPixels(
-            (is_empty | is_worse) & is_usable | is_other, keep_large_regions(is_other)
+            of_invented=((is_empty | is_worse) & is_usable) | is_other,
+            of_lifted=keep_large_regions(is_other),
         )
 
     return list(get_view_map(others.means, len(others))(find, views, renders, differences))
@@ -210,18 +218,48 @@ def return_needed(
     is_dropped = find_unneeded_candidates(candidates, views, frozen, plans, scenes.renderer, config)
 
     # No photograph may be worse than it was with all of them.
-    whole = merge(given.parts)
-    images = (scenes.renderer.render(whole, view.camera).image for view in views)
-    limits = limit_errors(images, views, config.tolerance)
+    limits = limit_errors(render_all(given, views, scenes.renderer), views, config.tolerance)
     dropped = exclude_needed_additions(plans, candidates.opacities, is_dropped, views, limits)
-    gone = contested.rows.masked_scatter(contested.rows, dropped)
-    return fade_before_returned(drop_rows(state, given, gone), views, limits, scenes)
+    faded = fade_before_returned(
+        drop_rows(state, given, contested.place(dropped)), views, limits, scenes
+    )
+    if are_within(limits, faded, views, scenes.renderer):
+        return faded
+
+    # Candidates gave way to what photographs added, and that has faded: all of it, if most had to.
+    # A photograph of 42 dB ended at 17 dB. Without it, at most all of them return: the scene as it
+    # was.
+    bare = replace(state, added_parts=())
+    frozen = scenes.freeze_at(bare.parts, [view.camera for view in views])
+    plans = [scene.vary_opacities(candidates, is_fading=True) for scene in frozen]
+    dropped = exclude_needed_additions(plans, candidates.opacities, dropped, views, limits)
+    return drop_rows(bare, given, contested.place(dropped))
+
+
+def are_within(
+    limits: Sequence[float], state: Completion, views: Sequence[View], renderer: Renderer
+) -> bool:
+    """Check whether all photographs are within limits of their mean squared error in a scene."""
+    errors = limit_errors(render_all(state, views, renderer), views, tolerance=0.0)
+    return all(
+        error <= add_psnr_loss(limit, MIN_PSNR_LOSS) + ROUNDING_ERROR
+        for error, limit in zip(errors, limits, strict=True)
+    )
+
+
+def render_all(
+    state: Completion, views: Sequence[View], renderer: Renderer
+) -> Iterator[Float[Tensor, "_ _ 3"]]:
+    """Render the whole scene at each photograph."""
+    scene = merge(state.parts)
+    for view in views:
+        yield renderer.render(scene, view.camera).image
 
 
 def fade_before_returned(
     state: Completion, views: Sequence[View], limits: Sequence[float], scenes: SceneRenderer
 ) -> Completion:
-    """Fade what photographs added until each photograph is within a mean squared error.
+    """Fade what photographs added until each photograph is within a mean squared error, if it can.
 
     Some of it stands before Gaussians that returned, by which the photographs that these were
     lifted from lose: 0.3 dB of 36 at a fountain.

@@ -54,10 +54,11 @@ MAX_VOTE_ROUNDS = 8
 VOTE_SHARPNESS = 8
 """Decay of a vote with its cost; at 1, averaged patches lose a quarter of their detail."""
 MIN_VOTE = 1e-6
+"""Smallest vote: a pixel whose patches all fit badly gets their mean."""
 WEIGHT_DECAY = 0.85
 """Weight factor of an unknown pixel per pixel from the border of the hole."""
 FINEST_SPACING = 2
-"""Only every second patch is matched on the finest level, like the squares of one colour."""
+"""Only every second patch is matched on the finest level, as the white squares of a chessboard."""
 MIN_SIZE = 80
 """Shorter side of the coarsest level, in pixels; coarser ones cost 0.3 dB."""
 FINE_REACH = 8
@@ -159,7 +160,9 @@ class Sources:
 
     images: Float[Tensor, "s h w 3"]
     valid: Bool[Tensor, "s h w"]
+    """True for pixels that may be copied; padding is not."""
     log_depth: Float[Tensor, "s h w"]
+    """Logarithm of the z-depth in scene units, in the camera of each source."""
 
     @staticmethod
     def stack_images(
@@ -188,12 +191,15 @@ class Sources:
 
 @dataclass(frozen=True)
 class InpaintLevel:
-    """One pyramid level: image, known pixels, expected log-depth and sources."""
+    """One level of the pyramid of a target; level 0 is the finest."""
 
     image: Float[Tensor, "h w 3"]
+    """Unknown pixels hold a first guess of the tone."""
     known: Bool[Tensor, "h w"]
     expected: Float[Tensor, "h w"]
+    """Expected log-depth, as that of the sources."""
     sources: Sources
+    """At the size of this level, too."""
 
 
 Field = Int64[ndarray, "_ _ 3"]

@@ -17,22 +17,27 @@ from gscompleter.types import Camera, Gaussians
 TANGENT_MARGIN = 0.15
 """Border at which the perspective Jacobian is clamped, relative to the image size."""
 
-TangentRange = tuple[Tensor, Tensor]
-"""Smallest and largest tangent of a ray along one axis."""
+TangentRange = tuple[Float[Tensor, ""], Float[Tensor, ""]]
+"""Smallest and largest tangent of a ray along one axis of the camera."""
 
 
 def compute_tangent_limits(
     K: Float[Tensor, "3 3"], size: tuple[int, int], padding: tuple[int, int]
 ) -> list[TangentRange]:
-    """Compute the ranges of x/z and y/z at which the Jacobian is evaluated.
+    """Compute the ranges of x/z and y/z in the camera at which the Jacobian is evaluated.
 
-    They end beside the image without its padding; `size` is the width and height with it.
+    They end `TANGENT_MARGIN` beside the image without its padding; `size` is the width and height
+    with it. Lengths are in pixels.
     """
     limits = []
     for axis, (side, pad) in enumerate(zip(size, padding, strict=True)):
-        focal, center, inner = K[axis, axis], K[axis, 2] - pad, side - 2 * pad
-        margin = TANGENT_MARGIN * inner
-        limits.append((-(center + margin) / focal, (inner - center + margin) / focal))
+        focal = K[axis, axis]
+        inner_center = K[axis, 2] - pad
+        inner_side = side - 2 * pad
+        margin = TANGENT_MARGIN * inner_side
+        lowest = -(inner_center + margin) / focal
+        highest = (inner_side - inner_center + margin) / focal
+        limits.append((lowest, highest))
     return limits
 
 
@@ -51,16 +56,12 @@ def compute_covariances(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "
     z = points[:, 2].clamp_min(camera.near_plane)
     K = camera.K.to(gaussians.means)
     size = (camera.width, camera.height)
+    drawn = compute_tangent_limits(K, size, (0, 0))
+    wanted = compute_tangent_limits(K, size, camera.padding)
     shears = []
-    for axis, (drawn, wanted) in enumerate(
-        zip(
-            compute_tangent_limits(K, size, (0, 0)),
-            compute_tangent_limits(K, size, camera.padding),
-            strict=True,
-        )
-    ):
+    for axis in range(2):
         tangent = points[:, axis] / z
-        shears.append(tangent.clamp(*drawn) - tangent.clamp(*wanted))
+        shears.append(tangent.clamp(*drawn[axis]) - tangent.clamp(*wanted[axis]))
 
     # Columns are the axes of each Gaussian, in the camera.
     axes = rotation @ (quats_to_rotations(gaussians.quats) * gaussians.scales[:, None, :])

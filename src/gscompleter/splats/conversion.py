@@ -85,12 +85,21 @@ def convert_rows(
     keep_labels: bool,
     ignore_properties: bool,
     edit: Callable[[Gaussians], Gaussians] | None = None,
+    leaves_out_band_4: bool = False,
 ) -> Conversion:
     """Convert a .ply to a .ply, some Gaussians at a time; `edit` changes or leaves out some."""
     made_by = read_provenance(source) if keep_labels else NOTHING_KNOWN
-    return Conversion(
-        *copy_ply(source, out, drop_nonfinite, keep_labels, made_by, ignore_properties, edit)
+    num_written, num_generated = copy_ply(
+        source,
+        out,
+        drop_nonfinite,
+        keep_labels,
+        made_by,
+        ignore_properties,
+        edit,
+        leaves_out_band_4,
     )
+    return Conversion(num_written, num_generated)
 
 
 def write_converted(

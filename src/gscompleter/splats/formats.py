@@ -146,13 +146,13 @@ def decode_splat(path: Path, leaves_out_band_4: bool = False) -> Gaussians:
     return validate_ranges(gaussians, path)
 
 
-def find_origin(path: Path) -> Origin | None:
+def find_origin(path: Path, leaves_out_band_4: bool = False) -> Origin | None:
     """Find the origin of the Gaussians of a file; None if its coordinates lie near zero."""
     path = resolve_splat(path)
     row = SPLAT_FORMATS[detect_splat_format(path)]
     if row is PLY:
-        return read_scene(path).origin
-    return decode_splat(path).origin if row.holds_origin else None
+        return read_scene(path, leaves_out_band_4).origin
+    return decode_splat(path, leaves_out_band_4).origin if row.holds_origin else None
 
 
 def load_splat_at(path: Path, origin: Origin | None, drop_nonfinite: bool = False) -> Gaussians:

@@ -633,14 +633,15 @@ def copy_ply(
     made_by: Provenance = NOTHING_KNOWN,
     ignore_properties: bool = False,
     edit: Callable[[Gaussians], Gaussians] | None = None,
+    leaves_out_band_4: bool = False,
 ) -> tuple[int, int]:
     """Write what `load_ply` and `save_ply` would, some Gaussians at a time.
 
-    `edit` changes or leaves out Gaussians on the way; harmonics of degree 4 are then read, without
-    the fourth band. Returns the numbers of Gaussians written, and of those of them that the file
-    says were generated, whether or not `keep_labels` writes that.
+    `edit` changes or leaves out Gaussians on the way, and `leaves_out_band_4` reads harmonics of
+    degree 4 without the fourth band. Returns the numbers of Gaussians written, and of those of them
+    that the file says were generated, whether or not `keep_labels` writes that.
     """
-    scene = read_scene(source, leaves_out_band_4=edit is not None)
+    scene = read_scene(source, leaves_out_band_4)
     if not ignore_properties:
         refuse_other_kinds(scene.rows.dtype.names or (), source)
     total = len(scene.rows)

@@ -10,7 +10,9 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from gscompleter.splats.formats import load_splat
+from gscompleter.splats.formats import decode_splat, list_property_names
+from gscompleter.splats.ply import require_finite
+from gscompleter.splats.properties import refuse_other_kinds
 from gscompleter.splats.sog import LOD_KEY, LOD_META, META
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_json
@@ -19,6 +21,11 @@ from gscompleter.types import Gaussians, merge
 
 MAX_NODES = 1_000_000
 """Most boxes of a tree."""
+FILES_KEY = "filenames"
+"""Key of an index that lists its files, by whose numbers the boxes name them."""
+INDEX_ADVICE = "export the scene again"
+"""What helps where an index cannot be read."""
+
 FileRange = tuple[int, int, int]
 """Number of a file, of its first Gaussian, and of Gaussians."""
 
@@ -30,14 +37,33 @@ def is_streamed(path: Path) -> bool:
     )
 
 
+def list_streamed_files(path: Path) -> list[Path]:
+    """List the files that the index of a streamed scene names, a folder or its `lod-meta.json`.
+
+    They are none if it has no such list: `load_level` refuses it.
+    """
+    index = locate_index(path)
+    table = read_json(index, INDEX_ADVICE)
+    files = table.get(FILES_KEY) if isinstance(table, dict) else None
+    return [index.parent / str(file) for file in files] if isinstance(files, list) else []
+
+
+def locate_index(path: Path) -> Path:
+    """Locate the index of a streamed scene, a folder or its `lod-meta.json`."""
+    return path / LOD_META if path.is_dir() else path
+
+
 def load_level(path: Path, level: int, drop_nonfinite: bool = False) -> Gaussians:
-    """Load the Gaussians of one level of a streamed scene, a folder or its `lod-meta.json`."""
-    index = path / LOD_META if path.is_dir() else path
+    """Load the Gaussians of one level of a streamed scene, a folder or its `lod-meta.json`.
+
+    `drop_nonfinite` drops those with NaN, infinity or a zero quaternion instead of refusing them.
+    """
+    index = locate_index(path)
     name = quote_value(index)
-    table = read_json(index, "export the scene again")
+    table = read_json(index, INDEX_ADVICE)
     try:
         levels = int(table[LOD_KEY])
-        files = [str(file) for file in table["filenames"]]
+        files = [str(file) for file in table[FILES_KEY]]
         parts = sorted(set(_list_parts(table["tree"], level)))
         fits = all(0 <= file < len(files) and first >= 0 < count for file, first, count in parts)
     except (KeyError, TypeError, ValueError, AttributeError) as error:
@@ -53,14 +79,16 @@ def load_level(path: Path, level: int, drop_nonfinite: bool = False) -> Gaussian
         by_file.setdefault(part[0], []).append(part)
     for number, wanted in track(list(by_file.items()), "reading places"):
         place = _locate_sog(index, files[number])
-        scene = load_splat(place)
+        # Parts are rows of the file as it is, so that what is not finite goes afterwards.
+        scene = decode_splat(place)
+        refuse_other_kinds(list_property_names(place), place)
         if any(first + count > len(scene) for _, first, count in wanted):
             raise InputError(
                 f"{quote_value(place)} has {len(scene):,} Gaussians, fewer than {name} says; "
                 "export the scene again."
             )
         gaussians += [scene[first : first + count] for _, first, count in wanted]
-    return merge(gaussians)
+    return require_finite(merge(gaussians), index, drop_nonfinite)
 
 
 def _list_parts(tree: Mapping[str, Any], level: int) -> Iterator[FileRange]:

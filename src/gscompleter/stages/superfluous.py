@@ -34,7 +34,7 @@ from gscompleter.types import Gaussians, View
 FADED_OPACITY = 0.02
 """Largest opacity of a faded Gaussian; at zero it would have no gradient."""
 MIN_REFERENCE_ERROR = 1e-12
-"""Smallest mean squared error that fractions refer to."""
+"""Smallest mean squared error that its changes are divided by."""
 MAX_RETURN_ROUNDS = 16
 """Rounds of putting back what a photograph needs most, before it gets back all that it sees."""
 GRADIENT_OPACITY = 0.1
@@ -76,10 +76,10 @@ def sum_error_changes(
     plans: Iterable[OpacityRender],
     config: CleaningConfig,
 ) -> ErrorChanges:
-    """Sum the error changes of Gaussians that are added to a scene, which is frozen at the views.
+    """Sum what photographs gain and lose without each of n Gaussians that are added to a scene.
 
-    A plan for each view renders the scene with them, at other opacities than their own ones [n].
-    Those in `faded` are faint meanwhile.
+    `frozen` is the scene without them at each view, and a plan renders it with them, at whatever
+    opacities [n]. `opacities` are their own, but those in `faded` are faint in the comparison.
     """
     generator = torch.Generator().manual_seed(0)
     gained = torch.zeros_like(opacities)
@@ -106,8 +106,8 @@ def predict_error_change(
 ) -> tuple[Float[Tensor, "n"], float]:
     """Predict the relative change of a photograph's squared error without each Gaussian.
 
-    `plan` renders them with other opacities than their `full` ones; those in `faded` are faint.
-    Also returns the mean squared error with all of them.
+    `plan` renders them at whatever opacities: here their `full` ones, but those in `faded` are
+    faint. Also returns the mean squared error with all of them.
     """
     current = torch.where(faded, full.clamp_max(FADED_OPACITY), full)
     image, backpropagate = begin_gradients(plan, current)
@@ -212,9 +212,10 @@ def exclude_needed_additions(
     views: Sequence[View],
     max_errors: Sequence[float],
 ) -> Bool[Tensor, "n"]:
-    """Remove needed ones of n additions from a mask, as `exclude_needed`.
+    """Remove needed ones of n additions to a scene from a mask, as `exclude_needed`.
 
-    A plan for each photograph renders the scene with the additions.
+    A plan for each photograph renders the scene with them, at whatever opacities [n]; `opacities`
+    are those of additions that stay.
     """
 
     def check(plan: OpacityRender, view: View, max_error: float) -> PhotographCheck:
@@ -278,7 +279,8 @@ def find_needed_by_photograph(
             return None if plan is None else back
 
         # Most photographs are within their limits after the first pass, and need no plan.
-        plan = plan or check.make_plan()
+        if plan is None:
+            plan = check.make_plan()
         # To first order, the error falls by -gradient * opacity if a Gaussian returns.
         faint = torch.where(absent, GRADIENT_OPACITY, 1.0) * opacities
         image, backpropagate = begin_gradients(plan, faint)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -81,8 +82,15 @@ class ConvertOptions(WritingOptions):
     `generated` in a .ply, no file beside other formats), nor who made them."""
 
     def check_overlap(self) -> None:
-        """Refuse to write over an input."""
-        refuse_input_file(self.out, list_inputs(self))
+        """Refuse to write over an input, and over what the index of a streamed scene names."""
+        # Imported here, so that help pages do not wait for torch.
+        with import_without_collection():
+            from gscompleter.splats.streamed import is_streamed, list_streamed_files
+
+        inputs = list_inputs(self)
+        streamed = [path for path in inputs if is_streamed(path)]
+        named = [file for path in streamed for file in list_streamed_files(path)]
+        refuse_input_file(self.out, [*inputs, *named])
 
 
 def decide_conversion(options: ConvertOptions) -> ConversionRequest:
@@ -99,26 +107,22 @@ def decide_conversion(options: ConvertOptions) -> ConversionRequest:
         scale=options.scale,
         rotate=options.rotate,
         translate=options.translate,
-        decimate=parse_number(options.decimate),
+        decimate=None if options.decimate is None else parse_decimation(options.decimate),
         drop_nonfinite=options.drop_nonfinite,
         ignore_properties=options.ignore_properties,
         plain=options.plain,
     )
 
 
-def parse_number(words: str | None) -> float | int | None:
-    """Parse a number of Gaussians, or a share in percent as a float from 0 to 1."""
-    if words is None:
-        return None
-    try:
+def parse_decimation(words: str) -> float | int:
+    """Parse how many Gaussians are left: a number, or a share in percent as a float up to 1."""
+    with suppress(ValueError):
         if words.endswith("%"):
-            share = float(words[:-1]) / 100
+            share = float(words.removesuffix("%")) / 100
             if 0 < share <= 1:
                 return share
         elif int(words) > 0:
             return int(words)
-    except ValueError:
-        pass
     raise InputError(
         f"{quote_value(words)} is no number of Gaussians such as 100000, and no share such as 25%.",
         "decimate",

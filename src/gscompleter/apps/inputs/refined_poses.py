@@ -122,14 +122,14 @@ def ask_splat(
     whole = merge_taken_out(task.scene, task.splat_file)
     # Photographs are read relative to their origin, and the frame of a task begins at their own.
     transform = task.frame @ compute_frame_from_photographs(-given.origin)
-    before, after = (
+    given_views, refined_views = (
         [
             transform_view(view.to(task.device), transform)
             for view in sample_views(photographs, task.context_frames)
         ]
         for photographs in (given, refined)
     )
-    agreement = compare_poses(whole, before, after, load_renderer(task.device.type))
-    if agreement is None:
+    compared = compare_poses(whole, given_views, refined_views, load_renderer(task.device.type))
+    if compared is None:
         return refinement
-    return replace(refinement, splat_given=agreement[0], splat_refined=agreement[1])
+    return replace(refinement, splat_given=compared.given, splat_refined=compared.refined)

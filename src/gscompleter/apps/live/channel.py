@@ -14,7 +14,11 @@ HEARTBEAT = b": still here\n\n"
 
 
 class Channel:
-    """Sends messages as server-sent events; a browser that comes gets the latest one first."""
+    """Sends messages as server-sent events; a browser that comes gets the latest one first.
+
+    A browser that reads slowly loses none, since each may be an answer to it. They are short, and
+    few: the steps of a session.
+    """
 
     def __init__(self) -> None:
         self._latest: dict[str, Any] = {}
@@ -23,7 +27,7 @@ class Channel:
 
     @property
     def latest(self) -> dict[str, Any]:
-        """The latest message."""
+        """The latest message; empty before the first one."""
         return self._latest
 
     def send(self, message: dict[str, Any]) -> None:
@@ -37,7 +41,8 @@ class Channel:
         """Wait for messages and yield each as an event, without end."""
         queue = SimpleQueue[dict[str, Any]]()
         with self._lock:
-            queue.put(self._latest)
+            if self._latest:
+                queue.put(self._latest)
             self._listeners.append(queue)
         try:
             while True:

@@ -32,16 +32,27 @@ from gscompleter.system.files.writing import encode_text
 from gscompleter.types import Camera, Gaussians
 
 ASSETS = Path(__file__).with_name("assets")
-PAGE_PARTS = (
-    *("state", "libraries", "pictures", "camera", "path", "marks", "saving", "box", "connection"),
-    *("controls", "texts", "start"),
+PROGRAM_FILES = (
+    "state",
+    "libraries",
+    "pictures",
+    "camera",
+    "path",
+    "marks",
+    "saving",
+    "box",
+    "connection",
+    "controls",
+    "texts",
+    "start",
 )
-"""Files of the page's program in their order: each uses only names of those before it at once."""
+"""Files of the page's program in their order. While one is loaded it uses only names of those
+before it; functions that are called later may use all."""
 PAGE_EXTENT = 4.0
-"""Median distance of Gaussians from the centre, within a factor of 2, in page units."""
+"""Extent of the scene (`measure_shown_extent`), within a factor of 2, in page units."""
 MAX_PAGE_DISTANCE = 4096.0
 """Largest distance of a Gaussian from the centre, in page units; leaves ten fractional bits."""
-PART = 48_000_000
+MAX_SCRIPT_BYTES = 48_000_000
 """Bytes of Gaussians per script element, below the longest string of any browser."""
 SOURCES_MARK = "\0"
 """Character that stands in the page for its sources, and that no text of it can have."""
@@ -50,7 +61,9 @@ THREE_FROM_OPENCV = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.
 MAX_LANDMARKS = 100_000
 """Approximate number of Gaussians that determine the focus of a camera."""
 OVERVIEW_DISTANCE = 2.5
-"""Distance of a camera for the whole scene, relative to the median distance of Gaussians."""
+"""Distance of a camera for the whole scene, relative to its extent (`measure_shown_extent`)."""
+SHOWN_DEVIATIONS = 2.0
+"""Standard deviations from its centre up to which a Gaussian is seen."""
 
 LEG_SECONDS = 2.0
 """Mean time of the camera path from one camera to the next."""
@@ -79,13 +92,25 @@ class PageFrame:
 
 
 def compute_page_frame(gaussians: Gaussians) -> PageFrame:
-    """Compute the page's frame from the median position and spread of Gaussians."""
+    """Compute the page's frame from the median position and the extent of Gaussians."""
     means = gaussians.means.double().cpu()
     centre = means.median(dim=0).values
-    spread = (means - centre).norm(dim=1).median().item()
+    extent = measure_shown_extent(means, centre, gaussians.scales)
     # A power of two scales floats without rounding.
-    power = math.floor(math.log2(spread / PAGE_EXTENT)) if spread > 0 else 0
+    power = math.floor(math.log2(extent / PAGE_EXTENT))
     return PageFrame(centre, 2.0**power)
+
+
+def measure_shown_extent(
+    means: Float[Tensor, "n 3"], centre: Float[Tensor, "3"], scales: Float[Tensor, "n 3"]
+) -> float:
+    """Measure the median distance of Gaussians from the centre, in scene units, above 0.
+
+    Where most of them are in one place, as a single one is, what is seen is their own size.
+    """
+    spread = (means - centre).norm(dim=1).median().item()
+    size = SHOWN_DEVIATIONS * scales.amax(dim=1).median().item()
+    return spread or size or 1.0
 
 
 def is_within_page(gaussians: Gaussians, frame: PageFrame) -> Bool[Tensor, "n"]:
@@ -135,7 +160,7 @@ def make_page_parts(
 
     # Most completions leave the context as it is, which is then embedded once for both layers.
     layer_sources = {name: name for name in sources}
-    if sources.get("before") == sources.get("observed", b""):
+    if "before" in sources and sources["before"] == sources.get("observed"):
         del sources["before"]
         layer_sources["before"] = "observed"
 
@@ -147,7 +172,7 @@ def make_page_parts(
     content = {
         "title": viewer_content.title,
         "frame": {"centre": place_page(frame, after, is_live), "unit": frame.unit},
-        "counts": {name: len(part) for name, part in shown.items()},
+        "counts": {name: len(rows) for name, rows in shown.items()},
         "layers": layer_sources,
         "antialiased": {name: scene.is_antialiased for name, scene in scenes.items()},
         "path": plan_tour([camera.camera for camera in cameras]),
@@ -191,9 +216,9 @@ def make_scripts(sources: dict[str, bytes]) -> Iterator[bytes]:
     separator = b""
     for name in sorted(sources):
         content = sources.pop(name)
-        for start in range(0, len(content), PART):
+        for start in range(0, len(content), MAX_SCRIPT_BYTES):
             yield separator + b'<script>gscPart("%s", "' % name.encode()
-            yield base64.b64encode(content[start : start + PART])
+            yield base64.b64encode(content[start : start + MAX_SCRIPT_BYTES])
             yield b'");</script>'
             separator = b"\n"
 
@@ -202,9 +227,9 @@ def make_overview(scene: Gaussians, up: Direction) -> ViewerCamera:
     """Make a camera that sees the scene from aside, for a page without any other."""
     means = scene.means.cpu()
     centre = means.median(dim=0).values
-    distance = OVERVIEW_DISTANCE * (means - centre).norm(dim=1).median()
+    distance = OVERVIEW_DISTANCE * measure_shown_extent(means, centre, scene.scales)
     upward = normalize(torch.tensor(up), dim=0)
-    # Along z, as photographs look if y is down; or along y if z is up.
+    # Along z, as photographs look if y is down; or along y if z is the axis that is upright.
     aside = torch.eye(3)[2 if upward[2].abs() < upward.abs().amax() else 1]
     forward = aside - upward * (aside @ upward)
     c2w = torch.eye(4)
@@ -245,17 +270,18 @@ def describe_page_camera(
 
 def plan_tour(cameras: Sequence[Camera]) -> list[tuple[int, float]]:
     """Plan a path from the first camera, each time to the nearest one left: indices and seconds."""
-    where = embed_cameras([camera.to("cpu") for camera in cameras]).double()
-    apart = torch.cdist(where, where)
+    places = embed_cameras([camera.to("cpu") for camera in cameras]).double()
+    apart = torch.cdist(places, places)
     # Visited cameras are infinitely far.
-    left = torch.zeros(len(where))
+    handicap = torch.zeros(len(places))
     stops = [0]
     for _ in cameras[1:]:
-        left[stops[-1]] = torch.inf
-        stops.append(int((apart[stops[-1]] + left).argmin()))
-    steps = apart[stops[:-1], stops[1:]].sqrt()  # slower in short legs, but not by as much
-    steps = steps / steps.mean().clamp_min(1e-9) + 0.1
-    times = LEG_SECONDS * steps.cumsum(dim=0)
+        handicap[stops[-1]] = torch.inf
+        stops.append(int((apart[stops[-1]] + handicap).argmin()))
+    # A leg of four times the length takes twice the time; no leg takes none.
+    legs = apart[stops[:-1], stops[1:]].sqrt()
+    legs = legs / legs.mean().clamp_min(1e-9) + 0.1
+    times = LEG_SECONDS * legs.cumsum(dim=0)
     return list(zip(stops, [0.0, *times.tolist()], strict=True))
 
 
@@ -278,7 +304,7 @@ def fill_template(content: Mapping[str, Any], scripts: str) -> str:
 
 def read_program() -> str:
     """Read the page's program: its files, one after the other, share their names."""
-    return "".join(read_asset(f"{name}.js") for name in PAGE_PARTS)
+    return "".join(read_asset(f"{name}.js") for name in PROGRAM_FILES)
 
 
 def read_asset(name: str) -> str:

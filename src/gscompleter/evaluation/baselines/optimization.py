@@ -1,7 +1,10 @@
 """Completion by 3DGS optimization (Kerbl et al., 2023) with the synthesized view added.
 
 All attributes are fitted (`distill`), optionally with adaptive density control (`densify`).
-Learning rates are those of 3DGS; its 30,000 iterations are cut to a few hundred.
+Learning rates are those of 3DGS; its 30,000 iterations are cut to a few hundred. So what 3DGS does
+over thousands of them is left out: its decay of the rate of positions, new bands of harmonics (all
+are fitted from the first iteration on, at one rate), the reset of opacities, and the pruning of
+large Gaussians.
 """
 
 from __future__ import annotations
@@ -55,41 +58,46 @@ def optimize(
     seed: int = 0,
     config: OptimizationConfig = OptimizationConfig(),
 ) -> Gaussians:
-    """Fit all attributes of `scene` to `views`; `seed` sets their order and the splitting."""
+    """Fit all attributes of `scene` to `views`; `seed` sets their order and the splitting.
+
+    The result has no gradient.
+    """
     random = torch.Generator().manual_seed(seed)
     extent = compute_extent([view.camera for view in views])
-    state = SceneParameters(scene, extent)
-    # Sum of the image gradients of each Gaussian since the last round, and of its views.
+    parameters = SceneParameters(scene, extent)
+    # Of each Gaussian since the last round of density control: the sum of its image gradients, and
+    # the number of renders that it was seen in.
     gradients = torch.zeros_like(scene.opacities)
     counts = torch.zeros_like(scene.opacities)
-    # Rounds of density control, evenly over the first 80 % of the iterations.
-    last = 0.8 * config.iterations
-    total = config.density_rounds
-    rounds = {math.ceil(last * (i + 1) / total) for i in range(total)}
+    # Iterations after which such a round follows, evenly over the first 80 % of them.
+    last_round = 0.8 * config.iterations
+    num_rounds = config.density_rounds
+    rounds = {math.ceil(last_round * (i + 1) / num_rounds) for i in range(num_rounds)}
     order: list[int] = []
     for number in track(range(1, config.iterations + 1), "Optimising"):
         # Each view once in random order, then all again.
         order = order or torch.randperm(len(views), generator=random).tolist()
         view = views[order.pop()]
-        gaussians = state.make_gaussians()
+        gaussians = parameters.make_gaussians()
         image = view.fill_ignored(renderer.render(gaussians, view.camera).image)
         loss = (1 - DSSIM_WEIGHT) * (image - view.image).abs().mean()
         loss = loss + DSSIM_WEIGHT * (1 - ssim_map(image, view.image).mean())
-        state.optimizer.zero_grad()
+        parameters.optimizer.zero_grad()
         loss.backward()
 
-        gradient, seen = compute_image_gradients(gaussians.means, state.leaves[0].grad, view.camera)
+        gradient, seen = compute_image_gradients(
+            gaussians.means, parameters.means.grad, view.camera
+        )
         gradients = gradients + gradient
         counts = counts + seen
-        state.optimizer.step()
+        parameters.optimizer.step()
         if number in rounds:
             crowded = gradients / counts.clamp_min(1) >= config.gradient_threshold
-            dense = control_density(state.make_gaussians(), crowded, extent, random)
-            state = SceneParameters(dense, extent)
+            dense = control_density(parameters.make_gaussians(), crowded, extent, random)
+            parameters = SceneParameters(dense, extent)
             gradients = torch.zeros_like(dense.opacities)
             counts = torch.zeros_like(dense.opacities)
-    with torch.no_grad():  # so that the result is detached from the parameters
-        return state.make_gaussians()[:]
+    return parameters.make_gaussians().detach()
 
 
 class SceneParameters:
@@ -100,27 +108,38 @@ class SceneParameters:
 
     def __init__(self, scene: Gaussians, extent: float) -> None:
         self.scene = scene
-        log_scales = scene.scales.clamp_min(1e-12).log()
-        values = (scene.means, scene.quats, log_scales, scene.opacities.logit(eps=1e-4), scene.sh)
-        rates = (
-            POSITION_RATE * extent,
-            ROTATION_RATE,
-            SCALE_RATE,
-            OPTIMIZED_OPACITY_RATE,
-            COLOR_RATE,
+        self.means = make_parameter(scene.means)
+        self.quats = make_parameter(scene.quats)
+        self.log_scales = make_parameter(scene.scales.clamp_min(1e-12).log())
+        self.logits = make_parameter(scene.opacities.logit(eps=1e-4))
+        self.sh = make_parameter(scene.sh)
+        self.optimizer = torch.optim.Adam(
+            [
+                {"params": [self.means], "lr": POSITION_RATE * extent},
+                {"params": [self.quats], "lr": ROTATION_RATE},
+                {"params": [self.log_scales], "lr": SCALE_RATE},
+                {"params": [self.logits], "lr": OPTIMIZED_OPACITY_RATE},
+                {"params": [self.sh], "lr": COLOR_RATE},
+            ],
+            eps=1e-15,
         )
-        self.leaves = [value.detach().clone().requires_grad_() for value in values]
-        both = zip(self.leaves, rates, strict=True)
-        groups = [{"params": [leaf], "lr": rate} for leaf, rate in both]
-        self.optimizer = torch.optim.Adam(groups, eps=1e-15)
 
     def make_gaussians(self) -> Gaussians:
         """Assemble the scene, differentiable in the parameters."""
-        means, quats, log_scales, logits, sh = self.leaves
-        leaves = means, quats, log_scales.exp(), logits.sigmoid(), sh, self.scene.generated
-        return Gaussians(
-            *leaves, is_antialiased=self.scene.is_antialiased, origin=self.scene.origin
+        return replace(
+            self.scene,
+            means=self.means,
+            quats=self.quats,
+            scales=self.log_scales.exp(),
+            opacities=self.logits.sigmoid(),
+            sh=self.sh,
+            encoded=None,
         )
+
+
+def make_parameter(values: Float[Tensor, "n *c"]) -> Float[Tensor, "n *c"]:
+    """Make a variable that begins with given values."""
+    return values.detach().clone().requires_grad_()
 
 
 def compute_extent(cameras: Sequence[Camera]) -> float:
