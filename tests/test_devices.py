@@ -44,11 +44,12 @@ from gscompleter.models.feed_forward import (
 )
 from gscompleter.models.feed_forward.depth_predictor import DepthConfig
 from gscompleter.models.feed_forward.depthsplat import VARIANTS
-from gscompleter.reconstructors import Reconstructor, iterate_tensors, run_reconstructor
+from gscompleter.reconstructors import Reconstructor, run_reconstructor
 from gscompleter.reconstructors.from_depth import FromDepth
 from gscompleter.stages.context import measure_depth_range
 from gscompleter.stages.filter_holes import select_in_mask
 from gscompleter.stages.lift import lift_pair
+from gscompleter.system.tensor_checks import iterate_tensors
 from gscompleter.types import Lift, Reconstruction, View
 from scenes import Room, camera_at, gaussians_of, view_of
 
