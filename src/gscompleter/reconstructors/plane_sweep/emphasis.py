@@ -15,7 +15,7 @@ from gscompleter.types import Camera, View
 
 NUM_REFINED = 3
 """Number of photographs nearest to a target that get further steps."""
-NUM_FAVOURED = 5
+NUM_FAVORED = 5
 """Number of photographs nearest to a target whose colours count whole."""
 FAR_WEIGHT = 0.2
 """Weight of the colours of all others."""
@@ -38,8 +38,8 @@ class Emphasis:
         """Weigh the colours of each view."""
         if not self.targets:
             return [1.0] * len(views)
-        favoured = set(find_nearest_views(self.targets, views, NUM_FAVOURED))
-        return [1.0 if number in favoured else FAR_WEIGHT for number in range(len(views))]
+        favored = set(find_nearest_views(self.targets, views, NUM_FAVORED))
+        return [1.0 if number in favored else FAR_WEIGHT for number in range(len(views))]
 
 
 def find_nearest_views(targets: Sequence[Camera], views: Sequence[View], count: int) -> list[int]:
