@@ -91,6 +91,15 @@ def test_another_scene_is_frozen_anew(frozen_scenes, change):
     assert len(frozen_scenes) == 2
 
 
+def test_an_image_that_widens_splats_otherwise_is_another_one(frozen_scenes):
+    scenes = SceneRenderer(CpuRenderer())
+    scenes.freeze_at((SCENE,), [CAMERA])
+    (sampled,) = scenes.freeze_at((SCENE,), [replace(CAMERA, blur=0.05)])
+    assert len(frozen_scenes) == 2
+    plain = CpuRenderer().render(SCENE, CAMERA)
+    assert not torch.allclose(sampled.render.alpha, plain.alpha)
+
+
 @pytest.mark.parametrize("antialiased", [False, True], ids=["classic", "antialiased"])
 def test_what_is_hidden_is_drawn_again_only_where_it_showed(frozen_scenes, antialiased):
     camera = camera_at(size=96)

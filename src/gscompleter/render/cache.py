@@ -133,4 +133,5 @@ def make_camera_key(camera: Camera) -> Hashable:
     # Not the far plane, which no renderer uses, and of the near one what renderers make of it.
     camera = camera.on_cpu
     numbers = (*camera.c2w.flatten().tolist(), *camera.K.flatten().tolist())
-    return (*numbers, camera.width, camera.height, *camera.padding, camera.near_plane)
+    size = camera.width, camera.height
+    return (*numbers, *size, *camera.padding, camera.near_plane, camera.blur)
