@@ -60,7 +60,7 @@ def make_system_error(number: int, name: str | None = None) -> OSError:
         (make_system_error(errno.ENAMETOOLONG, "x" * 300), "is no path", WRONG_INPUT),
         (make_system_error(errno.ENOMEM, "x.ply"), "The memory ran out", ERROR),
         (make_system_error(errno.ENOSPC, "x.ply"), "x.ply cannot be written", ERROR),
-        (make_system_error(errno.ENOSPC), "A file cannot be written", ERROR),
+        (make_system_error(errno.ENOSPC), "A file or the standard output cannot be written", ERROR),
         (make_system_error(errno.EIO, "x.ply"), "check the disk", ERROR),
         (make_system_error(errno.EMFILE, "x.ply"), "limit of open files", ERROR),
     ],

@@ -230,7 +230,10 @@ def test_what_is_left_is_drawn_without_copying_it(removed, monkeypatch, name, si
     # The slow renderer joins what it freezes.
     assert name == "reference" or sum(copied) == 0
     assert torch.equal(pair.before.image, renderer.render(state.context, camera).image)
-    assert torch.equal(pair.after.image, expected.image)
+    # The slow renderer may sum in another order.
+    largest = float(expected.image.max())
+    bound = 0.0 if name == "cpu" else 1e-6 * largest
+    assert float((pair.after.image - expected.image).abs().max()) <= bound
     assert not torch.equal(pair.after.image, pair.before.image)
 
 

@@ -27,8 +27,9 @@ from gscompleter.models.feed_forward import (
 )
 from gscompleter.models.feed_forward.depth_predictor import DepthConfig
 from gscompleter.models.feed_forward.depthsplat import VARIANTS
-from gscompleter.reconstructors import Reconstructor, iterate_tensors, run_reconstructor
+from gscompleter.reconstructors import Reconstructor, run_reconstructor
 from gscompleter.reconstructors.from_depth import FromDepth
+from gscompleter.system.tensor_checks import iterate_tensors
 from gscompleter.types import Render
 from known_room import TARGET, known_room
 from scenes import Room, answer, camera_at, view_of

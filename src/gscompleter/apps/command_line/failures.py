@@ -102,7 +102,9 @@ def explain_system_error(error: BaseException) -> Failure | None:
             f"The limit of open files is reached: {reason}; raise it (ulimit -n).", ERROR
         )
     if number in FULL_DISK_ERRORS and error.filename is None:
-        return Failure(f"A file cannot be written: {reason}; free some space.", ERROR)
+        return Failure(
+            f"A file or the standard output cannot be written: {reason}; free some space.", ERROR
+        )
 
     # Without a file name any other error names nothing that the user could correct: it may be of a
     # network connection.

@@ -110,6 +110,7 @@ class PlaneSweep(Splatter):
 
         They lie there only if its renderer is used.
         """
+        check_given_views(views)
         here = views[0].image.device
         is_chosen = self.device.partition(":")[0] == "cuda"
         if here.type != "cuda" or not is_chosen:
@@ -123,7 +124,6 @@ class PlaneSweep(Splatter):
         emphasis: Emphasis = Emphasis(),
     ) -> Reconstruction:
         """Reconstruct everything, or what any view shows in its mask, and fit it to all views."""
-        check_given_views(views)
         views = set_depth_range(views, *get_depth_range(views))
         rig = build_rig(views, self.device)
         contradicted = find_contradicted(rig, views)
