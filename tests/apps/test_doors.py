@@ -255,8 +255,8 @@ def test_a_closed_or_full_output_is_no_traceback(splat, tmp_path):
     assert full.returncode == 1
     # The library that draws tables fails, and its error does not name what is full.
     assert full.stderr == (
-        "gscompleter: A file or the standard output cannot be written: No space left on device; free "
-        "some space.\n"
+        "gscompleter: A file or the standard output cannot be written: No space left on device; "
+        "free some space.\n"
     )
     assert run_apart("--version", shell="{} > /dev/full").stderr == (
         "gscompleter: the standard output cannot be written: No space left on device.\n"
