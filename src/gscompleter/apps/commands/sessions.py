@@ -115,7 +115,7 @@ def decide_replay(options: CompletingOptions, strokes: Path) -> SessionRequest:
     return replace(
         begun,
         steps=read_steps(saved.frames, path.parent),
-        notes=tuple(describe_differences(begun, saved)),
+        notes=tuple(describe_session_changes(begun, saved)),
     )
 
 
@@ -321,7 +321,7 @@ def describe_continuation(
     """
     count = len(saved.frames)
     yield f"Going on after {count} {'step' if count == 1 else 'steps'}, which are done again."
-    yield from describe_differences(begun, saved)
+    yield from describe_session_changes(begun, saved)
     if not continues:
         return
     completed = find_completed(begun.out)
@@ -329,7 +329,7 @@ def describe_continuation(
         yield f"{quote_value(completed)} was changed by another program; Save replaces it."
 
 
-def describe_differences(begun: SessionRequest, saved: StrokesFile) -> Iterator[str]:
+def describe_session_changes(begun: SessionRequest, saved: StrokesFile) -> Iterator[str]:
     """Say what the steps are done with that the session did not begin with: splat and options."""
     splat = begun.completion.work.splat
     # A splat in a folder of its own, such as an unpacked .sog, has no SHA-256.
