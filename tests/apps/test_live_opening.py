@@ -265,6 +265,8 @@ def test_steps_are_done_on_a_scene_that_is_named(saved, room, splat, tmp_path):
     opening = find_opening(*words)
     assert (len(opening.steps), opening.completion.source.scene.folder) == (2, room)
     assert opening.completion.source.context == (0, 1)
+    with pytest.raises(InputError, match="holds a session, which knows its scene"):
+        find_opening(saved, "--scene", splat, "--out", tmp_path / "new")
     with pytest.raises(InputError, match="steps of its own"):
         other = tmp_path / "strokes.json"
         shutil.copyfile(saved / "strokes.json", other)

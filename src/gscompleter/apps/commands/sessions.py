@@ -179,11 +179,20 @@ def find_session(options: AnyOptions, strokes: Path | None) -> tuple[AnyOptions,
 
     SCENE may name the session itself: its folder, or the completed scene in it. Then the options
     that are returned name no scene, which the session knows. An output folder without steps stands
-    for the completed scene in it.
+    for the completed scene in it. Raises InputError if a second scene or session is named, too.
     """
     folder = options.folder
     path = None if strokes is None else find_strokes_file(strokes)
-    if folder is None or options.scene is not None:
+    if folder is None:
+        return options, path
+    if options.scene is not None:
+        # A session holds no photographs, and its steps would not be done.
+        if holds_session(folder):
+            raise InputError(
+                f"{quote_value(folder)} holds a session, which knows its scene; leave --scene out, "
+                f"or do its steps on another one with --strokes {quote_value(folder)}.",
+                "scene",
+            )
         return options, path
     if os.path.isdir(folder):
         if holds_session(folder):
