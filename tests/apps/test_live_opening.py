@@ -21,7 +21,7 @@ import torch
 from rich.console import Console
 
 from command import run
-from gscompleter import save_ply
+from gscompleter import __version__, save_ply
 from gscompleter.apps.commands.live import decide_live
 from gscompleter.apps.commands.sessions import describe_value
 from gscompleter.apps.live import saving, serving
@@ -37,6 +37,7 @@ from gscompleter.data.scene import describe_camera
 from gscompleter.splats.edits import read_edits
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.output_folder import list_session, read_listing, reserve_output
+from gscompleter.system.files.result_format import RESULT_MARK
 from gscompleter.types import Camera, Gaussians, merge
 from live_marks import make_mark
 from scenes import Room, camera_at, gaussians_of, photographed, view_of
@@ -264,6 +265,8 @@ def test_steps_are_done_on_a_scene_that_is_named(saved, room, splat, tmp_path):
     opening = find_opening(*words)
     assert (len(opening.steps), opening.completion.source.scene.folder) == (2, room)
     assert opening.completion.source.context == (0, 1)
+    with pytest.raises(InputError, match="holds a session, which knows its scene"):
+        find_opening(saved, "--scene", splat, "--out", tmp_path / "new")
     with pytest.raises(InputError, match="steps of its own"):
         other = tmp_path / "strokes.json"
         shutil.copyfile(saved / "strokes.json", other)
@@ -293,6 +296,93 @@ def change(out: Path, **session: object) -> None:
     (out / "strokes.json").write_text(json.dumps(content))
 
 
+def begin(out: Path, *words: object) -> Path:
+    """Begin a session without steps, as a program that was killed leaves it."""
+    opening = find_opening(*words, "--out", out)
+    out.mkdir()
+    content = {
+        **RESULT_MARK,
+        "version": __version__,
+        "resolution": opening.resolution,
+        "session": opening.record,
+        "frames": [],
+    }
+    (out / "strokes.json").write_text(json.dumps(content))
+    return out
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("--config.refine.iterations", 7),
+        ("--config.refine.iterations", 7, "--no-recolor", "--holes", "enclosed"),
+        ("--config", "paper", "--holes", "all"),
+    ],
+)
+@pytest.mark.parametrize("has_splat", [False, True])
+def test_a_setting_that_is_given_again_is_that_of_the_session(
+    room, splat, tmp_path, words, has_splat
+):
+    scene = (room, "--scene", splat) if has_splat else (room,)
+    out = begin(tmp_path / "out", *scene, *words)
+    begun = find_opening(out).completion.work.config
+    assert find_opening(out, *words).completion.work.config == begun
+    with pytest.raises(InputError, match="began with") as told:
+        find_opening(out, "--config.refine.iterations", 8)
+    assert told.value.argument == "config"
+
+
+def test_an_option_that_an_early_session_did_not_know_is_refused_and_not_ignored(
+    room, splat, tmp_path
+):
+    out = begin(tmp_path / "out", room)
+    content = json.loads((out / "strokes.json").read_text())
+    del content["session"]["geometry"]
+    del content["session"]["synthesis"]["generator_retries"]
+    (out / "strokes.json").write_text(json.dumps(content))
+    for words in (("--geometry", splat), ("--generator-retries", 2)):
+        with pytest.raises(InputError, match="began with"):
+            find_opening(out, *words)
+    assert find_opening(out).completion.work.geometry is None
+
+
+def test_functions_of_ones_own_are_named_again_from_any_folder(room, tmp_path, monkeypatch):
+    """The same word names another program in another folder."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("own.py", "elsewhere/own.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_text("def paint(*words):\n    return None\n\n\nkeep = paint\n")
+    words = ("--generator", "own.py:paint", "--config.guards", "psnr", "own.py:keep")
+    out = begin(tmp_path / "out", room, *words)
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    with pytest.raises(InputError, match="a program"):
+        find_opening(out)
+    with pytest.raises(InputError, match="began with"):
+        find_opening(out, *words)
+    same = [f"../{word}" if ".py:" in word else word for word in words]
+    work = find_opening(out, *same).completion.work
+    assert work.models.generator == f"{tmp_path}/own.py:paint"
+    assert work.config.guards == ("psnr", f"{tmp_path}/own.py:keep")
+
+
+def test_what_differs_from_the_session_is_said_where_a_scene_is_named(room, splat, tmp_path):
+    out = begin(tmp_path / "out", room, "--scene", splat, "--seed", 3, "--generator", "oracle")
+    words = (room, "--scene", splat, "--strokes", out, "--out", tmp_path / "new")
+    (note,) = find_opening(*words, "--seed", 3, "--generator", "oracle").notes
+    assert note.startswith("Going on")
+    _, note = find_opening(*words).notes
+    assert note.startswith("The session began with other values of --seed, --generator;")
+
+    # Another splat is known as such, also by its folder.
+    content = json.loads((out / "strokes.json").read_text())
+    (out / "strokes.json").write_text(json.dumps({**content, "scene_sha256": "0" * 64}))
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    shutil.copyfile(splat, alone / "splat.ply")
+    notes = find_opening(alone, "--strokes", out, "--out", tmp_path / "new").notes
+    assert any("splat.ply is another file than the session began with" in note for note in notes)
+
+
 def test_a_session_from_elsewhere_runs_no_program(saved, tmp_path, monkeypatch):
     out = copy_of(saved, tmp_path)
     # Named once more it is run, as a program of the user's own.
@@ -310,8 +400,14 @@ def test_what_is_missing_or_damaged_is_said(saved, tmp_path):
     change(out, scene=str(tmp_path / "moved.ply"))
     with pytest.raises(InputError, match=r"moved\.ply is missing"):
         find_opening(out)
+    change(out, scene="/x" * 3000)
+    with pytest.raises(InputError, match="is missing"):
+        find_opening(out)
     change(out, seed="x")
     with pytest.raises(InputError, match="damaged"):
+        find_opening(out)
+    change(out, scene=None, folder=None)
+    with pytest.raises(InputError, match="does not tell of which scene"):
         find_opening(out)
     content = json.loads((out / "strokes.json").read_text())
     del content["session"]

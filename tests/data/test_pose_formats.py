@@ -3,6 +3,7 @@
 import json
 import shutil
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +11,16 @@ import pytest
 import torch
 from PIL import Image
 
-from gscompleter import InputError, load_cameras
-from gscompleter.apps.inputs.captures import find_cameras_beside
+from gscompleter import InputError, load_cameras, save_ply
+from gscompleter.apps.inputs.captures import RenderRequest, find_cameras_beside
+from gscompleter.apps.requests.scene import SceneRequest
 from gscompleter.data.camera_files import is_in_splat_frame
 from gscompleter.data.formats import SCENE_FORMATS, open_photographs
 from gscompleter.data.points import MIN_RANGE_POINTS, add_depth_range, compute_depth_range
 from gscompleter.data.scene import write_cameras
 from gscompleter.data.transforms import read_dataparser_transforms
-from gscompleter.types import Camera
+from gscompleter.render.loading import load_renderer
+from gscompleter.types import Camera, make_observed
 from pose_files import (
     CAMERAS,
     NAMES,
@@ -103,6 +106,25 @@ def test_cameras_are_found_beside_a_splat_that_is_a_link(tmp_path):
     assert find_cameras_beside(splat) == beside
     beside.rename(stored.with_name("cameras.json"))
     assert find_cameras_beside(splat) == stored.with_name("cameras.json")
+
+
+def test_a_named_upward_direction_needs_no_cameras_beside_the_splat(tmp_path):
+    rows = json.loads(write_camera_list(tmp_path / "cameras.json").read_text())
+    (tmp_path / "cameras.json").write_text(json.dumps([{**row, "fx": -1} for row in rows]))
+    scene = make_observed(
+        torch.rand(100, 3, generator=torch.Generator().manual_seed(0)),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]).repeat(100, 1),
+        torch.ones(100, 3),
+        torch.ones(100),
+        torch.zeros(100, 1, 3),
+    )
+    save_ply(tmp_path / "splat.ply", scene)
+    request = RenderRequest(reading=SceneRequest(tmp_path / "splat.ply"))
+    renderer = load_renderer("cpu")
+    with pytest.raises(InputError):
+        request.find_up(scene, renderer)
+    named = replace(request, up=(0.0, 0.0, 2.0)).find_up(scene, renderer)
+    assert named.direction.tolist() == [0.0, 0.0, 1.0]
 
 
 def test_every_format_is_tried_here_or_in_the_file_of_its_own():

@@ -118,6 +118,18 @@ def test_few_that_lost_a_neighbour_ask_the_tree_that_is_there(monkeypatch):
     assert (nearest.rows[left.numpy()] == numbers[anew.rows[left.numpy()]]).all()
 
 
+def test_of_two_in_one_place_each_has_the_other_for_a_neighbour_and_not_itself():
+    """Which of both a search finds first does not count."""
+    places = torch.arange(40)[:, None] * torch.tensor([[1.0, 0.0, 0.0]])
+    scene = merge([blobs(places, 4.0), blobs(places, 1.0)])
+    around = Surroundings(scene, 2)
+    # Of two neighbours, the one in the same place and one of the next place, the smaller counts.
+    nearest = torch.from_numpy(around._nearest.rows)
+    for own in range(len(scene)):
+        others = [number for number in nearest[own].tolist() if number != own]
+        assert around.sigma[own] == scene.scales[others].amax(dim=1).min()
+
+
 def test_a_strength_of_two_takes_more_and_of_a_half_less():
     scene = merge([ROOM, *(blobs(MIDDLE, size, opacity=0.9) for size in (3.0, 5.0, 8.0))])
     counts = [taken(scene, FloaterConfig().strengthen(s)).sum().item() for s in (0.5, 1.0, 2.0)]

@@ -115,7 +115,7 @@ def test_a_mistake_in_a_file_of_scenes_is_one_sentence(tmp_path, content, senten
 def test_evaluate_leaves_out_what_is_apart_and_says_so(rooms, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     assert run(monkeypatch, "evaluate", rooms / "cases.json", *QUICK, "--out", out) == 0
-    assert "1 cases are left out, because" in capsys.readouterr().err
+    assert "1 case is left out, because" in capsys.readouterr().err
     scenes, source = read_run(out)
     assert scenes == {"seen"}
     assert "apart" not in source
@@ -138,7 +138,8 @@ def test_a_use_is_written_down_and_counted_once(tmp_path, rooms, monkeypatch, ca
     assert scenes == {"seen", "unseen"}
     assert source["apart"] == 1
     for name in ("tables.md", "tables.tex", "timings.md"):
-        assert "1 cases that are kept apart were used (apart_uses.md)" in (out / name).read_text()
+        said = "1 case that is kept apart was used (apart_uses.md)"
+        assert said in (out / name).read_text()
     assert json.loads((out / "tables.json").read_text())["made_with"]["num_apart"] == 1
     assert count_uses(tmp_path / LEDGER, cases) == 1
     row = (tmp_path / LEDGER).read_text().splitlines()[-1]
@@ -159,7 +160,7 @@ def test_a_use_is_written_down_and_counted_once(tmp_path, rooms, monkeypatch, ca
 def test_a_file_of_scenes_is_data_of_a_protocol(rooms, tmp_path, monkeypatch, capsys):
     words = ("evaluate", rooms / "scenes.json", "--protocol", "n-1", "--resolution", 32, 32, *QUICK)
     assert run(monkeypatch, *words, "--out", tmp_path / "out") == 0
-    assert "1 scenes are left out" in capsys.readouterr().err
+    assert "1 scene is left out" in capsys.readouterr().err
     assert read_run(tmp_path / "out")[0] == {"unseen"}
 
 
@@ -176,7 +177,7 @@ def test_scenes_that_are_opened_in_vain_are_said_beside_what_is_apart(
         words = ("evaluate", rooms / "scenes.json", "--protocol", protocol, *QUICK)
         assert run(monkeypatch, *words, "--out", tmp_path / "out") != 0
         said = capsys.readouterr().err
-        assert "1 scenes are left out" in said
+        assert "1 scene is left out" in said
         assert f"Skipped unseen: {reason}." in said
 
 

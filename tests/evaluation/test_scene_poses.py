@@ -14,7 +14,7 @@ from gscompleter.apps.evaluating.cases import collect_tasks
 from gscompleter.apps.requests.evaluation import EvaluationRequest, ReproductionRequest
 from gscompleter.data.formats import open_photographs
 from gscompleter.evaluation import scene_poses
-from gscompleter.evaluation.run_facts import RunFacts
+from gscompleter.evaluation.run_facts import RunFacts, strip_folder
 from gscompleter.evaluation.scene_poses import is_contradicted, refine_scene
 from gscompleter.evaluation.store import list_row_paths, read_run_file
 from scenes import photographed
@@ -95,7 +95,7 @@ def test_methods_see_refined_cameras_and_tables_say_so(cases, tmp_path, monkeypa
     assert read_context_psnr(refined) > read_context_psnr(given) + 0.5
 
     first_line = (refined / "tables.md").read_text().splitlines()[0]
-    said = "poses: refined where matches missed them (room 0.40 to 0.10 px, of 256)"
+    said = "poses: refined where matches missed them (room 0.40 to 0.10, in pixels of images whose"
     assert said in first_line
     assert "poses: as given" in (given / "tables.md").read_text().splitlines()[0]
     content = json.loads((refined / "tables.json").read_text())
@@ -112,9 +112,25 @@ def test_a_line_says_what_was_done_to_the_poses_of_each_scene():
     assert facts.sentence.endswith("seed 0; poses: as given.")
     poses = {f"room{number}": vars(DONE) for number in range(7)}
     sentence = replace(facts, poses=poses).sentence
-    assert "room0 0.40 to 0.10 px, " in sentence
+    assert "room0 0.40 to 0.10, " in sentence
     assert "room5" not in sentence
-    assert sentence.endswith("and 2 more scenes, of 256).")
+    assert sentence.endswith("more scenes, in pixels of images whose shorter side has 256).")
+
+
+@pytest.mark.parametrize(
+    ("name", "shown"),
+    [
+        ("own/models.py:paint", "models.py:paint"),
+        ("/home/me/flux.1", "flux.1"),
+        ("~/flux.1", "flux.1"),
+        ("../flux.1", "flux.1"),
+        ("weights/own.safetensors", "own.safetensors"),
+        ("USER/flux.1", "USER/flux.1"),
+        ("warp-inpaint", "warp-inpaint"),
+    ],
+)
+def test_a_line_that_may_be_published_names_no_folder(name, shown):
+    assert strip_folder(name) == shown
 
 
 def test_without_colmap_poses_stay_and_a_line_says_what_would_help(

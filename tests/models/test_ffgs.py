@@ -126,7 +126,7 @@ def test_images_of_two_sizes_are_cropped_with_their_cameras(package):
     assert torch.allclose(given.intrinsics[0], VIEWS[0].camera.K)
 
 
-def test_what_the_package_refuses_is_one_sentence(package):
+def test_what_the_package_refuses_is_one_sentence(package, tmp_path):
     psi = load_reconstructor(f"ffgs:{VARIANT}")
     with pytest.raises(InputError, match="needs at least 2 views"):
         psi(VIEWS[:1])
@@ -134,6 +134,9 @@ def test_what_the_package_refuses_is_one_sentence(package):
         load_reconstructor("ffgs:none/such")
     with pytest.raises(InputError, match="There are no weights at some/where"):
         load_reconstructor(f"ffgs:{VARIANT}", "some/where")
+    (tmp_path / "mine.pt").touch()
+    with pytest.raises(InputError, match=r"mine\.pt is no folder"):
+        load_reconstructor(f"ffgs:{VARIANT}", tmp_path / "mine.pt")
 
 
 def test_weights_that_cannot_be_loaded_are_no_fault_of_the_name(package, tmp_path):

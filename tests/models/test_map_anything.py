@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from gscompleter import InputError, load_reconstructor
+from gscompleter.models import packages
 from gscompleter.models.map_anything import PUBLISHED
 from scenes import Room, camera_at, view_of
 
@@ -60,6 +61,10 @@ def package(monkeypatch):
     sys.modules["mapanything.models"].MapAnything = StandIn
 
 
+def exhaust(name: str) -> None:
+    raise MemoryError
+
+
 def test_depths_come_in_the_unit_of_the_cameras(package):
     psi = load_reconstructor("mapanything")
     depths = psi.model(VIEWS)
@@ -102,6 +107,15 @@ def test_what_is_missing_is_told(package, monkeypatch, tmp_path):
     # The package would search the hub for a repository of this name.
     with pytest.raises(InputError, match="There are no weights at some/where; correct the path"):
         load_reconstructor("mapanything", "some/where")
+    # As it would for a file, such as models/mine.pt: a repository of a user called models.
+    file = tmp_path / "mine.pt"
+    file.touch()
+    with pytest.raises(InputError, match=r"mine\.pt is no folder; name the folder"):
+        load_reconstructor("mapanything", file)
+    # The package is there: what lacks is memory, of which the command has a sentence of its own.
+    with monkeypatch.context() as scarce, pytest.raises(MemoryError):
+        scarce.setattr(packages, "import_module", exhaust)
+        load_reconstructor("mapanything")
     monkeypatch.setitem(sys.modules, "mapanything.models", None)
     with pytest.raises(InputError, match=r"needs its package: pip install .*\(.*halted"):
         load_reconstructor("mapanything")

@@ -105,8 +105,27 @@ def test_other_files_are_refused_with_one_sentence(tmp_path):
 def test_a_network_that_answers_in_another_shape_is_refused(tmp_path):
     turned = [helper.make_node("Transpose", ["image"], ["points"], perm=[0, 3, 2, 1]), *NODES[1:]]
     predict = load_moge("moge-2", save(tmp_path / "model.onnx", turned))
-    with pytest.raises(InputError, match="answered an image by points of"):
+    with pytest.raises(InputError, match=r"an image of \(60, 80\) by points of"):
         predict(view_of(Room(), replace(camera_at(size=80), height=60)))
+
+
+def test_a_mask_in_another_shape_is_told_as_that(tmp_path):
+    nodes = [
+        helper.make_node("Transpose", ["largest"], ["turned"], perm=[0, 2, 1]),
+        helper.make_node("Sigmoid", ["turned"], ["mask"]),
+    ]
+    predict = load_moge("moge-2", save(tmp_path / "model.onnx", [*NODES[:3], *nodes, *NODES[4:]]))
+    with pytest.raises(InputError, match=r"a mask of \(1, 80, 60\)"):
+        predict(view_of(Room(), replace(camera_at(size=80), height=60)))
+
+
+def test_points_too_few_to_tell_the_shift_have_no_depth(tmp_path):
+    """Taken for 0, the shift would be half of the nearest depth off, and nothing would say so."""
+    view = paint_points(view_of(Room(), camera_at(size=200)), 0.6)
+    sees = torch.zeros(200, 200, dtype=torch.bool)
+    sees[100, 100:102] = True
+    view.image[~sees] = -1.0
+    assert not load_moge("moge-2", save(tmp_path / "model.onnx"))(view).valid.any()
 
 
 @pytest.mark.slow

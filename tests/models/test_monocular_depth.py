@@ -76,11 +76,13 @@ def test_moge3_serves_a_single_photograph(package, tmp_path):
     assert torch.equal(view.given_depth > 0, psi.predict_depth(VIEW).valid)
 
 
-def test_moge3_without_its_package_or_weights(package, monkeypatch):
+def test_moge3_without_its_package_or_weights(package, monkeypatch, tmp_path):
     with pytest.raises(InputError, match="was not loaded from Ruicheng/moge-3-vitg"):
         load_depth_predictor("moge-3-giant")
     with pytest.raises(InputError, match="There are no weights at some/where"):
         load_depth_predictor("moge-3-large", Path("some/where"))
+    with pytest.raises(InputError, match="is no file; name the file"):
+        load_depth_predictor("moge-3-large", tmp_path)
     monkeypatch.setitem(sys.modules, "moge.model.v3", None)
     with pytest.raises(InputError, match="pip install git"):
         load_depth_predictor("moge-3-large")

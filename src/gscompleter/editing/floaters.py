@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int64
 from torch import Tensor
@@ -40,7 +41,7 @@ class Surroundings:
         """Search for the neighbours, and measure them."""
         self._means = scene.means
         self._longest = scene.scales.max(dim=1).values
-        # One more, because the nearest of all to a Gaussian is itself.
+        # One more, because a Gaussian is among its own nearest.
         self._nearest = NearestGaussians(scene.means, scene.means, neighbors + 1, NEIGHBOR_SEARCH)
         self.sigma = torch.empty_like(self._longest)
         """Median of the neighbours' largest standard deviations, in scene units."""
@@ -63,6 +64,7 @@ class Surroundings:
         return spacing.clamp_min(self.distance[rows].median())
 
     def _measure(self, rows: Int64[Tensor, "m"]) -> None:
+        """Measure the statistics of some Gaussians, in place."""
         for part in track(rows.split(FLOATER_BLOCK), "Comparing neighbours"):
             others = self._list_neighbors(part)
             offsets = self._means[part, None].double() - self._means[others].double()
@@ -74,8 +76,13 @@ class Surroundings:
             self.gap[part] = (apart / reach).median(dim=1).values
 
     def _list_neighbors(self, rows: Int64[Tensor, "m"]) -> Int64[Tensor, "m k"]:
-        numbers = self._nearest.rows[rows.cpu().numpy(), 1:]
-        return torch.from_numpy(numbers).long().to(rows.device)
+        """List the numbers of the neighbours, in no order that counts."""
+        asked = rows.cpu().numpy()
+        numbers = self._nearest.rows[asked]
+        # The first is the Gaussian itself; of several in one place it may be another one, which
+        # then takes the place of the Gaussian among the rest.
+        others = np.where(numbers[:, 1:] == asked[:, None], numbers[:, :1], numbers[:, 1:])
+        return torch.from_numpy(others).long().to(rows.device)
 
 
 def find_floaters(

@@ -62,6 +62,8 @@ def describe_left_out(left_out: Sequence[Apartable], kept: int, kind: str = "cas
             f"decided without them; ask for them, and the use is noted in {LEDGER}.",
             "apart",
         )
+    if len(left_out) == 1:
+        return [f"1 {kind.removesuffix('s')} is left out, because {file} keeps it apart."]
     return [f"{len(left_out)} {kind} are left out, because {file} keeps them apart."]
 
 

@@ -6,6 +6,7 @@ stands above every table, so that tables of two models cannot be confused.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path, PurePath
@@ -34,6 +35,7 @@ class RunFacts:
     generator: str
     """Name of Φ, with those of its settings that were given."""
     seed: int
+    """Seed of all random numbers."""
     num_apart: int
     """Number of cases that are kept apart, and were used."""
     commits: tuple[str, ...]
@@ -50,7 +52,9 @@ class RunFacts:
         if self.commits:
             parts.append(f"commit {' and '.join(self.commits)}")
         if self.num_apart:
-            parts.append(f"{self.num_apart} cases that are kept apart were used ({LEDGER})")
+            cases = "1 case that is" if self.num_apart == 1 else f"{self.num_apart} cases that are"
+            used = "was used" if self.num_apart == 1 else "were used"
+            parts.append(f"{cases} kept apart {used} ({LEDGER})")
         return "; ".join(parts) + "."
 
     def to_json(self) -> dict[str, Any]:
@@ -92,12 +96,15 @@ def describe_poses(refined: Mapping[str, Mapping[str, Any]]) -> str:
     if not refined:
         return "as given"
     errors = [
-        f"{strip_folder(scene)} {done['given_error']:.2f} to {done['refined_error']:.2f} px"
+        f"{strip_folder(scene)} {done['given_error']:.2f} to {done['refined_error']:.2f}"
         for scene, done in list(refined.items())[:MAX_NAMED]
     ]
     if len(refined) > MAX_NAMED:
         errors.append(f"and {len(refined) - MAX_NAMED} more scenes")
-    return f"refined where matches missed them ({', '.join(errors)}, of {ERROR_SIDE})"
+    return (
+        f"refined where matches missed them ({', '.join(errors)}, in pixels of images whose "
+        f"shorter side has {ERROR_SIDE})"
+    )
 
 
 def name_model_with_settings(name: str, settings: Mapping[str, Any]) -> str:
@@ -110,8 +117,12 @@ def name_model_with_settings(name: str, settings: Mapping[str, Any]) -> str:
 def strip_folder(name: str) -> str:
     """Strip the folder of a file, such as file.py:function; names on a hub are kept."""
     path = PurePath(name)
-    is_file = is_in_file(name) or path.is_absolute() or path.suffix in WEIGHT_FILES
-    return path.name if is_file else name
+    # USER/NAME may be a folder or a repository; paths that begin with ~ or . are no repositories.
+    is_path = path.is_absolute() or name.startswith(("~", "."))
+    if not (is_path or is_in_file(name) or path.suffix in WEIGHT_FILES):
+        return name
+    # In full, since the last part of a path such as `.` names nothing.
+    return os.path.basename(os.path.abspath(os.path.expanduser(name)))
 
 
 def describe_facts(facts: Mapping[str, RunFacts]) -> list[str]:

@@ -108,7 +108,7 @@ def load_ffgs(variant: str, weights: Path | None = None, device: str = "cpu") ->
     Raises:
         InputError: The package is missing, or the model cannot be loaded.
     """
-    place = choose_weights(weights, variant, "weights")
+    place = choose_weights(weights, variant, "weights", "folder")
     title = f"The reconstructor '{PREFIX}{quote_value(variant)}'"
     ffgs = import_authors_module("ffgs", title, INSTALL, "reconstructor")
     try:

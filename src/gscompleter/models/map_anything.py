@@ -88,7 +88,7 @@ def load_map_anything(weights: Path | None = None, device: str = "cpu") -> FromD
     Raises:
         InputError: The package is missing, or the weights cannot be loaded.
     """
-    place = choose_weights(weights, PUBLISHED, "weights")
+    place = choose_weights(weights, PUBLISHED, "weights", "folder")
     title = "The reconstructor 'mapanything'"
     package = import_authors_module("mapanything.models", title, INSTALL, "reconstructor")
     try:

@@ -5,6 +5,7 @@ Tested with tiny networks of the published signature. Not tested: published weig
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -41,11 +42,13 @@ class MoGe:
         of the camera determines.
         """
         pixels = view.image.detach().cpu().float().permute(2, 0, 1)[None].contiguous().numpy()
+        # Points in the axes of the camera, normals, scores of the mask, and metres per unit.
         points, _, mask, scale = self.network(image=pixels, num_tokens=NUM_TOKENS)
         size = pixels.shape[2:]
         if points.shape != (1, *size, 3) or mask.shape != (1, *size) or scale.size != 1:
             raise InputError(
-                f"The network answered an image by points of {points.shape}; {ADVICE}."
+                f"The network answered an image of {size} by points of {points.shape}, a mask of "
+                f"{mask.shape} and a scale of {scale.shape}; {ADVICE}."
             )
         valid = mask[0] >= MIN_MASK
         depth = scale.item() * (points[0, ..., 2] + fit_shift(points[0], valid, view.camera))
@@ -59,7 +62,11 @@ class MoGe:
 def fit_shift(
     points: Float[ndarray, "h w 3"], valid: Bool[ndarray, "h w"], camera: Camera
 ) -> float:
-    """Fit the shift along z after which the points project to their pixels; 0 without points."""
+    """Fit the shift along z after which the points project to their pixels.
+
+    It is NaN where fewer than two points tell it: their depths are then unknown, and 0 would pass
+    for a measurement.
+    """
     h, w = valid.shape
     # A grid of some pixels is enough for one number. A small image has fewer than that.
     rows = np.unique(np.linspace(0, h - 1, FIT_SIDE).round().astype(int))
@@ -67,7 +74,7 @@ def fit_shift(
     points = points[np.ix_(rows, columns)].astype(np.float64)
     used = valid[np.ix_(rows, columns)] & np.isfinite(points).all(axis=-1) & (points[..., 2] > 0)
     if used.sum() < 2:
-        return 0.0
+        return math.nan
 
     # The network assumes a central principal point: rays at z = 1 from the middle of the image.
     fx = camera.K[0, 0].item()

@@ -62,7 +62,7 @@ class MoGe3:
 
 def load_moge3(name: str, weights: Path | None = None, device: str = "cpu") -> MoGe3:
     """Load a published size, or a file `model.pt`; raise InputError if it cannot be loaded."""
-    place = choose_weights(weights, REPOSITORIES[name], "depth_weights")
+    place = choose_weights(weights, REPOSITORIES[name], "depth_weights", "file")
     moge = import_authors_module("moge.model.v3", f"The depth '{name}'", INSTALL, "depth")
     try:
         model = moge.MoGeModel.from_pretrained(place)

@@ -24,6 +24,9 @@ from gscompleter.system.threads import use_one_torch_thread
 from gscompleter.system.timing import timed_stage
 from gscompleter.types import Camera, DepthAffine, DepthMap, Gaussians, Lift, Registration, View
 
+PAPER_ADAM_BETAS = (0.9, 0.999)
+"""Adam's usual decay rates; the paper names neither the optimizer nor its rates."""
+
 
 @timed_stage("register")
 @use_one_torch_thread()
@@ -51,6 +54,8 @@ def initialize_distances(lifted: Gaussians, affine: DepthAffine, camera: Camera)
     same before and after the move. So the ratio of z-depths is the ratio of distances d_i. Our
     reading: the paper samples D at the projection u_i of a Gaussian, and we take the z-depth of its
     mean, which is that value for pixel-aligned Gaussians. Scales stay: the paper names no change.
+    Nor does it bound distances: a negative t may push near Gaussians behind the camera, where the
+    target does not see them (`register.apply_affine` stops them in front of it).
     """
     predicted = compute_z_depths(lifted.means, camera)
     aligned = affine.scale * predicted + affine.shift
@@ -118,8 +123,6 @@ def move_freely(initial: Gaussians, offsets: Float[Tensor, "n 3"], camera: Camer
 
 MOTIONS = {1: move_on_rays, 3: move_freely}
 """Motion by degrees of freedom."""
-PAPER_ADAM_BETAS = (0.9, 0.999)
-"""Adam's usual decay rates; the paper names neither the optimizer nor its rates."""
 
 
 def compute_depth_error(rendered: DepthMap, context: DepthMap) -> Float[Tensor, ""]:

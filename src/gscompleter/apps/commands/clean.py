@@ -21,14 +21,24 @@ from gscompleter.config import CleaningConfig, FloaterConfig
 from gscompleter.system.errors import InputError
 from gscompleter.system.process import import_without_collection
 
-CHECKED_OPTIONS = (
-    *("context", "format", "frames", "resolution", "near", "far", "no_given_depth"),
+OPTIONS_OF_PHOTOGRAPHS = (
+    "context",
+    "format",
+    "frames",
+    "resolution",
+    "near",
+    "far",
+    "no_given_depth",
     "no_refine_poses",
-    *("no_masks", "invert_masks", "large_masks", "ignore", "forget_edits"),
+    "no_masks",
+    "invert_masks",
+    "large_masks",
+    "ignore",
+    "forget_edits",
 )
-"""Options that only photographs can follow."""
-
+"""Options that only photographs can follow: without them no renders take their place here."""
 NEEDS_PHOTOGRAPHS = "There are no photographs to apply this to; name their SCENE."
+"""Sentence about such an option where there are none."""
 
 Strength = Annotated[float, Interval(ge=0.1, le=10)]
 
@@ -37,10 +47,10 @@ Strength = Annotated[float, Interval(ge=0.1, le=10)]
 class CleanOptions(SceneOptions, DeviceOptions):
     """Remove Gaussians of a splat that make its photographs worse or that none of them needs.
 
-    No photograph loses more than 0.01 dB. Without SCENE, remove those that stand out from their
-    neighbours (isolated, huge, needles, transparent) and long streaks beside which nothing lies.
-    The cleaned splat is OUT/completed.ply; removed.png shows what went, and `gscompleter strip`
-    puts all back.
+    No photograph loses more than 0.01 dB (times --strength). Without SCENE, remove those that stand
+    out from their neighbours (isolated, huge, needles, transparent) and long streaks beside which
+    nothing lies. The cleaned splat is OUT/completed.ply; removed.png shows what went, and
+    `gscompleter strip` puts all back.
 
     Example: gscompleter clean photographs --scene splat.ply --out cleaned
     """
@@ -71,7 +81,7 @@ def decide_cleaning(options: CleanOptions) -> CleaningRequest:
     check_context(options.context)
     if options.folder is None:
         defaults = {field.name: field.default for field in fields(options)}
-        for name in CHECKED_OPTIONS:
+        for name in OPTIONS_OF_PHOTOGRAPHS:
             if getattr(options, name) != defaults[name]:
                 raise InputError(NEEDS_PHOTOGRAPHS, name)
     refuse_unused_settings(options.config, options.folder is not None)
@@ -90,7 +100,11 @@ def decide_cleaning(options: CleanOptions) -> CleaningRequest:
 
 
 def refuse_unused_settings(config: CleaningConfig, has_photographs: bool) -> None:
-    """Refuse settings of what does not decide: photographs, or else neighbours (`floaters`)."""
+    """Refuse settings that nothing would read, instead of ignoring them.
+
+    Photographs decide by all settings but `floaters`. Without them neighbours decide, by `floaters`
+    alone.
+    """
     usual = CleaningConfig()
     if has_photographs:
         for field in fields(FloaterConfig):

@@ -16,6 +16,7 @@ from gscompleter.apps.commands.shared_options import (
     WritingOptions,
 )
 from gscompleter.data.mask_reading import MaskReading
+from gscompleter.data.sfm import NUM_VIDEO_FRAMES
 from gscompleter.system.process import import_without_collection
 
 
@@ -32,7 +33,7 @@ class PosesOptions(ComputeOptions, WritingOptions, MaskOptions):
     photographs: Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="PHOTOS")]
     """Folder of overlapping photographs or 360° panoramas (2:1) of one scene, or a video. They are
     not changed. Of a scene with cameras, its folder or camera file: its images alone have none."""
-    frames: NumFrames = 40
+    frames: NumFrames = NUM_VIDEO_FRAMES
     """Most frames of a video to take as photographs, sharp ones at even steps of the camera."""
     out: Path
     """Write results here. A folder, for upright copies in images, and cameras and points in
@@ -58,10 +59,10 @@ def run_poses(options: PosesOptions) -> None:
         poses = find_poses(
             options.photographs, options.out, options.overwrite, options.frames, reading
         )
+    origin = ", found by an earlier run" if poses.reused else ""
     sentence = (
         f"{poses.num_registered} of {poses.photographs} cameras and {poses.points:,} points, "
-        f"mean error {poses.error:.2f} px"
-        f"{', found by an earlier run' if poses.reused else ''}: {options.out}"
+        f"mean error {poses.error:.2f} px{origin}: {options.out}"
     )
     content = {
         "out": str(options.out),

@@ -16,6 +16,7 @@ from gscompleter.apps.command_line.chosen_config import ChosenConfig
 from gscompleter.apps.commands.shared_decisions import (
     check_context,
     check_generator,
+    decide_config,
     decide_filling,
     decide_results,
     has_splat_alone,
@@ -36,7 +37,7 @@ from gscompleter.apps.live.strokes import (
 )
 from gscompleter.apps.report.schema import find_completed
 from gscompleter.apps.requests.completion import CompletionRequest, TargetRequest
-from gscompleter.config import CompleterConfig, load_config
+from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.splats.edits import read_edits
 from gscompleter.system.errors import InputError, quote_value
@@ -94,12 +95,13 @@ def decide_session(options: AnyOptions, strokes: Path | None) -> SessionRequest:
     options = replace(options, out=out, overwrite=options.overwrite or continues)
     inputs = [*list_inputs(options), *(() if continues else (path,))]
     refuse_overlap(out, inputs, may_continue=False)
+    begun = begin_with(options)
     return replace(
-        begin_with(options),
+        begun,
         steps=read_steps(saved.frames, path.parent),
         undone=read_steps(saved.undone, path.parent),
         saved=saved.saved if continues else None,
-        notes=tuple(describe_continuation(options, saved, out if continues else None)),
+        notes=tuple(describe_continuation(begun, saved, continues)),
     )
 
 
@@ -109,8 +111,12 @@ def decide_replay(options: CompletingOptions, strokes: Path) -> SessionRequest:
     saved = read_strokes(path)
     if not saved.frames:
         raise InputError(f"{quote_value(path)} has no steps; {STROKES_ADVICE}.", "strokes")
-    steps = read_steps(saved.frames, path.parent)
-    return replace(begin_with(add_saved_options(options, saved)), steps=steps)
+    begun = begin_with(add_saved_options(options, saved))
+    return replace(
+        begun,
+        steps=read_steps(saved.frames, path.parent),
+        notes=tuple(describe_session_changes(begun, saved)),
+    )
 
 
 def begin_with(options: CompletingOptions) -> SessionRequest:
@@ -141,7 +147,7 @@ def describe_session(options: CompletingOptions, completion: CompletionRequest) 
     splat = completion.work.splat
     scene = None if splat is None else os.path.abspath(splat.path)
     folder = None if has_splat_alone(options) else describe_value("folder", options.folder)
-    config = asdict(completion.work.config)
+    config = describe_value("config", asdict(completion.work.config))
     return {**describe_options(options), "folder": folder, "scene": scene, "config": config}
 
 
@@ -155,10 +161,14 @@ def describe_options(options: CompletingOptions) -> dict[str, Any]:
 def describe_value(name: str, value: Any) -> Any:
     """Describe the value of an option as JSON; paths are absolute, as a later run is elsewhere."""
     if is_dataclass(value):
-        names = [field.name for field in fields(value)]
-        return {inner: describe_value(inner, getattr(value, inner)) for inner in names}
+        value = {field.name: getattr(value, field.name) for field in fields(value)}
+    if isinstance(value, Mapping):
+        return {inner: describe_value(inner, part) for inner, part in value.items()}
     if isinstance(value, tuple | list):
         return [describe_value(name, part) for part in value]
+    if is_in_file(value):
+        file, _, attribute = value.rpartition(":")
+        return f"{os.path.abspath(file)}:{attribute}"
     is_path = isinstance(value, Path)
     is_path |= name in WORDS_OR_PATHS and isinstance(value, str) and os.path.exists(value)
     return os.path.abspath(value) if is_path else value
@@ -169,11 +179,20 @@ def find_session(options: AnyOptions, strokes: Path | None) -> tuple[AnyOptions,
 
     SCENE may name the session itself: its folder, or the completed scene in it. Then the options
     that are returned name no scene, which the session knows. An output folder without steps stands
-    for the completed scene in it.
+    for the completed scene in it. Raises InputError if a second scene or session is named, too.
     """
     folder = options.folder
     path = None if strokes is None else find_strokes_file(strokes)
-    if folder is None or options.scene is not None:
+    if folder is None:
+        return options, path
+    if options.scene is not None:
+        # A session holds no photographs, and its steps would not be done.
+        if holds_session(folder):
+            raise InputError(
+                f"{quote_value(folder)} holds a session, which knows its scene; leave --scene out, "
+                f"or do its steps on another one with --strokes {quote_value(folder)}.",
+                "scene",
+            )
         return options, path
     if os.path.isdir(folder):
         if holds_session(folder):
@@ -212,46 +231,59 @@ def restore_options(options: AnyOptions, saved: StrokesFile, path: Path) -> AnyO
     Raises InputError if an option is given that differs from the session's, or if its scene is
     missing.
     """
-    if saved.session is None:
+    shown = quote_value(path)
+    if saved.session is None or not any(saved.session.get(name) for name in SCENE_PATHS):
         raise InputError(
-            f"{quote_value(path)} does not tell of which scene it is; name the scene, as in "
-            f"`gscompleter live splat.ply --strokes {quote_value(path)}`.",
+            f"{shown} does not tell of which scene it is; name the scene, as in "
+            f"`gscompleter live splat.ply --strokes {shown}`.",
         )
     kind = type(options)
     known = {**saved.session, **{name: getattr(saved, name) for name in SEPARATE_OPTIONS}}
-    given = {
-        **describe_options(options),
-        **{name: describe_value(name, getattr(options, name)) for name in SEPARATE_OPTIONS},
-        "config": describe_chosen_config(options),
-    }
-    for name, value in known.items():
-        refuse_other_value(name, given.get(name), value, kind)
-        refuse_code(name, given.get(name), value)
+    config = validate_typed(CompleterConfig, known.get("config", {}), shown, STROKES_ADVICE)
 
     # Of this run are its own options, and those of the command that no completion has.
     own = {field.name for field in fields(kind)}
     own -= {field.name for field in fields(CompletingOptions)} - set(OPTIONS_OF_A_RUN)
-    shown = quote_value(path)
-    config = validate_typed(CompleterConfig, known.get("config", {}), shown, STROKES_ADVICE)
-    chosen = ChosenConfig(changes=asdict(config))
-    values = {**known, **{name: getattr(options, name) for name in own}, "config": chosen}
+    values = {
+        **known,
+        **{name: getattr(options, name) for name in own},
+        "config": ChosenConfig(changes=asdict(config)),
+    }
     restored = validate_typed(kind, values, shown, STROKES_ADVICE)
     for name in SCENE_PATHS:
         scene = getattr(restored, name)
-        if scene is not None and not scene.exists():
+        if scene is not None and not os.path.exists(scene):
             raise InputError(
                 f"{quote_value(scene)} is missing, with which the session began; name it where it "
                 f"is now, as in `gscompleter live splat.ply --strokes {shown}`.",
             )
+
+    # What is typed are changes of a preset, and which preset depends on the session's options.
+    typed_config = decide_config(replace(restored, config=options.config))
+    given = {
+        **describe_options(options),
+        **{name: describe_value(name, getattr(options, name)) for name in SEPARATE_OPTIONS},
+        "config": describe_value("config", asdict(typed_config)),
+    }
+    for name, value in given.items():
+        # A config that was not typed is the one of the session.
+        if name != "config" or options.config != ChosenConfig():
+            refuse_other_value(name, value, known.get(name), kind)
+    for name, value in known.items():
+        refuse_code(name, given.get(name), value)
     return restored
 
 
 def refuse_other_value(name: str, given: Any, known: Any, kind: type[CompletingOptions]) -> None:
-    """Refuse an option that would change what the steps did, unless it has its default."""
-    if isinstance(known, Mapping) and isinstance(given, Mapping) and name != "config":
-        for inner, value in known.items():
-            refuse_other_value(inner, given.get(inner), value, kind)
-    elif normalize(given) not in [normalize(known), *list_defaults(name, kind)]:
+    """Refuse an option that would change what the steps did, unless it has its default.
+
+    `known` is the value in the file, which is None where an earlier version wrote none.
+    """
+    if isinstance(given, Mapping) and name != "config":
+        told = known if isinstance(known, Mapping) else {}
+        for inner, value in given.items():
+            refuse_other_value(inner, value, told.get(inner), kind)
+    elif given not in [describe_value(name, known), *list_defaults(name, kind)]:
         raise InputError(
             "A session goes on with the settings that it began with; leave this one out, or begin "
             "anew with it.",
@@ -261,7 +293,7 @@ def refuse_other_value(name: str, given: Any, known: Any, kind: type[CompletingO
 
 def refuse_code(name: str, given: Any, known: Any) -> None:
     """Refuse to run a file of Python because a session names it, which may come from elsewhere."""
-    words = [word for word in list_words(known) if is_in_file(word)]
+    words = [word for word in list_words(describe_value(name, known)) if is_in_file(word)]
     if words and not set(words) <= set(list_words(given)):
         raise InputError(
             f"The session ran {quote_value(words[0])}, a program; name it again if you trust it.",
@@ -282,50 +314,56 @@ def list_words(value: Any) -> Iterator[str]:
 
 
 def list_defaults(name: str, kind: type[CompletingOptions]) -> list[Any]:
-    """List the values of an option, as JSON, that mean that it was not given."""
-    if name == "config":
-        presets = [
-            load_config("default", is_splat, has_photographs)
-            for is_splat, has_photographs in ((False, True), (True, True), (True, False))
-        ]
-        return [normalize(asdict(preset)) for preset in presets]
+    """List the values of an option, as JSON, that mean that it was not given: one, or none."""
     places = (GeneratorOptions, kind)
     defaults = {field.name: field.default for place in places for field in fields(place)}
-    return [normalize(describe_value(name, defaults[name]))] if name in defaults else []
-
-
-def normalize(value: Any) -> Any:
-    """Return values of JSON with lists in place of tuples, so that they can be compared."""
-    if isinstance(value, Mapping):
-        return {name: normalize(inner) for name, inner in value.items()}
-    return [normalize(inner) for inner in value] if isinstance(value, list | tuple) else value
-
-
-def describe_chosen_config(options: CompletingOptions) -> dict[str, Any]:
-    """Describe the config that options choose, to compare it with that of a session."""
-    lacks_photographs = has_splat_alone(options)
-    is_splat = options.scene is not None or lacks_photographs
-    return asdict(options.config.decide(is_splat, not lacks_photographs))
+    is_known = name in defaults and name != "config"
+    return [describe_value(name, defaults[name])] if is_known else []
 
 
 def describe_continuation(
-    options: CompletingOptions, saved: StrokesFile, out: Path | None
+    begun: SessionRequest, saved: StrokesFile, continues: bool
 ) -> Iterator[str]:
-    """Say how many steps are done again, and which files are others than they were.
+    """Say how many steps are done again, and what is another than it was.
 
-    `out` is the folder of a session that goes on in its place; None for another folder.
+    `continues` is True for a session that goes on in its own folder.
     """
     count = len(saved.frames)
     yield f"Going on after {count} {'step' if count == 1 else 'steps'}, which are done again."
-    scene = options.scene or options.folder
-    is_known = saved.scene_sha256 is not None and scene is not None and scene.is_file()
-    if scene is not None and is_known and hash_file(scene) != saved.scene_sha256:
-        yield (
-            f"{quote_value(scene)} is another file than the session began with; its steps are "
-            "done on this one."
-        )
-    if out is None:
+    yield from describe_session_changes(begun, saved)
+    if not continues:
         return
-    completed = find_completed(out)
+    completed = find_completed(begun.out)
     if completed.is_file() and not read_edits(completed).is_unchanged:
         yield f"{quote_value(completed)} was changed by another program; Save replaces it."
+
+
+def describe_session_changes(begun: SessionRequest, saved: StrokesFile) -> Iterator[str]:
+    """Say what the steps are done with that the session did not begin with: splat and options."""
+    splat = begun.completion.work.splat
+    # A splat in a folder of its own, such as an unpacked .sog, has no SHA-256.
+    path = None if splat is None or saved.scene_sha256 is None else splat.path
+    if path is not None and path.is_file() and hash_file(path) != saved.scene_sha256:
+        yield (
+            f"{quote_value(path)} is another file than the session began with; its steps are done "
+            "on this one."
+        )
+    others = list_differences(begun.record, saved.session or {})
+    if others:
+        yield (
+            f"The session began with other values of {', '.join(others)}; its steps are done with "
+            "those of this command."
+        )
+
+
+def list_differences(record: Mapping[str, Any], known: Mapping[str, Any]) -> list[str]:
+    """List options whose values differ from those of a session, but for those of its scene."""
+    names: list[str] = []
+    for name, value in record.items():
+        if name in SCENE_PATHS or name not in known:
+            continue
+        if name == "synthesis" and isinstance(known[name], Mapping):
+            names += list_differences(value, known[name])
+        elif value != known[name]:
+            names.append(f"--{name.replace('_', '-')}")
+    return names

@@ -88,8 +88,7 @@ def decide_filling(
     # A splat without photographs may be SCENE itself.
     path = options.folder if lacks_photographs and options.scene is None else options.scene
     splat = None if path is None else decide_splat(options, path)
-    config = options.config.decide(splat is not None, not lacks_photographs, adapt)
-    config = stop_recoloring(config) if options.no_recolor else config
+    config = decide_config(options, adapt)
 
     masks = MaskReading(
         options.invert_masks and not has_marks,
@@ -108,10 +107,23 @@ def decide_filling(
         named = (*(context or ()), *targets.named)
         poses = PosesRequest(options.out, options.overwrite, options.frames, named)
         source = PhotographsRequest(scene, poses, context)
-        # With photographs, a scene is what they show, unless the user says otherwise.
-        config = config if options.holes == "auto" else config.for_holes(options.holes)
     work = WorkRequest(splat=splat, geometry=options.geometry, models=models, config=config)
     return CompletionRequest(source=source, work=work, targets=targets, results=results)
+
+
+def decide_config(
+    options: CompletingOptions, adapt: Adapt = lambda config: config
+) -> CompleterConfig:
+    """Decide on the settings of the method: those of `--config`, and what other options change."""
+    lacks_photographs = has_splat_alone(options)
+    is_splat = lacks_photographs or options.scene is not None
+    config = options.config.decide(is_splat, not lacks_photographs, adapt)
+    if options.no_recolor:
+        config = stop_recoloring(config)
+    # With photographs, a scene is what they show, unless the user says otherwise.
+    if not lacks_photographs and options.holes != "auto":
+        config = config.for_holes(options.holes)
+    return config
 
 
 def decide_results(options: SceneOptions) -> ResultsRequest:

@@ -20,10 +20,7 @@ from gscompleter.data.camera_files import INRIA_CAMERAS_FILE, has_camera_list
 from gscompleter.data.file_names import list_homes_of
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photograph_names import name_render
-from gscompleter.data.photographs import (
-    Photographs,
-    Resolution,
-)
+from gscompleter.data.photographs import Photographs
 from gscompleter.data.scene import load_cameras
 from gscompleter.numerics.geometry import add_near_plane, is_same_camera
 from gscompleter.render.protocols import Renderer
@@ -36,15 +33,23 @@ from gscompleter.virtual_capture.upward import Upward, find_upward
 from gscompleter.virtual_capture.witnesses import MAX_WITNESSES
 
 MAX_AROUND = 12
-"""Most cameras around all targets together: each takes the memory of a frozen scene."""
+"""Most cameras around all targets together, as each takes the memory of a frozen scene; around more
+targets than these, one each."""
 MIN_FOUND_COVERED = 0.9
 """Least share of its image in which a camera that was found sees the splat."""
 NUM_STANDPOINTS = 6
-"""Most cameras from which a trained splat looks well."""
+"""Most cameras from which a trained splat looks well, at which it is rendered."""
 MIN_FOUND_SIDE = 64
-"""Least width and height of such a camera, in pixels."""
-TRAINER_LEVELS = 2
-"""Folders between the cameras.json of a trainer and its point_cloud/iteration_N/*.ply."""
+"""Least width and height of the camera of a pixel-aligned splat, in pixels, however few its
+Gaussians are."""
+
+CaptureSource = Literal["cameras", "targets", "place", "pixels", "standpoints"]
+"""How cameras were come by.
+
+`cameras` are those of a file. All others were found: around the holes of `targets`; around the
+`place` of a removal; from the sizes of Gaussians that were lifted from `pixels`; or as
+`standpoints`, from which a trained splat looks like a photograph.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -80,9 +85,10 @@ class RenderRequest:
     """Limits of holes; `kind` chooses their kind in place of its own."""
 
     def find_up(self, scene: Gaussians, renderer: Renderer) -> Upward:
-        """Find the upward direction, for which the cameras beside the splat are read as well."""
+        """Find the upward direction: as named, or else also by the cameras beside the splat."""
         splat = self.reading.folder
-        beside = find_cameras_beside(splat)
+        # Where up is named, cameras beside the splat are not needed, and may be damaged.
+        beside = find_cameras_beside(splat) if self.up is None else None
         cameras = [] if beside is None else load_cameras(beside, self.reading.resolution)
         return find_upward(splat, scene, renderer, self.up, cameras)
 
@@ -93,9 +99,7 @@ class Capture:
 
     cameras: Sequence[Camera]
     names: Sequence[str]
-    source: str
-    """`cameras` of a file, found around the `targets` or the `place` of a removal, from the sizes
-    of `pixels`, or `standpoints`."""
+    source: CaptureSource
     where: str
     """Clause that says which cameras they are."""
     more: str
@@ -111,15 +115,11 @@ def find_cameras_beside(splat: Path) -> Path | None:
     folders = []
     for folder in list_homes_of(splat):
         folders.append(folder)
-        # The trainers of 3DGS write point_cloud/iteration_30000/point_cloud.ply below cameras.json.
+        # Trainers of 3DGS write point_cloud/iteration_30000/point_cloud.ply beside cameras.json.
         if folder.parent.name == "point_cloud":
-            folders.append(folder.parents[TRAINER_LEVELS - 1])
-    found = [
-        place / INRIA_CAMERAS_FILE
-        for place in folders
-        if has_camera_list(place / INRIA_CAMERAS_FILE)
-    ]
-    return found[0] if found else None
+            folders.append(folder.parent.parent)
+    files = [folder / INRIA_CAMERAS_FILE for folder in folders]
+    return next((file for file in files if has_camera_list(file)), None)
 
 
 def take_from_file(path: Path, known: Photographs, request: RenderRequest) -> Capture:
@@ -145,20 +145,21 @@ def find_cameras_alone(
     That of a pixel-aligned splat, at `pixel_center`, is taken with small moves of it; a trained
     splat tells no more than from where it looks well.
     """
-    resolution = request.reading.resolution
-    # Two photographs are the fewest, so that no image had more pixels than half of the Gaussians.
-    side = max(MIN_FOUND_SIDE, round((len(scene) / 2) ** 0.5))
-    sides = (side,) if resolution is None else (side, *np.ravel(resolution).tolist())
     upward = request.find_up(scene, renderer)
     if pixel_center is None:
         return find_standing_cameras(scene, renderer, upward, request)
-    camera = aim_pixel_camera(scene, pixel_center, upward.direction, min(sides))
+    # Two photographs are the fewest, so that no image had more pixels than half of the Gaussians.
+    side = max(MIN_FOUND_SIDE, round((len(scene) / 2) ** 0.5))
+    if request.reading.resolution is not None:
+        # The image is square, so that it is as large as the shorter side that was asked for.
+        side = min(side, int(np.min(request.reading.resolution)))
+    camera = aim_pixel_camera(scene, pixel_center, upward.direction, side)
     ranged = add_near_plane(camera, scene.means)
     seen = renderer.render(scene, ranged).depth_map()
     covered = seen.valid.float().mean().item()
     if covered < MIN_FOUND_COVERED:
         raise InputError(
-            f"The camera that fits the splat sees it in {covered:.0%} of its image, and at least "
+            f"The camera that fits the splat sees it in {covered:.1%} of its image, and at least "
             f"{MIN_FOUND_COVERED:.0%} are needed to trust it; name a camera with --target, or the "
             "cameras it was made from with --cameras."
         )
@@ -208,11 +209,14 @@ def search_around_place(
     return name_capture(cameras, "place", "cameras around what is removed", upward)
 
 
-def choose_side(resolution: Resolution) -> int:
-    """Choose the width and height of cameras that are found by the splat alone."""
-    if isinstance(resolution, (tuple, list)):
-        return max(resolution)
-    return resolution if isinstance(resolution, int) else DEFAULT_LONG_SIDE
+def choose_side(resolution: tuple[int, int] | int | None) -> int:
+    """Choose the width and height of the square cameras that are found for a trained splat.
+
+    A splat has no full size, for which None stands: they then have the usual one.
+    """
+    if resolution is None:
+        return DEFAULT_LONG_SIDE
+    return resolution if isinstance(resolution, int) else max(resolution)
 
 
 def search_around(
@@ -222,7 +226,7 @@ def search_around(
     renderer: Renderer,
 ) -> Capture:
     """Search for cameras around the holes of all targets."""
-    # Fewer around each of many targets.
+    # Fewer around each of many targets, and one at least.
     count = max(1, min(MAX_CHOSEN_CAMERAS, MAX_AROUND // max(len(targets), 1)))
     cameras: list[Camera] = []
     for target, hole in zip(targets, holes, strict=True):
@@ -239,7 +243,7 @@ def search_around(
 
 
 def name_capture(
-    cameras: Sequence[Camera], source: str, where: str, upward: Upward | None = None
+    cameras: Sequence[Camera], source: CaptureSource, where: str, upward: Upward | None = None
 ) -> Capture:
     """Name cameras that were found."""
     names = [name_render(number) for number in range(1, len(cameras) + 1)]

@@ -32,7 +32,7 @@ def replay_session(request: SessionRequest) -> int:
         show_progress(console),
         reserve_output(results.out, results.overwrite, COMPLETE_COMMAND, LIVE_RESULTS) as output,
     ):
-        print_lines(console, *output.describe_others())
+        print_lines(console, *request.notes, *output.describe_others())
         prepared = prepare_session(request, console)
         session = replay_steps(begin_session(prepared), request.steps, (), console)
         if not session.steps:
