@@ -19,11 +19,11 @@ from gscompleter.types import Camera, Gaussians
 MAX_REMOTENESS = 1e3
 """Ratio of the largest coordinate to the camera spread above which a local origin is used."""
 MAX_CAMERA_STEP = 1e-3
-"""Coarsest float32 step of coordinates, relative to the camera spread. In scene units for cameras
-in one place, of which nothing else tells a size."""
+"""Coarsest float32 step of coordinates, relative to the camera spread. For poses in one place, of
+whose scene nothing tells the size, it is in scene units."""
 MAX_SEEN_STEP = 1e-4
-"""Coarsest step relative to the distance of the scene, if that allows more: a tenth of a pixel at a
-focal length of 1000 pixels."""
+"""Coarsest step relative to the distance of what the cameras see, if that allows a coarser one: a
+tenth of a pixel at a focal length of 1000 pixels."""
 
 
 def choose_local_origin(poses: Sequence[Float[np.ndarray, "4 4"]]) -> Float[np.ndarray, "3"]:
@@ -51,9 +51,9 @@ def compute_step(coordinate: float) -> float:
 
 
 def is_near(middle: Float[np.ndarray, "3"], origin: Float[np.ndarray, "3"]) -> bool:
-    """Return True if a place is closer to an origin than half of the distance of that from zero.
+    """Return True if a place is less far from an origin than half as far as that is from zero.
 
-    Distances are the largest of those along the three axes.
+    Both distances are those along the axis on which they are largest.
     """
     return bool(np.abs(middle - origin).max() < 0.5 * np.abs(origin).max())
 
@@ -99,7 +99,7 @@ def shift_to_origin(
     require(
         step <= max(MAX_CAMERA_STEP * spread, MAX_SEEN_STEP * distance),
         f"The scene lies {farthest:g} units from its origin, where float32 has steps of {step:g}, "
-        f"and its cameras are {spread:g} apart; export the scene and its photographs relative to a "
-        "local origin.",
+        f"and its cameras are {spread:g} apart and {distance:g} from it; export the scene and its "
+        "photographs relative to a local origin.",
     )
     return replace(scene, means=means.float())

@@ -59,6 +59,7 @@ def complete_demo(models: ModelRequest, results: ResultsRequest) -> int:
         scene = folder / "scene"
         write_motorcycle_scene(scene)
         completion = folder / "completion"
+        # The scene has cameras, so that none are searched for.
         source = PhotographsRequest(
             scene=SceneRequest(scene, resolution=DEMO_SIZE),
             poses=PosesRequest(completion),

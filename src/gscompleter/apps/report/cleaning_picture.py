@@ -19,7 +19,7 @@ from gscompleter.types import Camera, Gaussians, merge
 
 REMOVED_PICTURE_FILE = "removed.png"
 NUM_ROWS = 2
-"""Rows of the picture, of which each is of a camera: those that see most of what goes."""
+"""Rows of the picture. Each is of one camera, of those that see most of what goes."""
 PICTURE_SIDE = 384
 """Width and height of an image from outside, in pixels."""
 OUTSIDE_ZOOM = 1.5
@@ -69,8 +69,8 @@ def choose_outside_cameras(
     whole splat and with a section that leaves out what stands in front, and the better one counts.
 
     Returns:
-        The cameras, and the share of what goes in the alpha that all cameras see of the whole
-        splat.
+        The cameras, and the share of what goes in what is seen from outside: in the alpha of all
+        cameras, without a section.
     """
     kept, gone = split_thinned(given, removed, MAX_PREVIEW_GAUSSIANS)
     both = merge([kept, gone])

@@ -45,7 +45,7 @@ def claim_share(out: Path, share: tuple[int, int]) -> Iterator[None]:
         with give_signs(claim):
             yield
     finally:
-        # A disk that has gone since may not hide what happened, nor undo jobs that are done.
+        # An error of the disk must not hide what happened, nor fail a run whose jobs are done.
         with suppress(OSError):
             claim.unlink()
 
@@ -61,6 +61,6 @@ def overlaps(share: tuple[int, int], claim: Path) -> bool:
         return False
     except (OSError, ValueError, TypeError):
         return True
-    # A job is i modulo n and j modulo m if and only if gcd(n, m) divides i - j (the Chinese
+    # Some job is i modulo n and j modulo m if and only if gcd(n, m) divides i - j (the Chinese
     # remainder theorem).
     return (number - share[0]) % math.gcd(count, share[1]) == 0
