@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from gscompleter import GSCompleter, InputError, merge
+from gscompleter.types import ContextScene
 from scenes import Room, camera_at, gaussians_of, random_gaussians, view_of
 
 
@@ -291,6 +292,18 @@ def unchecked(make, *arguments, **changes):
         return make(*arguments, **changes)
     finally:
         config.update("jaxtyping_disable", before)
+
+
+def test_of_a_context_some_or_all_are_left_out():
+    scene = random_gaussians(5)
+    source = ContextScene.whole(scene)
+    everything = torch.ones(5).bool()
+    half = source.leave_out(torch.arange(5) < 3)
+    assert torch.equal(half.rendered.means, scene.means[3:])
+    assert half.proxy_index[3:].tolist() == [0, 1]
+    empty = replace(source.leave_out(everything), replaced_mask=everything)
+    assert len(empty.leave_out(torch.zeros(0).bool()).rendered) == 0
+    assert torch.equal(empty.expand(torch.ones(0, 2)), torch.zeros(5, 2))
 
 
 def test_a_scene_of_one_part_is_not_copied():

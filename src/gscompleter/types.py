@@ -928,6 +928,8 @@ class ContextScene:
 
         The masks stay as they are: the caller knows whether what went was removed or replaced.
         """
+        if len(gone) == 0:  # all were left out before
+            return self
         # The new number of each rendered Gaussian: its place among those that stay. Those that are
         # gone take the number of one that is left, which nobody reads.
         number = ((~gone).cumsum(0) - 1).clamp_min(0)
@@ -937,6 +939,8 @@ class ContextScene:
         """Map values of rendered Gaussians to those they stand for; 0 for those that are gone."""
         if self.rendered is self.gaussians:
             return values
+        if len(values) == 0:  # nothing is left that `proxy_index` could name
+            return values.new_zeros((len(self.gaussians), *values.shape[1:]))
         expanded = values[self.proxy_index]
         expanded[self.gone_mask] = 0
         return expanded
