@@ -1,5 +1,6 @@
 """Impossible cameras and views are refused where they are made."""
 
+import json
 import math
 from dataclasses import replace
 
@@ -8,6 +9,7 @@ import pytest
 import torch
 
 from gscompleter import GSCompleter, InputError, merge
+from gscompleter.types import ContextScene
 from scenes import Room, camera_at, gaussians_of, random_gaussians, view_of
 
 
@@ -47,6 +49,7 @@ def lens(row: int, column: int, value: float) -> torch.Tensor:
         ({"K": lens(2, 2, 1e-3)}, "a skew or another last row"),
         ({"K": lens(2, 0, math.nan)}, "a skew or another last row"),
         ({"K": lens(1, 0, math.inf)}, "a skew or another last row"),
+        ({"K": lens(1, 0, math.nan)}, "a skew or another last row"),
         ({"K": lens(0, 1, 3.0)}, "a skew or another last row"),
         ({"K": lens(0, 0, 1e-30)}, "fit no lens"),
         ({"K": lens(0, 2, 1e6)}, "far outside of its image"),
@@ -74,9 +77,18 @@ def test_an_impossible_camera_is_refused_at_once(change, sentence):
 
 def test_numbers_of_numpy_become_those_of_python():
     """JSON cannot hold NumPy's."""
-    camera = unchecked(replace, camera_at(size=32), width=np.int64(32), near=np.float32(0.5))
+    changes = {"width": np.int64(32), "near": np.float32(0.5), "padding": (np.int64(4), 2)}
+    camera = unchecked(replace, camera_at(size=32), **changes)
     assert type(camera.width) is int
     assert type(camera.near) is float
+    view = unchecked(replace, view_of(Room(), camera), frame=np.int64(3))
+    place = (np.float32(0.5), 1.0, 2.0)
+    scene = unchecked(replace, random_gaussians(4), origin=place)
+    assert json.loads(json.dumps([camera.padding, view.frame, scene.origin])) == [
+        [4, 2],
+        3,
+        [0.5, 1.0, 2.0],
+    ]
 
 
 def test_a_rotation_may_be_rounded_and_planes_may_be_unknown():
@@ -169,6 +181,31 @@ def test_gaussians_of_other_types_and_shapes_are_refused_at_once(change, sentenc
         unchecked(replace, random_gaussians(4), **change)
 
 
+@pytest.mark.parametrize(
+    ("index", "sentence"),
+    [
+        (torch.ones(3).bool(), "A mask of 3 entries cannot select from 4 Gaussians"),
+        (torch.ones(5).bool(), "A mask of 5 entries"),
+        (torch.ones(4, 3).bool(), r"by a boolean mask of shape \[n\], .* tensor of bool and shape"),
+        (torch.ones(4), "a tensor of float32"),
+        (np.ones(4, bool), "not by a value of type ndarray"),
+        ([0, 1], "of type list"),
+        (0, "not by a value 0"),
+    ],
+)
+def test_what_selects_no_gaussians_is_refused(index, sentence):
+    with pytest.raises(InputError, match=sentence):
+        unchecked(random_gaussians(4).__getitem__, index)
+
+
+def test_gaussians_are_selected_by_masks_indices_and_slices():
+    scene = random_gaussians(4)
+    last = scene.means[2:]
+    assert torch.equal(scene[torch.arange(4) > 1].means, last)
+    assert torch.equal(scene[torch.tensor([2, 3])].means, last)
+    assert torch.equal(scene[2:].means, last)
+
+
 def test_constructors_read_no_number_of_large_tensors():
     """They run in every step of an optimisation, and a GPU would be waited for."""
     scene = random_gaussians(4)
@@ -255,6 +292,18 @@ def unchecked(make, *arguments, **changes):
         return make(*arguments, **changes)
     finally:
         config.update("jaxtyping_disable", before)
+
+
+def test_of_a_context_some_or_all_are_left_out():
+    scene = random_gaussians(5)
+    source = ContextScene.whole(scene)
+    everything = torch.ones(5).bool()
+    half = source.leave_out(torch.arange(5) < 3)
+    assert torch.equal(half.rendered.means, scene.means[3:])
+    assert half.proxy_index[3:].tolist() == [0, 1]
+    empty = replace(source.leave_out(everything), replaced_mask=everything)
+    assert len(empty.leave_out(torch.zeros(0).bool()).rendered) == 0
+    assert torch.equal(empty.expand(torch.ones(0, 2)), torch.zeros(5, 2))
 
 
 def test_a_scene_of_one_part_is_not_copied():

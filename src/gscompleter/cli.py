@@ -145,6 +145,7 @@ def main() -> None:
         if isinstance(command_options, ComputeOptions):
             limit_threads(command_options.threads)
         if isinstance(command_options, Options):
+            command_options.refuse_addresses()
             command_options.check_overlap()
             if command_options.quiet:
                 logging.getLogger("gscompleter").setLevel(logging.ERROR)

@@ -38,10 +38,11 @@ from gscompleter.system.tensor_checks import (
     is_whole_number,
 )
 
+# Bounds of a camera. Files hold float64 and the pipeline uses float32, in which 1e300 is infinity
+# and 1e-300 is zero. Every real camera keeps these bounds, and squares and quotients of numbers
+# within them are finite.
 MAX_IMAGE_SIDE = 16_384
-"""Largest width or height of an image, in pixels. Files hold float64 and the pipeline uses float32,
-where 1e300 is infinity and 1e-300 is zero: every real camera keeps these bounds, and squares and
-quotients of its numbers are finite."""
+"""Largest width or height of an image, in pixels."""
 MAX_COORDINATE = 1e9
 """Largest coordinate of a camera centre, in scene units."""
 FOCAL_RANGE = (1e-3, 1e6)
@@ -113,9 +114,9 @@ class Camera(Displayed, TensorDataclass):
     far: float | None = None
     """Largest z-depth of the scene, in scene units, or None if unknown."""
     padding: tuple[int, int] = (0, 0)
-    """Pixels, left and right each and above and below each, by which the image is larger than the
-    one that it pads. Both show the same Gaussians alike: renderers distort those beside the image
-    as in the smaller one."""
+    """Pixels that were added to an image on the left and right each, and above and below each.
+    Renderers distort Gaussians beside the image as they do without padding (`render.padding`), so
+    that both images show the same where both are."""
     blur: float = BLUR
     """Variance by which projected Gaussians are widened, in square pixels. It belongs to the pixels
     that a scene was made for: a smaller image of it has less (`geometry.sample_image`)."""
@@ -136,8 +137,6 @@ class Camera(Displayed, TensorDataclass):
         )
         if defect is not None:
             raise InputError(f"There is no such camera: {defect}.")
-        # NumPy's numbers cannot be written as JSON. Fields of a frozen dataclass are set through
-        # `object`.
         for name, convert in (
             ("width", int),
             ("height", int),
@@ -147,7 +146,9 @@ class Camera(Displayed, TensorDataclass):
         ):
             number = getattr(self, name)
             if number is not None and type(number) is not convert:
-                object.__setattr__(self, name, convert(number))
+                _set_field(self, name, convert(number))
+        if any(type(pixels) is not int for pixels in self.padding):
+            _set_field(self, "padding", tuple(int(pixels) for pixels in self.padding))
 
     def summarize(self) -> str:
         """Describe size, focal length, place and depth range."""
@@ -197,6 +198,11 @@ class Camera(Displayed, TensorDataclass):
         pixels = torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
         pixels = torch.nn.functional.pad(pixels, (0, 1), value=1.0)
         return pixels @ torch.linalg.inv_ex(self.K).inverse.T @ self.c2w[:3, :3].T
+
+
+def _set_field(value: TensorDataclass, name: str, number: object) -> None:
+    """Set a field of a frozen value to a number of Python; JSON cannot hold one of NumPy."""
+    object.__setattr__(value, name, number)
 
 
 def _find_size_defect(width: object, height: object) -> str | None:
@@ -275,12 +281,15 @@ def _find_intrinsics_defect(K: Float[Tensor, "3 3"], width: int, height: int) ->
         return "its K requires a gradient, which nothing computes; detach it"
     if K.device.type != "cpu":
         return None
-    (fx, skew, cx), (below, fy, cy), last = K.tolist()
+    (fx, skew, cx), (below, fy, cy), last_row = K.tolist()
     # The sum is finite only if all of them are.
     if not (fx > 0 and fy > 0 and math.isfinite(fx + fy + cx + cy)):
         return f"its focal lengths are {fx:g} and {fy:g}, its centre is ({cx:g}, {cy:g})"
     # Renderers read the focal lengths and the centre only; rays take the inverse of the whole K.
-    if last != [0, 0, 1] or not max(abs(skew), abs(below)) <= MAX_ROUNDED_SKEW * min(fx, fy):
+    largest_skew = MAX_ROUNDED_SKEW * min(fx, fy)
+    # Not by `max`, which loses a NaN in its second place.
+    has_right_angles = abs(skew) <= largest_skew and abs(below) <= largest_skew
+    if last_row != [0, 0, 1] or not has_right_angles:
         return "its K has a skew or another last row than 0 0 1; pixels must be right-angled"
     low, high = FOCAL_RANGE
     if not (low <= fx / width <= high and low <= fy / height <= high):
@@ -298,8 +307,9 @@ class PaddedCamera:
     padded: Camera
     """The padded camera; its rays through the pixels of `target` are those of `target`."""
     left: int
-    """Padding in pixels on the left and on the right each; `top` likewise."""
+    """Padding on the left and on the right each, in pixels."""
     top: int
+    """Padding above and below each, in pixels."""
 
     @property
     def is_padded(self) -> bool:
@@ -363,6 +373,8 @@ class View(Displayed, TensorDataclass):
                 f"The frame of a view is {describe(self.frame)}; give the number of a frame or "
                 "None."
             )
+        if self.frame is not None and type(self.frame) is not int:
+            _set_field(self, "frame", int(self.frame))
         size = (self.camera.height, self.camera.width)
         for name in self.forms:
             pixels = getattr(self, name)
@@ -504,6 +516,8 @@ class Gaussians(Displayed, TensorDataclass):
                 f"The origin of Gaussians has to be three numbers or None, and is "
                 f"{describe(self.origin)}."
             )
+        if self.origin is not None and any(type(x) not in (int, float) for x in self.origin):
+            _set_field(self, "origin", tuple(float(x) for x in self.origin))
 
     def summarize(self) -> str:
         """Describe the number, the generated ones, the extent and the degree of harmonics."""
@@ -525,15 +539,28 @@ class Gaussians(Displayed, TensorDataclass):
 
     def __getitem__(self, index: Tensor | slice) -> Gaussians:
         """Return the Gaussians at a boolean mask [n], integer indices [m] or a slice."""
-        values = {name: value for name, value in vars(self).items() if isinstance(value, Tensor)}
+        values = self._list_parts()
         rows: dict[str, Any]
         if isinstance(index, slice):
             rows = {name: value[index] for name, value in values.items()}
-        else:
-            # Every property would look for the rows of a mask by itself.
-            chosen = index.nonzero()[:, 0] if index.dtype == torch.bool else index
-            chosen = chosen.to(self.means.device)
-            rows = {name: select_rows(value, chosen) for name, value in values.items()}
+            return replace(self, **rows)
+        is_list = isinstance(index, Tensor) and index.dim() == 1
+        if not is_list or index.dtype not in (*BOOLS, *INTEGERS):
+            raise InputError(
+                "Gaussians are selected by a boolean mask of shape [n], by integer indices of "
+                f"shape [m] or by a slice, and not by a value {describe(index)}."
+            )
+        # Its rows are looked for once, and not by each property. `nonzero` takes a mask of any
+        # length.
+        if index.dtype == torch.bool:
+            if len(index) != len(self):
+                raise InputError(
+                    f"A mask of {len(index):,} entries cannot select from {len(self):,} Gaussians; "
+                    "give one for each."
+                )
+            index = index.nonzero()[:, 0]
+        chosen = index.to(self.means.device)
+        rows = {name: select_rows(value, chosen) for name, value in values.items()}
         return replace(self, **rows)
 
     def hide(self, hidden: Bool[Tensor, "n"]) -> Gaussians:
@@ -584,10 +611,12 @@ def merge(parts: Sequence[Gaussians]) -> Gaussians:
     Gaussians that were made for a scene are.
     """
     if not isinstance(parts, (list, tuple)):
-        raise InputError(f"merge takes a list of Gaussians, and got one {describe(parts)}.")
+        raise InputError(f"What is merged has to be a list of Gaussians, and is {describe(parts)}.")
     for part in parts:
         if not isinstance(part, Gaussians):
-            raise InputError(f"merge takes a list of Gaussians, and got one with {describe(part)}.")
+            raise InputError(
+                f"Each part that is merged has to be Gaussians, and one is {describe(part)}."
+            )
     if not parts:
         raise InputError("merge needs at least one set of Gaussians, and got none.")
     if len({part.is_antialiased for part in parts}) > 1:
@@ -785,20 +814,35 @@ class Lift:
     reference_depth: DepthMap
     anchor_depth: DepthMap
     pixel_index: Int[Tensor, "n"] | None
-    """Row-major pixel of the reference that each Gaussian comes from, or None if unknown."""
+    """Row-major pixel of the reference image that each Gaussian comes from, or None if unknown."""
     notes: tuple[str, ...] = ()
     """Sentences of Ψ for the user."""
 
 
 @dataclass(frozen=True)
 class Registration:
-    """Registered Gaussians."""
+    """Gaussians of the reference image, registered with the context."""
 
     gaussians: Gaussians
     pixel_index: Int[Tensor, "n"] | None
-    """Row-major pixel of the reference that each Gaussian comes from, or None if unknown."""
+    """Row-major pixel of the reference image that each Gaussian comes from, or None if unknown."""
     losses: tuple[float, ...]
     """Value of Eq. 11 at each iteration."""
+
+
+@dataclass(frozen=True)
+class DepthPairs:
+    """A sample of the z-depths that an affine was fitted to, in scene units."""
+
+    fit_view: Literal["anchor", "target"]
+    predicted: Float[Tensor, "n"]
+    context: Float[Tensor, "n"]
+    inlier_mask: Bool[Tensor, "n"]
+
+    @staticmethod
+    def empty() -> DepthPairs:
+        """Return no pairs."""
+        return DepthPairs("anchor", torch.empty(0), torch.empty(0), torch.empty(0).bool())
 
 
 @dataclass(frozen=True)
@@ -817,32 +861,8 @@ class DepthAffine:
     """Fraction of the target image over which that was checked."""
     is_refitted_at_target: bool = False
     """True if the fit at the anchor was replaced by one at the target."""
-    pairs: DepthPairs = field(default_factory=lambda: DepthPairs.empty(), repr=False, compare=False)
+    pairs: DepthPairs = field(default_factory=DepthPairs.empty, repr=False, compare=False)
     """A sample of the compared depths, for the report."""
-
-
-@dataclass(frozen=True)
-class DepthPairs:
-    """A sample of the z-depths that an affine was fitted to, in scene units."""
-
-    fit_view: Literal["anchor", "target"]
-    predicted: Float[Tensor, "n"]
-    context: Float[Tensor, "n"]
-    inlier_mask: Bool[Tensor, "n"]
-
-    @staticmethod
-    def empty() -> DepthPairs:
-        """Return no pairs."""
-        return DepthPairs("anchor", torch.empty(0), torch.empty(0), torch.empty(0).bool())
-
-
-def find_equal_positions(
-    points: Float[Tensor, "n 3"], others: Float[Tensor, "_m 3"]
-) -> Bool[Tensor, "n"]:
-    """Find the points that are exactly at the position of one of the others."""
-    # Equal positions get equal numbers, which can be compared as single values.
-    _, numbers = torch.unique(torch.cat([others, points]), dim=0, return_inverse=True)
-    return torch.isin(numbers[len(others) :], numbers[: len(others)])
 
 
 @dataclass(frozen=True)
@@ -904,10 +924,12 @@ class ContextScene:
         return self.removed_mask | self.replaced_mask
 
     def leave_out(self, gone: Bool[Tensor, "m"]) -> ContextScene:
-        """Return the context without some of the rendered Gaussians, whose rows are numbered anew.
+        """Return the context without some of the rendered Gaussians; the others are renumbered.
 
-        Masks of what they stand for are those of the caller.
+        The masks stay as they are: the caller knows whether what went was removed or replaced.
         """
+        if len(gone) == 0:  # all were left out before
+            return self
         # The new number of each rendered Gaussian: its place among those that stay. Those that are
         # gone take the number of one that is left, which nobody reads.
         number = ((~gone).cumsum(0) - 1).clamp_min(0)
@@ -917,6 +939,8 @@ class ContextScene:
         """Map values of rendered Gaussians to those they stand for; 0 for those that are gone."""
         if self.rendered is self.gaussians:
             return values
+        if len(values) == 0:  # nothing is left that `proxy_index` could name
+            return values.new_zeros((len(self.gaussians), *values.shape[1:]))
         expanded = values[self.proxy_index]
         expanded[self.gone_mask] = 0
         return expanded

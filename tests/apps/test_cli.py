@@ -56,6 +56,25 @@ def completed(completed_room) -> Path:
     return completed_room
 
 
+@pytest.mark.parametrize(
+    ("words", "option"),
+    [
+        (("complete", "scene", "--out", "s3://bucket/out"), "out"),
+        (("complete", "scene", "--out", "out", "--export-holes", "gs://bucket"), "export-holes"),
+        (("batch", "scenes.csv", "--out", "s3://bucket/out"), "out"),
+        (("convert", "a.ply", "https://site.org/a.spz"), "out"),
+        (("view", "a.ply", "--save", "s3://bucket/page.html"), "save"),
+    ],
+)
+def test_an_address_is_no_place_for_results(words, option, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert run(monkeypatch, *words) == 2
+    said = capsys.readouterr().err
+    assert " is an address, and results are written to a disk; name a path" in said
+    assert f"--{option}" in said
+    assert not list(tmp_path.iterdir())
+
+
 def test_out_holds_all_that_the_contract_names(completed):
     assert {p.name for p in completed.iterdir()} == {
         "completed.ply",

@@ -4,12 +4,14 @@ import json
 
 from command import run
 from gscompleter.apps.completing import demo
+from gscompleter.apps.completing.complete import complete_folder
 from gscompleter.system.files.image import read_image
+from gscompleter.system.files.unfinished import UNFINISHED_PREFIX
 
 
 def test_both_targets_are_completed_and_shown_before_and_after(tmp_path, monkeypatch):
     height, width = 32, 48
-    monkeypatch.setattr(demo, "RESOLUTION", (height, width))
+    monkeypatch.setattr(demo, "DEMO_SIZE", (height, width))
     out = tmp_path / "demo"
     assert run(monkeypatch, "demo", "--out", out, "--quiet") == 0
     summary = json.loads((out / "completion" / "summary.json").read_text())
@@ -19,3 +21,19 @@ def test_both_targets_are_completed_and_shown_before_and_after(tmp_path, monkeyp
     images = read_image(out / "before_after.png")
     assert images.shape[0] == height
     assert images.shape[1] >= 4 * width
+    texts = [path for path in out.rglob("*") if path.suffix in (".json", ".html", ".csv")]
+    assert len(texts) > 3
+    assert not [path for path in texts if UNFINISHED_PREFIX in path.read_text()]
+
+
+def test_a_demo_that_fails_says_so(tmp_path, monkeypatch, capsys):
+    def fail(request):
+        summary = complete_folder(request)
+        summary["outcome"] |= {"status": "not-reconstructed", "headline": "There is no scene."}
+        (request.results.out / "summary.json").write_text(json.dumps(summary))
+        return summary
+
+    monkeypatch.setattr(demo, "DEMO_SIZE", (32, 48))
+    monkeypatch.setattr(demo, "complete_folder", fail)
+    assert run(monkeypatch, "demo", "--out", tmp_path / "demo", "--quiet") == 1
+    assert "There is no scene." in capsys.readouterr().err

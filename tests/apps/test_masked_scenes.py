@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import shutil
 from collections import UserDict
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +14,11 @@ from PIL import Image
 
 from command import run
 from exact_room import ExactCamera, make_cameras, write_colmap, write_transforms
-from gscompleter import load_ply
+from gscompleter import InputError, load_ply
+from gscompleter.apps.inputs.reading import read_photographs
+from gscompleter.apps.inputs.task import Opened
+from gscompleter.apps.requests.scene import SceneRequest
+from gscompleter.data.formats import open_photographs
 from gscompleter.evaluation.store import list_row_paths
 from gscompleter.system.files.image import read_pixels
 
@@ -168,6 +174,28 @@ def test_a_context_photograph_that_is_hidden_is_not_chosen(scenes, tmp_path, mon
     assert run(monkeypatch, *words, "--out", tmp_path / "a") == 0
     assert run(monkeypatch, *words, "--context", 0, 1, "--out", tmp_path / "b") == 2
     assert "All of frame 1 of scene (images/photo_001.png) is masked" in capsys.readouterr().err
+
+    # `clean` takes all photographs but these, unless it is told which.
+    photographs = open_photographs(scene)
+    opened = Opened(SceneRequest(scene), photographs, "nerfstudio", len(photographs))
+    assert read_photographs(opened, None, "cpu").context_frames == (0, 3, 4)
+    with pytest.raises(InputError, match="All of frame 1 of scene"):
+        read_photographs(opened, (0, 1), "cpu")
+
+
+def test_photographs_of_which_none_can_be_used_have_their_reason(tmp_path):
+    scene = write_transforms(tmp_path / "scene", small_cameras()[:3])
+    (scene / "masks").mkdir()
+    for photograph in (scene / "images").iterdir():
+        Image.new("L", (WIDTH, HEIGHT)).save(scene / "masks" / photograph.name)
+    photographs = open_photographs(scene)
+    opened = Opened(SceneRequest(scene), photographs, "nerfstudio", len(photographs))
+    with pytest.raises(InputError, match="Masks hide all of each photograph of .*add --no-masks"):
+        read_photographs(opened, None, "cpu")
+    shutil.rmtree(scene / "images")
+    opened = replace(opened, photographs=open_photographs(scene))
+    with pytest.raises(InputError, match=r"None of the 3 photographs .* 3 are missing \(images/ph"):
+        read_photographs(opened, None, "cpu")
 
 
 def read_scores(out: Path) -> dict:

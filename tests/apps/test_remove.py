@@ -15,6 +15,7 @@ from gscompleter import InputError, load_ply, save_ply
 from gscompleter.apps.inputs.removal import (
     describe_masks_in_vain,
     find_by_position,
+    find_equal_positions,
     find_in_boxes,
     find_in_masks,
     find_in_region,
@@ -30,7 +31,7 @@ from gscompleter.numerics.geometry import axis_angle_to_matrix, rotations_to_qua
 from gscompleter.parts import NOT_INVENTED
 from gscompleter.render.loading import load_renderer
 from gscompleter.system.files.image import read_image, write_image
-from gscompleter.types import find_equal_positions, merge
+from gscompleter.types import merge
 from scenes import Room, camera_at, cast, gaussians_of, photographed, random_gaussians, view_of
 from splat_files import write_supersplat
 

@@ -89,11 +89,35 @@ def spoil_zip(path: Path) -> None:
 
 
 WRONG = {
-    "a pose of words": (scannet, lambda f: (f / "pose/1.txt").write_text("a b"), r"pose/1\.txt"),
-    "a lens of words": (
+    "a pose of words": (
+        scannet,
+        lambda f: (f / "pose/1.txt").write_text("a b"),
+        r"pose/1\.txt holds other text than numbers",
+    ),
+    "half a lens": (
         scannet,
         lambda f: (f / "intrinsic/intrinsic_color.txt").write_text("1 2"),
-        "4 × 4 numbers",
+        "intrinsic_color.txt holds 2 numbers, and 4 × 4 numbers are needed",
+    ),
+    "an infinite lens": (
+        scannet,
+        lambda f: (f / "intrinsic/intrinsic_color.txt").write_text("inf " * 16),
+        "inf",
+    ),
+    "a trajectory without poses": (
+        replica,
+        lambda f: (f / "traj.txt").write_text("\n"),
+        r"traj\.txt is empty",
+    ),
+    "half a row": (
+        replica,
+        lambda f: (f / "traj.txt").write_text("1 " * 24),
+        "holds 24 numbers, and rows of 16 numbers are needed",
+    ),
+    "a huge number": (
+        replica,
+        lambda f: (f / "traj.txt").write_text("1e30 " * 16),
+        r"holds a number of 1e\+30, and 1e\+12 is the largest",
     ),
     "a pose too few": (
         replica,

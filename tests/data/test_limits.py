@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from command import run
 from gscompleter import InputError, load_camera, load_cameras, load_views
+from gscompleter.data.local_origin import choose_local_origin, shift_to_origin
 from gscompleter.data.scene import write_cameras
-from scenes import camera_at, photographed
+from scenes import camera_at, photographed, random_gaussians
 
 SIZE = 64
 PLACES = ((-0.3, 0), (0.1, 0), (0.7, 12))
@@ -164,6 +167,32 @@ def test_large_coordinates_keep_the_baselines(room, tmp_path):
         assert np.allclose(theirs.camera.center, expected, atol=1e-6)
     # A camera alone is in the same frame as the views.
     assert np.array_equal(load_camera(far, 2).c2w, remote[2].camera.c2w)
+
+
+def test_a_photograph_alone_in_a_map_has_a_local_origin():
+    """What is seen from it would be rounded to steps of half a metre."""
+    pose = np.eye(4)
+    pose[:3, 3] = UTM
+    assert choose_local_origin([pose]).tolist() == list(UTM)
+    assert choose_local_origin([pose, pose]).tolist() == list(UTM)
+    pose[:3, 3] /= 1000
+    assert not choose_local_origin([pose]).any()
+
+
+def test_a_splat_far_away_is_fine_enough_for_one_camera_or_for_none():
+    """Of one camera the spread tells nothing."""
+    camera = camera_at(size=16)
+    splat = replace(random_gaussians(50), means=random_gaussians(50).means + 5)
+    for offset, is_fine in ((2000.0, True), (5e6, False)):
+        origin = np.array([offset, 0.0, 0.0])
+        there = replace(splat, means=splat.means + torch.from_numpy(origin).float())
+        for cameras in ([camera], [camera, camera]):
+            if is_fine:
+                moved_back = shift_to_origin(origin, there, cameras)
+                assert torch.allclose(moved_back.means, splat.means, atol=1e-3)
+            else:
+                with pytest.raises(InputError, match="float32 has steps of 0.5"):
+                    shift_to_origin(origin, there, cameras)
 
 
 def test_coordinates_that_float32_can_hold_are_left_alone(room, tmp_path):

@@ -13,6 +13,7 @@ from exact_room import make_cameras, write_colmap
 from gscompleter import InputError, load_views
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.mask_checks import (
+    MAX_READ,
     are_probably_inverted,
     check_hiding_masks,
     check_selected_share,
@@ -143,6 +144,31 @@ def test_what_goes_is_seldom_most_of_the_images_or_of_the_splat(tmp_path):
     check_selected_share(0.8, LARGE)
     with pytest.raises(InputError, match="select 80 % of the Gaussians of the splat, where what"):
         check_selected_share(0.8, MaskReading())
+
+
+def test_the_share_that_a_sentence_names_is_above_half_as_that_of_most(tmp_path):
+    wrong = save(tmp_path / "wrong.png", paint(upper_quarter()))
+    right = save(tmp_path / "right.png", paint(np.ones((HEIGHT, WIDTH), bool)))
+    with pytest.raises(InputError, match="Masks hide 75 % of the photographs"):
+        check_hiding_masks([wrong, right, wrong], MaskReading(), 3)
+
+
+def test_masks_beside_a_sample_that_hides_everything_tell_as_well(tmp_path):
+    black = save(tmp_path / "black.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    right = save(tmp_path / "right.png", paint(~upper_quarter()))
+    masks = [right] * 100
+    for sampled in np.linspace(0, 99, MAX_READ).round().astype(int):
+        masks[sampled] = black
+    check_hiding_masks(masks, MaskReading(), len(masks))
+    with pytest.raises(InputError, match="black everywhere"):
+        check_hiding_masks([black] * 100, MaskReading(), 100)
+
+
+def test_masks_of_which_names_turn_some_are_white_or_black_where_they_hide(tmp_path):
+    black = save(tmp_path / "a.png", paint(upper_quarter()))
+    white = save(tmp_path / "dynamic_mask_b.png", paint(~upper_quarter()))
+    with pytest.raises(InputError, match="75 % .* where what is black or white is ignored"):
+        check_hiding_masks([black, white], MaskReading(), 2)
 
 
 def test_masks_of_another_option_are_not_turned_by_this_one(tmp_path):

@@ -1,9 +1,11 @@
 """Claims: two runs do not do the same jobs of a folder at once."""
 
+import errno
 import json
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -40,12 +42,41 @@ def test_jobs_that_another_run_does_are_refused(tmp_path, share, other, overlap)
         pass
 
 
-def test_a_claim_that_is_being_written_counts_for_all_jobs(tmp_path):
+@pytest.mark.parametrize("content", [b"", b"[0, 1", b"5", b"null", b'["a", 1]', b"[0, null]"])
+def test_a_claim_that_cannot_be_read_counts_for_all_jobs(tmp_path, content):
+    """It may be half written."""
     entry = tmp_path / make_unfinished_name(CLAIM)
-    entry.write_bytes(b"")
+    entry.write_bytes(content)
     with pytest.raises(InputError, match="Another run"), claim_share(tmp_path, (1, 8)):
         pass
     assert os.listdir(tmp_path) == [entry.name]
+
+
+def test_a_claim_of_another_user_counts_for_all_jobs(tmp_path, monkeypatch):
+    entry = tmp_path / make_unfinished_name(CLAIM)
+    entry.write_bytes(b"[0, 2]")
+
+    def refuse(path):
+        raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(Path, "read_bytes", refuse)
+    with pytest.raises(InputError, match="Another run"), claim_share(tmp_path, (1, 2)):
+        pass
+
+
+def test_a_claim_that_cannot_be_removed_hides_nothing(tmp_path, monkeypatch):
+    """Of a disk that has gone meanwhile, or of a folder that is none."""
+    file = tmp_path / "file"
+    file.touch()
+    with pytest.raises(InputError, match="Cannot write"), claim_share(file, (0, 1)):
+        pass
+
+    def refuse(path, missing_ok=False):
+        raise OSError(errno.ESTALE, "Stale file handle")
+
+    monkeypatch.setattr(Path, "unlink", refuse)
+    with claim_share(tmp_path, (0, 1)):
+        pass
 
 
 @pytest.mark.linux

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from statistics import fmean
+from statistics import median
 
 import numpy as np
 from jaxtyping import Bool
@@ -40,9 +40,9 @@ def are_probably_inverted(shares: Sequence[float]) -> bool:
 
 
 def read_masks_as_asked(photographs: Photographs, reading: MaskReading) -> Photographs:
-    """Check the masks of photographs, and return the photographs with masks that are read so.
+    """Check the masks of photographs, and return the photographs with masks as `reading` says.
 
-    What an alpha channel hides is certain, so that neither the check nor the inversion is for it.
+    What an alpha channel hides is certain: it is neither checked nor inverted.
     """
     check_hiding_masks(photographs.list_masks(), reading, len(photographs))
     return photographs.invert_masks() if reading.ignores_white else photographs
@@ -65,13 +65,14 @@ def check_hiding_masks(masks: Sequence[Path], reading: MaskReading, num_photogra
     """
     if reading.may_be_large or not masks:
         return
-    sampled = sample_evenly(masks)
-    ignored = [float(read_ignored(path, reading.ignores_white).mean()) for path in sampled]
-    shares = [share for share in ignored if share < 1.0]
-    places = name_masks(path.parent for path in masks)
-    color = "white" if hides_white(masks[0], reading.ignores_white) else "black"
+    # All of them are read only where each mask of the sample hides its whole photograph.
+    shares = measure_hidden(sample_evenly(masks), reading) or measure_hidden(masks, reading)
     if not shares and len(masks) < num_photographs:
-        return
+        return  # photographs without a mask are left
+    places = name_masks(path.parent for path in masks)
+    # The names of some masks may turn them.
+    are_white = {hides_white(path, reading.ignores_white) for path in masks}
+    color = " or ".join("white" if is_white else "black" for is_white in sorted(are_white))
     if not shares:
         raise InputError(
             f"The masks of the photographs ({places}) are {color} everywhere, and what is {color} "
@@ -87,12 +88,13 @@ def check_hiding_masks(masks: Sequence[Path], reading: MaskReading, num_photogra
 def check_selecting_masks(masks: Sequence[Path], reading: MaskReading, images: str) -> None:
     """Refuse masks of what goes that select nothing, or more than half of most of their images.
 
-    A mask that selects nothing is of an image that does not show the thing. `images` says of what
-    the masks are.
+    A mask that selects nothing is of an image that does not show the thing. `images` are what the
+    masks are of, for errors.
     """
-    # Only where some say nothing are all of them read.
+    # All of them are read only where no mask of the sample selects anything.
     shares = measure_selected(sample_evenly(masks), reading) or measure_selected(masks, reading)
-    taken, left = ("black", "white") if reading.is_inverted else ("white", "black")
+    taken = "black" if reading.is_inverted else "white"
+    left = "white" if reading.is_inverted else "black"
     if not shares:
         raise InputError(
             f"{name_masks(masks)} {'is' if len(masks) == 1 else 'are'} {left} everywhere, and what "
@@ -122,6 +124,12 @@ def sample_evenly(masks: Sequence[Path]) -> list[Path]:
     return [masks[step] for step in steps]
 
 
+def measure_hidden(masks: Iterable[Path], reading: MaskReading) -> list[float]:
+    """Measure the shares that masks hide of their photographs; without those that hide all."""
+    shares = [float(read_ignored(path, reading.ignores_white).mean()) for path in masks]
+    return [share for share in shares if share < 1.0]
+
+
 def measure_selected(masks: Iterable[Path], reading: MaskReading) -> list[float]:
     """Measure the shares that masks select of their images; without those that select nothing."""
     shares = [float(read_selected(path, reading).mean()) for path in masks]
@@ -133,14 +141,17 @@ def read_selected(
 ) -> Bool[np.ndarray, "h w"]:
     """Read the pixels of a mask that say what goes: white ones, or black ones if inverted.
 
-    `name` is for errors of bytes.
+    `name` stands for the mask in errors if `stored` are bytes.
     """
     black = read_mask(stored, name)
     return black if reading.is_inverted else ~black
 
 
 def name_ways_out(reading: MaskReading, hides: bool = False) -> str:
-    """Name the options that turn masks, or take them as they are; `hides` for those of SCENE."""
+    """Name the options that turn masks, or take them as they are.
+
+    `hides` is True for masks of what is ignored in photographs, which can be left out, too.
+    """
     turn = "leave --invert-masks out" if reading.is_inverted else "add --invert-masks"
     if not reading.is_turned_by_option:
         turn = "save them in the other colours"
@@ -149,10 +160,13 @@ def name_ways_out(reading: MaskReading, hides: bool = False) -> str:
 
 
 def name_masks(paths: Iterable[Path]) -> str:
-    """Name masks, or the folders of them."""
+    """Name the first of the masks, or of their folders, each once."""
     return join_names(list(dict.fromkeys(paths)), MAX_NAMED_MASKS, MAX_MASK_NAME_LENGTH)
 
 
 def format_share(shares: Sequence[float]) -> str:
-    """Format the mean of shares as a percentage."""
-    return f"{100 * fmean(shares):.0f} %"
+    """Format the median of shares as a percentage.
+
+    It is above `MAX_TAKEN` wherever most shares are, which a mean need not be.
+    """
+    return f"{100 * median(shares):.0f} %"

@@ -217,7 +217,7 @@ class Photographs:
         chosen = self.frame(frame)
         if not self.uses_masks or (chosen.mask is None and not _has_alpha_channel(chosen)):
             return False
-        hidden = self._load_colors(chosen)[1]
+        hidden = self._load_pixels(chosen)[1]
         return hidden is not None and bool(hidden.all())
 
     def at_origin(self, origin: Float[np.ndarray, "3"]) -> Photographs:
@@ -376,6 +376,13 @@ class Photographs:
         Hidden pixels have the colours of their surroundings, so that no later step can take over
         what they show.
         """
+        colors, hidden = self._load_pixels(frame)
+        return (colors if hidden is None else fill_hidden(colors, hidden)), hidden
+
+    def _load_pixels(
+        self, frame: Frame
+    ) -> tuple[UInt8[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"] | None]:
+        """Load the upright photograph as it is, and the pixels that masks hide or None."""
         colors, alpha, orientation = frame.load_pixels()
         size = colors.shape[1], colors.shape[0]
         hidden = None
@@ -386,7 +393,7 @@ class Photographs:
         if self.regions is not None:
             ignored = self.regions.draw(*size)
             hidden = ignored if hidden is None else hidden | ignored
-        return (colors if hidden is None else fill_hidden(colors, hidden)), hidden
+        return colors, hidden
 
     def _load_depth(
         self, frame: Frame, camera: Camera, size: tuple[int, int], resolution: Resolution

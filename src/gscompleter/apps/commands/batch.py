@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Literal
@@ -13,7 +12,6 @@ from annotated_types import Interval
 from gscompleter.apps.commands.engines import decide_engine, parse_pairs
 from gscompleter.apps.commands.shared_options import EngineOptions, list_inputs
 from gscompleter.apps.requests.batch import BatchRequest
-from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.jobs.engine_names import EngineName
 from gscompleter.system.process import import_without_collection
@@ -45,15 +43,13 @@ class BatchOptions(EngineOptions):
 
     def check_overlap(self) -> None:
         """Refuse an output that is, holds or lies in an input."""
-        # Results may lie in a folder of scenes; the scenes themselves are compared later.
+        # Results may lie in a folder of scenes; `prepare_batch` compares the scenes themselves when
+        # it has read the manifest.
         refuse_overlap(self.out, [path for path in list_inputs(self) if not path.is_dir()])
 
 
 def decide_batch(options: BatchOptions) -> BatchRequest:
     """Decide which scenes are completed, and where."""
-    # Two letters at least: `C:/results` is a path of Windows.
-    if re.match(r"\w\w+:/", str(options.out)):
-        raise InputError(f"{quote_value(options.out)} is an address; name a folder.", "out")
     return BatchRequest(
         manifest=options.manifest,
         out=options.out,

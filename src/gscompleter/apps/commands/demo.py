@@ -22,8 +22,8 @@ class DemoOptions(RunOptions, WritingOptions):
     """Write results here. A folder, for the scene, its completion and before_after.png."""
 
 
-def run_demo(options: DemoOptions) -> None:
-    """Write the scene, complete it for both targets, and join before and after."""
+def run_demo(options: DemoOptions) -> int:
+    """Write the scene, complete it for both targets, and return the exit code."""
     # Imported here, so that help pages do not wait for torch.
     with import_without_collection():
         from gscompleter.apps.completing.demo import complete_demo
@@ -33,4 +33,4 @@ def run_demo(options: DemoOptions) -> None:
         device=devices.renderer, network_device=devices.networks, seed=options.seed
     )
     results = ResultsRequest(out=options.out, overwrite=options.overwrite, answer=options.answer)
-    complete_demo(models, results)
+    return complete_demo(models, results)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from gscompleter.apps.requests.scene import FRAME_NUMBER, Names, Size
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Device, Seed, Settings
 from gscompleter.data.sfm import NUM_VIDEO_FRAMES
-from gscompleter.system.errors import InputError
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.jobs.engine_names import EngineName
 
@@ -29,6 +30,9 @@ OUTPUTS = ("out", "save", "export_holes")
 """Options that name what a command writes."""
 WORDS_OR_PATHS = ("target", "protocol", "generator_weights", "generator_depth")
 """Options whose words may be paths of files or folders that are read."""
+ADDRESS = re.compile(r"\w\w+:/")
+"""Beginning of an address such as s3://bucket; a path makes one of its two slashes. It has two
+letters at least, since `C:/results` is a path of Windows."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,6 +48,17 @@ class Options(Settings):
     def answer(self) -> AnswerRequest:
         """Return what the command prints."""
         return AnswerRequest(self.quiet, self.json)
+
+    def refuse_addresses(self) -> None:
+        """Raise an InputError if an output is an address, which would become folders here."""
+        for name in OUTPUTS:
+            out = getattr(self, name, None)
+            if isinstance(out, Path) and ADDRESS.match(out.as_posix()):
+                raise InputError(
+                    f"{quote_value(out)} is an address, and results are written to a disk; name a "
+                    "path.",
+                    name.replace("_", "-"),
+                )
 
     def check_overlap(self) -> None:
         """Raise an InputError if the output of the command is, holds or lies in an input."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -99,10 +100,16 @@ def get_results(request: FillingRequest | UpdateRequest) -> ResultsRequest:
 
 def complete_scene(request: FillingRequest | UpdateRequest) -> int:
     """Complete the scene, print a summary, and return the exit code."""
-    results = get_results(request)
     complete_folder(request)
+    return answer_outcome(get_results(request))
+
+
+def answer_outcome(
+    results: ResultsRequest, further: Mapping[str, Any] = MappingProxyType({})
+) -> int:
+    """Print a completion, as `answer_completion` does, and return the exit code of its outcome."""
     outcome = read_summary(results.out).outcome
-    answer_completion(results)
+    answer_completion(results, further)
     if outcome.status != "not-reconstructed":
         return DONE
     # A quiet run that fails says why, and so does one whose answer is for a program.

@@ -16,6 +16,7 @@ from gscompleter.apps.inputs.named_photographs import (
 from gscompleter.apps.inputs.selection import (
     choose_context,
     collect_usable_cameras,
+    explain_unusable,
     select_closest,
 )
 from gscompleter.apps.inputs.task import CompletionTask, Opened, Target
@@ -30,9 +31,9 @@ from gscompleter.types import Camera
 MIN_IMAGE_SIZE = 16
 """Smallest side of an image, in pixels."""
 MAX_FIT_VIEWS = 8
-"""Most photographs to which a scene is fitted besides its context."""
+"""Most photographs beside the context to which a scene is fitted (decision 139)."""
 MIN_FITTED_CONTEXT = 3
-"""Fewest photographs of a context that is fitted jointly."""
+"""Fewest photographs of a context that is fitted to others, too."""
 
 
 def read_task(
@@ -69,15 +70,18 @@ def add_fit_views(task: CompletionTask, opened: Opened) -> CompletionTask:
 
     They are nearest to the targets, or spread over the scene, and as many photographs stay unused
     and score the result. What looks right from the context alone, such as shards before a wall, is
-    wrong in others (decision 139).
+    wrong in others (decision 139). A task with a smaller context than `MIN_FITTED_CONTEXT`, or
+    without photographs to spare, stays as it is.
     """
+    if len(task.views) < MIN_FITTED_CONTEXT:
+        return task
     photographs = opened.photographs
     resolution = opened.request.resolution
     known = task.used_frames | set(opened.held_out)
     others = [frame for frame in range(len(photographs)) if frame not in known]
     cameras = collect_usable_cameras(photographs, others, resolution)
     count = min(MAX_FIT_VIEWS, len(cameras) // 2)
-    if len(task.views) < MIN_FITTED_CONTEXT or count == 0:
+    if count == 0:
         return task
     if task.targets:
         chosen = select_closest(task.goals, cameras, count)
@@ -86,7 +90,7 @@ def add_fit_views(task: CompletionTask, opened: Opened) -> CompletionTask:
         chosen = [frames[index] for index in select_spread_cameras(list(cameras.values()), count)]
     views = []
     for frame in chosen:
-        # One that a mask hides tells nothing, and others do.
+        # One that is damaged or hidden by a mask tells nothing, and others do.
         with suppress(InputError):
             views += photographs.views([frame], resolution)
     return replace(task, check_views=[view.to(task.device) for view in views])
@@ -95,19 +99,30 @@ def add_fit_views(task: CompletionTask, opened: Opened) -> CompletionTask:
 def read_photographs(
     opened: Opened, context: PhotographNames | None, device: str
 ) -> CompletionTask:
-    """Read the named photographs of a splat, or all."""
+    """Read the named photographs of a splat, or all that can be used."""
+    frames = find_context(opened.photographs, context)
+    return make_task(opened, frames or find_usable_frames(opened), (), device, has_splat=True)
+
+
+def find_usable_frames(opened: Opened) -> list[int]:
+    """Find the photographs that have a camera and are not hidden by a mask.
+
+    Raises:
+        InputError: There is none.
+    """
     photographs = opened.photographs
-    request = opened.request
-    frames = find_context(photographs, context)
-    if not frames:
-        numbers = range(len(photographs))
-        frames = tuple(collect_usable_cameras(photographs, numbers, request.resolution))
-    if not frames:
+    resolution = opened.request.resolution
+    numbers = range(len(photographs))
+    cameras = collect_usable_cameras(photographs, numbers, resolution)
+    if not cameras:
+        raise InputError(explain_unusable(photographs, numbers, resolution))
+    shown = [frame for frame in cameras if not photographs.is_hidden(frame)]
+    if not shown:
         raise InputError(
-            f"No photograph of {quote_value(request.folder)} can be used; name the folder that the "
-            "splat was trained on."
+            f"Masks hide all of each photograph of {quote_value(opened.request.folder)}; add "
+            "--no-masks to use all pixels."
         )
-    return make_task(opened, frames, (), device, has_splat=True)
+    return shown
 
 
 def make_task(
@@ -117,37 +132,34 @@ def make_task(
     device: str,
     has_splat: bool,
 ) -> CompletionTask:
-    """Read the photographs of `frames`, in ascending order, and those of the targets."""
+    """Read the photographs of `frames`, sorted, and those of the targets."""
     frames = sorted(frames)
     request = opened.request
     photographs = opened.photographs
     resolution = request.resolution
 
-    # `bounded` has the depth range of the request and the scene, or that of its sparse points. The
-    # targets were read before the context was known that chooses the points.
+    # `bounded` has the depth range of the request and the scene, or that of the sparse points that
+    # the context sees. The targets were read before the context was known, so they get it here.
     bounded = add_depth_range(photographs, frames, resolution)
-    targets = [
+    bounded_targets = [
         replace(target, camera=replace(target.camera, near=bounded.near, far=bounded.far))
         for target in targets
     ]
     cameras = [bounded.camera(frame, resolution) for frame in frames]
-    check_sizes([*cameras, *(target.camera for target in targets)])
+    check_sizes([*cameras, *(target.camera for target in bounded_targets)])
 
     if request.uses_given_depth:
-        scoring = {*opened.held_out, *(target.frame for target in targets)}
+        scoring = {*opened.held_out, *(target.frame for target in bounded_targets)}
         read = read_with_depth(bounded, frames, resolution, scoring)
     else:
         read = DepthReading(bounded.views(frames, resolution))
-    views = [view.to(device) for view in read.views]
-
-    # Photographs of the targets score the result, and only the oracle generator sees them.
-    targets = [add_photograph(target, bounded, resolution) for target in targets]
     return CompletionTask(
-        views,
-        targets,
-        compute_frame_from_photographs(photographs.origin),
-        photographs.origin,
-        find_depth_sources(opened, bounded, has_splat),
+        views=[view.to(device) for view in read.views],
+        # Photographs of the targets score the result, and only the oracle generator sees them.
+        targets=[add_photograph(target, bounded, resolution) for target in bounded_targets],
+        frame=compute_frame_from_photographs(photographs.origin),
+        origin=photographs.origin,
+        depths=find_depth_sources(opened, bounded, has_splat),
         depth_notes=read.notes,
         predicted_depths=read.predicted,
     )
@@ -164,9 +176,12 @@ def check_sizes(cameras: Sequence[Camera]) -> None:
 
 
 def find_depth_sources(opened: Opened, bounded: Photographs, has_splat: bool) -> dict[str, str]:
-    """Find the sources of `near` and `far`; `bounded` has those of the sparse points."""
+    """Find the sources of `near` and `far`, as `CompletionTask.depths` names them.
+
+    `bounded` are the photographs with what the sparse points tell of both.
+    """
     estimate = "splat" if has_splat else "features"
-    # In this order: each of them keeps what the one before it has.
+    # In this order: each of them has what the one before it has, and may have more.
     sources = {"given": opened.request, "scene": opened.photographs, "points": bounded}
     source_by_name = {}
     for name in ("near", "far"):

@@ -30,7 +30,7 @@ from gscompleter.splats.formats import load_splat, load_splat_at
 from gscompleter.splats.origin import format_corners
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.progress import track
-from gscompleter.types import Camera, Gaussians, find_equal_positions
+from gscompleter.types import Camera, Gaussians
 
 MAX_MARGIN = 0.05
 """Largest margin of regions, relative to the shortest side of the boxes and the sphere's radius.
@@ -139,6 +139,15 @@ def find_by_position(
         # are those of the same Gaussians.
         chosen |= find_equal_positions(scene.means, selected.means.to(scene.means.device))
     return chosen
+
+
+def find_equal_positions(
+    points: Float[Tensor, "n 3"], others: Float[Tensor, "_m 3"]
+) -> Bool[Tensor, "n"]:
+    """Find the points that are exactly at the position of one of the others."""
+    # Equal positions get equal numbers, which can be compared as single values.
+    _, numbers = torch.unique(torch.cat([others, points]), dim=0, return_inverse=True)
+    return torch.isin(numbers[len(others) :], numbers[: len(others)])
 
 
 def compute_file_points(

@@ -19,18 +19,21 @@ from gscompleter.types import Camera, Gaussians, merge
 
 REMOVED_PICTURE_FILE = "removed.png"
 NUM_ROWS = 2
-"""Cameras that the picture shows, those that see most of what goes."""
+"""Rows of the picture. Each is of one camera, of those that see most of what goes."""
 PICTURE_SIDE = 384
 """Width and height of an image from outside, in pixels."""
 OUTSIDE_ZOOM = 1.5
-"""Factor on the focal length of these images: they show 1.3 times the extent of what stays."""
+"""Factor on the focal length of these images, which then show 1.3 times the extent of what stays
+instead of twice."""
 PREVIEW_SIDE = 64
 """Width and height of the images in which cameras from outside are compared."""
 CUT = 0.25
-"""Place of the section through a splat that is seen from outside, before its middle, in radii."""
+"""Distance of a section through a splat from its middle, towards the camera, in radii of its
+extent."""
 GAP = 4
 """Pixels between rows."""
 REMOVED_COLOR = (1.0, 0.1, 0.1)
+"""Red, green and blue of what goes, in [0, 1]."""
 DIMMING = 0.5
 """Brightness of what stays beside what goes."""
 
@@ -49,7 +52,10 @@ class RemovalVisibility:
 def measure_removal_visibility(
     frozen: FrozenScene, removed: Bool[Tensor, "n"], camera: Camera
 ) -> RemovalVisibility:
-    """Measure how much a camera, of a frozen splat, sees of what goes: True in `removed`."""
+    """Measure how much a camera sees of the Gaussians that go, for which `removed` is True.
+
+    `frozen` is the whole splat, frozen at that camera.
+    """
     weights = frozen.splat(removed.to(frozen.render.image))
     return RemovalVisibility(camera, weights.sum().item(), frozen.render.alpha.sum().item())
 
@@ -57,19 +63,23 @@ def measure_removal_visibility(
 def choose_outside_cameras(
     given: Gaussians, removed: Bool[Tensor, "n"], renderer: Renderer
 ) -> tuple[list[Camera], float]:
-    """Choose cameras outside of a splat that see most of what goes.
+    """Choose the cameras outside of a splat that see most of what goes.
 
-    Of a room they see a section, without the walls in front. Also returns which share of the alpha
-    in the images of all cameras around the splat, without a section, is of what goes.
+    The walls of a room hide what goes in it from outside. So each camera is tried twice, with the
+    whole splat and with a section that leaves out what stands in front, and the better one counts.
+
+    Returns:
+        The cameras, and the share of what goes in what is seen from outside: in the alpha of all
+        cameras, without a section.
     """
     kept, gone = split_thinned(given, removed, MAX_PREVIEW_GAUSSIANS)
     both = merge([kept, gone])
     goes = mark_last(both, len(gone))
     extent = measure_extent(kept)
     cameras = list_outside_cameras(extent, PREVIEW_SIDE)
-    # The section lies `CUT` radii before the middle; renderers clip at a hundredth of `near`.
-    section = 100 * (DISTANCE - CUT) * extent.radius
-    cut = [replace(camera, near=section) for camera in cameras]
+    # Renderers clip at a hundredth of `near` (`Camera.near_plane`).
+    near = 100 * (DISTANCE - CUT) * extent.radius
+    cut = [replace(camera, near=near) for camera in cameras]
 
     def measure(camera: Camera) -> RemovalVisibility:
         return measure_removal_visibility(renderer.freeze(both, camera), goes, camera)
@@ -77,7 +87,8 @@ def choose_outside_cameras(
     view_map = get_view_map(given.means)
     whole = list(view_map(measure, cameras))
     pairs = zip(whole, view_map(measure, cut), strict=True)
-    best = choose_most_removed([max(pair, key=lambda seen: seen.removed) for pair in pairs])
+    better = [max(pair, key=lambda seen: seen.removed) for pair in pairs]
+    best = choose_most_removed(better)
     share = sum(seen.removed for seen in whole) / max(sum(seen.shown for seen in whole), 1e-12)
     return [enlarge(camera) for camera in best], share
 
@@ -85,10 +96,13 @@ def choose_outside_cameras(
 def split_thinned(
     given: Gaussians, removed: Bool[Tensor, "n"], max_gaussians: int
 ) -> tuple[Gaussians, Gaussians]:
-    """Split a splat into what stays and what goes, each thinned to about so many Gaussians."""
-    # Without colours by direction, which are most of the memory of a scene.
+    """Split a splat into what stays and what goes, each of at most about `max_gaussians`.
+
+    Both are without colours by direction, which are most of the memory of a scene.
+    """
     plain = replace(given, sh=given.sh[:, :1], encoded=None)
-    kept, gone = (thin_gaussians(plain[mask], max_gaussians) for mask in (~removed, removed))
+    kept = thin_gaussians(plain[~removed], max_gaussians)
+    gone = thin_gaussians(plain[removed], max_gaussians)
     return kept, gone
 
 
@@ -106,10 +120,11 @@ def choose_most_removed(seen: Sequence[RemovalVisibility]) -> list[Camera]:
 
 def enlarge(camera: Camera) -> Camera:
     """Enlarge the images of an outside camera to `PICTURE_SIDE`, with less of what is around."""
-    K = camera.K * camera.K.new_tensor(
-        [[PICTURE_SIDE / PREVIEW_SIDE], [PICTURE_SIDE / PREVIEW_SIDE], [1.0]]
-    )
-    K = K * K.new_tensor([[OUTSIDE_ZOOM, 1.0, 1.0], [1.0, OUTSIDE_ZOOM, 1.0], [1.0, 1.0, 1.0]])
+    K = camera.K.clone()
+    # Focal lengths and centre grow with the image; a longer focal length shows less around it.
+    K[:2] *= PICTURE_SIDE / PREVIEW_SIDE
+    K[0, 0] *= OUTSIDE_ZOOM
+    K[1, 1] *= OUTSIDE_ZOOM
     return replace(camera, K=K, width=PICTURE_SIDE, height=PICTURE_SIDE)
 
 
@@ -124,7 +139,7 @@ def draw_removal_rows(
     for camera in cameras:
         frozen = renderer.freeze(both, camera)
         before = frozen.render.image.clamp(0, 1)
-        # The root, so that what is faint is seen.
+        # Compositing weights of what goes. Their square root makes visible what is faint.
         weights = frozen.splat(goes).clamp(0, 1).sqrt()[..., None]
         grey = DIMMING * before.mean(dim=2, keepdim=True)
         marked = grey * (1 - weights) + weights * torch.tensor(REMOVED_COLOR).to(grey)

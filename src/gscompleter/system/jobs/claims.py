@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from gscompleter.system.errors import InputError, quote_value
@@ -25,11 +25,12 @@ CLAIM = "jobs in this folder"
 def claim_share(out: Path, share: tuple[int, int]) -> Iterator[None]:
     """Claim the jobs i, i + n, … of an existing folder during the block, with `share` (i, n).
 
-    Raise InputError if another run, on this machine or elsewhere, claims one of them. Of two that
-    begin at the same moment both may be refused.
+    Raise InputError if another run, on this machine or elsewhere, claims one of them.
     """
     claim = out / make_unfinished_name(CLAIM)
     try:
+        # Written before the others are listed: of two runs that begin at the same moment at least
+        # one sees the other. Both may, and then both are refused.
         with convert_write_errors(out):
             claim.write_text(json.dumps(share), "ascii")
         for entry in list_unfinished(out, CLAIM):
@@ -44,16 +45,22 @@ def claim_share(out: Path, share: tuple[int, int]) -> Iterator[None]:
         with give_signs(claim):
             yield
     finally:
-        claim.unlink(missing_ok=True)
+        # An error of the disk must not hide what happened, nor fail a run whose jobs are done.
+        with suppress(OSError):
+            claim.unlink()
 
 
 def overlaps(share: tuple[int, int], claim: Path) -> bool:
-    """Return True if any job is in a share and in that of a claim; one half written has all."""
+    """Return True if a share and that of a claim have a job in common.
+
+    A claim that is still being written, or that cannot be read, counts as one of all jobs.
+    """
     try:
-        number, count = json.loads(claim.read_bytes())
-    except FileNotFoundError:
+        number, count = map(int, json.loads(claim.read_bytes()))
+    except FileNotFoundError:  # its run has ended since
         return False
-    except ValueError:
+    except (OSError, ValueError, TypeError):
         return True
-    # Some k is i modulo n and j modulo m just if gcd(n, m) divides i - j.
+    # Some job is i modulo n and j modulo m if and only if gcd(n, m) divides i - j (the Chinese
+    # remainder theorem).
     return (number - share[0]) % math.gcd(count, share[1]) == 0
