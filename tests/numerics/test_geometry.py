@@ -13,6 +13,7 @@ from gscompleter.numerics.geometry import (
     is_inside,
     is_same_camera,
     measure_baseline,
+    measure_distances,
     measure_rotation,
     multiply_quats,
     pad_camera,
@@ -158,3 +159,10 @@ def test_a_padded_camera_knows_the_image_that_it_pads():
     image = torch.rand(48, 48, 3)
     assert torch.equal(pair.crop(pair.paste(torch.ones(32, 32, 3), image)), torch.ones(32, 32, 3))
     assert torch.equal(pair.paste(pair.crop(image), image), image)
+
+
+def test_a_camera_is_as_far_as_the_nearest_target():
+    cameras = [camera_at(0.0), camera_at(2.0), camera_at(-1.0)]
+    distances = measure_distances(cameras, [camera_at(0.5), camera_at(-3.0)])
+    assert distances.tolist() == pytest.approx([0.5, 1.5, 1.5])
+    assert len(measure_distances([], [camera_at(0.0)])) == 0

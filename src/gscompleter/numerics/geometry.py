@@ -276,6 +276,17 @@ def resize_camera(camera: Camera, width: int, height: int) -> Camera:
     return replace(camera, K=K, width=width, height=height, padding=(left, top))
 
 
+def measure_distances(cameras: Sequence[Camera], targets: Sequence[Camera]) -> Float[Tensor, "c"]:
+    """Measure how far each camera stands from the nearest target, in scene units."""
+    # Numbers of a camera on a GPU are copied once.
+    places = torch.stack([target.on_cpu.center for target in targets])
+    # There may be no camera.
+    distances = [
+        (places - camera.on_cpu.center.to(places)).norm(dim=-1).min().item() for camera in cameras
+    ]
+    return torch.tensor(distances, dtype=places.dtype)
+
+
 def sample_image(small: Camera, large: Camera) -> Camera:
     """Let the image of a small camera sample that of a large one, of the same photograph.
 

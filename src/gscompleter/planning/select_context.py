@@ -18,7 +18,7 @@ import torch
 from jaxtyping import Float
 from torch import Tensor
 
-from gscompleter.numerics.geometry import is_inside, project
+from gscompleter.numerics.geometry import is_inside, measure_distances, project
 from gscompleter.types import Camera
 
 MAX_TARGET_POINTS = 1000
@@ -76,16 +76,8 @@ def select_context(
     closest = worth.sum(1).argsort(descending=True, stable=True)[:MAX_NEAR_PHOTOGRAPHS]
     near = [candidates[i] for i in closest.tolist()]
     rays = compute_directions(near, torch.cat(seen))
-    chosen = select_greedily(worth[closest], rays, measure_distances(targets, near), count)
+    chosen = select_greedily(worth[closest], rays, measure_distances(near, targets), count)
     return sorted(closest[chosen].tolist())
-
-
-def measure_distances(
-    targets: Sequence[Camera], candidates: Sequence[Camera]
-) -> Float[Tensor, "c"]:
-    """Measure how far each candidate stands from the nearest target, in scene units."""
-    centers = torch.stack([target.center for target in targets])
-    return torch.stack([(centers - c.center).norm(dim=-1).amin() for c in candidates])
 
 
 def select_greedily(

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from gscompleter.apps.inputs.task import Target
 from gscompleter.data.photographs import Photographs, Resolution
-from gscompleter.numerics.geometry import select_spread_cameras
+from gscompleter.numerics.geometry import measure_distances, select_spread_cameras
 from gscompleter.planning.select_context import make_points_in_front, select_context
 from gscompleter.planning.select_overview import select_overview, summarize_cameras
 from gscompleter.reconstructors.features.depth_range import estimate_depth_range
@@ -170,12 +170,9 @@ def select_closest(
     targets: Sequence[Camera], cameras: Mapping[int, Camera], count: int
 ) -> list[int]:
     """Select the frames whose cameras are nearest to a target, in ascending order."""
-    centers = torch.stack([target.center for target in targets])
-    distances = {}
-    for frame, camera in cameras.items():
-        distances[frame] = (centers - camera.center.to(centers)).norm(dim=-1).min().item()
-    nearest = sorted(cameras, key=lambda frame: distances[frame])[:count]
-    return sorted(nearest)
+    frames = list(cameras)
+    nearest = measure_distances(list(cameras.values()), targets).argsort(stable=True)
+    return sorted(frames[place] for place in nearest[:count].tolist())
 
 
 def sample_scene_points(

@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import torch
-
+from gscompleter.numerics.geometry import measure_distances
 from gscompleter.types import Camera, View
 
 NUM_REFINED = 3
@@ -44,10 +43,9 @@ class Emphasis:
 
 def find_nearest_views(targets: Sequence[Camera], views: Sequence[View], count: int) -> list[int]:
     """Find the numbers of the `count` views nearest to each target; in ascending order."""
+    cameras = [view.camera for view in views]
     nearest: set[int] = set()
-    # Numbers of a camera on a GPU are copied once.
-    centers = torch.stack([view.camera.on_cpu.center for view in views])
     for target in targets:
-        distances = (centers - target.on_cpu.center.to(centers)).norm(dim=-1)
-        nearest.update(distances.argsort(stable=True)[:count].tolist())
+        order = measure_distances(cameras, [target]).argsort(stable=True)
+        nearest.update(order[:count].tolist())
     return sorted(nearest)
