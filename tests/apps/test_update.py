@@ -103,7 +103,7 @@ def test_photographs_without_cameras_are_placed_and_used(
     assert {6, 7} <= frames
     printed = capsys.readouterr()
     assert "2 of 2 new photographs were placed among those of the scene." in printed.err
-    assert "context 6 (3.png)" in printed.out
+    assert "context 6 (new0/3.png)" in printed.out
     for row in summary["context"]:
         assert row["psnr_after"] > row["psnr_before"] + 2
     assert bool((load_ply(out / "completed.ply").generated == NOT_INVENTED).any())
