@@ -130,7 +130,7 @@ def test_depths_are_compared_in_one_table(room, tmp_path, monkeypatch, capsys):
     assert "Scored 0, failed 0, done earlier 1" in capsys.readouterr().err
     assert "named twice" in refuse(monkeypatch, capsys, *words, "--depth", "none", "none")
     line = refuse(monkeypatch, capsys, *words, "--depth", "none", DEPTH, "--table", "models")
-    assert "table of their own" in line
+    assert "methods of their own" in line
 
 
 # The test before compares depths by the same code.
@@ -165,7 +165,7 @@ def test_generators_are_compared_in_one_table(room, tmp_path, monkeypatch, capsy
     assert "None of the generators" in line
     assert "named twice" in refuse(monkeypatch, capsys, *words, "--generator", PAINTER, PAINTER)
     line = refuse(monkeypatch, capsys, *words, "--generator", *both, "--depth", "none", DEPTH)
-    assert "table of their own" in line
+    assert "one after the other" in line
 
 
 def test_a_setting_goes_to_the_generators_that_have_it():

@@ -252,3 +252,11 @@ def test_shards_one_after_the_other_add_up(finished, tasks, tmp_path):
         assert counts == RowCounts(4 if number == 0 else 2, 0, 0)
     write_tables(out)
     same_tables(out, finished)
+
+
+def test_of_settings_within_settings_the_one_that_differs_is_named(tmp_path):
+    claim(tmp_path / "run", {"source": {"paths": ["cases.json"] * 100, "one_per_scene": False}})
+    with pytest.raises(
+        InputError, match=r"with source\.one_per_scene False, and this run has True"
+    ):
+        claim(tmp_path / "run", {"source": {"paths": ["cases.json"] * 100, "one_per_scene": True}})

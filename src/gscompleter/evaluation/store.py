@@ -86,14 +86,34 @@ def claim(out: Path, settings: Mapping[str, Any]) -> None:
     wanted = json.loads(json.dumps({"version": RUN_VERSION, **settings}))
     claim_folder(out, "run", wanted)
     existing = read_run_settings(out)
+    difference = find_difference(existing, wanted)
+    if difference is not None:
+        name, old, new = difference
+        raise InputError(
+            f"{quote_value(out)} holds a run with {name} {quote_value(repr(old))}, and this run "
+            f"has {quote_value(repr(new))}; name another folder."
+        )
+
+
+def find_difference(
+    existing: Mapping[str, Any], wanted: Mapping[str, Any]
+) -> tuple[str, object, object] | None:
+    """Find the first setting that differs: its name with dots, and both values; None for none.
+
+    A setting that is not there has the value None.
+    """
     for key in {**wanted, **existing}:
-        if existing.get(key) != wanted.get(key):
-            old = quote_value(repr(existing.get(key)))
-            new = quote_value(repr(wanted.get(key)))
-            raise InputError(
-                f"{quote_value(out)} holds a run with {key} {old}, and this run has {new}; name "
-                "another folder."
-            )
+        old = existing.get(key)
+        new = wanted.get(key)
+        if old == new:
+            continue
+        # Of settings within settings only one may differ, and a sentence holds few.
+        if isinstance(old, Mapping) and isinstance(new, Mapping):
+            inner = find_difference(old, new)
+            if inner is not None:
+                return f"{key}.{inner[0]}", *inner[1:]
+        return key, old, new
+    return None
 
 
 def read_run_settings(out: Path) -> dict[str, Any]:
