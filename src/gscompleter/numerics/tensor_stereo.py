@@ -49,7 +49,7 @@ class CostRule:
     """How the colours of two windows are compared, and the costs of several sources combined."""
 
     radius: int
-    """Of the windows, in pixels."""
+    """Radius of the windows, in pixels."""
     floor: float
     """Squared image noise, summed over a window of three colours; above 0. Weaker texture does not
     correlate."""
@@ -164,7 +164,8 @@ def multiply_colors(a: Float32[Tensor, "3 *n"], b: Float32[Tensor, "3 *n"]) -> T
 def tile_image(image: Float32[Tensor, "h w 3"], radius: int) -> TiledImage:
     """Cut an image into tiles, and measure means and variances of the windows of their pixels."""
     h, w, _ = image.shape
-    missing_rows, missing_columns = -h % TILE_ROWS, -w % TILE_COLUMNS
+    missing_rows = -h % TILE_ROWS
+    missing_columns = -w % TILE_COLUMNS
     border = [radius, radius + missing_columns, radius, radius + missing_rows]
     padded = pad(image.permute(2, 0, 1)[None], border, mode="replicate")[0]
     tiles = padded.unfold(1, TILE_ROWS + 2 * radius, TILE_ROWS)
@@ -188,7 +189,8 @@ def sum_windows(
     Other sums would round otherwise, and small differences of large sums are what counts.
     """
     tall, wide = values.shape[-2:]
-    rows, columns = tall - 2 * radius, wide - 2 * radius
+    rows = tall - 2 * radius
+    columns = wide - 2 * radius
     running = torch.zeros_like(values[..., 0, :])
     for y in range(2 * radius):
         running += values[..., y, :]

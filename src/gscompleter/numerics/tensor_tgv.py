@@ -73,7 +73,8 @@ def iterate(
     cause at most.
     """
     share = pull / (tolerance + pull)
-    lower, lowest_pull = -bounds, -pull
+    lower = -bounds
+    lowest_pull = -pull
     dual_rates, primal_rates = (
         torch.tensor(rates)[:, None, None].to(state, non_blocking=True)
         for rates in (
@@ -87,7 +88,8 @@ def iterate(
     duals = state.new_zeros((2, *state.shape))
     along_row, along_column = duals
     # `steps` belong to u_x - v_x and u_y - v_y, `bends` to the derivatives of v.
-    steps, bends = duals[:, 0], duals[:, 1:]
+    steps = duals[:, 0]
+    bends = duals[:, 1:]
     for _ in range(iterations):
         rise = ahead[:, :, 1:] - ahead[:, :, :-1]
         along_row[:, :, :-1].addcmul_(rise, dual_rates)
@@ -108,5 +110,8 @@ def iterate(
         miss = after[0] - target
         after[0].sub_(torch.clamp(miss.mul_(share), lowest_pull, pull))
         torch.lerp(state, after, 2.0, out=ahead)
-        state, after = after, state
+        # The array of the state before is written over in the next iteration.
+        previous = state
+        state = after
+        after = previous
     return state

@@ -24,7 +24,7 @@ MAX_NODES = 1_000_000
 FILES_KEY = "filenames"
 """Key of an index that lists its files, by whose numbers the boxes name them."""
 INDEX_ADVICE = "export the scene again"
-"""What helps where an index cannot be read."""
+"""Advice where an index cannot be read."""
 
 FileRange = tuple[int, int, int]
 """Number of a file, of its first Gaussian, and of Gaussians."""

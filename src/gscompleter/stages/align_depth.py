@@ -65,7 +65,8 @@ def refit_at_target(
     """
     if len(at_target) < MIN_FIT_PIXELS:
         return affine
-    x, y = at_target.predicted, at_target.context
+    x = at_target.predicted
+    y = at_target.context
     agree = find_affine_inliers(x, y, affine.scale, affine.shift).double().mean().item()
     affine = replace(affine, agreement=agree, coverage=len(x) / at_target.num_pixels)
     if agree >= config.min_agreement:
@@ -81,7 +82,8 @@ def sample_depth_pairs(
 ) -> DepthPairs:
     """Sample the depths that `affine` was fitted to."""
     step = max(1, -(-len(depths) // MAX_DEPTH_PAIRS))
-    x, y = depths.predicted[::step], depths.context[::step]
+    x = depths.predicted[::step]
+    y = depths.context[::step]
     inlier_mask = find_affine_inliers(x, y, affine.scale, affine.shift)
     # All tensors of a completion lie on one device.
     x, y, inlier_mask = (part.to(depths.device, non_blocking=True) for part in (x, y, inlier_mask))

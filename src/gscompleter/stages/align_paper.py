@@ -42,9 +42,9 @@ class ComparedDepths:
     context: Float64[Tensor, "n"]
     """D_ctx, as the scene is rendered."""
     num_pixels: int
-    """Of the whole image."""
+    """Number of pixels of the whole image."""
     device: torch.device
-    """Where the maps lie."""
+    """Device of the maps."""
 
     def __len__(self) -> int:
         return len(self.predicted)
@@ -64,7 +64,8 @@ def fit_affine(depths: ComparedDepths, rng: torch.Generator) -> DepthAffine:
 
     The fallback is the median ratio with shift 0, and the identity if nothing can be compared.
     """
-    x, y = depths.predicted, depths.context
+    x = depths.predicted
+    y = depths.context
     if len(x) < MIN_FIT_PIXELS:
         return DepthAffine()
     if len(x) > MAX_SCORED_PIXELS:

@@ -1,4 +1,4 @@
-"""What a device computes of the depths of plane-sweep.
+"""Compute the planes and surfaces of plane-sweep on a device.
 
 The CPU has compiled loops, whose bytes never change; a GPU has the same as operations on tensors.
 Everything else of stereo stays on the CPU: it takes a tenth of the time.

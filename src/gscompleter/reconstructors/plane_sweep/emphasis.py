@@ -1,4 +1,4 @@
-"""Which photographs count most in a joint fit: those near the cameras that the scene is made for.
+"""Favour the photographs near the targets in a joint fit.
 
 Photographs of one surface differ by exposure, reflections, and errors of depth and pose. Fitted to
 all of them alike, a scene shows their mean, which is right at none (decision 143).
@@ -22,7 +22,7 @@ FAR_WEIGHT = 0.2
 
 @dataclass(frozen=True)
 class Emphasis:
-    """What a joint fit is made for, beside the photographs that the scene comes from."""
+    """Check views and targets of a joint fit, beside the photographs that the scene comes from."""
 
     check_views: Sequence[View] = ()
     """Photographs that no Gaussian comes from, and to which the scene is fitted, too."""

@@ -29,7 +29,7 @@ OPEN_FILES = "/proc/self/fd"
 MAPPED_BLOCK = 8192
 """Rows that are read or written at a time, before their pages are released."""
 _FOLDERS: dict[int, Path] = {}
-"""What the file of mapped values lies beside, by their address.
+"""Folder of the file of mapped values, or what it lies beside, by their address.
 
 Entries of values that are gone stay: they are small, and the next values there replace them.
 """
