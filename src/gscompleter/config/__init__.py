@@ -223,7 +223,7 @@ class PsnrGuardConfig(Settings):
 class GapConfig(Settings):
     """Closing of thin gaps, which open where the camera moves from a target."""
 
-    displacement: Annotated[float, Interval(ge=0, le=2)] = 0.35
+    displacement: Annotated[float, Interval(ge=0, le=2)] = 0.6
     """Moves of the cameras that look for gaps, away from the photograph nearest to the target and
     to both sides, relative to their baseline; 0 closes none (paper)."""
     max_alpha: Annotated[float, Interval(gt=0, le=1)] = 0.85
