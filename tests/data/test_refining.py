@@ -140,8 +140,8 @@ def test_poses_are_refined_only_where_kept_back_matches_agree_better(given, refi
 def test_poses_that_no_kept_back_match_compares_are_left(tmp_path, monkeypatch):
     """As COLMAP's process answers if it kept no match back: then nothing is known of the errors."""
     scene = open_photographs(photographed(tmp_path / "scene", CAMERAS[:4]))
-    moved = [np.linalg.inv(camera.c2w.double().numpy())[:3] + 0.01 for camera in CAMERAS[:4]]
-    answer = {"viewmats": np.array(moved).tolist(), "given_error": None, "refined_error": None}
+    moved = [camera.c2w.double().numpy() + 0.01 for camera in CAMERAS[:4]]
+    answer = {"poses": np.array(moved).tolist(), "given_error": None, "refined_error": None}
     monkeypatch.setattr("gscompleter.data.sfm.refining.run_colmap", lambda *_: answer)
     monkeypatch.setattr("gscompleter.data.sfm.refining.require_pycolmap", lambda: None)
     assert refine_poses(scene) == (scene, None)

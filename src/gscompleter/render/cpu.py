@@ -141,12 +141,12 @@ class CpuFrozenScene:
         rows = np.concatenate([self.rows[context_rows], order[new_rows] + np.int32(self.count)])
         frame = frame._replace(used=used)
         self.release()
-        # They may be limits of `freeze_occluders`. Those of what is shown never grow.
+        # A limit never grows: those of `freeze_occluders` are nearer than what the frame tells.
         np.minimum(depth_limits, self.depth_limits, out=depth_limits)
         return CpuFrozenScene(self.viewpoint, layer, frame, depth_limits, rows, count)
 
     def freeze_occluders(self, others: Gaussians) -> CpuFrozenScene:
-        """Freeze `others` as far as the last frozen Gaussian of each tile, and not beside these."""
+        """Freeze `others` up to the last frozen Gaussian of each tile; none in tiles without."""
         # A list ends with the splat behind all others. No depth is below 0.
         limits = np.full(self.viewpoint.tiles, -1, np.float32)
         touched = find_touched_tiles(self.layer)
@@ -342,8 +342,8 @@ class CpuOpacityRender:
         images: Float[Tensor, "images h w 3"],
     ) -> list[Float[Tensor, "n"]]:
         """Compute a gradient in the opacities from each gradient of the image of `frame`."""
-        view = self.scene
-        sums = view.viewpoint.backpropagate_images(view.layer, binned, frame, to_float32(images))
+        scene = self.scene
+        sums = scene.viewpoint.backpropagate_images(scene.layer, binned, frame, to_float32(images))
         return [divide_by_opacity(column, to_float32(opacities)) for column in sums.T]
 
 
@@ -352,32 +352,33 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, view: CpuFrozenScene, is_antialiased: bool, *tensors: Tensor
+        ctx: Any, scene: CpuFrozenScene, is_antialiased: bool, *tensors: Tensor
     ) -> tuple[Tensor, ...]:
         gaussians = GaussianArrays(*[to_float32(tensor) for tensor in tensors])
-        splats = view.viewpoint.project(gaussians, is_antialiased)
-        layer = view.viewpoint.fill_lists(splats, view.depth_limits)
-        frame, render = view.composite_layer(layer)
+        splats = scene.viewpoint.project(gaussians, is_antialiased)
+        layer = scene.viewpoint.fill_lists(splats, scene.depth_limits)
+        frame, render = scene.composite_layer(layer)
         if not any(ctx.needs_input_grad):
             return render.image, render.depth, render.alpha
         # `save_for_backward` takes tensors alone; arrays are attributes.
-        ctx.scene = (view, splats.factors, bin_layer(layer), frame)
-        # Torch raises an error if a saved tensor is written to before the backward pass.
+        ctx.scene = (scene, splats.factors, bin_layer(layer), frame)
+        # Torch raises an error if a saved tensor is written to before the backward pass. This one
+        # reads depth and alpha of the frame, and not its image.
         ctx.save_for_backward(*tensors, render.depth, render.alpha)
         return render.image, render.depth, render.alpha
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *d_frame: Tensor) -> tuple[Tensor | None, ...]:
-        view, factors, binned, frame = ctx.scene
+        scene, factors, binned, frame = ctx.scene
         gaussians = GaussianArrays(*[to_float32(tensor) for tensor in ctx.saved_tensors[:5]])
-        values, written = view.viewpoint.composite_backward(view.layer, binned, frame, d_frame)
+        values, written = scene.viewpoint.composite_backward(scene.layer, binned, frame, d_frame)
         result = GaussianArrays(*[np.zeros_like(array) for array in gaussians])
-        view.viewpoint.share(
+        scene.viewpoint.share(
             project.project_backward,
             len(result.means),
             gaussians,
-            view.viewpoint.pinhole,
+            scene.viewpoint.pinhole,
             factors,
             binned.layer.splats,
             binned.slot_start,
@@ -393,10 +394,10 @@ class _VaryOpacities(torch.autograd.Function):
     """Image, depth and alpha for varying opacities: nothing is projected, sorted or binned."""
 
     @staticmethod
-    def forward(ctx: Any, plan: CpuOpacityRender, opacities: Tensor) -> tuple[Tensor, ...]:
-        binned = plan.set_opacities(opacities)
-        frame, render = plan.scene.composite_layer(binned.layer)
-        ctx.scene = (plan, binned, frame)
+    def forward(ctx: Any, varied: CpuOpacityRender, opacities: Tensor) -> tuple[Tensor, ...]:
+        binned = varied.set_opacities(opacities)
+        frame, render = varied.scene.composite_layer(binned.layer)
+        ctx.scene = (varied, binned, frame)
         ctx.save_for_backward(opacities, render.depth, render.alpha)
         # An output that nothing depends on has no gradient then, where it would have zeros.
         ctx.set_materialize_grads(False)
@@ -405,17 +406,17 @@ class _VaryOpacities(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *d_frame: Tensor | None) -> tuple[Tensor | None, ...]:
-        plan, binned, frame = ctx.scene
+        varied, binned, frame = ctx.scene
         opacities, *_ = ctx.saved_tensors
         d_image, d_depth, d_alpha = d_frame
         if d_image is not None and d_depth is None and d_alpha is None:
             # Most functions read the image alone, and this way fills a tenth of the memory.
-            (result,) = plan.differentiate(binned, frame, opacities, d_image[None])
+            (result,) = varied.differentiate(binned, frame, opacities, d_image[None])
             return None, result
-        view = plan.scene
+        scene = varied.scene
         outputs = (frame.image, frame.depth, frame.alpha)
-        gradients = view.viewpoint.composite_backward(
-            view.layer,
+        gradients = scene.viewpoint.composite_backward(
+            scene.layer,
             binned,
             frame,
             tuple(
@@ -423,7 +424,7 @@ class _VaryOpacities(torch.autograd.Function):
                 for gradient, output in zip(d_frame, outputs, strict=True)
             ),
         )
-        sums = view.viewpoint.sum_by_gaussian(binned, gradients)[:, project.SUM]
+        sums = scene.viewpoint.sum_by_gaussian(binned, gradients)[:, project.SUM]
         return None, divide_by_opacity(sums, to_float32(opacities))
 
 
@@ -432,12 +433,12 @@ class _VaryDepths(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, view: CpuFrozenScene, splats: Splats, depths: Tensor
+        ctx: Any, scene: CpuFrozenScene, splats: Splats, depths: Tensor
     ) -> tuple[Tensor, ...]:
-        moved = splats.move_to_depths(to_float32(depths), view.viewpoint.pinhole.near)
-        binned = view.viewpoint.enter(moved, view.depth_limits)
-        frame, render = view.composite_layer(binned.layer)
-        ctx.scene = (view, binned, frame)
+        moved = splats.move_to_depths(to_float32(depths), scene.viewpoint.pinhole.near)
+        binned = scene.viewpoint.enter(moved, scene.depth_limits)
+        frame, render = scene.composite_layer(binned.layer)
+        ctx.scene = (scene, binned, frame)
         ctx.save_for_backward(render.depth, render.alpha)
         # Footprints are constant, so that only the depth varies smoothly; order may change.
         ctx.mark_non_differentiable(render.image, render.alpha)
@@ -446,9 +447,9 @@ class _VaryDepths(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *d_frame: Tensor) -> tuple[Tensor | None, ...]:
-        view, binned, frame = ctx.scene
-        gradients = view.viewpoint.composite_backward(view.layer, binned, frame, d_frame)
-        sums = view.viewpoint.sum_by_gaussian(binned, gradients)[:, project.SUM_DEPTH]
+        scene, binned, frame = ctx.scene
+        gradients = scene.viewpoint.composite_backward(scene.layer, binned, frame, d_frame)
+        sums = scene.viewpoint.sum_by_gaussian(binned, gradients)[:, project.SUM_DEPTH]
         return None, None, torch.from_numpy(sums.copy())
 
 

@@ -19,7 +19,7 @@ from gscompleter.splats.formats import (
     read_provenance,
     save_splat,
 )
-from gscompleter.splats.morton import argsort_morton
+from gscompleter.splats.morton import argsort_all
 from gscompleter.splats.ply import PLY, copy_ply
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance
 from gscompleter.splats.table import get_written_format
@@ -121,8 +121,7 @@ def measure_rounding(
     if not row.rounds_geometry:
         return None
     if row.is_sorted:
-        places = means.double().numpy()
-        order = argsort_morton(places, places.min(0), places.max(0))
+        order = argsort_all(means)
         means = means[order]
         scales = scales[order]
     read = decode_splat(path)

@@ -40,8 +40,13 @@ def sort_nearby(gaussians: Gaussians) -> Int64[Tensor, "n"]:
 
 def sort_along_morton(gaussians: Gaussians) -> Gaussians:
     """Sort Gaussians along the curve, so that each chunk is compact in space."""
-    means = gaussians.means.double().numpy()
-    return gaussians[argsort_morton(means, means.min(0), means.max(0))]
+    return gaussians[argsort_all(gaussians.means)]
+
+
+def argsort_all(means: Float[Tensor, "n 3"]) -> Int64[Tensor, "n"]:
+    """Compute the order along the curve through the box of all positions, that of sorted files."""
+    places = means.double().numpy()
+    return argsort_morton(places, places.min(0), places.max(0))
 
 
 def argsort_morton(

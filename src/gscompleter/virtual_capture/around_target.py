@@ -70,7 +70,7 @@ ENOUGH_BASELINE = 0.15
 ENOUGH_APART = 0.1
 """The same between two chosen cameras."""
 KNOWN_WORTH = 0.25
-"""Worth of a camera that shows no new part of the border, relative to one that shows all of it."""
+"""Worth of a camera that shows no new part of the border; the new part it shows is added to it."""
 MIN_CAMERA_GAIN = 1e-4
 """Gain below which no further camera is chosen."""
 
@@ -108,8 +108,11 @@ def choose_cameras_around(
 ) -> list[Camera]:
     """Choose up to `count` cameras around a target, the best first; none if it sees no hole.
 
-    `holes` are pixels of the target; by default those that the scene does not cover.
+    `holes` are pixels of the target; by default those that the scene does not cover. The cameras
+    have no near and far.
     """
+    # Planes of the target need not suit cameras elsewhere, so the scene tells each one's near
+    # plane.
     target = replace(target, near=None, far=None)
     small_scene = thin_gaussians(scene, MAX_PREVIEW_GAUSSIANS)
     border = find_hole_border(scene, small_scene, target, renderer, holes)
@@ -151,7 +154,7 @@ def find_hole_border(
 
 
 def propose_around(target: Camera, border: HoleBorder) -> list[Camera]:
-    """Propose about fifty cameras: moves of the target, straight or turned to the border."""
+    """Propose 40 cameras: moves of the target, straight or turned to the border, and turns."""
     axes = target.c2w[:3, :3].T
     up = -axes[1]
     middle = border.points.mean(dim=0)

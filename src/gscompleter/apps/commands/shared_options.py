@@ -220,7 +220,8 @@ class CompletingOptions(SceneOptions, ModelOptions, GeometryOptions):
     without photographs may be SCENE itself."""
     scene: Path | None = None
     """File of Gaussians (a splat) to work on. It is of these photographs, and completed instead of
-    reconstructing the scene; all are kept."""
+    reconstructing the scene; all are kept, but what earlier commands added gives way where
+    photographs show something else."""
     cameras: Path | None = None
     """Cameras to look at the splat from: a file as in `complete --target`. If there are no
     photographs, renders at some of them take their place. If not given, a cameras.json beside the

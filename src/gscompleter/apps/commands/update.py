@@ -41,7 +41,8 @@ class UpdateOptions(SceneOptions, ReconstructorOptions, GeometryOptions):
     """
 
     scene: Path = field()  # without the default of `complete`
-    """File of Gaussians (a splat) to work on. All are kept."""
+    """File of Gaussians (a splat) to work on. All are kept, but what earlier commands added gives
+    way where photographs show something else."""
     photos: Path | None = None
     """Folder of new photographs without cameras. COLMAP places them among those of SCENE, whose
     cameras stay as they are; the new cameras are kept in OUT/colmap."""
@@ -67,6 +68,7 @@ def decide_update(options: UpdateOptions) -> UpdateRequest:
             "config",
         )
     config = stop_recoloring(config) if options.no_recolor else config
+    # A request names a generator; it is not asked, since there are no targets.
     models = decide_models(options, GeneratorOptions())
     splat = decide_splat(options, options.scene)
     return UpdateRequest(

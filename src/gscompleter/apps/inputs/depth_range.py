@@ -13,7 +13,10 @@ from gscompleter.types import Gaussians
 
 
 def apply_splat_range(task: CompletionTask, scene: Gaussians, renderer: Renderer) -> CompletionTask:
-    """Set the depth range of the photographs of an input splat; it is measured if not known."""
+    """Set the depth range of the photographs of an input splat; it is measured if not known.
+
+    `task.depths` names the splat as its source from the beginning (`find_depth_sources`).
+    """
     near, far = find_splat_range(task.views, scene, renderer)
     return replace(task, views=set_depth_range(task.views, near, far))
 
@@ -30,6 +33,7 @@ def apply_scene_range(
     # of a range estimated from features.
     trained = get_trained_range(reconstructor)
     found = find_scene_range(reconstructor, task.views)
+    # All photographs of a task have the same planes.
     camera = task.views[0].camera
     depths = dict(task.depths)
     for name, before, after in (

@@ -1,4 +1,4 @@
-"""Bounds of requests, answers, and silence about who leaves, for both servers of the page."""
+"""Bounds of requests, answers, and silence about who leaves: for servers of `view` and `live`."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class PageHandler(BaseHTTPRequestHandler):
     timeout = ANSWER_SECONDS
 
     def setup(self) -> None:
-        """Begin to wait for the request."""
+        """Begin to wait for the request, the only one of its connection (HTTP/1.0)."""
         super().setup()
         self.server.awaited[self.connection] = time.monotonic()
 

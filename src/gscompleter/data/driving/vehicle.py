@@ -15,7 +15,7 @@ from gscompleter.system.files.reading import read_bytes
 POINT_BYTES = 16
 """Size of a point of KITTI: x, y, z and reflectance as float32."""
 MIN_SPEED = 0.5
-"""Smallest speed of a moving object, in metres per second."""
+"""Smallest speed of a moving object over ground, in metres per second."""
 BOX_MARGIN = 0.1
 """Relative enlargement of a box, for shadows, mirrors and time offsets."""
 
@@ -52,19 +52,21 @@ def build_poses(angles_and_places: Float[np.ndarray, "*n 6"]) -> Float[np.ndarra
 
 
 def compute_moving_boxes(
-    vehicle: Float[np.ndarray, "4 4"], objects: Float[np.ndarray, "n _"]
+    world_from_local: Float[np.ndarray, "4 4"], objects: Float[np.ndarray, "n _"]
 ) -> Float[np.ndarray, "m 8 3"]:
-    """Compute the enlarged corners of moving boxes in the world frame.
+    """Compute the enlarged corners of moving boxes in the world frame, in metres.
 
-    A row of `objects` has centre, sides (metres) and heading (radians) of an upright box (z up) on
-    the vehicle, then its velocity, which is NaN if unknown.
+    A row of `objects` has the middle of a box that stands upright in the local frame (z up), which
+    is that of the vehicle or of its laser; its length along the heading, width and height in
+    metres; the heading in radians from x towards y; then its velocity over ground in metres per
+    second, in any axes, which is NaN if unknown.
     """
     # Not `>=`: an unknown speed is NaN, and such an object counts as moving.
     moving = objects[~(np.linalg.norm(objects[:, 7:], axis=1) < MIN_SPEED)]
     centers, sides, headings = np.split(moving[:, :7], [3, 6], axis=1)
-    # Boxes stand level on the vehicle: only the yaw turns them.
+    # Boxes stand level in the local frame: only the yaw turns them.
     level = np.zeros((len(moving), 2))
-    poses = vehicle @ build_poses(np.concatenate([level, headings, centers], axis=1))
+    poses = world_from_local @ build_poses(np.concatenate([level, headings, centers], axis=1))
     # Signs of the eight corners, from the centre of a box of side 1.
     signs = np.array(list(product((-0.5, 0.5), repeat=3)))
     return transform_points((1 + BOX_MARGIN) * sides[:, None] * signs, poses[:, None])

@@ -166,7 +166,7 @@ def _read_segment_points(segment: Path, time: int) -> Float[np.ndarray, "n 3"]:
 
     The roof laser rotates while the vehicle drives; `lidar_pose` has the vehicle pose per pixel.
     """
-    vehicle = _read_vehicle_pose(segment, time)
+    world_from_vehicle = _read_vehicle_pose(segment, time)
     # Of each laser its pose on the vehicle, its beams, and their lower and upper end.
     calibration = _locate_component(segment, "lidar_calibration")
     beams = (f"beam_inclination.{name}" for name in ("values", "min", "max"))
@@ -190,7 +190,7 @@ def _read_segment_points(segment: Path, time: int) -> Float[np.ndarray, "n 3"]:
         hit = np.isfinite(ranges) & (ranges > 0)
         local = _compute_points(title, ranges, *lasers[laser])[hit]
         # Without `lidar_pose` the vehicle is taken to stand still during the turn.
-        pose = vehicle if moving is None else build_poses(moving[hit])
+        pose = world_from_vehicle if moving is None else build_poses(moving[hit])
         points.append(transform_points(local, pose))
     return np.concatenate(points)
 
@@ -245,14 +245,16 @@ def _read_range_images(path: Path, time: int) -> dict[int, Float[np.ndarray, "h 
 
 def _read_segment_boxes(segment: Path, time: int) -> Float[np.ndarray, "n 8 3"]:
     """Read the boxes of moving objects around the vehicle, except signs."""
-    vehicle = _read_vehicle_pose(segment, time)
+    world_from_vehicle = _read_vehicle_pose(segment, time)
     center = [f"box.center.{axis}" for axis in "xyz"]
     size = [f"box.size.{axis}" for axis in "xyz"]
     speed = [f"speed.{axis}" for axis in "xyz"]
     columns = ["type", *center, *size, "box.heading", *speed]
     rows = _read_table_rows(_locate_component(segment, "lidar_box"), columns, {TIME: time})
     objects = [numbers for kind, *numbers in rows if kind != SIGN]
-    return compute_moving_boxes(vehicle, np.array(objects, dtype=np.float64).reshape(-1, 10))
+    return compute_moving_boxes(
+        world_from_vehicle, np.array(objects, dtype=np.float64).reshape(-1, 10)
+    )
 
 
 def _parse_matrix(values: Any, title: str) -> Float[np.ndarray, "4 4"]:

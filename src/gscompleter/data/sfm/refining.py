@@ -4,7 +4,7 @@ Poses of phones, SLAM and drives are off by a fraction of a pixel or more, which
 made from several photographs. The photographs are refined together (`refining_process`), those of
 targets too: refining one pair alone moves the scene against the frame of everything else. Of very
 many, `choose_known` takes some far apart, and the others keep their poses. A bundle adjustment
-leaves the frame of the scene free, so a similarity moves the result into the given one.
+leaves the frame of the scene free, so a similarity moves its result into the given one.
 """
 
 from __future__ import annotations
@@ -127,15 +127,12 @@ def refine_poses(photographs: Photographs) -> tuple[Photographs, PoseRefinement 
         result = run_colmap(REFINING_PROCESS, job, home, "Refining poses")
 
     given = np.stack([invert_pose_rows(copy.viewmat) for copy in copies])
-    found = [row is not None for row in result["viewmats"]]
+    found = [pose is not None for pose in result["poses"]]
     if sum(found) < MIN_REFINED or result["given_error"] is None:
         return photographs, None
     # Photographs that COLMAP could not refine keep their poses.
     refined = given.copy()
-    refined[found] = move_to_given_frame(
-        np.stack([invert_pose_rows(row) for row in result["viewmats"] if row is not None]),
-        given[found],
-    )
+    refined[found] = [pose for pose in result["poses"] if pose is not None]
     # From pixels of the copies, most of which have the size of the first.
     scale = ERROR_SIDE / min(copies[0].width, copies[0].height)
     moves = np.linalg.norm(refined[found][:, :3, 3] - given[found][:, :3, 3], axis=1)

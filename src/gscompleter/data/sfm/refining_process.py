@@ -1,6 +1,10 @@
 """Refinement of the cameras of posed photographs, in a separate process as `mapping_process`.
 
 Standard input is a `RefiningJob` as JSON. The last line of the output is the result, as JSON too.
+Its `poses`, in the order of the copies, are camera to world (rows of 4 × 4) in the frame and unit
+of the given ones, or null for a copy that kept its pose. `given_error` and `refined_error` are
+median distances of kept-back matches from their epipolar lines, in pixels of the copies, or null.
+
 Points are triangulated from the given cameras, and a bundle adjustment moves cameras and points
 until the features of each point meet. Intrinsics stay; the centre of each camera is held to where
 it was given, because forward motion with few near points leaves the lengths of steps free. A fifth
@@ -11,6 +15,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -33,6 +38,7 @@ from gscompleter.data.sfm.matching import (
 )
 from gscompleter.data.sfm.placing import KnownCopy, PinholeNumbers
 from gscompleter.data.sfm.placing_process import make_known_camera
+from gscompleter.data.sfm.refining import MIN_REFINED, invert_pose_rows, move_to_given_frame
 
 REFINING_ROUNDS = 3
 """Rounds of triangulation and adjustment; better cameras find more points."""
@@ -40,6 +46,9 @@ LOSS_SCALE = 1.0
 """Residual in pixels from which a feature counts less (soft L1): some matches are false."""
 MIN_CAMERA_POINTS = 30
 """Fewest points that determine a camera; one with fewer keeps its pose."""
+
+ViewmatRows = Sequence[Sequence[float]]
+"""World to camera, as the rows of a 3 × 4 matrix."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,19 +78,23 @@ def main() -> None:
         kept_back = keep_back_tracks(database, numbers)
         keypoints = {number: database.read_keypoints(number)[:, :2] for number in numbers}
     model = adjust_bundle(job, cameras, numbers)
-    given = {n: make_pose(copy) for n, copy in zip(numbers, job.copies, strict=True)}
-    seen = {
-        image.image_id for image in model.images.values() if image.num_points3D >= MIN_CAMERA_POINTS
+    copy_by_number = dict(zip(numbers, job.copies, strict=True))
+    adjusted = {
+        number: model.images[number].cam_from_world().matrix().tolist()
+        for number in numbers
+        if model.images[number].num_points3D >= MIN_CAMERA_POINTS
     }
-    refined = {number: model.images[number].cam_from_world() for number in seen}
-    rows = [refined[n].matrix().tolist() if n in refined else None for n in numbers]
-    intrinsics = {n: copy.pinhole for n, copy in zip(numbers, job.copies, strict=True)}
+    moved = move_adjusted(adjusted, copy_by_number)
+    rows = [moved[n].tolist() if n in moved else None for n in numbers]
+
+    intrinsics = {n: copy.pinhole for n, copy in copy_by_number.items()}
     errors: dict[str, float | None] = {}
-    for title, poses in (("given_error", given), ("refined_error", {**given, **refined})):
+    for title, refined in (("given_error", {}), ("refined_error", moved)):
+        poses = join_poses(refined, copy_by_number)
         distances = measure_epipolar_distances(kept_back, keypoints, poses, intrinsics)
         # Without a match that was kept back, nothing tells which poses agree better.
         errors[title] = float(np.median(distances)) if len(distances) else None
-    print(json.dumps({"viewmats": rows, **errors}))
+    print(json.dumps({"poses": rows, **errors}))
 
 
 def extract_refining_features(job: RefiningJob) -> list[int]:
@@ -95,10 +108,10 @@ def extract_refining_features(job: RefiningJob) -> list[int]:
     return cameras
 
 
-def make_pose(copy: KnownCopy) -> pycolmap.Rigid3d:
-    """Make COLMAP's pose, world to camera, of a copy."""
-    viewmat = np.array(copy.viewmat)
-    return pycolmap.Rigid3d(pycolmap.Rotation3d(viewmat[:, :3]), viewmat[:, 3])
+def make_pose(viewmat: ViewmatRows) -> pycolmap.Rigid3d:
+    """Make COLMAP's pose, which is world to camera, too."""
+    rows = np.array(viewmat)
+    return pycolmap.Rigid3d(pycolmap.Rotation3d(rows[:, :3]), rows[:, 3])
 
 
 def adjust_bundle(
@@ -110,7 +123,7 @@ def adjust_bundle(
         for copy, camera, number in zip(job.copies, cameras, numbers, strict=True):
             model.add_camera_with_trivial_rig(database.read_camera(camera))
             image = pycolmap.Image(name=copy.name, camera_id=camera, image_id=number)
-            model.add_image_with_trivial_frame(image, make_pose(copy))
+            model.add_image_with_trivial_frame(image, make_pose(copy.viewmat))
     priors = make_position_priors(job, numbers, model)
     for number in range(REFINING_ROUNDS):
         folder = Path(job.work) / f"triangulated{number}"
@@ -119,8 +132,34 @@ def adjust_bundle(
             model, job.database, job.images, folder, refine_intrinsics=False
         )
         adjust_once(model, job, priors)
-    model.update_point_3d_errors()
     return model
+
+
+def move_adjusted(
+    adjusted: dict[int, ViewmatRows], copy_by_number: dict[int, KnownCopy]
+) -> dict[int, Float[np.ndarray, "4 4"]]:
+    """Move adjusted cameras into the frame of the copies; return them camera to world.
+
+    Priors of centres alone leave the frame free: the cameras of a straight drive may all have
+    turned about its line. Too few cameras determine no frame, and then none is returned.
+    """
+    if len(adjusted) < MIN_REFINED:
+        return {}
+    moved = move_to_given_frame(
+        np.stack([invert_pose_rows(viewmat) for viewmat in adjusted.values()]),
+        np.stack([invert_pose_rows(copy_by_number[n].viewmat) for n in adjusted]),
+    )
+    return dict(zip(adjusted, moved, strict=True))
+
+
+def join_poses(
+    refined: dict[int, Float[np.ndarray, "4 4"]], copy_by_number: dict[int, KnownCopy]
+) -> dict[int, pycolmap.Rigid3d]:
+    """Join refined poses, camera to world in the frame of the copies, and those of other copies."""
+    poses = {n: make_pose(copy.viewmat) for n, copy in copy_by_number.items()}
+    for number, c2w in refined.items():
+        poses[number] = make_pose(np.linalg.inv(c2w)[:3].tolist())
+    return poses
 
 
 def make_position_priors(
