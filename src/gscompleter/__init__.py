@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
 
+# For type checkers; `_HOMES` has the same names (tests/project/test_names.py).
 if TYPE_CHECKING:
     from gscompleter.completer import GSCompleter as GSCompleter
     from gscompleter.config import CompleterConfig as CompleterConfig

@@ -51,7 +51,8 @@ class Completion(Displayed):
     """Context photographs, then check photographs."""
     num_context: int
     trust: Trust
-    """Trust in `rendered_context`; added Gaussians have full trust."""
+    """Trust in `rendered_context`; added Gaussians have full trust, as those at its end have that
+    returned after a removal."""
     added_parts: tuple[Part, ...] = ()
     """What was added, part by part, in the order of addition."""
     targets: tuple[TargetResult, ...] = ()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import json
 import os
 import re
@@ -504,6 +505,18 @@ def test_help_has_every_option_and_one_for_the_settings(monkeypatch, capsys, com
 def test_every_command_has_both_kinds_of_help(monkeypatch, capsys, words):
     assert run(monkeypatch, *words) == 0
     assert capsys.readouterr().out.startswith("usage: gscompleter")
+
+
+def test_the_page_of_all_commands_is_plain_where_the_output_has_no_boxes(monkeypatch):
+    """A pipe on Windows has an encoding of few characters."""
+    bytes_out = io.BytesIO()
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(bytes_out, encoding="cp1252"))
+    assert run(monkeypatch, "--help") == 0
+    sys.stdout.flush()
+    page = bytes_out.getvalue().decode("cp1252")
+    assert page.isascii()
+    assert "+- options ---" in page
+    assert "  * complete  Fill the parts" in page
 
 
 def test_help_all_knows_every_setting(monkeypatch, capsys):

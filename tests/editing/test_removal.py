@@ -30,7 +30,7 @@ from gscompleter.render.loading import load_renderer
 from gscompleter.render.removed import find_removed
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
-from gscompleter.trust.photometric import PhotoObservations, gather_observations
+from gscompleter.trust.photometric import PhotoObservations, gather_observations, load_trust
 from gscompleter.types import Gaussians, make_observed, merge, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, view_of
 
@@ -145,7 +145,16 @@ def test_what_photographs_need_elsewhere_returns(begun):
         proxy_index=state.source.proxy_index.clamp_max(len(state.rendered_context) - 2),
         revealed_mask=state.source.revealed_mask | (torch.arange(len(scene)) == len(scene) - 1),
     )
-    state = replace(state, source=hidden, rendered_context=hidden.rendered, added_parts=())
+    # The trust of a splat has values for the rows that are there before any returns.
+    views = [photo.view for photo in state.photos]
+    trust = load_trust(CompleterConfig.splat(), (hidden.rendered,), views, COMPLETER.scenes)
+    state = replace(
+        state,
+        source=hidden,
+        rendered_context=hidden.rendered,
+        added_parts=(),
+        trust_elsewhere=trust,
+    )
     restored = restore_surroundings(state, COMPLETER.renderer)
     assert restored.source.stand_ins[-1] == len(restored.rendered_context) - 1
     assert torch.equal(restored.scene.means[-1], glow.means[0])
@@ -159,6 +168,7 @@ def test_what_photographs_need_elsewhere_returns(begun):
     assert restored.is_restored
     assert not further.is_restored
     assert not again.is_restored
+    assert len(again.trust_elsewhere.observations.means) == len(trust.observations.means)
 
 
 def test_what_shows_in_the_hole_alone_does_not_return(removed):

@@ -1,5 +1,8 @@
 """A name of a module has one meaning in the whole package."""
 
+import ast
+
+import gscompleter
 from density import find_repeated
 from paths import PACKAGE
 from sources import parse_package
@@ -22,3 +25,15 @@ def test_a_name_is_defined_in_one_module():
     modules = {path: tree for path, tree in parse_package().items() if models not in path.parents}
     repeated = set(find_repeated(modules)) - REPEATED
     assert not repeated, f"name these for what they mean where they stand: {sorted(repeated)}"
+
+
+def test_type_checkers_see_the_public_names_that_there_are():
+    tree = parse_package()[PACKAGE / "__init__.py"]
+    (block,) = [statement for statement in tree.body if isinstance(statement, ast.If)]
+    declared = {
+        alias.asname: statement.module
+        for statement in block.body
+        if isinstance(statement, ast.ImportFrom)
+        for alias in statement.names
+    }
+    assert declared == {name: f"gscompleter.{home}" for name, home in gscompleter._HOMES.items()}

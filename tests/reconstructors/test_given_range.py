@@ -30,8 +30,8 @@ def test_a_near_plane_behind_what_features_show_is_brought_forward(unit):
     assert 0.5 * unit < found.near < 2.0 * unit
     assert found.far == 20.0 * unit
     (note,) = found.notes
-    assert note.startswith(f"Matched features stand at {2.2 * unit:.2g}, ")
-    assert f"nearer than the near plane at {CUT * unit:.3g}: the depth range was widened" in note
+    assert note.startswith(f"Matched features stand at {2.2 * unit:g}, ")
+    assert f"nearer than the near plane at {CUT * unit:g}: the depth range was widened" in note
     # What was found is contradicted by nothing.
     again = find_depth_range(see_room(found.near / unit, 20.0, unit))
     assert again == replace(found, notes=())

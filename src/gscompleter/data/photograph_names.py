@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+from gscompleter.system.errors import format_rounded
 from gscompleter.types import Camera
 
 RENDER = "render "
@@ -64,7 +65,8 @@ def describe_offset(camera: Camera, base: Camera) -> str:
         key=lambda one: abs(one[0]),
     )
     if abs(length) >= MIN_SHIFT * max(1.0, base.center.abs().max().item()):
-        parts.append(f"moved {positive if length > 0 else negative} by {abs(length):.2g}")
+        side = positive if length > 0 else negative
+        parts.append(f"moved {side} by {format_rounded(abs(length), 2)}")
 
     if max(abs(yaw), abs(pitch)) >= MIN_TURN:
         if abs(yaw) >= abs(pitch):

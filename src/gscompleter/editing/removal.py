@@ -60,7 +60,7 @@ def remove_gaussians(
     """
     source = state.source
     first = state.rendered_context
-    # What gave way to photographs is not there any more.
+    # What went earlier, or gave way to photographs, is not there any more.
     chosen = chosen & ~source.gone_mask
 
     # Rendered Gaussians go if they stand for none but chosen ones.
@@ -84,7 +84,8 @@ def remove_gaussians(
     )
     # As long as nothing is recoloured, the state has that of its source itself, which tells so.
     context = remaining.rendered if first is source.rendered else first[~gone]
-    # Outer pieces are no Gaussians of the file: they are added to it.
+    # Outer pieces are no Gaussians of the file: they are added to it. Those that come to light only
+    # now go for good, as parts of a chosen Gaussian that no photograph showed.
     rest = make_part(PartOrigin("piece"), outer[~is_outer_revealed])
     parts = (*state.added_parts, rest) if len(rest) else state.added_parts
     kept = (~gone).nonzero()[:, 0]
@@ -99,8 +100,7 @@ def remove_gaussians(
         is_restored=False,
     )
 
-    # The photographs still show the object. Its pixels are ignored and painted over, so that no
-    # model copies from them.
+    # The photographs still show the object, and its pixels are ignored.
     views = [hide_removed(photo.view, remaining, scenes.renderer) for photo in state.photos]
     shown = scenes.freeze_at(changed.parts, [view.camera for view in views])
     photos = tuple(
@@ -148,7 +148,8 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
     added = merge([first[:0], *(part.gaussians for part in invented)])
     is_needed = find_needed_revealed(revealed, context, known, added, views)
 
-    # Revealed Gaussians that return follow those that are rendered, as rows of their own.
+    # Revealed Gaussians that return follow those that are rendered, as rows of their own. No trust
+    # has values for these: it takes them for added ones.
     remaining = source
     if is_needed.any():
         returned = revealed[is_needed]
@@ -240,9 +241,10 @@ def sum_in_mask(frozen: FrozenScene, inside: Float[Tensor, "h w"]) -> Float[Tens
 def fade_harmful(
     parts: Sequence[Part], scene: Parts, state: Completion, renderer: Renderer
 ) -> list[Part]:
-    """Fade what was invented until no photograph is worse than with `scene` alone.
+    """Fade what was invented until no photograph is clearly worse than with `scene` alone.
 
-    Gaussians that faded altogether stay, unless all of them did.
+    Clearly is beyond `psnr_guard.max_drop`, or what revealed Gaussians may cost that stay away, if
+    that is more. Those that faded stay, but all go if they lose more than `max_opacity_loss`.
     """
     if not parts:
         return []

@@ -6,12 +6,14 @@ The command `remove` does the same with a choice by boxes, masks or a file (`app
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.completer import GSCompleter
+from gscompleter.config import CompleterConfig
 from gscompleter.editing.cutting import Region
 from gscompleter.editing.removal import remove_gaussians, restore_surroundings
 from gscompleter.numerics.value_checks import check_gaussians
@@ -45,17 +47,21 @@ def remove(
         views: Posed photographs or renders of the scene; they still show what goes.
         targets: Cameras to complete the place for. If there are none, up to four are chosen among
             those of `views`, as `PhotographPlanner` does.
-        completer: Models and settings; the default ones if None.
+        completer: Models and settings, by default those of an input splat. As in the command,
+            `CompleterConfig.for_removal` adapts them, so that nothing but the hole is completed.
         contains: Function from points [n, 3] to True for those in a region. Gaussians that reach
             out of it are cut at its border; if None, they go as a whole.
 
     Returns:
-        The completion. Its `source.removed` has what went, and `save(splat=...)` keeps it.
+        The completion. `save(splat=...)` also writes what went: chosen Gaussians, and those behind
+        them that no photograph showed.
 
     Raises:
         InputError: Nothing or everything is chosen, or as in `GSCompleter`.
     """
     completer = completer or GSCompleter()
+    config = completer.config or CompleterConfig.splat()
+    completer = replace(completer, config=config.for_removal())
     check_gaussians(scene, "The scene")
     is_mask = isinstance(chosen, Tensor) and chosen.dtype == torch.bool
     if not is_mask or chosen.shape != (len(scene),):

@@ -32,7 +32,7 @@ from gscompleter.reconstructors.features.depth_range import (
 from gscompleter.reconstructors.features.given_range import DepthRange, find_depth_range
 from gscompleter.render.lod import build_proxy
 from gscompleter.render.protocols import Renderer
-from gscompleter.system.errors import InputError
+from gscompleter.system.errors import InputError, format_rounded
 from gscompleter.trust.lifted import is_lifted
 from gscompleter.types import Camera, ContextScene, Gaussians, Reconstruction, View
 
@@ -160,8 +160,9 @@ def find_scene_range(reconstructor: Reconstructor, views: Sequence[View]) -> Dep
     is_given = found.near == get_given_range(views)[0]
     if is_given and near < found.near:
         note = (
-            f"Surfaces of the photographs stand nearer than the near plane at {found.near:.3g}: "
-            f"the depth range was widened to {near:.2g} to {found.far:.3g}."
+            "Surfaces of the photographs stand nearer than the near plane at "
+            f"{format_rounded(found.near)}: the depth range was widened to "
+            f"{format_rounded(near, 2)} to {format_rounded(found.far)}."
         )
         notes = (*notes, note)
     return DepthRange(near, found.far, notes)

@@ -129,6 +129,11 @@ def join_names(names: Sequence[object], most: int, length: int | None = None) ->
     return f"{shown} and {len(names) - most} more" if len(names) > most else shown
 
 
+def format_rounded(value: float, digits: int = 3) -> str:
+    """Format a number to some significant digits, below a million without an exponent."""
+    return f"{float(f'{value:.{digits}g}'):g}"
+
+
 def refuse_pointer(path: Path) -> None:
     """Raise InputError for a git-lfs pointer in place of the file itself."""
     if not os.path.isfile(path):

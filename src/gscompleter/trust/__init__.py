@@ -56,7 +56,7 @@ class Trust:
         return self
 
     def thin(self, rows: Int[Tensor, "r"], growth: Float[Tensor, "r"]) -> Trust:
-        """Restrict to rows that stand for their neighbours, each enlarged by a factor.
+        """Restrict to ascending rows that stand for their neighbours, each enlarged by a factor.
 
         `growth` is the factor of the lengths.
         """

@@ -98,8 +98,12 @@ class PhotometricTrust(Trust):
         )
 
     def thin(self, rows: Int[Tensor, "r"], growth: Float[Tensor, "r"]) -> PhotometricTrust:
-        """Restrict to rows that stand for their neighbours, each enlarged by a factor."""
+        """Restrict to ascending rows that stand for their neighbours, each enlarged by a factor."""
         seen = self.observations
+        # Rows that returned after a removal follow those observed, and are taken for added ones.
+        is_observed = rows < len(seen.means)
+        rows = rows[is_observed]
+        growth = growth[is_observed]
         thinned = PhotoObservations(
             means=seen.means[rows],
             centers=seen.centers,

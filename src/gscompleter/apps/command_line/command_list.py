@@ -7,6 +7,7 @@ other pages. The sentences are those of the command's own page, read from its fi
 from __future__ import annotations
 
 import shutil
+import sys
 import textwrap
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -24,10 +25,15 @@ WIDTHS = (40, 106)
 """Fewest and most characters in a line; with the most, each sentence is in one."""
 BORDERS = 4
 """Characters beside the text of a line in a box."""
+PLAIN_BOX = str.maketrans("╭╮╰╯─│•", "++++-|*")
+"""What is printed for the characters of boxes where the encoding of the output lacks them."""
 
 
 def format_command_list(names: Sequence[str]) -> str:
-    """Format the page of the commands with these names, as wide as the terminal."""
+    """Format the page of the commands with these names, as wide as the terminal.
+
+    It looks like the page that tyro would make of them.
+    """
     narrowest, widest = WIDTHS
     width = min(max(narrowest, shutil.get_terminal_size().columns), widest)
     commands = {f"  • {name}": read_command_sentence(name) for name in names}
@@ -36,7 +42,17 @@ def format_command_list(names: Sequence[str]) -> str:
         format_box("subcommands", ["(required)", *format_list_rows(commands, 2, width)], width),
     )
     usage = f"usage: gscompleter [-h] [--version] {{{','.join(names)}}}"
-    return "\n".join([usage, "", DESCRIPTION, "", *boxes, ""])
+    page = "\n".join([usage, "", DESCRIPTION, "", *boxes, ""])
+    return page if is_printable(page) else page.translate(PLAIN_BOX)
+
+
+def is_printable(text: str) -> bool:
+    """Return True if the standard output has all characters; pipes on Windows lack some."""
+    try:
+        text.encode(sys.stdout.encoding or "ascii")
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def read_command_sentence(name: str) -> str:

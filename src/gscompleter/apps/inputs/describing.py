@@ -13,7 +13,7 @@ from gscompleter.data.photograph_names import name_photograph
 from gscompleter.data.photographs import Photographs
 from gscompleter.numerics.image_ops import compute_mask_fraction
 from gscompleter.splats.formats import describe_oddities
-from gscompleter.system.errors import join_names, quote_value
+from gscompleter.system.errors import format_rounded, join_names, quote_value
 from gscompleter.system.memory import format_whole_gigabytes, read_memory_bytes
 from gscompleter.types import View
 
@@ -74,6 +74,9 @@ def describe_goal(opened: Opened, task: CompletionTask, max_targets: int, doing:
 def describe_opening(opened: Opened, task: CompletionTask) -> list[str]:
     """Write the lines on the opened scene."""
     camera = task.views[0].camera
+    # Set when the scene was opened.
+    assert camera.near is not None
+    assert camera.far is not None
     photographs = opened.photographs
     unused = ""
     if photographs.unused:
@@ -81,8 +84,9 @@ def describe_opening(opened: Opened, task: CompletionTask) -> list[str]:
         unused = f"; not used: {unused}"
     return [
         f"Opened: {describe_opened(opened, task)}{unused}.",
-        f"Found: {task.frame_description.rstrip('.')}; depths from {camera.near:.3g} to "
-        f"{camera.far:.3g}; worked at {camera.width} x {camera.height} (--resolution changes it).",
+        f"Found: {task.frame_description.rstrip('.')}; depths from "
+        f"{format_rounded(camera.near)} to {format_rounded(camera.far)}; worked at {camera.width} "
+        f"x {camera.height} (--resolution changes it).",
         *describe_missing_photographs(photographs),
         *describe_masks(photographs, task),
         *([] if task.splat_file is None else describe_oddities(task.splat_file.path)),

@@ -22,7 +22,7 @@ from gscompleter.reconstructors.features.depth_factor import (
     fit_depth_factor,
     join_samples,
 )
-from gscompleter.system.errors import InputError, join_names, quote_value
+from gscompleter.system.errors import InputError, format_rounded, join_names, quote_value
 from gscompleter.types import View
 
 WAY_OUT = "--no-given-depth leaves it out"
@@ -262,4 +262,4 @@ def describe_contradiction(samples: DepthSamples) -> str:
 def describe_range(depths: Float[np.ndarray, "n"]) -> str:
     """Write the range of depths without the outermost 2 % on both sides."""
     low, high = np.quantile(depths, RANGE_QUANTILES)
-    return f"{low:.3g} to {high:.3g}"
+    return f"{format_rounded(low)} to {format_rounded(high)}"

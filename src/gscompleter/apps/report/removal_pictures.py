@@ -18,7 +18,7 @@ from gscompleter.render.removed import find_removed
 from gscompleter.state import Completion
 
 ENDED_COLOR = (0.0, 1.0, 1.0)
-"""Colour of the outline where what was removed ends."""
+"""Colour of the outline where the surface ends; where it goes on, it is `MARK_COLOR`."""
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class RemovalPictures:
     pair: RenderPair
     outline: Outline
 
-    def name_images(self) -> dict[str, Tensor | None]:
+    def name_images(self) -> dict[str, Tensor]:
         """Name the images [h, w, 3]."""
         return {
             "before": self.pair.before.image,
@@ -41,9 +41,10 @@ class RemovalPictures:
 def draw_removal(
     completion: Completion, renderer: Renderer, files: Mapping[int | None, str]
 ) -> RemovalPictures | None:
-    """Draw what was removed in the photograph that shows it largest.
+    """Draw what was removed in the photograph of the context that shows it largest.
 
-    `files` are those of the photographs by frame. Return None if no photograph shows any of it.
+    Check photographs, which may be smaller, are no pictures for a report. `files` are those of the
+    photographs by frame. Return None if no photograph of the context shows any of it.
     """
     if len(completion.source.removed) == 0:
         return None

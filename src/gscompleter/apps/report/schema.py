@@ -190,7 +190,7 @@ class TargetRow(ScoreRow):
 
 @dataclass(frozen=True)
 class RemovalRow:
-    """Signs that a removal left parts of an object, in the photograph that shows it largest."""
+    """Signs that a removal left parts of an object, in the context photograph it is largest in."""
 
     frame: int | None
     file: str | None

@@ -20,11 +20,14 @@ POSITION_BASE = 100.0
 
 
 class Dpt(nn.Module):
-    """Conversion of tokens to maps at 4, 2, 1 and 1/2 times the patch resolution."""
+    """Conversion of tokens to maps at 4, 2, 1 and 1/2 times the patch resolution.
 
-    def __init__(self, channels: int, widths: Sequence[int], coded: bool) -> None:
+    With `has_positions` the encoding of their place in the image is added to the maps.
+    """
+
+    def __init__(self, channels: int, widths: Sequence[int], has_positions: bool) -> None:
         super().__init__()
-        self.coded = coded
+        self.has_positions = has_positions
         self.projects = create_projections(channels, widths)
         self.resize_layers = create_resizers(widths)
 
@@ -37,7 +40,7 @@ class Dpt(nn.Module):
             # From tokens [b, v, rows * columns, c] to maps [b * v, c, rows, columns].
             patches = self.normalize_patches(level.patches).flatten(0, 1).transpose(1, 2)
             x = project(patches.unflatten(2, (rows, columns)))
-            if self.coded:
+            if self.has_positions:
                 x = add_position_encoding(x, columns / rows)
             maps.append(resize(x))
         return maps
@@ -48,10 +51,14 @@ class Dpt(nn.Module):
 
 
 class ImageScratch(Scratch):
-    """Fusion of the levels, followed by two convolutions at image resolution."""
+    """Fusion of the levels, and the layers of the output, which heads call after it.
+
+    `output_conv1` is for the fused map, at 8 times the patch resolution. The head resizes its
+    result to the image, and `output_conv2` is for that.
+    """
 
     def __init__(self, widths: Sequence[int], features: int, out: int) -> None:
-        super().__init__(widths, features, None)
+        super().__init__(widths, features, out=None)
         self.output_conv1 = nn.Conv2d(features, features // 2, 3, 1, 1)
         self.output_conv2 = create_output_layers(features // 2, out)
 

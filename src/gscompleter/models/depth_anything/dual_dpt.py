@@ -71,7 +71,7 @@ class DualDpt(Dpt):
     scratch: DualScratch
 
     def __init__(self, channels: int, widths: Sequence[int], features: int) -> None:
-        super().__init__(channels, widths, coded=True)
+        super().__init__(channels, widths, has_positions=True)
         self.norm = nn.LayerNorm(channels)
         self.scratch = DualScratch(widths, features)
 

@@ -33,7 +33,7 @@ class GaussianDpt(Dpt):
     scratch: ImageScratch
 
     def __init__(self, channels: int, widths: Sequence[int], features: int) -> None:
-        super().__init__(channels, widths, coded=True)
+        super().__init__(channels, widths, has_positions=True)
         self.scratch = ImageScratch(widths, features, sum(CHANNELS))
         # Layers that add features of the image itself to the fused map.
         layers: list[nn.Module] = []

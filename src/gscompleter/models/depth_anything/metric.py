@@ -62,7 +62,7 @@ class MetricDpt(Dpt):
     scratch: SkyScratch
 
     def __init__(self, channels: int, widths: Sequence[int], features: int) -> None:
-        super().__init__(channels, widths, coded=False)
+        super().__init__(channels, widths, has_positions=False)
         self.scratch = SkyScratch(widths, features)
 
 

@@ -29,7 +29,7 @@ from gscompleter.reconstructors.features.depth_range import (
 from gscompleter.reconstructors.features.matches import Pixels, triangulate
 from gscompleter.reconstructors.features.neighbours import find_neighbours
 from gscompleter.reconstructors.features.stereo_image import make_stereo_images
-from gscompleter.system.errors import InputError
+from gscompleter.system.errors import InputError, format_rounded
 from gscompleter.types import View
 
 NEIGHBOURHOOD = 0.1
@@ -92,6 +92,8 @@ def find_depth_range(
         found = DepthRange(*get_depth_range(views, lambda _: trained))
         if None in known:
             return replace(found, notes=describe_untrained_range(views, found))
+    # Found above; or the range that the authors of a network give every scene in their evaluation,
+    # where a sentence would come with each of them.
     if known in ((None, None), trained):
         return found
     if not keeps:
@@ -115,19 +117,23 @@ def widen_range(views: Sequence[View], given: DepthRange, outcome: str = "") -> 
         if off > MAX_WIDENING:
             notes = (
                 *notes,
-                f"{seen.source} stand {off:.2g} times outside of the depth range from {near:.3g} "
-                f"to {far:.3g}, which is kept: they are damaged, or in another unit.",
+                f"{seen.source} stand {format_rounded(off, 2)} times outside of the depth range "
+                f"from {format_rounded(near)} to {format_rounded(far)}, which is kept: they are "
+                "damaged, or in another unit.",
             )
             continue
         places = []
         if nearest is not None:
-            places.append(f"at {nearest:.2g}, nearer than the near plane at {near:.3g}")
+            place = format_rounded(nearest, 2)
+            places.append(f"at {place}, nearer than the near plane at {format_rounded(near)}")
             near = MARGINS[0] * nearest
         if farthest is not None:
-            places.append(f"at {farthest:.2g}, farther than the far plane at {far:.3g}")
+            place = format_rounded(farthest, 2)
+            places.append(f"at {place}, farther than the far plane at {format_rounded(far)}")
             far = MARGINS[1] * farthest
         if places:
-            end = outcome or f"the depth range was widened to {near:.2g} to {far:.3g}"
+            widened = f"{format_rounded(near, 2)} to {format_rounded(far)}"
+            end = outcome or f"the depth range was widened to {widened}"
             notes = (*notes, f"{seen.source} stand {' and '.join(places)}: {end}.")
     return DepthRange(near, far, notes)
 
@@ -150,9 +156,10 @@ def describe_untrained_range(views: Sequence[View], trained: DepthRange) -> tupl
         return ()
     factor = math.sqrt(trained.near * trained.far) / middle
     return (
-        f"The scene lies at depths from {nearest:.2g} to {farthest:.2g}, and this model was "
-        f"trained on {trained.near:g} to {trained.far:g}: multiply the positions of the cameras "
-        f"by about {factor:.3g}, or give near and far.",
+        f"The scene lies at depths from {format_rounded(nearest, 2)} to "
+        f"{format_rounded(farthest, 2)}, and this model was trained on {trained.near:g} to "
+        f"{trained.far:g}: multiply the positions of the cameras by about "
+        f"{format_rounded(factor)}, or give near and far.",
     )
 
 

@@ -89,8 +89,8 @@ class Splatter:
         each other (decision 031). Clearly different exposures are normalized to their mean.
         `depths` are in scene units. `layers` hold the inverse depths, with the widest baseline as
         unit of length, and `transforms` relate the views of these layers. With `masks`, only what
-        any view shows in its mask is built and fitted. The scene of three views or more is fitted
-        with `emphasis`, to its check views where it covers them.
+        any view shows in its mask is built and fitted, and the sky behind surfaces. The scene of
+        three views or more is fitted with `emphasis`, to its check views where it covers them.
         """
         gains = torch.from_numpy(estimate_gains(layers, transforms)).float()
         device = views[0].image.device
@@ -113,6 +113,8 @@ class Splatter:
             of_scene = candidates[kept]
             fitted_views = ignore_elsewhere(of_scene, fitted_views, depths, masks)
             kept = kept.masked_scatter(kept, find_in_valid(of_scene, fitted_views))
+        # Those of a part, too, are behind all surfaces: few, and whoever asked for the part selects
+        # by its masks once more.
         skies = [
             (number, gaussians.to(self.fit_device), pixels.to(self.fit_device))
             for number, gaussians, pixels in self.extend_skies(normalized, depths)

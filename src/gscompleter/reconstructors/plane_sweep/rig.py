@@ -94,6 +94,8 @@ def halve_image(image: StereoImage) -> StereoImage:
         image=pixels.astype(np.float32),
         K=image.K * np.array([[0.5], [0.5], [1.0]]),
         given=np.maximum(nearest[:, ::2], nearest[:, 1::2]),
+        # One pixel of four is enough for what is read here, the share of a photograph that stands
+        # before the near plane. Depths that are kept are masked at full size.
         ignore_mask=None if image.ignore_mask is None else image.ignore_mask[::2, ::2],
     )
 
