@@ -199,6 +199,7 @@ class GSCompleter:
         invented: Bool[Tensor, "n"] | None = None,
         lifted: Bool[Tensor, "n"] | None = None,
         geometry: GivenGeometry | None = None,
+        has_scene_range: bool = False,
     ) -> Completion:
         """Initialize the context (stage 1; paper, Eq. 5); arguments and errors as in `__call__`.
 
@@ -206,6 +207,8 @@ class GSCompleter:
         `invented` marks the Gaussians of `scene` that Φ invented earlier, and `lifted` those that Ψ
         lifted from photographs: they give way where photographs show something else. By default
         nothing of a scene does, since a label does not tell them from Gaussians of a user.
+        `has_scene_range` is True if near and far of the views are those that
+        `stages.context.find_scene_range` found, so that they are not looked for again.
         """
         check_inputs(views, scene, check_views or (), targets)
         check_row_mask(invented, scene, "The mask of what was invented")
@@ -226,6 +229,8 @@ class GSCompleter:
                 targets,
                 favored,
                 self.renderer,
+                # Depth of geometry may reach farther than what photographs showed before.
+                has_scene_range and geometry is None,
             )
 
         with record_seconds() as seconds, timed_stage("context"):

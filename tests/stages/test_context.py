@@ -76,3 +76,12 @@ def test_a_reconstructor_may_ask_for_the_range_that_was_given(caplog, keeps):
     reconstruct_context(psi, see_room(2.9, 20.0))
     assert (psi.ranges[0][0] == 2.9) == keeps
     assert ("gets the range as it was given" if keeps else "was widened to") in caplog.text
+
+
+def test_a_range_that_was_found_before_is_not_looked_for_again(caplog):
+    caplog.set_level("WARNING", logger="gscompleter")
+    psi = Recorder([], depth_range=None)
+    reconstruct_context(psi, see_room(2.9, 20.0), has_scene_range=True)
+    # It would be widened, as above.
+    assert psi.ranges == [(2.9, 20.0)] * 2
+    assert not caplog.text

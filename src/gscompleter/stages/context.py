@@ -81,19 +81,20 @@ def init_context(
     targets: Sequence[Camera],
     favored: Sequence[Camera],
     renderer: Renderer,
+    has_scene_range: bool = False,
 ) -> InitialContext:
     """Reconstruct the context from photographs, or take the scene that was given (Eq. 5).
 
-    A reconstruction is fitted most closely to the photographs near the `favored` targets. A given
-    scene that is large is rendered through an LOD proxy, which is made fine enough for all
-    photographs and targets.
+    A reconstruction is fitted most closely to the photographs near the `favored` targets.
+    `has_scene_range` is that of `reconstruct_context`. A given scene that is large is rendered
+    through an LOD proxy, which is made fine enough for all photographs and targets.
     """
     if not views:
         raise InputError("No context view was given; name at least one frame.")
     views = sort_by_frame(views)
     if scene is None:
         views = prepare_single(reconstructor, views)
-        return reconstruct_context(reconstructor, views, check_views, favored)
+        return reconstruct_context(reconstructor, views, check_views, favored, has_scene_range)
 
     photos = [*views, *check_views]
     source = build_proxy(scene.detach(), [*targets, *(view.camera for view in photos)])
@@ -119,14 +120,19 @@ def reconstruct_context(
     views: Sequence[View],
     check_views: Sequence[View] = (),
     favored: Sequence[Camera] = (),
+    has_scene_range: bool = False,
 ) -> InitialContext:
     """Reconstruct `G_ctx = Ψ(V_in)` from posed photographs (paper, Eq. 5).
 
     Ψ fits the scene to `check_views`, too, which are no photographs of the context; photographs
-    near `favored` targets count most.
+    near `favored` targets count most. `has_scene_range` is True if near and far of the photographs
+    are those that `find_scene_range` found, which takes a tenth of a reconstruction.
     """
     check_texture(views)
-    found = find_scene_range(reconstructor, views)
+    if has_scene_range:
+        found = DepthRange(*get_depth_range(views))
+    else:
+        found = find_scene_range(reconstructor, views)
     for note in found.notes:
         logging.getLogger("gscompleter").warning("gscompleter: %s", note)
     views = set_depth_range(views, found.near, found.far)

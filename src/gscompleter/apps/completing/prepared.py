@@ -84,6 +84,7 @@ class Prepared:
             invented=task.invented,
             lifted=task.lifted,
             geometry=task.geometry,
+            has_scene_range=task.scene is None,
         )
         guarding = tuple(begun.with_depth_range(camera) for camera in task.witnesses.guarding)
         begun = replace(begun, free_space_cameras=guarding)

@@ -26,8 +26,8 @@ def apply_scene_range(
 ) -> tuple[CompletionTask, tuple[str, ...]]:
     """Set the depth range of the photographs from which Ψ reconstructs the scene.
 
-    Also returns sentences about a range that was changed. If it was not, the context stage says
-    what contradicts it.
+    Also returns sentences about what contradicts a range that was given. The context stage takes
+    this range as it is (`Prepared.begin`).
     """
     # A published network has the depth range of its authors (decision 047), which takes the place
     # of a range estimated from features.
@@ -44,6 +44,5 @@ def apply_scene_range(
             depths[name] = "model"
         elif before != after:
             depths[name] = "features"
-    is_changed = (camera.near, camera.far) != (found.near, found.far)
     views = set_depth_range(task.views, found.near, found.far)
-    return replace(task, views=views, depths=depths), found.notes if is_changed else ()
+    return replace(task, views=views, depths=depths), found.notes
