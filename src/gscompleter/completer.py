@@ -13,6 +13,7 @@ from torch import Tensor
 
 from gscompleter.config import CompleterConfig
 from gscompleter.config.settings import validate
+from gscompleter.editing.remaking import remake_scene
 from gscompleter.editing.replacing import find_contested, let_step_aside, return_needed
 from gscompleter.generators import (
     FunctionGenerator,
@@ -200,6 +201,7 @@ class GSCompleter:
         lifted: Bool[Tensor, "n"] | None = None,
         geometry: GivenGeometry | None = None,
         has_scene_range: bool = False,
+        remade: Bool[Tensor, "n"] | None = None,
     ) -> Completion:
         """Initialize the context (stage 1; paper, Eq. 5); arguments and errors as in `__call__`.
 
@@ -208,11 +210,14 @@ class GSCompleter:
         lifted from photographs: they give way where photographs show something else. By default
         nothing of a scene does, since a label does not tell them from Gaussians of a user.
         `has_scene_range` is True if near and far of the views are those that
-        `stages.context.find_scene_range` found, so that they are not looked for again.
+        `stages.context.find_scene_range` found, so that they are not looked for again. `remade`
+        marks the Gaussians of `scene` that Ψ made of photographs among `views`, and makes anew of
+        all of them.
         """
         check_inputs(views, scene, check_views or (), targets)
         check_row_mask(invented, scene, "The mask of what was invented")
         check_row_mask(lifted, scene, "The mask of what was lifted")
+        check_row_mask(remade, scene, "The mask of what is made anew")
         config = choose_config(self.config, scene, check_views)
         if geometry is not None:
             check_geometry(geometry, config)
@@ -256,14 +261,32 @@ class GSCompleter:
             # What earlier commands made steps aside where photographs show something else, so that
             # nobody takes it for a part of the scene that they contradict.
             contested = find_contested(state, invented, lifted, self.scenes)
-            state = let_step_aside(state, contested)
-            # Guards measure the scene as it was given, so before anything changes.
-            state = prepare_guards(state, self.scenes)
-
-            # The order of evidence: what photographs show goes in first, what the scene shows is
-            # kept, and Φ invents only the rest (decision 051).
-            state = add_observed(self.reconstructor, state, self.scenes)
-            state = return_needed(state, contested, self.scenes)
+            new_scene = None
+            if remade is not None:
+                new_scene = remake_scene(
+                    self.reconstructor,
+                    state,
+                    views,
+                    remade,
+                    contested,
+                    self.renderer,
+                    has_scene_range,
+                )
+            if new_scene is not None:
+                state = new_scene.state
+                context = replace(
+                    context,
+                    views=tuple(photo.view for photo in state.photos),
+                    exposure_gains=new_scene.exposure_gains,
+                )
+            else:
+                state = let_step_aside(state, contested)
+                # Guards measure the scene as it was given, so before anything changes.
+                state = prepare_guards(state, self.scenes)
+                # The order of evidence: what photographs show goes in first, what the scene shows
+                # is kept, and Φ invents only the rest (decision 051).
+                state = add_observed(self.reconstructor, state, self.scenes)
+                state = return_needed(state, contested, self.scenes)
             if state.num_observed or contested is not None:
                 # What photographs gained by it has to stay, too.
                 state = prepare_guards(state, self.scenes)

@@ -201,8 +201,9 @@ class SceneOptions(ComputeOptions, WritingOptions, MaskOptions):
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
     forget_edits: bool = False
-    """Use photographs also where they show what earlier commands removed from the splat, or what
-    was marked there as wrong, so that it may come back."""
+    """Do without the record of earlier commands: use photographs also where they show what was
+    removed from the splat, or marked as wrong, so that it may come back; and keep a splat that
+    complete reconstructed from other photographs of SCENE, where complete would make it anew."""
     ignore_properties: bool = False
     """Go on with a splat whose further properties change what is seen, such as a moving one."""
 

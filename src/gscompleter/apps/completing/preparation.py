@@ -33,6 +33,7 @@ from gscompleter.apps.inputs.earlier_work import mark_earlier_work
 from gscompleter.apps.inputs.memory import check_gpu, check_scene
 from gscompleter.apps.inputs.named_photographs import check_target_files
 from gscompleter.apps.inputs.opening import choose_working_size, open_scene
+from gscompleter.apps.inputs.own_scene import find_own_photographs
 from gscompleter.apps.inputs.paintings import read_paintings
 from gscompleter.apps.inputs.reading import add_fit_views, read_task
 from gscompleter.apps.inputs.refined_poses import read_at_refined_poses, take_over_poses
@@ -123,7 +124,7 @@ def prepare_completion(
         check_models(work)
         config = work.config if work.splat is None else work.config.for_photographs()
         opened = open_for_completion(work, source, targets, console)
-        opened, task = read_opened(work, source, targets, opened, console)
+        opened, task = read_opened(work, source, targets, opened, console, remakes_own=True)
     loaded = load_models(work, config, targets, opened, task, geometry, console)
     return make_prepared(request, targets, loaded)
 
@@ -190,12 +191,13 @@ def read_opened(
     opened: Opened,
     console: Console,
     num_known: int | None = None,
+    remakes_own: bool = False,
 ) -> tuple[Opened, CompletionTask]:
     """Read the inputs, at refined poses unless these are to be taken as they are.
 
-    `num_known` is that of `refine_opened`.
+    `num_known` is that of `refine_opened`, and `remakes_own` that of `read_inputs`.
     """
-    read = partial(read_inputs, work, photographs, targets)
+    read = partial(read_inputs, work, photographs, targets, remakes_own=remakes_own)
     # The paper takes poses as they are.
     if follows_paper(work) or not photographs.scene.refines_poses:
         return opened, read(opened)
@@ -212,10 +214,12 @@ def read_inputs(
     photographs: PhotographsRequest,
     targets: TargetRequest,
     opened: Opened,
+    remakes_own: bool,
 ) -> CompletionTask:
     """Read the context and the targets, and add the input splat; compile the kernels.
 
-    A context that is not named is fitted to further photographs.
+    A context that is not named is fitted to further photographs. `remakes_own` is True if a splat
+    that an earlier command reconstructed is to be made anew, also from its photographs.
     With a splat everything is in its frame from here on, and else in that of the photographs.
     """
     device = work.models.device
@@ -226,11 +230,13 @@ def read_inputs(
         with show_preparation("reading photographs"):
             has_splat = splat is not None
             is_free = splat is None and not follows_paper(work)
+            can_remake = remakes_own and splat is not None and work.config.add_observed
+            own = find_own_photographs(work, opened.files) if can_remake else ()
             # Plane-sweep fits a scene to any number of photographs (decision 140); networks were
             # trained with few.
             is_fitted = is_free and work.models.reconstructor == "plane-sweep"
             task = read_task(
-                opened, photographs.context, targets.named, device, has_splat, is_fitted
+                opened, photographs.context, targets.named, device, has_splat, is_fitted, own
             )
             task = add_paintings(task, targets, opened)
             if is_free and photographs.context is None:
@@ -303,15 +309,15 @@ def load_models(
     # The depth range is counted as a part of the context stage, whose seconds it is added to.
     with show_preparation("depth range"), record_seconds() as seconds, timed_stage("context"):
         notes: tuple[str, ...] = ()
-        if work.splat is None or task.scene is None:  # both or none
+        if task.scene is None or task.is_remade:
             task, notes = apply_scene_range(task, reconstructor)
         else:
             task = apply_splat_range(task, task.scene, completer.renderer)
-            # Renders of the splat itself show nothing that it lacks.
-            if opened.renders_from is None:
-                task, notes = mark_earlier_work(task)
-                task, edited = take_over_edits(task, work.splat.forget_edits, completer.renderer)
-                notes = (*notes, *edited)
+        # Renders of the splat itself show nothing that it lacks.
+        if work.splat is not None and opened.renders_from is None:
+            task, told = mark_earlier_work(task)
+            task, edited = take_over_edits(task, work.splat.forget_edits, completer.renderer)
+            notes = (*notes, *told, *edited)
     print_lines(console, *notes)
     return Loaded(opened, task, completer, collect_cameras(opened, task), seconds)
 

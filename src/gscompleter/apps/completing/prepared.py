@@ -84,7 +84,8 @@ class Prepared:
             invented=task.invented,
             lifted=task.lifted,
             geometry=task.geometry,
-            has_scene_range=task.scene is None,
+            has_scene_range=task.scene is None or task.is_remade,
+            remade=task.remade,
         )
         guarding = tuple(begun.with_depth_range(camera) for camera in task.witnesses.guarding)
         begun = replace(begun, free_space_cameras=guarding)

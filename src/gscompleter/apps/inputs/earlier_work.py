@@ -18,6 +18,11 @@ from gscompleter.system.errors import quote_value
 from gscompleter.system.files.writing import EDITS_FILE
 from gscompleter.types import Gaussians
 
+REMAKING = (
+    "The splat was reconstructed from photographs of this folder: it is reconstructed anew from "
+    "those and the photographs of this command (--forget-edits adds to it as it is)."
+)
+
 
 def mark_earlier_work(task: CompletionTask) -> tuple[CompletionTask, tuple[str, ...]]:
     """Mark what earlier commands made of the splat of a task; lines tell about it.
@@ -28,6 +33,10 @@ def mark_earlier_work(task: CompletionTask) -> tuple[CompletionTask, tuple[str, 
     assert task.splat_file is not None
     edits = task.splat_file.edits
     invented = read_rows(task.splat_file, task.scene, INVENTED_KINDS)
+    if task.is_remade:
+        # The record tells all rows, or nothing would be made anew.
+        assert invented is not None
+        return replace(task, invented=invented, remade=~invented), (REMAKING,)
     # What a first command lifted stays: its own photographs would lose (decision 113).
     lifted = read_rows(task.splat_file, task.scene, ("photographs",))
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 from gscompleter.apps.inputs.given_depth import DepthReading, read_with_depth
 from gscompleter.apps.inputs.named_photographs import (
@@ -13,6 +14,7 @@ from gscompleter.apps.inputs.named_photographs import (
     find_context,
     read_targets,
 )
+from gscompleter.apps.inputs.own_scene import join_photographs
 from gscompleter.apps.inputs.selection import (
     choose_context,
     collect_usable_cameras,
@@ -21,7 +23,7 @@ from gscompleter.apps.inputs.selection import (
 )
 from gscompleter.apps.inputs.task import CompletionTask, Opened, Target
 from gscompleter.data.local_origin import compute_frame_from_photographs
-from gscompleter.data.photographs import Photographs
+from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.data.points import add_depth_range
 from gscompleter.numerics.geometry import select_spread_cameras
 from gscompleter.system.errors import InputError, quote_value
@@ -43,26 +45,39 @@ def read_task(
     device: str,
     has_splat: bool,
     is_fitted: bool,
+    own: Sequence[int] = (),
 ) -> CompletionTask:
     """Read the context and the targets, after checking the memory.
 
     A context that is not named is chosen. `has_splat` is True if an input splat is completed, and
-    `is_fitted` if Ψ makes the scene and fits it to all photographs of the context together.
+    `is_fitted` if Ψ makes the scene and fits it to all photographs of the context together. From
+    the frames `own` it made the splat, which it makes anew if that and the context are not too many
+    photographs together.
     """
     photographs = opened.photographs
     resolution = opened.request.resolution
     targets = read_targets(photographs, target_words, resolution, has_splat)
-    frames = find_context(photographs, context)
-    if not frames:
-        frames = choose_context(
-            photographs, targets, resolution, has_splat, opened.held_out, is_fitted
-        )
+    named = find_context(photographs, context)
+    choose = partial(choose_context, photographs, targets, resolution, held_out=opened.held_out)
+    scoring = {*opened.held_out, *(target.frame for target in targets)}
+    joined: tuple[int, ...] = ()
+    if own:
+        chosen = named or choose(has_splat=False, is_fitted=True)
+        joined = join_photographs(own, chosen, scoring, count_pixels(photographs, resolution))
+    frames = joined or named or choose(has_splat=has_splat, is_fitted=is_fitted)
 
     # Cameras are enough to estimate the memory, before any photograph is loaded.
     cameras = [photographs.camera(frame, resolution) for frame in frames]
     cameras += [target.camera for target in targets]
     check_memory(max(camera.width * camera.height for camera in cameras), len(cameras))
-    return make_task(opened, frames, targets, device, has_splat)
+    task = make_task(opened, frames, targets, device, has_splat)
+    return replace(task, is_remade=len(joined) > 0)
+
+
+def count_pixels(photographs: Photographs, resolution: Resolution) -> int:
+    """Count the pixels of the first photograph at the working size."""
+    camera = photographs.camera(0, resolution)
+    return camera.width * camera.height
 
 
 def add_fit_views(task: CompletionTask, opened: Opened) -> CompletionTask:

@@ -154,6 +154,11 @@ class CompletionTask:
     photographs show; None for none."""
     lifted: Bool[Tensor, "n"] | None = None
     """Mask of those that earlier commands lifted from photographs, which give way likewise."""
+    is_remade: bool = False
+    """True if Ψ made the input splat of photographs of the same folder, which are among `views`,
+    and makes it anew."""
+    remade: Bool[Tensor, "n"] | None = None
+    """Mask of the Gaussians of `scene` that it makes anew; None for none."""
 
     @property
     def device(self) -> torch.device:

@@ -1,0 +1,133 @@
+"""A scene that Ψ made of a few photographs, made anew of more (not in the paper; decision 145).
+
+Ψ fits a scene to its photographs, and what looks right from them may be shards from elsewhere. What
+further photographs show cannot be added around shards, nor do they give way: the photographs that
+they were made of would lose. So Ψ makes the scene of all photographs together. What Φ invented
+stays, but where photographs show the place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from jaxtyping import Bool, Float
+from torch import Tensor
+
+from gscompleter.config.settings import COVERED
+from gscompleter.editing.replacing import Contested, drop_rows, mark_rendered
+from gscompleter.generators.exposure import compute_median_ratio
+from gscompleter.parts import PartOrigin, make_part
+from gscompleter.reconstructors import Reconstructor
+from gscompleter.render.protocols import Renderer
+from gscompleter.stages.context import InitialContext, reconstruct_context, sort_by_frame
+from gscompleter.state import Completion, Photo
+from gscompleter.types import SH_C0, ContextScene, Gaussians, Render, View, merge
+
+
+@dataclass(frozen=True)
+class RemadeScene:
+    """A begun completion whose scene Ψ made anew."""
+
+    state: Completion
+    exposure_gains: Float[Tensor, "v 3"]
+    """Exposure gain per channel of each photograph of the context relative to the scene."""
+
+
+def remake_scene(
+    reconstructor: Reconstructor,
+    state: Completion,
+    views: Sequence[View],
+    remade: Bool[Tensor, "n"],
+    contested: Contested | None,
+    renderer: Renderer,
+    has_scene_range: bool,
+) -> RemadeScene | None:
+    """Make anew what Ψ made of the scene of a begun completion, from its photographs.
+
+    `views` are those of the context as they were given, `remade` marks Gaussians of the given
+    scene, and `has_scene_range` is that of `reconstruct_context`. The `contested` ones, which Φ
+    invented, go as well. Returns None if the photographs are not nearer to the new scene than to
+    the given one, in the mean of their PSNR.
+    """
+    views = sort_by_frame(views)  # as those of `state` are
+    given = render_at_all(merge(state.parts), views, renderer)
+    made = reconstruct_context(reconstructor, views, has_scene_range=has_scene_range)
+    shown = render_at_all(made.source.gaussians, views, renderer)
+    factor = measure_exposure(given, shown, views)
+    made = multiply_exposure(made, views, factor)
+
+    gone = mark_rendered(state.source, remade)
+    if contested is not None:
+        gone = gone | contested.rows
+    part = make_part(PartOrigin("photographs"), made.source.gaussians)
+    # The scene has one exposure, which photographs of the context share from here on.
+    context = tuple(Photo(view) for view in made.views)
+    begun = replace(
+        drop_rows(state, state, gone),
+        photos=(*context, *state.photos[len(context) :]),
+        added_parts=(part,),
+        context_notes=(*state.context_notes, *made.notes),
+    )
+    new = render_at_all(merge(begun.parts), made.views, renderer)
+    if compute_psnrs(new, made.views).mean() <= compute_psnrs(given, made.views).mean():
+        return None
+    assert made.exposure_gains is not None
+    return RemadeScene(begun, made.exposure_gains)
+
+
+def render_at_all(scene: Gaussians, views: Sequence[View], renderer: Renderer) -> list[Render]:
+    """Render a scene at the cameras of photographs."""
+    return [renderer.render(scene, view.camera) for view in views]
+
+
+def compute_psnrs(renders: Sequence[Render], views: Sequence[View]) -> Float[Tensor, "v"]:
+    """Compute the PSNR of each photograph, in dB; pixels that are ignored count as right."""
+    errors = [
+        (view.fill_ignored(render.image.clamp(0, 1)) - view.image).square().mean()
+        for render, view in zip(renders, views, strict=True)
+    ]
+    return -10 * torch.stack(errors).clamp_min(1e-10).log10()
+
+
+def measure_exposure(
+    given: Sequence[Render], shown: Sequence[Render], views: Sequence[View]
+) -> Float[Tensor, "3"]:
+    """Measure the exposure of the given scene relative to a new one, per channel.
+
+    They are compared where both show the half of the photographs that the given scene was made of,
+    as far as its errors tell. What was invented and stays has the exposure of the given scene.
+    """
+    best = compute_psnrs(given, views).argsort(descending=True)[: (len(views) + 1) // 2]
+    old_colors = []
+    new_colors = []
+    for index in best.tolist():
+        old = given[index]
+        new = shown[index]
+        both = (old.alpha >= COVERED) & (new.alpha >= COVERED)
+        old_colors.append(old.image[both])
+        new_colors.append(new.image[both])
+    return compute_median_ratio(torch.cat(new_colors), torch.cat(old_colors))
+
+
+def multiply_exposure(
+    made: InitialContext, views: Sequence[View], factor: Float[Tensor, "3"]
+) -> InitialContext:
+    """Multiply the exposure of a scene, and of its photographs, by a factor per channel.
+
+    `views` are the photographs as they were given, from which those of `made` are normalized anew.
+    """
+    scene = made.source.gaussians
+    # A colour is a half and a sum of harmonics, of which the first is constant.
+    offset = 0.5 * (factor - 1) / SH_C0
+    sh = scene.sh * factor
+    sh = torch.cat([sh[:, :1] + offset, sh[:, 1:]], dim=1)
+    gains = factor.new_ones(len(views), 3) if made.exposure_gains is None else made.exposure_gains
+    gains = gains / factor
+    normalized = tuple(
+        replace(view, image=raw.normalize_exposure(gain).image)
+        for view, raw, gain in zip(made.views, views, gains, strict=True)
+    )
+    source = ContextScene.whole(replace(scene, sh=sh))
+    return replace(made, source=source, views=normalized, exposure_gains=gains)

@@ -1,0 +1,117 @@
+"""A scene that Ψ made of two photographs is made anew of more."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from gscompleter import GSCompleter, load_renderer
+from gscompleter.config import CompleterConfig
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.parts import NOT_INVENTED
+from gscompleter.state import Completion
+from gscompleter.types import (
+    SH_C0,
+    Gaussians,
+    Reconstruction,
+    View,
+    make_observed,
+    merge,
+    sh_from_rgb,
+)
+from scenes import Room, camera_at, gaussians_of, reconstruction_of, view_of
+
+RENDERER = load_renderer("cpu")
+PLACES = (-0.6, -0.2, 0.2, 0.6)
+PHOTOS = [view_of(Room(), camera_at(x, size=48), k) for k, x in enumerate(PLACES)]
+WHOLE = merge([gaussians_of(view) for view in PHOTOS])
+NUM_OWN = 2
+"""Photographs that the given scene was made of."""
+
+
+def reconstruct_exactly(views: list[View]) -> Reconstruction:
+    """Reconstruct photographs as an ideal Ψ: the true surface of each pixel."""
+    return reconstruction_of(views, [view.depth for view in views])
+
+
+def make_shards() -> Gaussians:
+    """Make what looks right from the first photographs alone: some of it at a wrong depth."""
+    shards = []
+    for view in PHOTOS[:NUM_OWN]:
+        scene = gaussians_of(view)
+        half = torch.arange(len(scene)) % 2 == 0
+        center = view.camera.center
+        means = torch.where(half[:, None], center + 0.6 * (scene.means - center), scene.means)
+        scales = torch.where(half[:, None], 0.6 * scene.scales, scene.scales)
+        shards.append(replace(scene, means=means, scales=scales))
+    return merge(shards)
+
+
+def make_invented(x: float) -> Gaussians:
+    """Make a Gaussian that was invented for target 1."""
+    colors = sh_from_rgb(torch.full((1, 3), 0.5))
+    mean = torch.tensor([[x, 0.0, 3.0]])
+    quat = torch.tensor([[1.0, 0, 0, 0]])
+    made = make_observed(mean, quat, torch.full((1, 3), 0.02), torch.tensor([0.9]), colors)
+    return replace(made, generated=torch.ones_like(made.generated))
+
+
+SHARDS = make_shards()
+ASIDE = make_invented(30.0)
+
+
+def begin(scene: Gaussians, photos: list[View], is_remade: bool = True) -> Completion:
+    completer = GSCompleter(reconstruct_exactly, config=CompleterConfig.splat())
+    is_invented = scene.generated == 1
+    remade = ~is_invented if is_remade else None
+    return completer.begin(photos, scene, [], invented=is_invented, remade=remade)
+
+
+def score(scene: Gaussians, photos: list[View] = PHOTOS) -> list[float]:
+    return [psnr(RENDERER.render(scene, v.camera).image.clamp(0, 1), v.image) for v in photos]
+
+
+def test_all_photographs_gain_and_what_nobody_sees_stays():
+    given = merge([SHARDS, ASIDE])
+    added = begin(given, PHOTOS, is_remade=False)
+    made = begin(given, PHOTOS)
+    # Around shards the new photographs stay wrong.
+    for after, around in list(zip(score(made.scene), score(added.scene), strict=True))[NUM_OWN:]:
+        assert after > around + 3
+    for after, true in zip(score(made.scene), score(WHOLE), strict=True):
+        assert abs(after - true) < 0.1
+
+    # What went is known, so that strip puts it back.
+    assert made.source.replaced_mask.tolist() == [True] * len(SHARDS) + [False]
+    assert (made.scene.generated == 1).sum() == 1
+    assert (made.scene.generated == NOT_INVENTED).sum() == len(made.scene) - 1
+    assert made.num_observed == len(made.scene) - 1
+
+
+def test_the_new_scene_keeps_the_exposure_of_the_given_one():
+    """All photographs of the second command are given darker than those of the first were."""
+    darker = [replace(view, image=0.8 * view.image) for view in PHOTOS]
+    made = begin(SHARDS, darker)
+    assert made.exposure_gains is not None
+    assert torch.allclose(made.exposure_gains, torch.tensor(0.8), atol=0.02)
+    # The photographs are brought to the scene.
+    for photos in (PHOTOS, list(made.views)):
+        for after, true in zip(score(made.scene, photos), score(WHOLE), strict=True):
+            assert abs(after - true) < 0.5
+
+
+def test_a_scene_stays_if_its_photographs_are_nearer_to_it():
+    """Ψ fails here: it makes everything grey."""
+
+    def reconstruct_grey(views: list[View]) -> Reconstruction:
+        made = reconstruct_exactly(views)
+        grey = torch.zeros_like(made.gaussians.sh)
+        grey[:, 0] = -0.3 / SH_C0
+        return replace(made, gaussians=replace(made.gaussians, sh=grey))
+
+    completer = GSCompleter(reconstruct_grey, config=CompleterConfig.splat())
+    remade = torch.ones(len(WHOLE), dtype=torch.bool)
+    begun = completer.begin(PHOTOS, WHOLE, [], remade=remade)
+    assert not begun.source.replaced_mask.any()
+    assert torch.equal(begun.scene.means[: len(WHOLE)], WHOLE.means)
