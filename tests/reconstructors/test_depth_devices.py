@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 from functools import partial
 
@@ -23,7 +24,7 @@ from gscompleter.numerics.tensor_stereo import (
     prefer_given_planes,
     select_volume_planes,
 )
-from gscompleter.numerics.tensor_tgv import LAUNCHES_PER_ITERATION, fit_on_device
+from gscompleter.numerics.tensor_tgv import FIT_BYTES, LAUNCHES_PER_ITERATION, fit_on_device
 from gscompleter.reconstructors.features.stereo_image import StereoImage
 from gscompleter.reconstructors.plane_sweep import PlaneSweep, depth_devices, matching
 from gscompleter.reconstructors.plane_sweep.depth_devices import TensorDepth
@@ -33,13 +34,18 @@ from gscompleter.reconstructors.plane_sweep.matching import (
     aggregate,
     compute_costs,
     compute_jumps,
+    estimate_group_bytes,
     group_searches,
     list_tile_planes,
     search_with_tensors,
     spread_over_tiles,
 )
 from gscompleter.reconstructors.plane_sweep.surfaces import FitHeights, fit_surfaces
-from gscompleter.reconstructors.plane_sweep.sweep import make_bands, make_full_bands
+from gscompleter.reconstructors.plane_sweep.sweep import (
+    MAX_PLANES,
+    make_bands,
+    make_full_bands,
+)
 from scenes import Room, camera_at, view_of
 
 SIZE = 40, 76
@@ -228,30 +234,50 @@ def test_launches_grow_with_rows_and_columns_and_the_host_waits_once():
     assert counts.launches.total() <= 8 * sum(SIZE) + 250 * sources + 150 * len(searches)
 
 
-def estimate_most_bytes(size: tuple[int, int], planes: int, part: int) -> int:
-    """Estimate the most bytes that a search holds on the device at once."""
-    height, width = size
-    pixels = height * width
-    cells = pixels * planes
-    # Images of four views, their tiles, and penalties of jumps.
-    always = 120 * pixels
-    matching = cells + 8 * part
-    path_states = 2 * 2 * 3 * (width + 2) * (planes + 2) * 2
-    aggregation = 3 * cells + 3 * part + path_states
-    return always + max(matching, aggregation)
-
-
-@pytest.mark.parametrize("part", [40_000, 200_000])
-def test_a_large_image_with_all_planes_takes_less_than_two_gibibytes(monkeypatch, part):
-    """An estimate holds for a small image in small parts, and then says it of a large one."""
-    assert estimate_most_bytes((1080, 1920), 256, tensor_stereo.PART_BYTES) < 2 * 2**30
-    size, planes = (32, 128), 40
+@pytest.mark.parametrize(
+    ("size", "planes", "count", "part"),
+    [
+        ((32, 128), 40, 1, 40_000),
+        ((32, 128), 40, 1, 200_000),
+        ((32, 128), 40, 3, 40_000),
+        ((48, 64), 48, 1, 20_000),
+    ],
+)
+def test_the_estimate_of_a_search_holds_what_a_device_counts(
+    monkeypatch, size, planes, count, part
+):
+    """Where parts are small. Of large ones not all arrays are there at once."""
     monkeypatch.setattr(tensor_stereo, "PART_BYTES", part)
+    monkeypatch.setattr(matching, "GROUP_CELLS", count * size[0] * size[1] * planes)
     with fake_cuda():
-        search_with_tensors([make_search(size, planes)], "cuda")
+        search_with_tensors([make_search(size, planes)] * count, "cuda")
         peak = max(get_device().memory.peaks.values())
-    estimate = estimate_most_bytes(size, planes, part)
-    assert 0.5 * estimate < peak < estimate
+    estimate = estimate_group_bytes([size] * count, planes)
+    assert (0.6 if part > 100_000 else 0.85) * estimate < peak < estimate
+
+
+def test_a_large_image_with_all_planes_takes_less_than_two_gibibytes():
+    large = (1080, 1920)
+    one = estimate_group_bytes([large], MAX_PLANES)
+    assert 1.5 * 2**30 < one < 2 * 2**30
+    # Large images are searched one after the other, and small ones together.
+    assert estimate_group_bytes([large] * 8, MAX_PLANES) == one
+    small = [estimate_group_bytes([(256, 256)] * number, MAX_PLANES) for number in (1, 2, 8, 24)]
+    assert small[0] < small[1] < small[2] == small[3] < one
+
+
+def test_maps_are_fitted_one_after_the_other():
+    """Each takes memory of its own, and a GPU is not faster with several."""
+    with fake_cuda():
+        fit = partial(fit_on_device, "cuda")
+        threads = [threading.Thread(target=fit_level, args=(fit, 3)) for _ in range(4)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+        peak = max(get_device().memory.peaks.values())
+    estimate = FIT_BYTES * SIZE[0] * SIZE[1]
+    assert 0.7 * estimate < peak < estimate
 
 
 def fit_level(fit: FitHeights, iterations: int) -> tuple[np.ndarray, np.ndarray]:

@@ -297,16 +297,16 @@ def find_revealed(
         revealed &= confirmed_area < MIN_SHOWN_BEFORE * largest
         if not revealed.any():
             break
-        gone = gone | revealed
+        gone = gone | revealed.to(gone.device)
     return gone[: len(first)], gone[len(gone) - len(outer) :]
 
 
 def measure_areas(
     parts: Parts, views: Sequence[View], scenes: SceneRenderer
 ) -> Float[Tensor, "k m"]:
-    """Measure the visible area of each Gaussian of the first part in photographs."""
+    """Measure the visible area of each Gaussian of the first part in photographs, on the CPU."""
     means = parts[0].means
-    areas = means.new_zeros((len(views), len(means)))
+    areas = torch.zeros((len(views), len(means)), dtype=means.dtype)
     frozen = scenes.freeze_at(parts, [view.camera for view in views])
 
     def measure(k: int) -> None:

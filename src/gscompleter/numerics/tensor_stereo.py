@@ -7,7 +7,8 @@ bands, needs no look-up of where a neighbour's costs lie. It holds more, but a G
 launches rather than for arithmetic.
 
 **Memory.** Of an image of 1920 x 1080 pixels with 256 planes, costs take 0.5 GiB and their sums 1
-GiB; everything beside them is made in parts of about `PART_BYTES`, so that all stays below 2 GiB.
+GiB; everything beside them is made in parts of about `PART_BYTES`, so that all stays below 2 GiB
+(`estimate_search_bytes`).
 """
 
 from __future__ import annotations
@@ -37,6 +38,10 @@ PART_BYTES = 2**26
 """Bytes of one array of a part of a volume. Some four of such arrays are held at once."""
 CELL_BYTES = 300
 """Most bytes that the matching of one pixel at one plane holds at once."""
+IMAGE_BYTES = 110
+"""Bytes for each pixel of the images, tiles and sources of one view while it is matched."""
+JUMP_BYTES = 44
+"""Bytes for each pixel of a view of the penalties of jumps, and of the planes that are found."""
 LEAST_DEPTH_RATIO = 1e-3
 """Smallest z-depth in the source over that in the reference at which a point is projected."""
 
@@ -114,6 +119,30 @@ def split_length(length: int, longest: int) -> Iterator[slice]:
     step = max(1, longest)
     for begin in range(0, length, step):
         yield slice(begin, min(begin + step, length))
+
+
+def estimate_search_bytes(size: tuple[int, int], num_planes: int, num_views: int) -> int:
+    """Estimate the most bytes that costs, paths and best planes of views of one size take at once.
+
+    `size` is the height and width of their images, whose costs are stacked and summed together.
+    """
+    height, width = size
+    pixels = height * width
+    padded_rows = -(-height // TILE_ROWS) * TILE_ROWS
+    padded_columns = -(-width // TILE_COLUMNS) * TILE_COLUMNS
+    # One byte for each cost. Those of one view are not copied, those of several are stacked.
+    cells = padded_rows * padded_columns * num_planes
+    volumes = num_views * cells
+    stacked = num_views * pixels * num_planes if num_views > 1 else 0
+    # Windows of a small image, which is one part, reach beyond its tiles.
+    matching = volumes + IMAGE_BYTES * pixels + min(8 * PART_BYTES, 2 * CELL_BYTES * cells)
+    # Sums are of two bytes. Two rows of three paths, in two directions, have planes at both ends.
+    sums = 2 * num_views * pixels * num_planes
+    states = 2 * 2 * 2 * 3 * num_views * (width + 2) * (num_planes + 2)
+    jumps = JUMP_BYTES * num_views * pixels
+    parts = 3 * min(PART_BYTES, 4 * num_views * pixels * num_planes)
+    summing = volumes + stacked + sums + states + jumps + parts
+    return max(matching, summing)
 
 
 def compute_cost_volume(

@@ -6,6 +6,8 @@ are the dual variables of each direction: they are differentiated, and moved, to
 
 from __future__ import annotations
 
+import threading
+
 import numpy as np
 import torch
 from jaxtyping import Float32
@@ -20,6 +22,11 @@ from gscompleter.numerics.kernels.tgv import (
 
 LAUNCHES_PER_ITERATION = 20
 """Operations of an iteration, each of which a GPU is given alone."""
+
+FIT_BYTES = 140
+"""Most bytes for each pixel that a fit holds on its device."""
+_FITTING = threading.Lock()
+"""Held during a fit: several at a time would launch no faster, and hold as much each."""
 
 HeightMap = Float32[np.ndarray, "h w"]
 
@@ -39,23 +46,24 @@ def fit_on_device(
     """Fit heights and their gradients, in place, as `fit` of the kernels does.
 
     The host waits once, for the result. Roundings differ: the result is equal to about 1e-5 of the
-    largest height.
+    largest height. One map is fitted at a time, from whatever threads.
     """
 
     def upload(*arrays: np.ndarray) -> Tensor:
         return torch.from_numpy(np.stack(arrays)).to(device, non_blocking=True)
 
-    state = upload(heights, *gradients)
-    # Beyond the last column and the last row there is nothing to step to.
-    bounds = upload(across, down)
-    bounds[0, :, -1] = 0
-    bounds[1, -1] = 0
-    (target,) = upload(data)
-    (pull,) = upload(PRIMAL_STEP * weight)
-    state = iterate(state, bounds, target, pull, float(bend), float(tolerance), iterations)
-    found = state.cpu().numpy()
-    heights[:] = found[0]
-    gradients[:] = found[1:]
+    with _FITTING:
+        state = upload(heights, *gradients)
+        # Beyond the last column and the last row there is nothing to step to.
+        bounds = upload(across, down)
+        bounds[0, :, -1] = 0
+        bounds[1, -1] = 0
+        (target,) = upload(data)
+        (pull,) = upload(PRIMAL_STEP * weight)
+        state = iterate(state, bounds, target, pull, float(bend), float(tolerance), iterations)
+        found = state.cpu().numpy()
+        heights[:] = found[0]
+        gradients[:] = found[1:]
 
 
 def iterate(

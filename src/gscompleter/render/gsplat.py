@@ -7,18 +7,21 @@ inevitably is the number of tile intersections, which gsplat reads to allocate m
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+import weakref
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
+from typing import TypeVar
 
 import torch
 from jaxtyping import Bool, Float, Int, Int64
 from torch import Tensor
 
+from gscompleter.numerics.geometry import move_to_depths
 from gscompleter.render.device import choose_device
 from gscompleter.render.padding import compute_covariances
-from gscompleter.render.protocols import ColorErrors, ColorSums, OpacityRender
-from gscompleter.render.redraw import RedrawnScene, make_empty_render, set_colors
+from gscompleter.render.protocols import ColorErrors, ColorSums, DepthRender, OpacityRender
+from gscompleter.render.redraw import make_empty_render
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.types import Camera, Gaussians, Render, merge, sh_from_rgb
 
@@ -26,11 +29,47 @@ MIN_DIVIDING_ALPHA = 1e-10
 """Smallest alpha that gsplat divides a depth by."""
 TILE_SIZE = 16
 """Side of a tile in pixels, gsplat's default."""
+GAUSSIAN_BLOCK = 2**18
+"""Gaussians of which colours, or covariances in padded images, are computed at a time: harmonics of
+degree 3 take 500 bytes each with the basis that they are summed with, and covariances 300."""
+
+T = TypeVar("T")
+
+
+class LastView:
+    """What was computed of the frozen scene that was used last.
+
+    The same of all frozen scenes at once would be most of the memory of a GPU, and several steps in
+    turn use it of one.
+    """
+
+    def __init__(self) -> None:
+        self._owner: weakref.ref[CudaFrozenScene] | None = None
+        self._values: dict[str, object] = {}
+
+    def compute(self, owner: CudaFrozenScene, name: str, make: Callable[[], T]) -> T:
+        """Return what `make` computes of a frozen scene, or what it computed before."""
+        if self._owner is None or self._owner() is not owner:
+            # What is known of another one is freed before more is made.
+            self._values = {}
+            self._owner = weakref.ref(owner, self._forget)
+        values = self._values
+        if name not in values:
+            values[name] = make()
+        return values[name]  # type: ignore[return-value]
+
+    def _forget(self, gone: weakref.ref[CudaFrozenScene]) -> None:
+        """Free what was computed of a frozen scene that is gone."""
+        if self._owner is gone:
+            self._owner = None
+            self._values = {}
 
 
 @dataclass(frozen=True)
 class CudaRenderer:
     """Renders on the device of the Gaussians, which must be a CUDA device."""
+
+    last_view: LastView = field(default_factory=LastView, compare=False, repr=False)
 
     def __post_init__(self) -> None:
         choose_device("cuda")
@@ -40,36 +79,29 @@ class CudaRenderer:
         (render,) = self.render_together(gaussians, [camera])
         return render
 
-    def render_together(
-        self, gaussians: Gaussians, cameras: Sequence[Camera], num_only_first: int = 0
-    ) -> list[Render]:
-        """Render `gaussians` from all cameras at once; the host waits once for all of them.
-
-        The first `num_only_first` Gaussians show in the image of the first camera alone.
-        """
+    def render_together(self, gaussians: Gaussians, cameras: Sequence[Camera]) -> list[Render]:
+        """Render `gaussians` from all cameras at once; the host waits once for all of them."""
         if len(gaussians) == 0:
             return [make_empty_render(camera, gaussians.means.device) for camera in cameras]
-        binned = project_and_bin(gaussians, cameras, num_only_first)
         colors = torch.stack([compute_colors(gaussians, camera) for camera in cameras])
-        return binned.render(colors)
+        return project_and_bin(drop_colors(gaussians), cameras).render(colors)
 
     def freeze(self, context: Gaussians, camera: Camera) -> CudaFrozenScene:
         """Prepare `context` for many renders from `camera`."""
-        rows, seen = self.show_from(context, camera)
-        return CudaFrozenScene(self, seen, camera, rows, len(context))
+        return CudaFrozenScene(self, camera, (self.show_from(context, camera),))
 
-    def show_from(
-        self, gaussians: Gaussians, camera: Camera
-    ) -> tuple[Int64[Tensor, "seen"], Gaussians]:
-        """Return the Gaussians that a camera sees, in the colours that it sees, and their rows.
+    def show_from(self, gaussians: Gaussians, camera: Camera) -> SeenPart:
+        """Find the Gaussians that a camera sees, in the colours that it sees.
 
         Colours of one camera are fixed, so that harmonics need not be kept and evaluated again.
         """
         rows = self.find_visible(gaussians, camera).nonzero()[:, 0]
-        # What a writer needs stays behind: a frozen scene is the most that a completion holds.
-        seen = replace(gaussians, encoded=None)[rows]
-        center = camera.center.to(seen.means.device)
-        return rows, set_colors(seen, evaluate_colors(seen.sh, seen.means, center))
+        center = camera.center.to(gaussians.means.device)
+        colors = [
+            evaluate_colors(gaussians.sh[block], gaussians.means[block], center)
+            for block in rows.split(GAUSSIAN_BLOCK)
+        ]
+        return SeenPart(drop_colors(gaussians), rows, sh_from_rgb(torch.cat(colors)))
 
     @torch.no_grad()
     def find_visible(self, gaussians: Gaussians, camera: Camera) -> Bool[Tensor, "n"]:
@@ -86,20 +118,11 @@ class CudaRenderer:
             return BinnedGaussians.empty(camera, gaussians.means.device)
         return project_and_bin(gaussians, [camera])
 
-    def vary_opacities(self, gaussians: Gaussians, camera: Camera) -> OpacityRender:
-        """Project, sort and bin once; the opacities [n] must not exceed those of `gaussians`.
 
-        Fainter Gaussians render the same in the larger box, where alpha 1/255 drops the rest.
-        """
-        binned = self.bin_gaussians(gaussians, camera)
-        with torch.no_grad():
-            colors = compute_colors(gaussians, camera)[None]
-
-        def render(opacities: Float[Tensor, "n"]) -> Render:
-            (found,) = binned.render(colors, binned.antialiasing * opacities)
-            return found
-
-        return render
+def drop_colors(gaussians: Gaussians) -> Gaussians:
+    """Drop harmonics, and what a writer needs; the rest is shared, and one zero stands for all."""
+    zero = gaussians.means.new_zeros((1, 1, 3))
+    return replace(gaussians, sh=zero.expand(len(gaussians), 1, 3), encoded=None)
 
 
 def project_with_gsplat(
@@ -127,7 +150,11 @@ def project_with_gsplat(
     shapes = (None, gaussians.quats.float(), gaussians.scales.float())
     if cameras[0].padding != (0, 0):
         (camera,) = cameras
-        shapes = (compute_covariances(gaussians, camera).float(), None, None)
+        parts = [
+            compute_covariances(gaussians[start : start + GAUSSIAN_BLOCK], camera).float()
+            for start in range(0, len(gaussians), GAUSSIAN_BLOCK)
+        ]
+        shapes = (parts[0] if len(parts) == 1 else torch.cat(parts), None, None)
     radii, means2d, depths, conics, antialiasing = fully_fused_projection(
         gaussians.means.float(),
         *shapes,
@@ -183,6 +210,14 @@ def project_and_bin(
     )
 
 
+def compact(values: Int[Tensor, "n"], is_kept: Bool[Tensor, "n"], count: int) -> Int[Tensor, "m"]:
+    """List the values to keep, which are `count`; the host, which knows it, waits for nothing."""
+    place = is_kept.cumsum(0, dtype=torch.int32) - 1
+    # All others go to one place behind them.
+    place = place.where(is_kept, count).long()
+    return values.new_empty(count + 1).scatter_(0, place, values)[:count]
+
+
 def compute_colors(gaussians: Gaussians, camera: Camera) -> Float[Tensor, "n 3"]:
     """Compute the colours that `camera` sees, in one kernel of gsplat for all harmonics."""
     center = camera.center.to(gaussians.means)
@@ -235,6 +270,67 @@ class BinnedGaussians:
             rows=rows,
             sizes=[(camera.width, camera.height)],
         )
+
+    def select_tiles(self, num_context: int) -> TileSelection:
+        """Select the tiles of one image that show any but the first `num_context` Gaussians.
+
+        Other tiles do not change with these. They, and Gaussians of the first that no selected tile
+        shows, are dropped.
+        """
+        ((width, height),) = self.sizes
+        starts = self.tile_offsets.flatten()
+        if num_context == 0:
+            everything = starts.new_ones((height, width), dtype=torch.bool)
+            return TileSelection(self, starts.new_empty(0, dtype=torch.int64), everything)
+        counts = torch.cat([starts[1:], starts.new_full((1,), len(self.rows))]) - starts
+        is_selected, is_kept = self.find_tiles_behind(num_context, counts)
+        count = self.depths.shape[1]
+        # Entries of other tiles mark a row behind the last one.
+        is_used = torch.zeros(count + 1, dtype=torch.bool, device=starts.device)
+        is_used.index_fill_(0, self.rows.where(is_kept, count).long(), True)
+        is_used = is_used[:count]
+        is_used[num_context:] = True
+        # The host waits once, for both numbers.
+        num_kept, num_used = torch.stack([is_kept.sum(), is_used.sum()]).tolist()
+        rows = compact(self.rows, is_kept, num_kept).long()
+        used = compact(torch.arange(count, device=starts.device), is_used, num_used)
+        place = is_used.cumsum(0, dtype=torch.int32) - 1
+        counts = counts * is_selected
+        offsets = (counts.cumsum(0, dtype=torch.int32) - counts).to(starts.dtype)
+        antialiasing = self.antialiasing
+        # Without antialiasing one number stands for all factors.
+        is_plain = antialiasing.stride()[-1] == 0
+        binned = replace(
+            self,
+            means2d=self.means2d.index_select(1, used),
+            conics=self.conics.index_select(1, used),
+            depths=self.depths.index_select(1, used),
+            opacities=self.opacities.index_select(1, used),
+            antialiasing=antialiasing[:, :num_used]
+            if is_plain
+            else antialiasing.index_select(1, used),
+            tile_offsets=offsets.view(self.tile_offsets.shape),
+            rows=place[rows].to(self.rows.dtype),
+        )
+        _, tall, wide = self.tile_offsets.shape
+        # Each tile is repeated over its pixels, of which those at the border lie outside.
+        squares = is_selected.view(tall, 1, wide, 1).expand(tall, TILE_SIZE, wide, TILE_SIZE)
+        pixels = squares.reshape(tall * TILE_SIZE, wide * TILE_SIZE)[:height, :width]
+        num_new = count - num_context
+        return TileSelection(binned, used[: num_used - num_new].clone(), pixels)
+
+    def find_tiles_behind(
+        self, num_context: int, counts: Int[Tensor, "tiles"]
+    ) -> tuple[Bool[Tensor, "tiles"], Bool[Tensor, "intersections"]]:
+        """Find the tiles that show any but the first Gaussians, and the entries of these tiles.
+
+        `counts` are those of the entries of all tiles.
+        """
+        numbers = torch.arange(len(counts), dtype=torch.int32, device=counts.device)
+        tiles = numbers.repeat_interleave(counts, output_size=len(self.rows))
+        new_entries = (self.rows >= num_context).to(counts.dtype)
+        is_selected = torch.zeros_like(counts).index_add_(0, tiles, new_entries) > 0
+        return is_selected, is_selected[tiles]
 
     def render(
         self, colors: Float[Tensor, "c n 3"], opacities: Float[Tensor, "c n"] | None = None
@@ -293,29 +389,100 @@ class BinnedGaussians:
 
 
 @dataclass(frozen=True)
-class CudaFrozenScene(RedrawnScene):
-    """A frozen scene that holds only Gaussians visible to its camera, in the colours it sees.
+class TileSelection:
+    """Some tiles of an image, and the Gaussians that they show."""
+
+    binned: BinnedGaussians
+    """These Gaussians, in these tiles; all other tiles are empty."""
+    context: Int64[Tensor, "used_context"]
+    """Rows of those that do not change; after them come all that do."""
+    pixels: Bool[Tensor, "h w"]
+    """True in the tiles."""
+
+    def paste(self, drawn: Render, around: Render) -> Render:
+        """Put what is drawn in the tiles into a render of those that do not change."""
+        return Render(
+            torch.where(self.pixels[..., None], drawn.image, around.image),
+            torch.where(self.pixels, drawn.depth, around.depth),
+            torch.where(self.pixels, drawn.alpha, around.alpha),
+        )
+
+
+@dataclass(frozen=True)
+class SeenPart:
+    """What a camera sees of a part of a scene; all but the colours is shared with that."""
+
+    geometry: Gaussians
+    """The whole part, without colours."""
+    rows: Int64[Tensor, "seen"]
+    """Rows of the visible ones."""
+    sh: Float[Tensor, "seen 1 3"]
+    """Their colours, as harmonics of degree 0."""
+
+    def gather(self) -> Gaussians:
+        """Copy the visible ones."""
+        return replace(self.geometry[self.rows], sh=self.sh)
+
+
+@dataclass(frozen=True)
+class CudaFrozenScene:
+    """A frozen scene that holds which Gaussians its camera sees, and in which colours.
 
     Each composite still projects and sorts all of them, since new ones may lie anywhere in between.
+    What varies in opacity or colour alone is drawn only in the tiles that show it.
     """
 
     renderer: CudaRenderer
-    rows: Int64[Tensor, "seen"]
-    """Row of each Gaussian of `scene` in the context and what was added to it since."""
-    count: int
-    """Number of Gaussians of the context and of what was added, visible or not."""
+    camera: Camera
+    parts: tuple[SeenPart, ...]
+
+    @property
+    def count(self) -> int:
+        """Number of Gaussians of the scene, visible or not."""
+        return sum(len(part.geometry) for part in self.parts)
+
+    @property
+    def rows(self) -> Int64[Tensor, "seen"]:
+        """Row of each Gaussian of `scene` in all of the frozen ones."""
+        start = 0
+        rows = []
+        for part in self.parts:
+            rows.append(start + part.rows)
+            start += len(part.geometry)
+        return torch.cat(rows)
+
+    @property
+    def num_seen(self) -> int:
+        """Number of visible Gaussians."""
+        return sum(len(part.rows) for part in self.parts)
+
+    @property
+    def scene(self) -> Gaussians:
+        """The visible Gaussians, in the colours that the camera sees."""
+        return self.renderer.last_view.compute(
+            self, "scene", lambda: merge([part.gather() for part in self.parts])
+        )
+
+    @property
+    def bins(self) -> BinnedGaussians:
+        """The visible Gaussians, binned for images in other colours."""
+        return self.renderer.last_view.compute(
+            self, "bins", lambda: self.renderer.bin_gaussians(self.scene, self.camera)
+        )
 
     @cached_property
-    def bins(self) -> BinnedGaussians:
-        """The Gaussians, binned for images in other colours."""
-        return self.renderer.bin_gaussians(self.scene, self.camera)
+    def render(self) -> Render:
+        """The render of the scene alone."""
+        with torch.no_grad():
+            return self.renderer.render(self.scene, self.camera)
 
     def extend(self, new: Gaussians) -> CudaFrozenScene:
         """Add those of `new` that are visible."""
-        new_rows, seen = self.renderer.show_from(new, self.camera)
-        rows = torch.cat([self.rows, self.count + new_rows])
-        count = self.count + len(new)
-        return replace(self, scene=merge([self.scene, seen]), rows=rows, count=count)
+        return replace(self, parts=(*self.parts, self.renderer.show_from(new, self.camera)))
+
+    def freeze_occluders(self, others: Gaussians) -> CudaFrozenScene:
+        """Freeze those of `others` that are visible."""
+        return self.renderer.freeze(others, self.camera)
 
     def repaint(self, rows: Int64[Tensor, "m"], painted: Gaussians) -> CudaFrozenScene:
         """Give the visible ones among the Gaussians at `rows` new colours."""
@@ -326,15 +493,20 @@ class CudaFrozenScene(RedrawnScene):
         new = painted[sources[painted_here]]
         center = self.camera.center.to(new.means.device)
         colors = sh_from_rgb(evaluate_colors(new.sh, new.means, center))
-        sh = self.scene.sh.index_copy(0, painted_here, colors)
-        return replace(self, scene=replace(self.scene, sh=sh))
+        sh = torch.cat([part.sh for part in self.parts]).index_copy(0, painted_here, colors)
+        of_parts = sh.split([len(part.rows) for part in self.parts])
+        # Copied: a part of a tensor would hold all of it.
+        parts = [
+            replace(part, sh=own.clone()) for part, own in zip(self.parts, of_parts, strict=True)
+        ]
+        return replace(self, parts=tuple(parts))
 
     def backproject(self, image: Float[Tensor, "h w 3"]) -> Float[Tensor, "n 3"]:
         """Sum `image` over the compositing weights; they are 0 for invisible Gaussians."""
         sums = image.new_zeros((self.count, 3))
-        if len(self.rows) == 0:
+        if self.num_seen == 0:
             return sums
-        seen = self.bins.backproject(torch.zeros_like(self.scene.means), image)
+        seen = self.bins.backproject(sums.new_zeros((self.num_seen, 3)), image)
         return sums.index_copy(0, self.rows, seen)
 
     def splat(self, values: Float[Tensor, "n"]) -> Float[Tensor, "h w"]:
@@ -343,28 +515,70 @@ class CudaFrozenScene(RedrawnScene):
         sums, _ = self.bins.composite(seen[None, :, None])
         return sums[0, ..., 0]
 
+    def composite(self, new: Gaussians) -> Render:
+        """Render the visible Gaussians and `new`."""
+        both, colors = self.join(new, [self.camera])
+        if len(both) == 0:
+            return make_empty_render(self.camera, new.means.device)
+        (render,) = project_and_bin(both, [self.camera]).render(colors)
+        return render
+
     def composite_beside(self, new: Gaussians, other: Camera) -> tuple[Render, Render]:
         """Render the visible Gaussians and `new`, and at once `new` alone from another camera."""
-        both = merge([self.scene, new])
-        here, there = self.renderer.render_together(
-            both, [self.camera, other], num_only_first=len(self.scene)
-        )
+        cameras = [self.camera, other]
+        both, colors = self.join(new, cameras)
+        if len(both) == 0:
+            here, there = (make_empty_render(camera, new.means.device) for camera in cameras)
+        else:
+            here, there = project_and_bin(both, cameras, self.num_seen).render(colors)
         return here, there
 
+    def join(
+        self, new: Gaussians, cameras: Sequence[Camera]
+    ) -> tuple[Gaussians, Float[Tensor, "c n 3"]]:
+        """Join the visible Gaussians and `new`, and their colours at cameras.
+
+        Without harmonics: of the visible ones, too, those of degree 3 would be joined.
+        """
+        context = compute_colors(self.scene, self.camera)
+        colors = [torch.cat([context, compute_colors(new, camera)]) for camera in cameras]
+        return merge([drop_colors(self.scene), drop_colors(new)]), torch.stack(colors)
+
     def vary_opacities(self, new: Gaussians, is_fading: bool = False) -> OpacityRender:
-        """Fix all of `new` but the opacities, with boxes that hold for every opacity to come."""
+        """Fix all of `new` but the opacities, with boxes that hold for every opacity to come.
+
+        Fainter Gaussians render the same in the larger box, where alpha 1/255 drops the rest.
+        """
+        with torch.no_grad():
+            colors = compute_colors(new, self.camera)
+        new = drop_colors(new)
+        rows = None
         if is_fading:
             rows = new.opacities.nonzero()[:, 0]
-            render = self.renderer.vary_opacities(merge([self.scene, new[rows]]), self.camera)
-            return lambda opacities: render(torch.cat([self.scene.opacities, opacities[rows]]))
-        opaque = replace(new, opacities=torch.ones_like(new.opacities))
-        render = self.renderer.vary_opacities(merge([self.scene, opaque]), self.camera)
-        return lambda opacities: render(torch.cat([self.scene.opacities, opacities]))
+            new = new[rows]
+            colors = colors[rows]
+        else:
+            new = replace(new, opacities=torch.ones_like(new.opacities))
+        selection = self.select_tiles(new)
+        context = selection.context
+        fixed = self.scene.opacities[context]
+        shown = compute_colors(self.scene, self.camera)[context]
+        binned = selection.binned
+        drawn_colors = torch.cat([shown, colors])[None]
+
+        def render(opacities: Float[Tensor, "n"]) -> Render:
+            varied = opacities if rows is None else opacities[rows]
+            drawn_opacities = binned.antialiasing * torch.cat([fixed, varied]).float()
+            (drawn,) = binned.render(drawn_colors, drawn_opacities)
+            return selection.paste(drawn, self.render)
+
+        return render
 
     def vary_colors(self, new: Gaussians) -> ColorErrors:
         """Fix all of `new` but its colours, in one forward and one backward pass per call."""
-        binned = self.renderer.bin_gaussians(merge([self.scene, new]), self.camera)
-        context = compute_colors(self.scene, self.camera)
+        selection = self.select_tiles(drop_colors(new))
+        binned = selection.binned
+        shown = compute_colors(self.scene, self.camera)[selection.context]
 
         def measure_errors(
             colors: Float[Tensor, "n 3"], photograph: Float[Tensor, "h w 3"]
@@ -374,13 +588,22 @@ class CudaFrozenScene(RedrawnScene):
             with torch.enable_grad():
                 # The fourth channel is not drawn: its gradient sums the weights alone.
                 leaf = torch.nn.functional.pad(colors.clamp_min(0), (0, 1)).requires_grad_()
-                drawn = torch.nn.functional.pad(context, (0, 1))
+                drawn = torch.nn.functional.pad(shown, (0, 1))
                 sums, _ = binned.composite(torch.cat([drawn, leaf])[None])
             # The gradient of Σ image · drawn in a colour is Σ_p w_ip image_p; ones in the fourth
-            # channel give Σ_p w_ip.
+            # channel give Σ_p w_ip. Beside the tiles nothing new has a weight.
             missing = photograph - sums[0, ..., :3].detach()
             image = torch.nn.functional.pad(missing, (0, 1), value=1.0)
             (gradient,) = torch.autograd.grad(sums, leaf, image[None])
             return gradient[:, :3], gradient[:, 3]
 
         return measure_errors
+
+    def select_tiles(self, new: Gaussians) -> TileSelection:
+        """Bin the visible Gaussians and `new`, and select the tiles that show any of these."""
+        both = merge([drop_colors(self.scene), new])
+        return self.renderer.bin_gaussians(both, self.camera).select_tiles(self.num_seen)
+
+    def vary_depths(self, new: Gaussians) -> DepthRender:
+        """Fix all of `new` but its depths."""
+        return lambda depths: self.composite(move_to_depths(new, self.camera, depths))

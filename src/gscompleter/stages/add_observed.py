@@ -141,7 +141,11 @@ def limit_stereo_photos(reconstructor: Reconstructor, views: Sequence[View]) -> 
     # Networks keep whole images, and were trained with few of them.
     if not isinstance(reconstructor, PartReconstructor):
         return MAX_STEREO_PHOTOS
-    pixels = max(view.valid_mask.numel() for view in views)
+    return limit_part_photos(max(view.valid_mask.numel() for view in views))
+
+
+def limit_part_photos(pixels: int) -> int:
+    """Compute how many photographs of so many pixels a Ψ takes that builds what is missing."""
     return min(max(MAX_STEREO_PIXELS // pixels, MAX_STEREO_PHOTOS), MAX_RECONSTRUCTED)
 
 

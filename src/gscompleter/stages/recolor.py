@@ -86,7 +86,7 @@ def recolor(reference: GeneratedView, view: TargetView, origin: PartOrigin) -> R
 
     recolored = replace(
         context,
-        sh=change_rows(context.sh, rows, select_rows(context.sh, rows) + delta),
+        sh=change_rows(context.sh, rows, delta.add_(select_rows(context.sh, rows))),
         generated=context.generated.index_fill(0, rows, origin.label),
     )
     # Trusted at later targets: otherwise targets in a row compound their errors (decision 038).
@@ -123,13 +123,13 @@ def fit_image_colors(
     # A Gaussian has k coefficients per channel, of which the target sees one combination, bᵀ sh. Of
     # all changes of that colour, A⁻¹ b is the one that costs the held views least. So one number s
     # per channel is left, and the colour changes by γ s.
-    opened = context[rows]
     change, colors, gains = solve_directions(
-        opened, rows, sums[rows], reference.camera, held, config.ridge
+        context, rows, sums[rows], reference.camera, held, config.ridge
     )
 
-    # Colours are given in each step, and harmonics, most of the memory, are not read any more.
-    opened = replace(opened, sh=torch.zeros_like(opened.means)[:, None])
+    # Colours are given in each step, so that harmonics, most of the memory, are not copied.
+    black = context.means.new_zeros((1, 1, 3)).expand(len(context), 1, 3)
+    opened = replace(context, sh=black, encoded=None)[rows]
     wanted = torch.lerp(frozen.render.image, reference.image, weight[..., None])
     others = scenes.freeze((context.hide(is_open), *added), reference.camera)
     errors = others.vary_colors(opened)
@@ -138,50 +138,63 @@ def fit_image_colors(
     # Changes that nobody sees would only mark Gaussians as generated. Leaving them out changes a
     # fifth as many, for the same gain (decision 038).
     is_changed = (gains * steps).abs().amax(dim=1) > config.min_change
-    delta = change[is_changed, :, None] * steps[is_changed, None]
-    return rows[is_changed], delta.to(context.sh)
+    change = change[is_changed]
+    steps = steps[is_changed]
+    delta = context.means.new_empty((*change.shape, 3))
+    # In blocks, as a product of all in float64 takes twice what harmonics do.
+    for start in range(0, len(delta), CHUNK):
+        block = slice(start, start + CHUNK)
+        delta[block] = change[block, :, None] * steps[block, None]
+    return rows[is_changed], delta
 
 
 def solve_directions(
-    opened: Gaussians,
+    context: Gaussians,
     rows: Int64[Tensor, "c"],
     sums: Float[Tensor, "c"],
     camera: Camera,
     held: HeldViews,
     ridge: float,
 ) -> tuple[Float64[Tensor, "c k"], Float64[Tensor, "c 3"], Float64[Tensor, "c 1"]]:
-    """Return the cheapest change of the k harmonics, A⁻¹ b, of the Gaussians at `rows`.
+    """Return the cheapest change of the k harmonics, A⁻¹ b, of the context at c ascending `rows`.
 
     Also returns their colours bᵀ sh at `camera`, and the gains γ = bᵀ A⁻¹ b, for the basis b there.
     A = Σ_v weight_v sum_v b_v b_vᵀ + ridge (sum + Σ_v sum_v) I over the held views v, where sums
     are the compositing weights of a Gaussian in an image; `sums` [c] are those at `camera`.
     """
     centers = torch.cat([held.centers, camera.center.to(held.centers)[None]])
-    k = opened.sh.shape[1]
+    k = context.sh.shape[1]
     # Chunks are written where they belong: joined at the end they would take the memory twice.
-    change = opened.sh.new_empty((len(rows), k), dtype=torch.float64)
+    change = context.means.new_empty((len(rows), k), dtype=torch.float64)
     colors = change.new_empty((len(rows), 3))
     gains = change.new_empty((len(rows), 1))
 
     def solve(start: int) -> None:
         # In float64, since views beside each other have nearly equal b, and A is close to singular.
         chunk = slice(start, start + CHUNK)
-        rays = normalize(opened.means[chunk, None].double() - centers.double(), dim=-1)
+        opened = rows[chunk]
+        means = context.means[opened]
+        rays = normalize(means[:, None].double() - centers.double(), dim=-1)
         basis = evaluate_sh_basis(rays.flatten(0, 1), k).unflatten(0, rays.shape[:2])
         held_basis = basis[:, :-1]
         target_basis = basis[:, -1]
-        held_sums = held.sums[:, rows[chunk]].double().T
+        held_sums = held.sums[:, opened].double().T
         cost = held_basis.mT @ (held_basis * (held_sums * held.weights)[..., None])
         # The ridge grows with all weights, so that the result does not depend on image sizes.
         own = sums[chunk] + held_sums.sum(dim=1)
         cost.diagonal(dim1=1, dim2=2).add_(ridge * own[:, None])
         solved = torch.cholesky_solve(target_basis[..., None], torch.linalg.cholesky(cost))[..., 0]
         change[chunk] = solved
-        colors[chunk] = 0.5 + torch.einsum("nk,nkc->nc", target_basis, opened.sh[chunk].double())
+        colors[chunk] = 0.5 + torch.einsum(
+            "nk,nkc->nc", target_basis, select_rows(context.sh, opened).double()
+        )
         gains[chunk] = (target_basis * solved).sum(dim=1, keepdim=True)
 
+    # One chunk after the other on a GPU, which gains nothing by several, and holds one.
+    map_chunks = map if rows.is_cuda else map_in_parallel
     with use_one_torch_thread():
-        map_in_parallel(solve, range(0, len(rows), CHUNK))
+        for _ in map_chunks(solve, range(0, len(rows), CHUNK)):
+            pass
     return change, colors, gains
 
 

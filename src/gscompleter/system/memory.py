@@ -30,14 +30,20 @@ BYTES_PER_PHOTO_PIXEL = 400
 
 # Counted on a device that is none, and not on a GPU: what compiled kernels allocate for themselves
 # is missing.
-GPU_BYTES_PER_GAUSSIAN = 390
+GPU_BYTES_PER_GAUSSIAN = 260
 """Bytes on a GPU per Gaussian of degree 0, apart from what each view holds of it."""
-GPU_BYTES_PER_SPLAT = 290
-"""Bytes per Gaussian in a view that is frozen there, while opacities are fitted to it."""
+GPU_BYTES_PER_SPLAT = 112
+"""Bytes per Gaussian in a view that is frozen there, while opacities are fitted to it all over."""
 GPU_COPIES = 2
 """Copies of the harmonics beyond degree 0 at once, each with the scene."""
-GPU_BYTES_PER_PIXEL = 80
+GPU_BYTES_PER_PIXEL = 70
 """Bytes per pixel of each image there."""
+GPU_BYTES_OF_SCENE = 73
+"""Bytes of a Gaussian of degree 0 there, as a file had it."""
+GPU_BYTES_OF_VIEW = 20
+"""Bytes of a Gaussian in a frozen view there, from which nothing is drawn at the moment."""
+GPU_BYTES_OF_RENDER = 40
+"""Bytes per pixel of a photograph there, and of a render of it."""
 
 # Of containers, for cgroup versions 2 and 1.
 _LIMIT_FILES = ("/sys/fs/cgroup/memory.max", "/sys/fs/cgroup/memory/memory.limit_in_bytes")
@@ -97,15 +103,21 @@ def estimate_scene_bytes(
     return max(4 * count * numbers, stages)
 
 
-def estimate_gpu_bytes(count: int, harmonics: int, shown: Sequence[int], pixels: int) -> int:
+def estimate_gpu_bytes(
+    count: int, harmonics: int, shown: Sequence[int], pixels: int, matching: int = 0
+) -> int:
     """Estimate the peak memory of a GPU for `count` Gaussians with so many harmonics of a channel.
 
-    `shown` is the number that each photograph shows, and `pixels` are those of all together. What
+    `shown` is the number that each photograph shows, and `pixels` are those of all together.
+    `matching` bytes are taken before stages that add and recolour, beside the frozen scene. What
     will be added is not known before.
     """
     further = 4 * 3 * (harmonics - 1)
     scene = count * (GPU_BYTES_PER_GAUSSIAN + GPU_COPIES * further)
-    return scene + GPU_BYTES_PER_SPLAT * sum(shown) + GPU_BYTES_PER_PIXEL * pixels
+    stages = scene + GPU_BYTES_PER_SPLAT * sum(shown) + GPU_BYTES_PER_PIXEL * pixels
+    frozen = count * (GPU_BYTES_OF_SCENE + further)
+    frozen += GPU_BYTES_OF_VIEW * sum(shown) + GPU_BYTES_OF_RENDER * pixels
+    return max(stages, frozen + matching)
 
 
 def check_gpu_bytes(needed: int, available: int, number: str) -> None:

@@ -45,14 +45,17 @@ FULL_TRUST_FRACTION = 0.5
 
 @dataclass(frozen=True)
 class PhotoObservations:
-    """Observations of m context Gaussians in k photographs, from which trust is computed."""
+    """Observations of m context Gaussians in k photographs, from which trust is computed.
+
+    Kernels of the CPU read them, so that what was measured lies there.
+    """
 
     means: Float[Tensor, "m 3"]
     centers: Float[Tensor, "k 3"]
     areas: Float[Tensor, "k m"]
-    """Visible area of each Gaussian in each photograph, in squared scene units."""
+    """Visible area of each Gaussian in each photograph, in squared scene units; on the CPU."""
     agreement: Float[Tensor, "k m"]
-    """Photometric consistency at each Gaussian, in [0, 1]; 0 if it is not visible."""
+    """Photometric consistency at each Gaussian, in [0, 1], on the CPU; 0 if it is not visible."""
 
 
 @dataclass(frozen=True)
@@ -104,11 +107,12 @@ class PhotometricTrust(Trust):
         is_observed = rows < len(seen.means)
         rows = rows[is_observed]
         growth = growth[is_observed]
+        measured = rows.cpu()
         thinned = PhotoObservations(
             means=seen.means[rows],
             centers=seen.centers,
-            areas=seen.areas[:, rows] * growth**2,  # growth is of the lengths
-            agreement=seen.agreement[:, rows],
+            areas=seen.areas[:, measured] * growth.cpu() ** 2,  # growth is of the lengths
+            agreement=seen.agreement[:, measured],
         )
         held = replace(self.held, sums=self.held.sums[:, rows])
         return PhotometricTrust(thinned, self.is_recolored[rows], self.config, held)
@@ -130,8 +134,13 @@ def load_trust(
 
     # Photographs hold colours by their summed weights in pixels. Those are the visible areas,
     # divided by the area of a pixel, and so leave out ignored pixels.
-    pixels = torch.stack([compute_pixel_areas(observations.means, camera) for camera in cameras])
-    sums = observations.areas / pixels.clamp_min(1e-30)
+    means = observations.means
+    sums = torch.stack(
+        [
+            area.to(means) / compute_pixel_areas(means, camera).clamp_min(1e-30)
+            for area, camera in zip(observations.areas, cameras, strict=True)
+        ]
+    )
     weights = sums.new_full((len(cameras),), config.recolor.hold_weight)
     held = HeldViews(observations.centers, sums, weights)
     is_recolored = torch.zeros(len(parts[0]), dtype=torch.bool, device=sums.device)
@@ -153,7 +162,8 @@ def gather_observations(
     differences, usual = compute_color_differences(views, [scene.render for scene in frozen])
     scale = config.color_sigma * max(1.0, usual / EXACT_DIFFERENCE)
 
-    areas, agreement = torch.empty((2, len(views), len(rendered))).to(rendered.means)
+    dtype = rendered.means.dtype
+    areas, agreement = torch.empty((2, len(views), len(rendered)), dtype=dtype)
 
     def gather(k: int) -> None:
         agrees = torch.exp(-((differences[k] / scale) ** 2))
@@ -172,6 +182,7 @@ def measure_agreement(
     """Measure visible area [m] and mean agreement [m] of the first m Gaussians at a photograph.
 
     `agrees` is the agreement of each pixel, in [0, 1]. Ignored pixels show none of the Gaussians.
+    Both come out on the CPU.
     """
     # Two sums are needed, and a backprojection takes three channels.
     valid = view.valid_mask.to(agrees)
@@ -188,7 +199,8 @@ def measure_agreement(
         area,
         agreement,
     )
-    return torch.from_numpy(area).to(means), torch.from_numpy(agreement).to(means)
+    dtype = means.dtype
+    return torch.from_numpy(area).to(dtype), torch.from_numpy(agreement).to(dtype)
 
 
 def compute_color_differences(

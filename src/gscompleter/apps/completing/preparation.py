@@ -253,7 +253,7 @@ def read_inputs(
     with show_preparation("aligning the scene"):
         task = move_to_splat(task, given, splat_file, opened)
     if device == "cuda":
-        check_gpu(task)
+        check_gpu(task, work.models)
     return task
 
 
@@ -436,7 +436,7 @@ def read_splat_alone(
         if device == "cpu":
             check_scene(alone.task, gaussians)
         else:
-            check_gpu(alone.task)
+            check_gpu(alone.task, work.models)
     config = work.config.choose_margin(alone.kind.is_lifted).for_holes(alone.kind.holes)
     return alone.opened, add_paintings(alone.task, targets, alone.opened), config
 

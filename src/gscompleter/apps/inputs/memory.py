@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from gscompleter.apps.inputs.task import CompletionTask
+from gscompleter.apps.requests.models import ModelRequest
 from gscompleter.numerics.geometry import is_inside, project
+from gscompleter.reconstructors.plane_sweep.device_memory import estimate_sweep_bytes
+from gscompleter.stages.add_observed import limit_part_photos
 from gscompleter.system.files.mapping import is_mapped
 from gscompleter.system.memory import (
     check_bytes,
@@ -31,27 +35,40 @@ def check_scene(task: CompletionTask, scene: Gaussians) -> None:
     check_bytes(estimate_memory(task, scene), what, remedy)
 
 
-def check_gpu(task: CompletionTask) -> None:
+def check_gpu(task: CompletionTask, models: ModelRequest) -> None:
     """Refuse a placed splat that does not fit on the GPU together with its photographs."""
     assert task.scene is not None
     views = [*task.views, *(task.check_views or ())]
-    needed = estimate_gpu_memory(task.scene, [view.camera for view in views])
+    cameras = [view.camera for view in views]
+    is_matched = models.reconstructor == "plane-sweep" and models.network_device == "cuda"
+    matching = estimate_matching_bytes(cameras) if is_matched else 0
+    needed = estimate_gpu_memory(task.scene, cameras, matching)
     free, _ = torch.cuda.mem_get_info()
     what = f"The {len(task.scene):,} Gaussians of the scene and {len(views)} photographs"
     check_gpu_bytes(needed, free, what)
 
 
-def estimate_gpu_memory(scene: Gaussians, cameras: Sequence[Camera]) -> int:
+def estimate_matching_bytes(cameras: Sequence[Camera]) -> int:
+    """Estimate the bytes that plane-sweep takes on a GPU for photographs that show what is lacking.
+
+    All of them may do so, as far as they are reconstructed together.
+    """
+    sizes = sorted([(camera.height, camera.width) for camera in cameras], key=math.prod)
+    number = limit_part_photos(math.prod(sizes[-1]))
+    return estimate_sweep_bytes(sizes[-number:])
+
+
+def estimate_gpu_memory(scene: Gaussians, cameras: Sequence[Camera], matching: int = 0) -> int:
     """Estimate the bytes that a completion of a placed splat needs on a GPU.
 
-    `cameras` are those of its photographs.
+    `cameras` are those of its photographs, and `matching` bytes are those of plane-sweep there.
     """
     # Views on a GPU hold the Gaussians in their image, whatever hides them.
     means = scene.means[:: max(1, len(scene) // NUM_SAMPLED)]
     inside = [is_inside(*project(means, camera), camera).float().mean() for camera in cameras]
     shown = [round(len(scene) * share) for share in torch.stack(inside).tolist()]
     pixels = sum(camera.width * camera.height for camera in cameras)
-    return estimate_gpu_bytes(len(scene), scene.sh.shape[1], shown, pixels)
+    return estimate_gpu_bytes(len(scene), scene.sh.shape[1], shown, pixels, matching)
 
 
 def estimate_memory(task: CompletionTask, scene: Gaussians | None) -> int:

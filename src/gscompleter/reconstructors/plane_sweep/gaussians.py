@@ -58,6 +58,9 @@ OPACITY = 0.98
 FIT_MARGIN = 3
 """Pixels around a part that is built alone in which it is built, too, as Gaussians overlap. With 8
 a fox is as good, and takes a sixth longer."""
+DISC_BYTES = 260
+"""Bytes on a GPU for each pixel of photographs of which little is reconstructed: their images, the
+discs of all pixels, and copies of these while some are selected and drawn."""
 IMAGE_COLOR_ROUNDS = 4
 """Rounds of the colour fit to a synthesized image."""
 
@@ -210,6 +213,8 @@ class Splatter:
             move_depths(depth, before, after)
             for depth, before, after in zip(depths, layers, moved, strict=True)
         ]
+        # Discs take most of the memory, and those before are not needed any more.
+        del candidates
         candidates = self.splat_all(views, depths)
         return candidates, self.select_pixels(candidates, fitted_views, moved, transforms), depths
 

@@ -22,6 +22,7 @@ from gscompleter.numerics.tensor_stereo import (
     TilePlanes,
     aggregate_volumes,
     compute_cost_volume,
+    estimate_search_bytes,
     prefer_given_planes,
     select_volume_planes,
 )
@@ -115,11 +116,25 @@ def group_searches(searches: Sequence[PlaneSearch]) -> list[list[int]]:
     for number, search in enumerate(searches):
         of_size.setdefault(search.reference.size, []).append(number)
     groups = []
-    for (height, width), numbers in of_size.items():
-        most_planes = max(len(searches[number].planes) for number in numbers)
-        most = max(1, GROUP_CELLS // (height * width * most_planes))
+    for size, numbers in of_size.items():
+        most = count_grouped(size, max(len(searches[number].planes) for number in numbers))
         groups += [numbers[begin : begin + most] for begin in range(0, len(numbers), most)]
     return groups
+
+
+def count_grouped(size: tuple[int, int], num_planes: int) -> int:
+    """Count the views of a size that are searched together, if there are so many."""
+    height, width = size
+    return max(1, GROUP_CELLS // (height * width * num_planes))
+
+
+def estimate_group_bytes(sizes: Sequence[tuple[int, int]], num_planes: int) -> int:
+    """Estimate the most bytes that `search_with_tensors` holds at once for views of these sizes.
+
+    Sizes are heights and widths in pixels.
+    """
+    groups = {size: min(sizes.count(size), count_grouped(size, num_planes)) for size in set(sizes)}
+    return max(estimate_search_bytes(size, num_planes, number) for size, number in groups.items())
 
 
 def search_group(group: Sequence[PlaneSearch], device: str) -> list[tuple[PixelMap, PixelMap]]:
