@@ -88,7 +88,7 @@ def prepare(request: FillingRequest | UpdateRequest, console: Console) -> Prepar
         return prepare_removal(request, console)
     if isinstance(request, RepairRequest):
         return prepare_repair(request, console)
-    return prepare_completion(request, console)
+    return prepare_completion(request, console, remakes_own=True)
 
 
 def get_results(request: FillingRequest | UpdateRequest) -> ResultsRequest:

@@ -104,11 +104,12 @@ def prepare_completion(
     console: Console,
     marks: Marks = Marks(),
     place: Selection | None = None,
+    remakes_own: bool = False,
 ) -> Prepared:
     """Open the scene and load the models.
 
     `marks` or `place` say what will go, and matter only without photographs: cameras are then found
-    around the place, and what is marked counts as the hole.
+    around the place, and what is marked counts as the hole. `remakes_own` is that of `read_inputs`.
 
     Raises:
         InputError: Something that is given is missing, damaged, or does not fit the rest.
@@ -124,7 +125,7 @@ def prepare_completion(
         check_models(work)
         config = work.config if work.splat is None else work.config.for_photographs()
         opened = open_for_completion(work, source, targets, console)
-        opened, task = read_opened(work, source, targets, opened, console, remakes_own=True)
+        opened, task = read_opened(work, source, targets, opened, console, remakes_own=remakes_own)
     loaded = load_models(work, config, targets, opened, task, geometry, console)
     return make_prepared(request, targets, loaded)
 
