@@ -8,8 +8,6 @@ from functools import cached_property
 from itertools import compress
 
 import torch
-from jaxtyping import Bool
-from torch import Tensor
 
 from gscompleter.config import CompleterConfig
 from gscompleter.config.settings import validate
@@ -32,7 +30,14 @@ from gscompleter.numerics.value_checks import (
     check_inputs,
     check_row_mask,
 )
-from gscompleter.parts import MAX_TARGET_ID, Part, PartOrigin, find_last_target_id, make_part
+from gscompleter.parts import (
+    MAX_TARGET_ID,
+    EarlierWork,
+    Part,
+    PartOrigin,
+    find_last_target_id,
+    make_part,
+)
 from gscompleter.reconstructors import Reconstructor, load_reconstructor
 from gscompleter.reconstructors.depth_predictors import predict_nothing
 from gscompleter.render.cache import SceneRenderer
@@ -197,27 +202,21 @@ class GSCompleter:
         scene: Gaussians | None = None,
         check_views: Sequence[View] | None = None,
         targets: Sequence[Camera] = (),
-        invented: Bool[Tensor, "n"] | None = None,
-        lifted: Bool[Tensor, "n"] | None = None,
+        earlier: EarlierWork = EarlierWork(),
         geometry: GivenGeometry | None = None,
         has_scene_range: bool = False,
-        remade: Bool[Tensor, "n"] | None = None,
     ) -> Completion:
         """Initialize the context (stage 1; paper, Eq. 5); arguments and errors as in `__call__`.
 
         The LOD proxy of a large scene is made fine enough for photographs and known targets.
-        `invented` marks the Gaussians of `scene` that Φ invented earlier, and `lifted` those that Ψ
-        lifted from photographs: they give way where photographs show something else. By default
-        nothing of a scene does, since a label does not tell them from Gaussians of a user.
-        `has_scene_range` is True if near and far of the views are those that
-        `stages.context.find_scene_range` found, so that they are not looked for again. `remade`
-        marks the Gaussians of `scene` that Ψ made of photographs among `views`, and makes anew of
-        all of them.
+        `earlier` marks what earlier commands made of `scene`. `has_scene_range` is True if near and
+        far of the views are those that `stages.context.find_scene_range` found, so that they are
+        not looked for again.
         """
         check_inputs(views, scene, check_views or (), targets)
-        check_row_mask(invented, scene, "The mask of what was invented")
-        check_row_mask(lifted, scene, "The mask of what was lifted")
-        check_row_mask(remade, scene, "The mask of what is made anew")
+        check_row_mask(earlier.invented, scene, "The mask of what was invented")
+        check_row_mask(earlier.lifted, scene, "The mask of what was lifted")
+        check_row_mask(earlier.remade, scene, "The mask of what is made anew")
         config = choose_config(self.config, scene, check_views)
         if geometry is not None:
             check_geometry(geometry, config)
@@ -256,29 +255,17 @@ class GSCompleter:
                 seed=self.seed,
                 context_notes=context.notes,
                 geometry=context.geometry,
+                exposure_gains=context.exposure_gains,
                 models=self.name_models(),
             )
             # What earlier commands made steps aside where photographs show something else, so that
             # nobody takes it for a part of the scene that they contradict.
-            contested = find_contested(state, invented, lifted, self.scenes)
-            new_scene = None
+            contested = find_contested(state, earlier, self.scenes)
+            remade = remake_scene(
+                self.reconstructor, state, views, earlier, contested, self.renderer, has_scene_range
+            )
             if remade is not None:
-                new_scene = remake_scene(
-                    self.reconstructor,
-                    state,
-                    views,
-                    remade,
-                    contested,
-                    self.renderer,
-                    has_scene_range,
-                )
-            if new_scene is not None:
-                state = new_scene.state
-                context = replace(
-                    context,
-                    views=tuple(photo.view for photo in state.photos),
-                    exposure_gains=new_scene.exposure_gains,
-                )
+                state = remade
             else:
                 state = let_step_aside(state, contested)
                 # Guards measure the scene as it was given, so before anything changes.
@@ -293,12 +280,13 @@ class GSCompleter:
 
             # Photographs that a splat was not trained on say nothing about the trust in it. They
             # are targets themselves, before all others (decision 041).
-            new = find_new_photos(config, state.parts, context.views, self.scenes)
-            trained = [view for index, view in enumerate(context.views) if index not in new]
+            views = [photo.view for photo in state.photos]
+            new = find_new_photos(config, state.parts, views, self.scenes)
+            trained = [view for index, view in enumerate(views) if index not in new]
             trust = load_trust(config, state.parts, trained, self.scenes)
             state = replace(state, trust=trust)
-            state = recolor_to_photos(state, [context.views[i] for i in new], self.scenes)
-        return replace(state, exposure_gains=context.exposure_gains, seconds=seconds)
+            state = recolor_to_photos(state, [views[i] for i in new], self.scenes)
+        return replace(state, seconds=seconds)
 
     def name_models(self) -> dict[str, str]:
         """Name Ψ, the depth that helps it, and Φ, for the record of what is invented."""

@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import torch
+from jaxtyping import Bool
+from torch import Tensor
 
 from gscompleter.types import Gaussians
 
@@ -29,6 +31,22 @@ PartKind = Literal["photographs", "target", "gap", "piece"]
 what closes thin gaps beside a target; a piece of a Gaussian that a removal cut."""
 INVENTED_KINDS: tuple[PartKind, ...] = ("target", "gap")
 """Kinds that no photograph and no given scene shows."""
+
+
+@dataclass(frozen=True)
+class EarlierWork:
+    """Masks of the Gaussians of a given scene that earlier commands made; None for none.
+
+    A label does not tell them from Gaussians of a user, so that nothing of a scene counts as one by
+    default.
+    """
+
+    invented: Bool[Tensor, "n"] | None = None
+    """Those that Φ invented. They give way where photographs show something else."""
+    lifted: Bool[Tensor, "n"] | None = None
+    """Those that Ψ lifted from further photographs, which give way likewise."""
+    remade: Bool[Tensor, "n"] | None = None
+    """Those that Ψ made of photographs of the context. It makes them anew, of all of these."""
 
 
 @dataclass(frozen=True)

@@ -242,7 +242,7 @@ def test_photographs_replace_what_was_invented_before(room, tmp_path):
     alone.write_bytes(completed.read_bytes())
     task = replace(TASK, scene=load_ply(alone), splat_file=InputSplatFile(alone))
     task, (line,) = mark_earlier_work(task)
-    assert task.invented is None
+    assert task.earlier.invented is None
     assert line.endswith("that stays, also where photographs show something else.")
 
 

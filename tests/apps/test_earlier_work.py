@@ -51,8 +51,8 @@ def test_labels_tell_what_was_invented_after_another_program_kept_them(tmp_path)
     for _ in range(2):
         task, notes = mark(path)
         assert notes == ()
-        assert task.invented is not None
-        assert task.invented.nonzero()[:, 0].tolist() == list(range(NUM_GIVEN, 25))
+        assert task.earlier.invented is not None
+        assert task.earlier.invented.nonzero()[:, 0].tolist() == list(range(NUM_GIVEN, 25))
         move(path, keeps_labels=True)
 
 
@@ -64,9 +64,9 @@ def test_a_splat_without_its_labels_does_not_count_as_given(tmp_path, kind):
     if kind == "photographs":
         # Nothing was invented, and nothing is said.
         assert notes == ()
-        assert task.invented is not None
-        assert not task.invented.any()
+        assert task.earlier.invented is not None
+        assert not task.earlier.invented.any()
     else:
-        assert task.invented is None
+        assert task.earlier.invented is None
         assert len(notes) == 1
         assert "tells what was invented: that stays" in notes[0]

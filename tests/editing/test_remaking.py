@@ -9,7 +9,7 @@ import torch
 from gscompleter import GSCompleter, load_renderer
 from gscompleter.config import CompleterConfig
 from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.parts import NOT_INVENTED
+from gscompleter.parts import NOT_INVENTED, EarlierWork
 from gscompleter.state import Completion
 from gscompleter.types import (
     SH_C0,
@@ -64,8 +64,8 @@ ASIDE = make_invented(30.0)
 def begin(scene: Gaussians, photos: list[View], is_remade: bool = True) -> Completion:
     completer = GSCompleter(reconstruct_exactly, config=CompleterConfig.splat())
     is_invented = scene.generated == 1
-    remade = ~is_invented if is_remade else None
-    return completer.begin(photos, scene, [], invented=is_invented, remade=remade)
+    earlier = EarlierWork(is_invented, remade=~is_invented if is_remade else None)
+    return completer.begin(photos, scene, [], earlier=earlier)
 
 
 def score(scene: Gaussians, photos: list[View] = PHOTOS) -> list[float]:
@@ -112,6 +112,6 @@ def test_a_scene_stays_if_its_photographs_are_nearer_to_it():
 
     completer = GSCompleter(reconstruct_grey, config=CompleterConfig.splat())
     remade = torch.ones(len(WHOLE), dtype=torch.bool)
-    begun = completer.begin(PHOTOS, WHOLE, [], remade=remade)
+    begun = completer.begin(PHOTOS, WHOLE, [], earlier=EarlierWork(remade=remade))
     assert not begun.source.replaced_mask.any()
     assert torch.equal(begun.scene.means[: len(WHOLE)], WHOLE.means)

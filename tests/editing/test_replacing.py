@@ -17,7 +17,7 @@ from gscompleter.editing.replacing import (
     return_needed,
 )
 from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.parts import OBSERVED, PartOrigin, make_part
+from gscompleter.parts import OBSERVED, EarlierWork, PartOrigin, make_part
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.stages.superfluous import limit_errors
 from gscompleter.state import Completion
@@ -77,7 +77,7 @@ def begin(
     """Begin with a scene, in which what has a label was invented, or nothing without `marks`."""
     completer = GSCompleter(reconstruct_exactly, config=config)
     invented = scene.generated != OBSERVED if marks else None
-    return completer.begin(photos[:2], scene, photos[2:], invented=invented)
+    return completer.begin(photos[:2], scene, photos[2:], earlier=EarlierWork(invented))
 
 
 def score(scene: Gaussians) -> list[float]:
@@ -118,7 +118,7 @@ def test_what_photographs_do_not_show_stays():
     inside = make_board(2.6, width=0.15)
     scene = merge([WHOLE, beside, inside])
     begun = begin(scene, marks=False)
-    assert find_contested(begun, scene.generated != OBSERVED, None, SCENES) is None
+    assert find_contested(begun, EarlierWork(scene.generated != OBSERVED), SCENES) is None
 
 
 def test_what_only_one_place_shows_stays_where_nothing_else_is_known():
@@ -134,7 +134,7 @@ def test_what_only_one_place_shows_stays_where_nothing_else_is_known():
 
 def begin_lifted(scene: Gaussians, lifted: torch.Tensor | None) -> Completion:
     completer = GSCompleter(reconstruct_exactly, config=SPLAT)
-    return completer.begin(PHOTOS[:2], scene, PHOTOS[2:], lifted=lifted)
+    return completer.begin(PHOTOS[:2], scene, PHOTOS[2:], earlier=EarlierWork(lifted=lifted))
 
 
 def test_what_was_lifted_to_a_wrong_place_gives_way():
@@ -226,8 +226,8 @@ def test_nothing_gives_way_where_photographs_add_nothing(config):
 def test_a_wrong_mask_is_refused():
     completer = GSCompleter(reconstruct_exactly)
     with pytest.raises(InputError, match="needs a truth value for each of"):
-        completer.begin(PHOTOS, WHOLE, invented=torch.zeros(3, dtype=torch.bool))
+        completer.begin(PHOTOS, WHOLE, earlier=EarlierWork(torch.zeros(3, dtype=torch.bool)))
     with pytest.raises(InputError, match="needs a truth value for each of"):
-        completer.begin(PHOTOS, WHOLE, lifted=torch.zeros(3, dtype=torch.bool))
+        completer.begin(PHOTOS, WHOLE, earlier=EarlierWork(lifted=torch.zeros(3, dtype=torch.bool)))
     with pytest.raises(InputError, match="marks Gaussians of a scene"):
-        completer.begin(PHOTOS, invented=torch.zeros(3, dtype=torch.bool))
+        completer.begin(PHOTOS, earlier=EarlierWork(torch.zeros(3, dtype=torch.bool)))

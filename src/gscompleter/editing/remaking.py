@@ -9,16 +9,16 @@ stays, but where photographs show the place.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.config.settings import COVERED
 from gscompleter.editing.replacing import Contested, drop_rows, mark_rendered
 from gscompleter.generators.exposure import compute_median_ratio
-from gscompleter.parts import PartOrigin, make_part
+from gscompleter.parts import EarlierWork, PartOrigin, make_part
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.render.protocols import Renderer
 from gscompleter.stages.context import InitialContext, reconstruct_context, sort_by_frame
@@ -26,31 +26,24 @@ from gscompleter.state import Completion, Photo
 from gscompleter.types import SH_C0, ContextScene, Gaussians, Render, View, merge
 
 
-@dataclass(frozen=True)
-class RemadeScene:
-    """A begun completion whose scene Ψ made anew."""
-
-    state: Completion
-    exposure_gains: Float[Tensor, "v 3"]
-    """Exposure gain per channel of each photograph of the context relative to the scene."""
-
-
 def remake_scene(
     reconstructor: Reconstructor,
     state: Completion,
     views: Sequence[View],
-    remade: Bool[Tensor, "n"],
+    earlier: EarlierWork,
     contested: Contested | None,
     renderer: Renderer,
     has_scene_range: bool,
-) -> RemadeScene | None:
+) -> Completion | None:
     """Make anew what Ψ made of the scene of a begun completion, from its photographs.
 
-    `views` are those of the context as they were given, `remade` marks Gaussians of the given
-    scene, and `has_scene_range` is that of `reconstruct_context`. The `contested` ones, which Φ
-    invented, go as well. Returns None if the photographs are not nearer to the new scene than to
-    the given one, in the mean of their PSNR.
+    `views` are those of the context as they were given, and `has_scene_range` is that of
+    `reconstruct_context`. The `contested` Gaussians, which Φ invented, go as well. Returns None if
+    nothing is to be made anew, or if the photographs are not nearer to the new scene than to the
+    given one, in the mean of their PSNR.
     """
+    if earlier.remade is None:
+        return None
     views = sort_by_frame(views)  # as those of `state` are
     given = render_at_all(merge(state.parts), views, renderer)
     made = reconstruct_context(reconstructor, views, has_scene_range=has_scene_range)
@@ -58,7 +51,7 @@ def remake_scene(
     factor = measure_exposure(given, shown, views)
     made = multiply_exposure(made, views, factor)
 
-    gone = mark_rendered(state.source, remade)
+    gone = mark_rendered(state.source, earlier.remade)
     if contested is not None:
         gone = gone | contested.rows
     part = make_part(PartOrigin("photographs"), made.source.gaussians)
@@ -68,13 +61,13 @@ def remake_scene(
         drop_rows(state, state, gone),
         photos=(*context, *state.photos[len(context) :]),
         added_parts=(part,),
+        exposure_gains=made.exposure_gains,
         context_notes=(*state.context_notes, *made.notes),
     )
     new = render_at_all(merge(begun.parts), made.views, renderer)
     if compute_psnrs(new, made.views).mean() <= compute_psnrs(given, made.views).mean():
         return None
-    assert made.exposure_gains is not None
-    return RemadeScene(begun, made.exposure_gains)
+    return begun
 
 
 def render_at_all(scene: Gaussians, views: Sequence[View], renderer: Renderer) -> list[Render]:

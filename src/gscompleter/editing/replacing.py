@@ -19,7 +19,7 @@ from torch import Tensor
 
 from gscompleter.config import CleaningConfig
 from gscompleter.numerics.image_ops import average_box
-from gscompleter.parts import PartOrigin, make_part
+from gscompleter.parts import EarlierWork, PartOrigin, make_part
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.protocols import FrozenScene, OpacityRender, Renderer
 from gscompleter.render.view_map import get_view_map
@@ -83,21 +83,18 @@ class ContestedPixels:
 
 
 def find_contested(
-    state: Completion,
-    invented: Bool[Tensor, "n"] | None,
-    lifted: Bool[Tensor, "n"] | None,
-    scenes: SceneRenderer,
+    state: Completion, earlier: EarlierWork, scenes: SceneRenderer
 ) -> Contested | None:
     """Find Gaussians of a begun scene that stand where photographs show something else.
 
-    The masks mark those of the context that Φ invented, and that Ψ lifted from photographs. Returns
-    None if none are contested, and without `add_observed`, as in the paper: nothing that
-    photographs show would take their place.
+    They are among those that Φ invented, and that Ψ lifted from photographs. Returns None if none
+    are contested, and without `add_observed`, as in the paper: nothing that photographs show would
+    take their place.
     """
-    if not state.config.add_observed or (invented is None and lifted is None):
+    if not state.config.add_observed or (earlier.invented is None and earlier.lifted is None):
         return None
-    is_invented = mark_rendered(state.source, invented)
-    is_lifted = mark_rendered(state.source, lifted) & ~is_invented
+    is_invented = mark_rendered(state.source, earlier.invented)
+    is_lifted = mark_rendered(state.source, earlier.lifted) & ~is_invented
     if not (is_invented | is_lifted).any():
         return None
 

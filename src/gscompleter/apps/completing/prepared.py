@@ -81,11 +81,9 @@ class Prepared:
             task.scene,
             task.check_views,
             task.target_cameras,
-            invented=task.invented,
-            lifted=task.lifted,
+            earlier=task.earlier,
             geometry=task.geometry,
             has_scene_range=task.scene is None or task.is_remade,
-            remade=task.remade,
         )
         guarding = tuple(begun.with_depth_range(camera) for camera in task.witnesses.guarding)
         begun = replace(begun, free_space_cameras=guarding)

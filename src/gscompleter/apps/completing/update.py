@@ -190,8 +190,8 @@ def measure_lacks(loaded: Loaded) -> dict[int, float]:
     task = loaded.task
     scene = task.scene
     assert scene is not None
-    if task.invented is not None:
-        scene = scene[~task.invented]
+    if task.earlier.invented is not None:
+        scene = scene[~task.earlier.invented]
     cameras = collect_cameras(opened, task)
     checks = {view.frame: view for view in task.check_views or ()}
     frames = []

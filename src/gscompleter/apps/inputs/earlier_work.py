@@ -10,7 +10,7 @@ from jaxtyping import Bool
 from torch import Tensor
 
 from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile
-from gscompleter.parts import INVENTED_KINDS, NOT_INVENTED, OBSERVED
+from gscompleter.parts import INVENTED_KINDS, NOT_INVENTED, OBSERVED, EarlierWork
 from gscompleter.splats.edits import Edits
 from gscompleter.splats.formats import detect_splat_format
 from gscompleter.splats.row_kinds import find_rows_of_kinds, has_recolored, tells_kinds
@@ -36,7 +36,7 @@ def mark_earlier_work(task: CompletionTask) -> tuple[CompletionTask, tuple[str, 
     if task.is_remade:
         # The record tells all rows, or nothing would be made anew.
         assert invented is not None
-        return replace(task, invented=invented, remade=~invented), (REMAKING,)
+        return replace(task, earlier=EarlierWork(invented, remade=~invented)), (REMAKING,)
     # What a first command lifted stays: its own photographs would lose (decision 113).
     lifted = read_rows(task.splat_file, task.scene, ("photographs",))
 
@@ -51,7 +51,7 @@ def mark_earlier_work(task: CompletionTask) -> tuple[CompletionTask, tuple[str, 
         invented = labelled
     is_unknown = invented is None and (has_labels or was_invented)
     notes = (describe_unknown(task.splat_file),) if is_unknown else ()
-    return replace(task, invented=invented, lifted=lifted), notes
+    return replace(task, earlier=EarlierWork(invented, lifted)), notes
 
 
 def read_rows(

@@ -19,6 +19,7 @@ from gscompleter.data.sfm.refining import PoseRefinement
 from gscompleter.editing.taken_out import TakenOut
 from gscompleter.generators.painted import Painting
 from gscompleter.numerics.given_geometry import GivenGeometry
+from gscompleter.parts import EarlierWork
 from gscompleter.splats.edits import Edits, read_edits
 from gscompleter.types import Camera, Gaussians, View
 from gscompleter.virtual_capture.witnesses import Witnesses
@@ -149,16 +150,11 @@ class CompletionTask:
     taken_out: TakenOut | None = None
     """What earlier edits took out of the input splat, which the photographs do not show any more;
     None for nothing."""
-    invented: Bool[Tensor, "n"] | None = None
-    """Mask of the Gaussians of `scene` that earlier commands invented, which give way to what
-    photographs show; None for none."""
-    lifted: Bool[Tensor, "n"] | None = None
-    """Mask of those that earlier commands lifted from photographs, which give way likewise."""
+    earlier: EarlierWork = EarlierWork()
+    """Gaussians of `scene` that earlier commands made."""
     is_remade: bool = False
     """True if Ψ made the input splat of photographs of the same folder, which are among `views`,
     and makes it anew."""
-    remade: Bool[Tensor, "n"] | None = None
-    """Mask of the Gaussians of `scene` that it makes anew; None for none."""
 
     @property
     def device(self) -> torch.device:
