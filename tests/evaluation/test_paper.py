@@ -322,7 +322,7 @@ def test_all_of_the_paper_on_photographs(clip, tmp_path, monkeypatch):
     monkeypatch.setattr("gscompleter.evaluation.methods.RegGSConfig", CoarseRegGS)
     out = tmp_path / "out"
     names = ("mvsplat-re10k", f"{ROOT / 'examples' / '07_own_reconstructor.py'}:Billboards")
-    more = ("--reconstructor", *names, "--weights", weights)
+    more = ("--reconstructor", *names, "--weights", f"mvsplat-re10k={weights}")
     every = ("--table", "all", "--figure", "all", "--generator", "warp-inpaint")
     assert reproduce(monkeypatch, clip, out, *every, *more) == 0
     steps = ("--table", "steps", "--preset", "re10k", "--limit", 1)
