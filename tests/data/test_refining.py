@@ -8,12 +8,14 @@ import pytest
 
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.photographs import Photographs
+from gscompleter.data.sfm.placing import write_known_copies
 from gscompleter.data.sfm.refining import (
     PoseRefinement,
     move_to_given_frame,
     pair_near,
     refine_poses,
 )
+from gscompleter.system.errors import InputError
 from scenes import camera_at, photographed
 
 CAMERAS = [
@@ -91,6 +93,19 @@ def test_cameras_that_agree_stay_bit_for_bit(tmp_path):
     assert not done.is_accepted
     assert kept is true
     assert done.describe().startswith("Given poses are kept")
+
+
+def test_damaged_photographs_are_left_out_unless_all_are(tmp_path):
+    photographs = open_photographs(photographed(tmp_path / "room", CAMERAS))
+    files = [frame.file.path for frame in photographs.frames]
+    files[2].write_bytes(b"no image")
+    copies, sources = write_known_copies(photographs, tmp_path / "copies")
+    assert [copy.name for copy in copies] == list(sources)
+    assert list(sources.values()) == [path.name for path in files if path != files[2]]
+    for path in files:
+        path.write_bytes(b"no image")
+    with pytest.raises(InputError, match=f"{files[0].name} is not an image"):
+        write_known_copies(photographs, tmp_path / "others")
 
 
 def test_two_photographs_hold_no_frame_and_are_left(tmp_path):

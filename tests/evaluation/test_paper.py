@@ -44,6 +44,7 @@ from gscompleter.models.feed_forward import MVSplat
 from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.system.errors import InputError, OutputError, WorkerError
 from gscompleter.system.files.image import read_pixels
+from paths import ROOT
 from scenes import Room, camera_at, view_of
 
 PAPER = load_paper()
@@ -266,13 +267,11 @@ def rooms(tmp_path_factory) -> Path:
 
 
 @pytest.fixture
-def clips(shared, tmp_path) -> Path:
-    """Write a chunk with two clips of photographs."""
-    folders = [shared / "data" / name for name in ("re10k_0d4de33c", "re10k_000c3ab1")]
-    opened = {folder.name: open_photographs(folder) for folder in folders}
-    views = {name: clip.views(range(FRAMES), (SIZE, SIZE)) for name, clip in opened.items()}
-    examples = [example(name, views=found) for name, found in views.items()]
-    return save_chunk(tmp_path / "000000.torch", *examples)
+def clip(shared, tmp_path) -> Path:
+    """Write a chunk with a clip of photographs."""
+    folder = shared / "data" / "re10k_0d4de33c"
+    views = open_photographs(folder).views(range(FRAMES), (SIZE, SIZE))
+    return save_chunk(tmp_path / "000000.torch", example(folder.name, views=views))
 
 
 def reproduce(monkeypatch, data: Path, out: Path, *more: object) -> int:
@@ -309,34 +308,31 @@ def test_a_table_and_a_figure_of_rooms(rooms, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_all_of_the_paper_on_photographs(clips, tmp_path, monkeypatch):
-    """Two models with random weights, and for steps a tiny model in place of PE-Field's."""
+def test_all_of_the_paper_on_photographs(clip, tmp_path, monkeypatch):
+    """A model with random weights, one without, and for steps a tiny one in place of PE-Field's."""
     pytest.importorskip("matplotlib", reason="needs gscompleter[evaluation]")
     pytest.importorskip("diffusers", reason="needs gscompleter[diffusion]")
-    weights = []
-    for seed in range(2):
-        torch.manual_seed(seed)
-        state = {f"encoder.{k}": v for k, v in MVSplat().state_dict().items()}
-        weights.append(tmp_path / f"{seed}.ckpt")
-        torch.save({"state_dict": state}, weights[-1])
+    torch.manual_seed(0)
+    state = {f"encoder.{k}": v for k, v in MVSplat().state_dict().items()}
+    weights = tmp_path / "random.ckpt"
+    torch.save({"state_dict": state}, weights)
     kontext = tiny_diffusion.saved(tiny_diffusion.kontext_pipeline(), tmp_path / "kontext")
     few = partial(RunConfig, baseline_iterations=3)
     monkeypatch.setattr("gscompleter.apps.evaluating.scoring.RunConfig", few)
     monkeypatch.setattr("gscompleter.evaluation.methods.RegGSConfig", CoarseRegGS)
-    out, names = tmp_path / "out", ("mvsplat-re10k", "mvsplat-acid")
-    more = ("--reconstructor", *names, "--weights", *weights)
+    out = tmp_path / "out"
+    names = ("mvsplat-re10k", f"{ROOT / 'examples' / '07_own_reconstructor.py'}:Billboards")
+    more = ("--reconstructor", *names, "--weights", f"mvsplat-re10k={weights}")
     every = ("--table", "all", "--figure", "all", "--generator", "warp-inpaint")
-    assert reproduce(monkeypatch, clips, out, *every, *more) == 0
-    tiny = ("--generator-weights", kontext, "--generator-depth", "context", "--limit", 1)
-    assert (
-        reproduce(monkeypatch, clips, out, "--table", "steps", "--preset", "re10k", *tiny, *more)
-        == 0
-    )
+    assert reproduce(monkeypatch, clip, out, *every, *more) == 0
+    steps = ("--table", "steps", "--preset", "re10k", "--limit", 1)
+    tiny = ("--generator-weights", kontext, "--generator-depth", "context")
+    assert reproduce(monkeypatch, clip, out, *steps, *tiny, *more) == 0
     for name, spec in PAPER.tables.items():
         table = json.loads((out / "tables" / f"{name}.json").read_text())
         assert {row["method"] for row in table["rows"]} == set(spec.methods)
         assert {row["model"] for row in table["rows"]} == set(names)
-        assert set(table["cases"].values()) == {1 if name == "steps" else 2}
+        assert set(table["cases"].values()) == {1}
         latex = (out / "tables" / f"{name}.tex").read_text()
         assert latex.count(r"\\") == 1 + len(table["rows"])
     for name in PAPER.figures:

@@ -75,6 +75,12 @@ def test_a_refinement_that_agrees_no_better_is_remembered(scene, tmp_path, monke
     assert kept.frames == photographs.frames
 
 
+def test_a_damaged_photograph_costs_no_case_of_others(scene):
+    photographs = open_photographs(scene)
+    photographs.frames[0].file.path.write_bytes(b"no image")
+    assert is_contradicted(photographs)
+
+
 def evaluate(monkeypatch, cases: Path, out: Path, *more: object) -> int:
     """Score the scene before completion."""
     return run(monkeypatch, "evaluate", cases, "--methods", "context", "--out", out, *more)

@@ -17,6 +17,7 @@ from gscompleter.data.sfm.refined_file import hash_poses, take_refined, write_re
 from gscompleter.data.sfm.refining import MIN_REFINED, PoseRefinement, refine_poses
 from gscompleter.evaluation.store import make_file_name
 from gscompleter.reconstructors.features.epipolar import measure_pose_fit
+from gscompleter.system.errors import InputError
 from gscompleter.system.jobs.jobs import make_folder
 
 POSES = "poses"
@@ -57,6 +58,13 @@ def is_contradicted(photographs: Photographs) -> bool:
         return False
     last = len(frames) - 2
     starts = np.linspace(0, last, min(MAX_PAIRS, last + 1)).round().astype(int)
-    pairs = (photographs.views(frames[start : start + 2], SIDE) for start in starts)
-    fits = (measure_pose_fit(pair) for pair in pairs)
-    return any(fit is not None and fit.is_contradicted for fit in fits)
+    for start in starts:
+        # A damaged photograph tells nothing, and other pairs do.
+        try:
+            pair = photographs.views(frames[start : start + 2], SIDE)
+        except InputError:
+            continue
+        fit = measure_pose_fit(pair)
+        if fit is not None and fit.is_contradicted:
+            return True
+    return False

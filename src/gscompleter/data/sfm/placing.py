@@ -14,6 +14,7 @@ import math
 import os
 import tempfile
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -261,12 +262,23 @@ def explain_unplaced(row: Mapping[str, Any], sources: Mapping[str, str]) -> str:
 def write_known_copies(
     photographs: Photographs, home: Path
 ) -> tuple[list[KnownCopy], dict[str, str]]:
-    """Write undistorted copies of photographs with known cameras; return their files by copy."""
+    """Write undistorted copies of photographs with known cameras; return their files by copy.
+
+    Damaged photographs are left out.
+
+    Raises:
+        InputError: All of them are damaged.
+    """
     frames = choose_known(photographs)
     copies = []
     sources = {}
+    damages = []
     for number in track(frames, "Reading photographs"):
-        (view,) = photographs.views([number], MAX_COPY_SIDE)
+        try:
+            (view,) = photographs.views([number], MAX_COPY_SIDE)
+        except InputError as error:
+            damages.append(error)
+            continue
         name = f"{KNOWN_FOLDER}/{number:05d}.png"
         is_masked = write_view(view, home, name)
         camera = view.camera
@@ -282,6 +294,8 @@ def write_known_copies(
             )
         )
         sources[name] = photographs.frame(number).file_name
+    if damages and not copies:
+        raise damages[0]
     return copies, sources
 
 
@@ -290,8 +304,16 @@ def choose_known(photographs: Photographs) -> list[int]:
     frames = [number for number in photographs.present if not photographs.is_hidden(number)]
     if len(frames) <= MAX_KNOWN:
         return frames
-    cameras = [photographs.camera(number, MAX_COPY_SIDE) for number in frames]
-    return sorted(frames[index] for index in select_spread_cameras(cameras, MAX_KNOWN))
+    cameras = {}
+    for number in frames:
+        # The camera of a damaged photograph has no size.
+        with suppress(InputError):
+            cameras[number] = photographs.camera(number, MAX_COPY_SIDE)
+    if not cameras:
+        return frames[:1]  # whose damage is named when it is read
+    usable = list(cameras)
+    chosen = select_spread_cameras(list(cameras.values()), MAX_KNOWN)
+    return sorted(usable[index] for index in chosen)
 
 
 def write_view(view: View, home: Path, name: str) -> bool:
