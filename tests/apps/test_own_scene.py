@@ -80,22 +80,30 @@ def test_photographs_are_joined_if_they_are_not_too_many():
     assert join_photographs((0,), (1, 2, 3), set(), MAX_STEREO_PIXELS // 3) == ()
 
 
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ("complete", ("--context", 4, 7, "--target", 5)),
+        # It chooses photographs that show what the splat lacks.
+        pytest.param("update", (), marks=pytest.mark.slow),
+    ],
+)
 def test_a_second_command_makes_the_scene_anew_and_strip_gives_the_first_one_back(
-    tmp_path, monkeypatch, capsys
+    tmp_path, monkeypatch, capsys, command, words
 ):
     room = photographed(tmp_path / "room", CAMERAS)
     quick = ("--resolution", 64, "--far", 20)
     first = ("complete", room, "--context", 0, 1, "--target", 3, "--out", tmp_path / "first")
     assert run(monkeypatch, *first, *quick, "--quiet") == 0
     given = tmp_path / "first" / "completed.ply"
-    named = ("--scene", given, "--context", 4, 7, "--target", 5, "--out", tmp_path / "second")
-    assert run(monkeypatch, "complete", room, *named, *quick) == 0
+    named = ("--scene", given, *words, "--out", tmp_path / "second")
+    assert run(monkeypatch, command, room, *named, *quick) == 0
     assert "it is reconstructed anew from those" in " ".join(capsys.readouterr().err.split())
 
     second = tmp_path / "second" / "completed.ply"
     summary = json.loads((second.parent / "summary.json").read_text())
     rows = {row["frame"]: row for row in summary["context"]}
-    assert sorted(rows) == [0, 1, 4, 7]
+    assert rows.keys() >= {0, 1, 4, 7}
     for frame in (4, 7):
         assert rows[frame]["psnr_after"] > rows[frame]["psnr_before"] + 3
     before = load_ply(given)

@@ -203,7 +203,7 @@ class SceneOptions(ComputeOptions, WritingOptions, MaskOptions):
     forget_edits: bool = False
     """Do without the record of earlier commands: use photographs also where they show what was
     removed from the splat, or marked as wrong, so that it may come back; and keep a splat that
-    complete reconstructed from other photographs of SCENE, where complete would make it anew."""
+    complete reconstructed from other photographs, where complete and update make it anew."""
     ignore_properties: bool = False
     """Go on with a splat whose further properties change what is seen, such as a moving one."""
 

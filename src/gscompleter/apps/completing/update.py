@@ -21,10 +21,12 @@ from gscompleter.apps.completing.preparation import (
     use_predicted_depth,
 )
 from gscompleter.apps.completing.prepared import Prepared
-from gscompleter.apps.inputs.depth_range import apply_splat_range
+from gscompleter.apps.inputs.depth_range import apply_scene_range, apply_splat_range
 from gscompleter.apps.inputs.describing import print_lines
+from gscompleter.apps.inputs.earlier_work import mark_earlier_work
 from gscompleter.apps.inputs.named_photographs import find_context
-from gscompleter.apps.inputs.reading import make_task
+from gscompleter.apps.inputs.own_scene import find_own_photographs, join_photographs
+from gscompleter.apps.inputs.reading import count_pixels, make_task
 from gscompleter.apps.inputs.selection import choose_check_size, collect_usable_cameras
 from gscompleter.apps.inputs.splat import add_check_views, read_check_view
 from gscompleter.apps.inputs.taken_out import hide_taken_out
@@ -33,8 +35,8 @@ from gscompleter.apps.requests.completion import (
     ResultsRequest,
     TargetRequest,
     UpdateRequest,
+    WorkRequest,
 )
-from gscompleter.apps.requests.models import ModelRequest
 from gscompleter.apps.requests.scene import Names
 from gscompleter.config import CompleterConfig
 from gscompleter.data.formats import find_format
@@ -78,7 +80,8 @@ def prepare_update(request: UpdateRequest, console: Console) -> Prepared:
 
     opened, task = read_opened(work, source, NO_TARGETS, opened, console, num_known)
     loaded = load_models(work, work.config, NO_TARGETS, opened, task, geometry, console)
-    loaded = choose_evidence(work.models, source.context, loaded, new)
+    loaded, notes = choose_evidence(work, source.context, loaded, new)
+    print_lines(console, *notes)
     settings = {
         "photos": None if request.photos is None else str(request.photos),
         "hold_out": request.hold_out,
@@ -140,28 +143,33 @@ def hold_out(opened: Opened, count: int, context: Names | None, new: Sequence[in
 
 
 def choose_evidence(
-    models: ModelRequest, context: Names | None, loaded: Loaded, new: Sequence[int]
-) -> Loaded:
+    work: WorkRequest, context: Names | None, loaded: Loaded, new: Sequence[int]
+) -> tuple[Loaded, tuple[str, ...]]:
     """Add new photographs to the context, and photographs that show what the splat lacks.
 
     A context is chosen to overlook the scene, and what it leaves out only checks, at a low
-    resolution. A context that the user named only gets the new photographs.
+    resolution. A context that the user named only gets the new photographs. A splat that an earlier
+    command reconstructed is made anew from its photographs and those that are added. Also returns
+    lines for the user.
     """
     task = loaded.task
     opened = loaded.opened
-    frames = set(task.context_frames)
-    frames.update(frame for frame in new if frame not in opened.held_out)
+    added = [frame for frame in new if frame not in opened.held_out]
     if context is None:
         shares = measure_lacks(loaded)
         lacking = [frame for frame, share in shares.items() if share >= MIN_ADDED_SHARE]
         lacking.sort(key=lambda frame: -shares[frame])
-        frames.update(lacking[:MAX_LACKING])
-    if frames == set(task.context_frames):
-        return loaded
+        added += lacking[:MAX_LACKING]
+    own = find_own_photographs(work, opened.files) if work.config.add_observed else ()
+    pixels = count_pixels(opened.photographs, opened.request.resolution)
+    joined = join_photographs(own, added, set(opened.held_out), pixels) if own else ()
+    frames = joined or tuple(sorted({*task.context_frames, *added}))
+    if not joined and set(frames) == set(task.context_frames):
+        return loaded, ()
 
     with show_preparation("reading photographs"):
         read = add_check_views(
-            make_task(opened, sorted(frames), (), task.device.type, has_splat=True), opened
+            make_task(opened, frames, (), task.device.type, has_splat=True), opened
         )
     # The new views go through what `load_models` and those before it did with the first ones.
     transform = compute_view_transform(opened, task)
@@ -171,13 +179,20 @@ def choose_evidence(
         check_views=[transform_view(view, transform) for view in read.check_views or ()],
         depth_notes=read.depth_notes,
         predicted_depths=read.predicted_depths,
+        is_remade=len(joined) > 0,
     )
-    assert task.scene is not None
-    task = apply_splat_range(task, task.scene, loaded.completer.renderer)
+    notes: tuple[str, ...] = ()
+    if task.is_remade:
+        task, about_range = apply_scene_range(task, loaded.completer.reconstructor)
+        task, about_scene = mark_earlier_work(task)
+        notes = (*about_range, *about_scene)
+    else:
+        assert task.scene is not None
+        task = apply_splat_range(task, task.scene, loaded.completer.renderer)
     task = hide_taken_out(task)
-    completer, task = use_predicted_depth(models, loaded.completer, task)
+    completer, task = use_predicted_depth(work.models, loaded.completer, task)
     cameras = collect_cameras(opened, task)
-    return replace(loaded, task=task, completer=completer, cameras=cameras)
+    return replace(loaded, task=task, completer=completer, cameras=cameras), notes
 
 
 def measure_lacks(loaded: Loaded) -> dict[int, float]:
