@@ -67,6 +67,8 @@ class Completion(Displayed):
     """Number of photographs that a given scene did not reproduce."""
     is_given: bool = False
     """True if the context is a scene that was given, and Ψ did not reconstruct it."""
+    is_remade: bool = False
+    """True if Ψ made the given scene anew, which may have another exposure since."""
     seed: int = 0
     """Seed of all random numbers."""
     context_notes: tuple[str, ...] = ()

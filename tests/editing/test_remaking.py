@@ -89,16 +89,22 @@ def test_all_photographs_gain_and_what_nobody_sees_stays():
     assert made.num_observed == len(made.scene) - 1
 
 
-def test_the_new_scene_keeps_the_exposure_of_the_given_one():
+def test_the_new_scene_keeps_the_exposure_of_what_stays():
     """All photographs of the second command are given darker than those of the first were."""
     darker = [replace(view, image=0.8 * view.image) for view in PHOTOS]
-    made = begin(SHARDS, darker)
+    made = begin(merge([SHARDS, ASIDE]), darker)
     assert made.exposure_gains is not None
     assert torch.allclose(made.exposure_gains, torch.tensor(0.8), atol=0.02)
     # The photographs are brought to the scene.
     for photos in (PHOTOS, list(made.views)):
         for after, true in zip(score(made.scene, photos), score(WHOLE), strict=True):
             assert abs(after - true) < 0.5
+
+    # Nothing stays that was invented.
+    alone = begin(SHARDS, darker)
+    assert alone.exposure_gains is None
+    for after, true in zip(score(alone.scene, darker), score(WHOLE), strict=True):
+        assert after > true
 
 
 def test_a_scene_stays_if_its_photographs_are_nearer_to_it():

@@ -18,6 +18,7 @@ from torch import Tensor
 from gscompleter.config.settings import COVERED
 from gscompleter.editing.replacing import Contested, drop_rows, mark_rendered
 from gscompleter.generators.exposure import compute_median_ratio
+from gscompleter.numerics.image_ops import take_exposure
 from gscompleter.parts import EarlierWork, PartOrigin, make_part
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.render.protocols import Renderer
@@ -40,20 +41,21 @@ def remake_scene(
     `views` are those of the context as they were given, and `has_scene_range` is that of
     `reconstruct_context`. The `contested` Gaussians, which Φ invented, go as well. Returns None if
     nothing is to be made anew, or if the photographs are not nearer to the new scene than to the
-    given one, in the mean of their PSNR.
+    given one, in the mean of their PSNR apart from their exposures.
     """
     if earlier.remade is None:
         return None
     views = sort_by_frame(views)  # as those of `state` are
     given = render_at_all(merge(state.parts), views, renderer)
     made = reconstruct_context(reconstructor, views, has_scene_range=has_scene_range)
-    shown = render_at_all(made.source.gaussians, views, renderer)
-    factor = measure_exposure(given, shown, views)
-    made = multiply_exposure(made, views, factor)
-
     gone = mark_rendered(state.source, earlier.remade)
     if contested is not None:
         gone = gone | contested.rows
+    if not gone.all():
+        # What was invented and stays has the exposure of the given scene. Else the new one keeps
+        # its own, in which no photograph is brightened until it is clipped.
+        shown = render_at_all(made.source.gaussians, views, renderer)
+        made = multiply_exposure(made, views, measure_exposure(given, shown, views))
     part = make_part(PartOrigin("photographs"), made.source.gaussians)
     # The scene has one exposure, which photographs of the context share from here on.
     context = tuple(Photo(view) for view in made.views)
@@ -63,11 +65,11 @@ def remake_scene(
         added_parts=(part,),
         exposure_gains=made.exposure_gains,
         context_notes=(*state.context_notes, *made.notes),
+        is_remade=True,
     )
     new = render_at_all(merge(begun.parts), made.views, renderer)
-    if compute_psnrs(new, made.views).mean() <= compute_psnrs(given, made.views).mean():
-        return None
-    return begun
+    is_nearer = compute_psnrs(new, made.views).mean() > compute_psnrs(given, made.views).mean()
+    return begun if is_nearer else None
 
 
 def render_at_all(scene: Gaussians, views: Sequence[View], renderer: Renderer) -> list[Render]:
@@ -76,11 +78,14 @@ def render_at_all(scene: Gaussians, views: Sequence[View], renderer: Renderer) -
 
 
 def compute_psnrs(renders: Sequence[Render], views: Sequence[View]) -> Float[Tensor, "v"]:
-    """Compute the PSNR of each photograph, in dB; pixels that are ignored count as right."""
-    errors = [
-        (view.fill_ignored(render.image.clamp(0, 1)) - view.image).square().mean()
-        for render, view in zip(renders, views, strict=True)
-    ]
+    """Compute the PSNR of each photograph apart from its exposure, in dB.
+
+    Pixels that are ignored count as right.
+    """
+    errors = []
+    for render, view in zip(renders, views, strict=True):
+        image = take_exposure(render.image, view.image, view.valid_mask).clamp(0, 1)
+        errors.append((view.fill_ignored(image) - view.image).square().mean())
     return -10 * torch.stack(errors).clamp_min(1e-10).log10()
 
 
@@ -90,7 +95,7 @@ def measure_exposure(
     """Measure the exposure of the given scene relative to a new one, per channel.
 
     They are compared where both show the half of the photographs that the given scene was made of,
-    as far as its errors tell. What was invented and stays has the exposure of the given scene.
+    as far as its errors tell.
     """
     best = compute_psnrs(given, views).argsort(descending=True)[: (len(views) + 1) // 2]
     old_colors = []

@@ -37,7 +37,7 @@ from gscompleter.evaluation.verdict.held_out import (
 )
 from gscompleter.evaluation.verdict.outcome import judge_completion
 from gscompleter.evaluation.verdict.rows import ScoreRow
-from gscompleter.numerics.image_ops import compute_mask_fraction
+from gscompleter.numerics.image_ops import compute_mask_fraction, take_exposure
 from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.reconstructors.features.consistency import measure_pose_errors
 from gscompleter.render.protocols import Renderer
@@ -133,7 +133,12 @@ def score_views(
 
     def score(view: View) -> ScoreValues:
         shown = hide_removed(view, completion.source, renderer)
-        return compute_scores(draw(view), shown)
+        pair = draw(view)
+        if completion.is_remade and shown is not None:
+            # The photographs have the exposure of the new scene, not that of the given one.
+            matched = take_exposure(pair.before.image, shown.image, shown.valid_mask)
+            pair = replace(pair, before=replace(pair.before, image=matched))
+        return compute_scores(pair, shown)
 
     map_views = get_view_map(completion.context.means, len(completion.context))
     return list(map_views(score, views))
