@@ -288,6 +288,10 @@ def test_a_splat_gains_at_its_photographs_where_no_other_one_tests_it():
         "Done: 1 photograph gains 7.0 dB, to 18.0 dB only, as the splat shows something else there "
         "and what was given stays"
     )
+    # Where a scene is made anew of more photographs, some of the first ones lose.
+    losing = [*context, context_row(33.0, 31.5)]
+    told = "Done: 2 photographs gain 5.0 dB, to 25.5 dB, and 1 loses 1.5 dB"
+    assert describe_gain("Done", [], losing) == told
     renders = [context_row(float("inf"), 40.0), context_row(None, None), context_row(50.0, 45.0)]
     assert describe_gain("Done", [], renders) == "Done"
     checked = replace(held_out(3.0, 5.0), psnr_before=20.0, psnr_after=20.0, is_check=True)

@@ -227,7 +227,9 @@ def describe_gain(
         gain = "1 photograph gains" if len(better) == 1 else f"{len(better)} photographs gain"
         after = average(row.psnr_after for row in better) or 0.0
         reached = f"{work}: {gain} {gains} dB, to {format_number(after, 1)} dB"
-        return f"{reached} {STILL_OTHER}" if after < MIN_ALIKE else reached
+        if after < MIN_ALIKE:
+            reached = f"{reached} {STILL_OTHER}"
+        return reached + describe_losses(context)
 
     rows = select_testing(scored)
     before = average(row.psnr_before for row in rows) or 0.0
@@ -242,6 +244,16 @@ def describe_gain(
         gain = "stays as it was" if is_one else "stay as they were"
     place = f"where the scene covers {'it' if is_one else 'them'}"
     return f"{work}: {name_unused(rows)} {gain} {place} ({scores})"
+
+
+def describe_losses(context: Sequence[ScoreRow]) -> str:
+    """Describe in a clause what photographs lose, as where a scene is made anew of more of them."""
+    losses = [-compute_psnr_gain(row) for row in context]
+    losses = [loss for loss in losses if loss >= MIN_BETTER_GAIN]
+    if not losses:
+        return ""
+    lost = format_number(average(losses), 1)
+    return f", and {f'{len(losses)} lose' if len(losses) > 1 else '1 loses'} {lost} dB"
 
 
 def compute_psnr_gain(row: ScoreRow) -> float:
