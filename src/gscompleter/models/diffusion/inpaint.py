@@ -168,8 +168,8 @@ class DiffusersInpaint:
         """Synthesize the image of one target."""
         nearest = request.nearest
         observed = complete_warp(nearest, request.target, request.context)
-        # Depth is unsure at the rim of the hole: colours warped there shall neither lead the
-        # network nor be compared with what it gives back elsewhere. The image keeps them.
+        # Depth is unsure at the rim of the hole, so that colours warped there neither lead the
+        # network nor take part in the comparison. The image keeps them, as all that is known.
         hole = dilate(~observed.known, BORDER_WIDTH)
 
         def paint(seed: int) -> Float[Tensor, "h w 3"]:
