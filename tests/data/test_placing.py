@@ -13,7 +13,8 @@ from gscompleter.data.formats import open_photographs
 from gscompleter.data.masks import find_given
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.sfm import placing, poses
-from gscompleter.data.sfm.placing import identify_input, name_new, place_photographs
+from gscompleter.data.sfm.placing import NewCopy, identify_input, name_new, place_photographs
+from gscompleter.numerics.geometry import resize_camera
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.image import write_image
 from mapping_stand_in import stand_in
@@ -81,6 +82,46 @@ def test_new_photographs_are_placed_and_known_cameras_stay(known, new, tmp_path)
     assert np.array_equal(again.frames[7].c2w, joined.frames[7].c2w)
 
 
+def test_a_known_lens_and_a_guessed_one_share_no_camera(tmp_path):
+    pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
+    from gscompleter.data.sfm.placing_process import PlacingJob, extract_placing_features
+
+    pinhole = (60.0, 60.0, 32.0, 32.0)
+    of_copies = {"a.png": None, "b.png": pinhole, "c.png": pinhole, "d.png": None}
+    for name in of_copies:
+        Image.new("RGB", (64, 64), "grey").save(tmp_path / name)
+    job = PlacingJob(
+        images=str(tmp_path),
+        masks="",
+        work=str(tmp_path),
+        model="",
+        threads=1,
+        known=[],
+        new=[NewCopy(name, 64, 64, "lens", None, of, False) for name, of in of_copies.items()],
+        origin=[0.0, 0.0, 0.0],
+    )
+    cameras = extract_placing_features(job)
+    assert cameras["a.png"] == cameras["d.png"] != cameras["b.png"] == cameras["c.png"]
+
+
+# The test above has two such copies alone.
+@pytest.mark.slow
+def test_copies_of_one_size_from_photographs_of_two_have_cameras_of_their_own(
+    known, new, tmp_path, monkeypatch
+):
+    pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
+    # The first has the size of the known photographs, and so their lens. The other one is reduced
+    # to that size.
+    monkeypatch.setattr(placing, "MAX_COPY_SIDE", 160)
+    large = resize_camera(CAMERAS[NEW[1]], 320, 320)
+    write_image(new / f"new {NEW[1]}.png", view_of(Room(), large).image)
+    joined, placed = place_photographs(new, known, tmp_path / "colmap")
+    assert placed.failures == {}
+    for distance, angle in measure_errors(joined, 2):
+        assert distance < 0.05
+        assert angle < 0.5
+
+
 # `test_refining.py` has a far origin, and `test_poses.py` names what is not placed.
 @pytest.mark.slow
 def test_a_far_origin_does_not_matter_and_what_shows_something_else_is_named(known, new, tmp_path):
@@ -141,7 +182,7 @@ def test_reasons_follow_from_the_features_in_common(known, new, tmp_path, monkey
         {"is_placed": False, "like": "known/00003.png", "matches": 12},
         {"is_placed": False, "like": "known/00001.png", "matches": 80},
     ]
-    script = f"import json\nprint(json.dumps(dict(new={rows}, error=0.5)))"
+    script = f"import json\nprint(json.dumps(dict(new={rows})))"
     stand_in(monkeypatch, tmp_path, script)
     monkeypatch.setattr(placing, "PLACING_PROCESS", "stand_in_mapping")
     monkeypatch.setattr(poses, "find_spec", lambda name: True)

@@ -21,7 +21,9 @@ ColorSums = tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]
 """Per Gaussian: compositing weight times an image [h, w, 3], and weight, summed over pixels."""
 
 ColorErrors = Callable[[Float[Tensor, "n 3"], Float[Tensor, "h w 3"]], ColorSums]
-"""Backprojects the residual of a photograph [h, w, 3], at given colours [n, 3]."""
+"""Backprojects the residual of a photograph [h, w, 3]: photograph minus render of the frozen scene
+with Gaussians that vary in colour only. Their colours [n, 3] are RGB as the camera sees them, in
+place of SH; those below 0 count as 0. There is no gradient."""
 
 
 @runtime_checkable
@@ -65,12 +67,13 @@ class FrozenScene(Protocol):
         """
 
     def vary_colors(self, new: Gaussians) -> ColorErrors:
-        """Fix all of `new` but its colours, which the camera sees as given, from 0 up."""
+        """Fix all of `new` but its colours; sums are over the Gaussians of `new`."""
 
     def vary_depths(self, new: Gaussians) -> DepthRender:
         """Fix all of `new` but its z-depths.
 
-        Gaussians move along the camera's rays with constant footprint. The depth is differentiable.
+        Gaussians move along the camera's rays with constant footprint. The rendered depth is
+        differentiable; image and alpha need not be, as only the order of Gaussians changes them.
         """
 
 
@@ -79,7 +82,7 @@ class JointScene(Protocol):
     """A frozen scene that draws for two cameras at once, in nearly the time of one on a GPU."""
 
     def composite_beside(self, new: Gaussians, other: Camera) -> tuple[Render, Render]:
-        """Render the scene with `new`, and `new` alone from another camera."""
+        """Render the scene with `new`, and `new` alone from `other`; differentiable in `new`."""
 
 
 @runtime_checkable

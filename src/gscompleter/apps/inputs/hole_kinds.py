@@ -55,7 +55,11 @@ OBJECT_NOTE = (
 
 
 def choose_kind(
-    kind: str, scene: Gaussians, is_lifted: bool, given: Sequence[Camera], renderer: Renderer
+    kind: Literal["auto"] | HoleKind,
+    scene: Gaussians,
+    is_lifted: bool,
+    given: Sequence[Camera],
+    renderer: Renderer,
 ) -> HoleKind:
     """Choose what a hole is: of an object on nothing, only what it encloses.
 
@@ -108,7 +112,10 @@ def mark_selected(
     Raises an InputError if no target shows any.
     """
     others = scene.hide(chosen)
-    marks = [mark_shown(scene[chosen], others, camera, renderer) for camera in targets]
+    marks = [
+        mark_shown(scene[chosen], others, add_near_plane(target, scene.means), renderer)
+        for target in targets
+    ]
     if not any(mark.any() for mark in marks):
         raise InputError(
             "No target camera sees the selected Gaussians; name a camera that does.", "target"
@@ -144,9 +151,10 @@ def read_marks(
             "mask",
         )
     if not marked.any() or marked.all():
+        wrong, right = ("black", "white") if reading.is_inverted else ("white", "black")
         raise InputError(
             f"{shown} marks {'all' if marked.all() else 'nothing'} of its target; "
-            "paint white what is wrong, and black what is right.",
+            f"paint {wrong} what is wrong, and {right} what is right.",
             "mask",
         )
     mask = torch.from_numpy(marked).to(target.K.device)[None, None].float()

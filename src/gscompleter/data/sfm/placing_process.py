@@ -62,7 +62,7 @@ def main() -> None:
     model = register_new(job, cameras)
     placed = find_placed(job, model)
     write_placed(job, model, placed)
-    print(json.dumps(describe_placed(job, model, placed)))
+    print(json.dumps(describe_placed(job, placed)))
 
 
 def extract_placing_features(job: PlacingJob) -> dict[str, int]:
@@ -73,9 +73,12 @@ def extract_placing_features(job: PlacingJob) -> dict[str, int]:
             cameras[known.name] = database.write_camera(make_known_camera(known.pinhole, known))
 
         # New photographs of one lens share a camera, whose focal length they determine together.
-        numbers: dict[tuple[int, int, str], int] = {}
+        # Copies of one size may be of photographs of two, and only one of these sizes that of a
+        # known lens, by which its copies were undistorted.
+        numbers: dict[tuple[int, int, str, tuple[float, ...] | None], int] = {}
         for new in job.new:
-            lens = new.width, new.height, new.lens
+            pinhole = None if new.pinhole is None else tuple(new.pinhole)  # a list in JSON
+            lens = new.width, new.height, new.lens, pinhole
             if lens not in numbers:
                 numbers[lens] = database.write_camera(make_new_camera(new))
             cameras[new.name] = numbers[lens]
@@ -117,7 +120,9 @@ def register_new(job: PlacingJob, cameras: dict[str, int]) -> pycolmap.Reconstru
             pose = pycolmap.Rigid3d(pycolmap.Rotation3d(viewmat[:, :3]), viewmat[:, 3])
             model.add_image_with_trivial_frame(image, pose)
 
-    # The mapper continues the model of a folder.
+    # The mapper continues the model of a folder. Intrinsics of a new photograph that come from a
+    # known one of its lens are refined like guessed ones: focus changes the focal length, and
+    # without EXIF all photographs of one size count as of one lens.
     triangulated = Path(job.work) / "triangulated"
     mapped = Path(job.work) / "mapped"
     triangulated.mkdir()
@@ -147,7 +152,8 @@ def find_placed(job: PlacingJob, model: pycolmap.Reconstruction) -> dict[str, py
         image = images.get(copy.name)
         if image is None:
             continue
-        # A known lens may be an odd one; a lens that was guessed has to be a usual one.
+        # A known lens may be an odd one, and its copies have no distortion that could be judged; a
+        # lens that was guessed has to be a usual one.
         if copy.pinhole is not None or is_plausible(model.cameras[image.camera_id]):
             placed[copy.name] = image
     return placed
@@ -179,10 +185,8 @@ def shift_pose(image: pycolmap.Image, origin: Float[np.ndarray, "3"]) -> pycolma
     return pycolmap.Rigid3d(pose.rotation, pose.translation - rotation @ origin)
 
 
-def describe_placed(
-    job: PlacingJob, model: pycolmap.Reconstruction, placed: dict[str, pycolmap.Image]
-) -> dict[str, Any]:
-    """Describe what became of each new photograph.
+def describe_placed(job: PlacingJob, placed: dict[str, pycolmap.Image]) -> dict[str, Any]:
+    """Describe what became of each new photograph, in the order of the job.
 
     `matches` are the features that fit one known photograph best, and `like` is its name.
     """
@@ -198,7 +202,7 @@ def describe_placed(
             like = max(counts, key=lambda name: counts[name])
             is_placed = copy.name in placed
             rows.append({"is_placed": is_placed, "like": like, "matches": counts[like]})
-    return {"new": rows, "error": float(model.compute_mean_reprojection_error())}
+    return {"new": rows}
 
 
 def count_matches(database: pycolmap.Database, one: int, other: int) -> int:

@@ -168,7 +168,8 @@ class DiffusersInpaint:
         """Synthesize the image of one target."""
         nearest = request.nearest
         observed = complete_warp(nearest, request.target, request.context)
-        # The rim of the hole is painted too, so that the colours of both can be compared there.
+        # Depth is unsure at the rim of the hole, so that colours warped there neither lead the
+        # network nor take part in the comparison. The image keeps them, as all that is known.
         hole = dilate(~observed.known, BORDER_WIDTH)
 
         def paint(seed: int) -> Float[Tensor, "h w 3"]:
