@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from command import run
-from gscompleter import InputError
+from gscompleter import InputError, completer
 from gscompleter.data.frame import Frame
 from gscompleter.data.photographs import Photographs
 from gscompleter.evaluation import methods, steps, store
@@ -96,9 +96,14 @@ def few_clusters():
 
 @pytest.fixture(scope="module", autouse=True)
 def small_holes():
-    """Accept the small holes of this room, of about 45 to 60 pixels."""
+    """Accept the small holes of this room, of about 45 to 60 pixels.
+
+    In an image of 32 pixels the hole of the next target is a thin gap beside the one before, which
+    would close it.
+    """
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scores, "MIN_DEPTH_PIXELS", 40)
+        patch.setattr(completer, "are_worth_closing", lambda gaps: False)
         yield
 
 

@@ -201,9 +201,8 @@ class SceneOptions(ComputeOptions, WritingOptions, MaskOptions):
     drop_nonfinite: bool = False
     """Drop Gaussians that contain NaN or infinity instead of refusing the file."""
     forget_edits: bool = False
-    """Do without the record of earlier commands: use photographs also where they show what was
-    removed from the splat, or marked as wrong, so that it may come back; and keep a splat that
-    complete reconstructed from other photographs, where complete and update make it anew."""
+    """Forget earlier edits: photographs may bring back what was removed or marked as wrong, and no
+    scene is made anew."""
     ignore_properties: bool = False
     """Go on with a splat whose further properties change what is seen, such as a moving one."""
 

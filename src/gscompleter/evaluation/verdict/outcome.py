@@ -229,7 +229,7 @@ def describe_gain(
         reached = f"{work}: {gain} {gains} dB, to {format_number(after, 1)} dB"
         if after < MIN_ALIKE:
             reached = f"{reached} {STILL_OTHER}"
-        return reached + describe_losses(context)
+        return reached + describe_lost_photographs(context)
 
     rows = select_testing(scored)
     before = average(row.psnr_before for row in rows) or 0.0
@@ -246,7 +246,7 @@ def describe_gain(
     return f"{work}: {name_unused(rows)} {gain} {place} ({scores})"
 
 
-def describe_losses(context: Sequence[ScoreRow]) -> str:
+def describe_lost_photographs(context: Sequence[ScoreRow]) -> str:
     """Describe in a clause what photographs lose, as where a scene is made anew of more of them."""
     losses = [-compute_psnr_gain(row) for row in context]
     losses = [loss for loss in losses if loss >= MIN_BETTER_GAIN]
