@@ -67,10 +67,10 @@ FEW = [
 
 
 MOST = {
-    "complete": (2970, 1_780_000),
+    "complete": (3240, 1_967_000),
     "complete, alone": (1320, 6_500_000),
     "complete, mask": (2070, 6_000_000),
-    "complete, painted": (970, 1_550_000),
+    "complete, painted": (1165, 1_550_000),
     "update": (1190, 1_230_000),
     "repair": (2040, 2_250_000),
     "remove, mask": (1800, 1_900_000),
