@@ -246,7 +246,7 @@ def test_launches_grow_with_rows_and_columns_and_the_host_waits_once():
 def test_the_estimate_of_a_search_holds_what_a_device_counts(
     monkeypatch, size, planes, count, part
 ):
-    """Where parts are small. Of large ones not all arrays are there at once."""
+    """Compare where parts are small: of large ones not all arrays are there at once."""
     monkeypatch.setattr(tensor_stereo, "PART_BYTES", part)
     monkeypatch.setattr(matching, "GROUP_CELLS", count * size[0] * size[1] * planes)
     with fake_cuda():

@@ -16,15 +16,15 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.config.settings import COVERED
-from gscompleter.editing.replacing import Contested, drop_rows, mark_rendered
+from gscompleter.editing.replacing import Contested, drop_rows, mark_rendered, render_at_views
 from gscompleter.generators.exposure import compute_median_ratio
-from gscompleter.numerics.image_ops import take_exposure
 from gscompleter.parts import EarlierWork, PartOrigin, make_part
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.render.protocols import Renderer
 from gscompleter.stages.context import InitialContext, reconstruct_context, sort_by_frame
+from gscompleter.stages.new_photos import compute_error
 from gscompleter.state import Completion, Photo
-from gscompleter.types import SH_C0, ContextScene, Gaussians, Render, View, merge
+from gscompleter.types import SH_C0, ContextScene, Render, View, merge
 
 
 def remake_scene(
@@ -46,7 +46,7 @@ def remake_scene(
     if earlier.remade is None:
         return None
     views = sort_by_frame(views)  # as those of `state` are
-    given = render_at_all(merge(state.parts), views, renderer)
+    given = list(render_at_views(merge(state.parts), views, renderer))
     made = reconstruct_context(reconstructor, views, has_scene_range=has_scene_range)
     gone = mark_rendered(state.source, earlier.remade)
     if contested is not None:
@@ -54,7 +54,7 @@ def remake_scene(
     if not gone.all():
         # What was invented and stays has the exposure of the given scene. Else the new one keeps
         # its own, in which no photograph is brightened until it is clipped.
-        shown = render_at_all(made.source.gaussians, views, renderer)
+        shown = list(render_at_views(made.source.gaussians, views, renderer))
         made = multiply_exposure(made, views, measure_exposure(given, shown, views))
     part = make_part(PartOrigin("photographs"), made.source.gaussians)
     # The scene has one exposure, which photographs of the context share from here on.
@@ -67,25 +67,16 @@ def remake_scene(
         context_notes=(*state.context_notes, *made.notes),
         is_remade=True,
     )
-    new = render_at_all(merge(begun.parts), made.views, renderer)
+    new = list(render_at_views(merge(begun.parts), made.views, renderer))
     is_nearer = compute_psnrs(new, made.views).mean() > compute_psnrs(given, made.views).mean()
     return begun if is_nearer else None
 
 
-def render_at_all(scene: Gaussians, views: Sequence[View], renderer: Renderer) -> list[Render]:
-    """Render a scene at the cameras of photographs."""
-    return [renderer.render(scene, view.camera) for view in views]
-
-
 def compute_psnrs(renders: Sequence[Render], views: Sequence[View]) -> Float[Tensor, "v"]:
-    """Compute the PSNR of each photograph apart from its exposure, in dB.
-
-    Pixels that are ignored count as right.
-    """
-    errors = []
-    for render, view in zip(renders, views, strict=True):
-        image = take_exposure(render.image, view.image, view.valid_mask).clamp(0, 1)
-        errors.append((view.fill_ignored(image) - view.image).square().mean())
+    """Compute the PSNR of each photograph apart from its exposure, in dB."""
+    errors = [
+        compute_error(render.image, view) for render, view in zip(renders, views, strict=True)
+    ]
     return -10 * torch.stack(errors).clamp_min(1e-10).log10()
 
 

@@ -248,9 +248,16 @@ def render_all(
     state: Completion, views: Sequence[View], renderer: Renderer
 ) -> Iterator[Float[Tensor, "_ _ 3"]]:
     """Render the whole scene at each photograph."""
-    scene = merge(state.parts)
+    for render in render_at_views(merge(state.parts), views, renderer):
+        yield render.image
+
+
+def render_at_views(
+    scene: Gaussians, views: Sequence[View], renderer: Renderer
+) -> Iterator[Render]:
+    """Render a scene at the cameras of photographs."""
     for view in views:
-        yield renderer.render(scene, view.camera).image
+        yield renderer.render(scene, view.camera)
 
 
 def fade_before_returned(

@@ -137,20 +137,6 @@ def keep_thin(mask: Bool[Tensor, "h w"], radius: int = THIN_RADIUS) -> Bool[Tens
     return mask & ~dilate(shrunk, radius + 1)
 
 
-def take_exposure(
-    image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"], counted: Bool[Tensor, "h w"]
-) -> Float[Tensor, "h w 3"]:
-    """Multiply each channel by the factor that brings it nearest to another image.
-
-    By least squares over the pixels that are `counted`; a channel that is black there stays.
-    """
-    seen = image[counted]
-    energy = seen.square().sum(dim=0)
-    products = (seen * truth[counted]).sum(dim=0)
-    gain = torch.where(energy > 0, products / energy.clamp_min(1e-12), 1.0)
-    return image * gain
-
-
 def label_regions(mask: Bool[Tensor, "h w"]) -> tuple[Int64[Tensor, "h w"], int]:
     """Label the connected regions of `mask` (8 neighbours) from 1, and count the labels with 0."""
     pixels = mask.cpu().numpy().astype(np.uint8)

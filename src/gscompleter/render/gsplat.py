@@ -37,7 +37,7 @@ T = TypeVar("T")
 
 
 class LastView:
-    """What was computed of the frozen scene that was used last.
+    """Keep what was computed of the frozen scene that was used last.
 
     The same of all frozen scenes at once would be most of the memory of a GPU, and several steps in
     turn use it of one.
@@ -410,7 +410,7 @@ class TileSelection:
 
 @dataclass(frozen=True)
 class SeenPart:
-    """What a camera sees of a part of a scene; all but the colours is shared with that."""
+    """Hold what a camera sees of a part of a scene; all but the colours is shared with that."""
 
     geometry: Gaussians
     """The whole part, without colours."""

@@ -26,7 +26,7 @@ WIDTHS = (40, 106)
 BORDERS = 4
 """Characters beside the text of a line in a box."""
 PLAIN_BOX = str.maketrans("╭╮╰╯─│•", "++++-|*")
-"""What is printed for the characters of boxes where the encoding of the output lacks them."""
+"""Plain characters to print for those of boxes, where the encoding of the output lacks them."""
 
 
 def format_command_list(names: Sequence[str]) -> str:

@@ -7,6 +7,8 @@ from dataclasses import asdict, dataclass, replace
 from types import MappingProxyType
 from typing import Any
 
+import torch
+
 from gscompleter.apps.inputs.task import Target
 from gscompleter.apps.report.schema import (
     SCORES,
@@ -19,7 +21,7 @@ from gscompleter.apps.report.schema import (
 )
 from gscompleter.editing.removal import hide_removed
 from gscompleter.evaluation.metrics.coverage import RenderPair
-from gscompleter.evaluation.metrics.fitted_camera import measure_fitted
+from gscompleter.evaluation.metrics.fitted_camera import fit_gains, measure_fitted
 from gscompleter.evaluation.metrics.image import compute_masked_psnr, ssim
 from gscompleter.evaluation.metrics.thin_gaps import (
     AT_TARGET,
@@ -37,7 +39,7 @@ from gscompleter.evaluation.verdict.held_out import (
 )
 from gscompleter.evaluation.verdict.outcome import judge_completion
 from gscompleter.evaluation.verdict.rows import ScoreRow
-from gscompleter.numerics.image_ops import compute_mask_fraction, take_exposure
+from gscompleter.numerics.image_ops import compute_mask_fraction
 from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.reconstructors.features.consistency import measure_pose_errors
 from gscompleter.render.protocols import Renderer
@@ -136,8 +138,10 @@ def score_views(
         pair = draw(view)
         if completion.is_remade and shown is not None:
             # The photographs have the exposure of the new scene, not that of the given one.
-            matched = take_exposure(pair.before.image, shown.image, shown.valid_mask)
-            pair = replace(pair, before=replace(pair.before, image=matched))
+            before = pair.before.image
+            arrays = (tensor.cpu().numpy() for tensor in (before, shown.image, shown.valid_mask))
+            gains = torch.from_numpy(fit_gains(*arrays)).to(before)
+            pair = replace(pair, before=replace(pair.before, image=before * gains))
         return compute_scores(pair, shown)
 
     map_views = get_view_map(completion.context.means, len(completion.context))
