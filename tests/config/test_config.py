@@ -19,6 +19,7 @@ from gscompleter.config import (
     load_config,
 )
 from gscompleter.config.settings import validate
+from gscompleter.config.yaml_file import read_yaml
 from gscompleter.evaluation.methods import METHODS
 from gscompleter.system.errors import InputError
 from paths import ROOT
@@ -122,11 +123,19 @@ def test_a_whole_number_is_a_float_and_an_empty_file_changes_nothing(tmp_path):
     assert load_config(str(file)) == CompleterConfig()
 
 
-@pytest.mark.parametrize("text", ["1e-3", "1E-3", "+1e-3", "0.1e-2", "1.0e-3", "1_0e-4", "00.001"])
+@pytest.mark.parametrize(
+    "text", ["1e-3", "1E-3", "+1e-3", "0.1e-2", "1.0e-3", "1_0e-4", ".1e-2", "00.001"]
+)
 def test_a_small_number_is_written_in_any_way(tmp_path, text):
     file = tmp_path / "mine.yaml"
     file.write_text(f"margin: {text}")
     assert load_config(str(file)).margin == pytest.approx(0.001)
+
+
+def test_a_name_that_begins_as_a_number_is_a_name(tmp_path):
+    file = tmp_path / "mine.yaml"
+    file.write_text("guards: [3e4_guards.py:Guard, 1e5abc]")
+    assert read_yaml(file) == {"guards": ["3e4_guards.py:Guard", "1e5abc"]}
 
 
 def refused(path: Path, text: str, sentence: str) -> None:

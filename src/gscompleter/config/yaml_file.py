@@ -21,8 +21,9 @@ MAX_REASON_LENGTH = 120
 """Characters of a sentence of PyYAML that are shown."""
 FLOAT_TAG = "tag:yaml.org,2002:float"
 INT_TAG = "tag:yaml.org,2002:int"
-EXPONENT = re.compile(r"[-+]?[0-9][0-9_]*(\.[0-9_]*)?[eE][-+]?[0-9]+")
-"""Numbers that PyYAML takes for texts: YAML 1.1, which it reads, wants a dot and a sign."""
+EXPONENT = re.compile(r"[-+]?([0-9][0-9_]*(\.[0-9_]*)?|\.[0-9][0-9_]*)[eE][-+]?[0-9]+$")
+"""Numbers that PyYAML takes for texts: YAML 1.1, which it reads, wants a dot and a sign. Without
+the end, a text that begins as a number would be taken for one."""
 SIXTIETHS = re.compile(r".*:")
 """Beginning of numbers that YAML 1.1 reads by hours, minutes and seconds: 1:30 is 90."""
 OCTAL = re.compile(r"[-+]?0[0-9_]")
@@ -34,13 +35,16 @@ class SettingsLoader(yaml.SafeLoader):
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         """Construct a mapping; a name that is there twice is refused, as PyYAML keeps the last."""
-        names: set[object] = set()
+        names: set[str] = set()
         # A tag such as !!map may be before anything, which the loader refuses.
         for key, _ in node.value if isinstance(node, yaml.MappingNode) else ():
-            if isinstance(key, yaml.ScalarNode) and key.value in names:
+            # Other nodes, lists and mappings, are no names, and the loader refuses them.
+            if not isinstance(key, yaml.ScalarNode):
+                continue
+            if key.value in names:
                 problem = f"'{quote_value(key.value)}' is there twice"
                 raise ConstructorError(None, None, problem, key.start_mark)
-            names.add(key.value if isinstance(key, yaml.ScalarNode) else key)
+            names.add(key.value)
         return super().construct_mapping(node, deep)
 
     def construct_int(self, node: yaml.ScalarNode) -> int:
@@ -57,7 +61,7 @@ class SettingsLoader(yaml.SafeLoader):
 
 SettingsLoader.add_constructor(INT_TAG, SettingsLoader.construct_int)
 SettingsLoader.add_constructor(FLOAT_TAG, SettingsLoader.construct_float)
-SettingsLoader.add_implicit_resolver(FLOAT_TAG, EXPONENT, list("-+0123456789"))
+SettingsLoader.add_implicit_resolver(FLOAT_TAG, EXPONENT, list("-+.0123456789"))
 
 
 def refuse_number(node: yaml.ScalarNode, form: re.Pattern[str]) -> None:
