@@ -142,6 +142,19 @@ def test_damaged_photographs_are_passed_over(tmp_path):
     assert overlap(view.ignore_mask, bonnet()) > 0.85
 
 
+def test_nothing_is_found_in_strips(tmp_path):
+    """The small copies of strips, as line sensors take them, are one pixel wide."""
+    strips = [
+        replace(camera, width=4 * SIZE, height=1)
+        for camera in (camera_at(z=STEP * n, size=SIZE) for n in range(COUNT))
+    ]
+    names = [f"{number:02}.png" for number in range(COUNT)]
+    for name in names:
+        write_image(tmp_path / name, torch.rand(1, 4 * SIZE, 3))
+    write_cameras(tmp_path / "transforms.json", strips, names)
+    assert open_photographs(tmp_path).views([0])[0].ignore_mask is None
+
+
 def test_it_can_be_switched_off(clip):
     assert CompleterConfig().ego_mask
     assert not CompleterConfig.paper().ego_mask

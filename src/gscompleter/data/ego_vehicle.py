@@ -67,7 +67,11 @@ OUTLINE_MARGIN = 1
 
 
 def attach_vehicle_detector(frames: Sequence[Frame]) -> tuple[Frame, ...]:
-    """Attach a lazy vehicle detector to each frame; those of one camera share it."""
+    """Attach a lazy vehicle detector to each frame; those of one camera share it.
+
+    The order of the frames is taken for that of time, as it is in a drive. In any other order the
+    steps between them have no steady direction, and nothing is found.
+    """
     cameras: dict[Hashable, list[Frame]] = {}
     for frame in frames:
         cameras.setdefault((frame.sensor, frame.intrinsics), []).append(frame)
@@ -77,7 +81,11 @@ def attach_vehicle_detector(frames: Sequence[Frame]) -> tuple[Frame, ...]:
 
 @lru_cache(maxsize=64)
 def detect_vehicle(frames: tuple[Frame, ...]) -> Bool[np.ndarray, "h w"] | None:
-    """Mask the vehicle in a small copy of the photographs of one of its cameras, if it is seen."""
+    """Mask the vehicle in a small copy of the photographs of one of its cameras, if it is seen.
+
+    `frames` are all of that camera in the order of time. None if no vehicle is found, whatever the
+    reason: damaged photographs are passed over.
+    """
     usable = [f for f in frames if find_pose_defect(f.c2w) is None and f.has_photograph()]
     if len(usable) < FEWEST:
         return None
@@ -97,7 +105,8 @@ def detect_vehicle(frames: tuple[Frame, ...]) -> Bool[np.ndarray, "h w"] | None:
     first = next(iter(small))
     images = np.stack(list(small.values()))
     size = first.size()
-    if first.find_defect(*size) is not None:
+    # The small copy of a strip is one pixel wide, which has no gradient.
+    if first.find_defect(*size) is not None or min(images.shape[1:]) < 2:
         return None
     pinhole = first.intrinsics.compute_pinhole(*size)
     return find_static_region(images, *predict_ground_flow(motion, pinhole, images.shape[1:]))
@@ -204,7 +213,7 @@ def find_static_region(
         top = max(first, int(outline.min()) - OUTLINE_CLEARANCE)
         fainter = trace_vehicle_outline(edges, top, limit, LENIENT)
         highest = np.minimum(highest, np.minimum(outline, fainter))
-        # The next outline has to lie above this one.
+        # The next outline has to lie above this one where it is rewarded, so that the loop ends.
         limit = np.where(highest < height, highest - OUTLINE_CLEARANCE, height)
     if (highest == height).all():
         return None
