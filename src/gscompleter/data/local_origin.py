@@ -68,9 +68,10 @@ def compute_frame_from_photographs(origin: Float[np.ndarray, "3"]) -> Float[np.n
 def choose_scene_origin(scene: Gaussians, origin: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3"]:
     """Choose a scene's origin: `origin`, that of the photographs, if the scene lies near it.
 
-    Otherwise it is zero: a given splat may have been exported at a local origin already.
+    Otherwise it is zero: a given splat may have been exported at a local origin already. It has a
+    Gaussian at least, as every splat that is read.
     """
-    if len(scene) == 0 or not origin.any():
+    if not origin.any():
         return origin
     # The median ignores floaters.
     middle = scene.means.median(dim=0).values.double().cpu().numpy()
@@ -82,8 +83,9 @@ def shift_to_origin(
 ) -> Gaussians:
     """Express a scene relative to `origin`, in scene units.
 
-    `cameras` are relative to it already. The means of a scene were rounded to float32 in its file,
-    which cannot be undone: raise InputError if the steps there are too coarse for the cameras.
+    `cameras`, one at least, are relative to it already. The means of a scene were rounded to
+    float32 in its file, which cannot be undone: raise InputError if the steps there are too coarse
+    for the cameras.
     """
     if not origin.any():
         return scene

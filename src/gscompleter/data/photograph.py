@@ -57,14 +57,18 @@ class Optics(NamedTuple):
     """What EXIF says of the lens of a photograph."""
 
     lens: str
-    """Key of camera, lens and zoom; photographs with the same one share intrinsics."""
+    """Key of camera, lens and zoom; photographs of one size with the same one share intrinsics."""
     focal: float | None
     """Focal length in image diagonals, or None."""
 
 
 @dataclass(frozen=True)
 class StoredPhotograph:
-    """A photograph in a file of its own, or among others in a container."""
+    """Hold a photograph in a file of its own, or among others in a container.
+
+    Its size, optics and pixels raise InputError where the file is damaged or gone. The orientation
+    and `has_alpha` do not: they are then 1 and False, as reading the pixels reports the error.
+    """
 
     source: Path | Callable[[], bytes]
     """An existing file, or a function that reads the bytes of one from its container."""
@@ -126,7 +130,10 @@ class StoredPhotograph:
 
 
 def read_lens(exif: Image.Exif) -> str:
-    """Read the key of camera, lens and zoom; photographs with the same one share intrinsics."""
+    """Read the key of camera, lens and zoom, which share intrinsics at one size.
+
+    All photographs without EXIF have the same key, since most come from one camera.
+    """
     detail = exif.get_ifd(EXIF)
     values = (
         exif.get(MAKE),
@@ -138,7 +145,7 @@ def read_lens(exif: Image.Exif) -> str:
 
 
 def read_focal(exif: Image.Exif) -> float | None:
-    """Read the focal length in image diagonals from the 35 mm equivalent; None if there is none."""
+    """Read the focal length in image diagonals from the 35 mm equivalent; None if unknown."""
     try:
         millimetres = float(exif.get_ifd(EXIF)[FOCAL_LENGTH_35])
     except (KeyError, TypeError, ValueError, ZeroDivisionError):  # broken values are common

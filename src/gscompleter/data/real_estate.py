@@ -127,8 +127,8 @@ def _read_index(index: Path) -> dict[str, str]:
     chunks = list(content.values()) if isinstance(content, dict) else []
     require(
         chunks and all(isinstance(chunk, str) for chunk in chunks),
-        f"{index} is no index of chunks: it has to map the key of each scene to the name of its "
-        ".torch file.",
+        f"{quote_value(index)} is no index of chunks: it has to map the key of each scene to the "
+        "name of its .torch file.",
     )
     return dict(content)
 

@@ -33,6 +33,7 @@ class GeneratedView(View):
     is_inconsistent: bool = False
     """True if the image is photometrically inconsistent with the photographs."""
     is_photograph: bool = False
+    """True if it is a true photograph, which may recolour all that it shows."""
     painter: str = ""
     """Who painted it elsewhere; empty for Φ itself."""
 
@@ -48,8 +49,8 @@ def make_generator_input(view: TargetView) -> GeneratorInput:
     forced = view.masks.edits.forced
     render = view.render
     alpha = view.alpha
-    # Φ takes as holes what has too little alpha, which is more than the holes of an object, or
-    # those of a removal.
+    # Φ takes as holes all pixels with too little alpha. Around an object, and away from what was
+    # removed, there are such pixels that are no holes: they get full alpha.
     if config.kind == "enclosed" or opened is not None:
         alpha = alpha.where(view.holes, 1.0)
     # What stands in a forced hole is wrong, so that Φ must not see it.
@@ -66,7 +67,11 @@ def synthesize(
     inputs: Sequence[tuple[Camera, GeneratorInput]],
     synthesis: SynthesisConfig = SynthesisConfig(),
 ) -> list[GeneratedView]:
-    """Synthesize `Ĩ_t = Φ(I_n, P_t)` for targets in one call of Φ (paper, Eq. 6)."""
+    """Synthesize `Ĩ_t = Φ(I_n, P_t)` for targets in one call of Φ (paper, Eq. 6).
+
+    `inputs` are the targets, padded or not, each with its input of Φ; the views are in their order.
+    InputError is raised if Φ returns anything else than it has to, or writes into its input.
+    """
     if not inputs:
         return []
     requests = []
@@ -111,7 +116,7 @@ def fingerprint(request: GeneratorRequest) -> tuple[object, ...]:
 
 
 def convert_output(output: object, target: Camera) -> GeneratedView:
-    """Convert the output of a generator to a view, after checking its size and values."""
+    """Convert the output of a generator to a view; InputError if it is not what it has to be."""
     if not isinstance(output, GeneratorOutput):
         raise InputError(
             f"The generator has to return a GeneratorOutput per request, and returned "

@@ -80,8 +80,8 @@ def write_report(
     )
     write_scenes(folder, completion, input_splat, run, edit or EditDraft("complete"))
     around = render_around()
-    name_view = "ignored" if run_info.get("scene", {}).get("renders_from") is None else "render"
-    write_pictures(folder / IMAGES_FOLDER, completion, targets, at_targets, name_view)
+    has_renders = run_info.get("scene", {}).get("renders_from") is not None
+    write_pictures(folder / IMAGES_FOLDER, completion, targets, at_targets, has_renders)
     for number, found in enumerate(gaps, start=1):
         write_pixels(folder / IMAGES_FOLDER / f"target{number}_gaps.png", draw_gap(found.worst))
     removal = draw_removal(completion, renderer, files)

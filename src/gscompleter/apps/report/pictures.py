@@ -29,22 +29,28 @@ def write_pictures(
     completion: Completion,
     targets: Sequence[Target],
     at_targets: Sequence[RenderPair],
-    name_view: str = "ignored",
+    has_renders: bool = False,
 ) -> None:
-    """Write `images/`: targets, and photographs with ignored regions, or all renders of a splat."""
+    """Write pictures of the targets and of photographs with ignored regions to `folder`.
+
+    `at_targets` are the scene before and after at the targets, in their order. With `has_renders`,
+    renders of a splat took the place of the photographs: all of them are written.
+    """
     results = zip(targets, completion.targets, at_targets, strict=True)
     for number, (target, result, pair) in enumerate(results, start=1):
         images = name_target_images(target, result, pair, completion.config.holes.dilation)
         write_images(folder, f"target{number}", images)
+    ending = "render" if has_renders else "ignored"
     for number, view in enumerate(completion.views, start=1):
-        if view.ignore_mask is not None or name_view == "render":
-            write_images(folder, f"context{number}", {name_view: paint_ignored(view)})
+        if has_renders or view.ignore_mask is not None:
+            write_images(folder, f"context{number}", {ending: paint_ignored(view)})
 
 
 def write_what_is_drawn(folder: Path, views: Sequence[View], draw: Drawing) -> Drawing:
-    """Return a `draw` that also writes photographs, and the scene before and after there.
+    """Return a `draw` that also writes the photograph and both renders of what it draws.
 
-    They are numbered from 1. So no image has to be kept, or rendered twice.
+    `views` are all views that it may be asked for, the same objects, and number the files from 1.
+    So no image has to be kept, or rendered twice.
     """
 
     def draw_and_write(view: View) -> RenderPair:
@@ -89,9 +95,10 @@ def paint_reference(result: TargetResult, dilation: int) -> Float[Tensor, "h w 3
 def name_target_images(
     target: Target, result: TargetResult, pair: RenderPair, dilation: int
 ) -> dict[str, Tensor | None]:
-    """Name the images of a target: colours [h, w, 3], grey or masks [h, w].
+    """Name the images of a target: colours [h, w, 3], or grey and masks [h, w]; None to have none.
 
-    `dilation` is that of the hole mask, in pixels.
+    `dilation` is that of the hole mask, in pixels. `support` is the trusted part of the scene's
+    alpha, which tells nothing where all of it is trusted.
     """
     alpha = result.trusted_alpha
     return {
@@ -106,7 +113,7 @@ def name_target_images(
 
 
 def write_images(folder: Path, name: str, images: Mapping[str, Tensor | None]) -> None:
-    """Write the images that there are, in parallel, as `{name}_{ending}.png`."""
+    """Write images by their endings, in parallel, as `{name}_{ending}.png`; None is left out."""
     known = {ending: image for ending, image in images.items() if image is not None}
     paths = [folder / f"{name}_{ending}.png" for ending in known]
     map_in_parallel(write_image, paths, known.values())
@@ -115,7 +122,7 @@ def write_images(folder: Path, name: str, images: Mapping[str, Tensor | None]) -
 def join_images(
     pictures: Sequence[Float[Tensor, "h _w 3"]], gap: int = 4
 ) -> Float[Tensor, "h wide 3"]:
-    """Join images of one height side by side on white."""
+    """Join images of one height side by side on white, `gap` pixels apart, on the CPU."""
     white = torch.ones((pictures[0].shape[0], gap, 3))
     parts = [part for picture in pictures for part in (white, picture.cpu().clamp(0, 1))]
     return torch.cat(parts[1:], dim=1)

@@ -20,6 +20,7 @@ class PublishedWeights:
     name: str
     """Our name: model, size, training data, and the image size unless it is 256x256."""
     model: str
+    """Name that the authors gave their model."""
     network: str | None
     """Configuration that fits the tensors, or None if unknown."""
     repository: str | None
@@ -36,9 +37,11 @@ class PublishedWeights:
     views: tuple[int, int]
     """Smallest and largest number of views in training."""
     image_size: tuple[int, int] = (256, 256)
+    """Height and width of the images in training, in pixels."""
     near_far: tuple[float, float] | None
     """Depth range of the authors' evaluation in scene units, if known."""
     code: str
+    """URL of the authors' code."""
     code_licence: str = "MIT"
     """Licence of that code; ours is independent of it."""
     weights_licence: str = UNSTATED
@@ -120,8 +123,6 @@ VOLSPLAT = PublishedWeights(
     source="https://huggingface.co/lhmd/VolSplat",
 )
 
-# Number of parameters by ViT size, number of scales, upsampling factor, and full resolution over
-# that of the coarsest features.
 PARAMETERS = {
     "small-s1-u4-l4": 38_346_416,
     "small-s1-u8-l8": 38_404_880,
@@ -130,6 +131,8 @@ PARAMETERS = {
     "large-s2-u2-l4": 354_337_760,
     "depth-base-s2-u4-l8": 111_229_753,
 }
+"""Number of parameters by configuration: ViT size, number of scales, upsampling factor, and full
+resolution over that of the coarsest features."""
 
 
 def _create_depthsplat(
@@ -163,7 +166,7 @@ def _create_depth_anything(
 ) -> PublishedWeights:
     return PublishedWeights(
         name=name,
-        model=repository.upper(),
+        model=repository,
         network=name,
         repository=f"depth-anything/{repository}",
         file="model.safetensors",

@@ -29,6 +29,7 @@ class StereoImage:
     rotation: Float[np.ndarray, "3 3"]
     """Rotation from camera to world axes."""
     center: Float[np.ndarray, "3"]
+    """Camera centre in world axes, relative to that of the first view."""
     given: Float32[np.ndarray, "h w"]
     """Inverse depths that are given, 0 where unknown."""
     ignore_mask: Bool[np.ndarray, "h w"] | None = None
@@ -44,8 +45,8 @@ def make_stereo_images(views: Sequence[View]) -> tuple[list[StereoImage], float]
     """Convert views to units of their widest baseline; return it in scene units too.
 
     Camera offsets are rounded to 2^-16 baselines, so that a scaled scene gives identical results.
-    The unit of a single view with given depth is its near plane. Raise InputError for another
-    single view, a tiny image, or no baseline.
+    The unit of a single view with given depth is its near plane, which has to be known. Raise
+    InputError for another single view, a tiny image, or no baseline.
     """
     is_single = len(views) == 1 and len(views[0].known_depths) > 0
     if len(views) < 2 and not is_single:
