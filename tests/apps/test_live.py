@@ -534,6 +534,18 @@ def page(splat_ready, splat_begun, journal, monkeypatch) -> LivePage:
     return built
 
 
+def test_a_page_is_named_by_the_splat_or_the_folder(splat_ready, splat, room, monkeypatch):
+    ready = splat_ready.scene
+    assert serving.name_session(ready) == splat.name
+    monkeypatch.chdir(room)
+    folder = decide_live(
+        options_for(Path("."), Path("../out"))
+    ).session.completion.source.scene.folder
+    source = replace(ready.source, scene=replace(ready.source.scene, folder=folder))
+    work = replace(ready.work, splat=None)
+    assert serving.name_session(replace(ready, source=source, work=work)) == room.name
+
+
 @pytest.fixture(autouse=True)
 def quick_end(monkeypatch) -> None:
     """Let a server notice at once that it is shut down; Python looks twice a second."""

@@ -154,6 +154,7 @@ def test_each_step_is_kept_at_once_and_a_session_goes_on(room, splat, tmp_path):
     again.ask("redo")
     third = Program(out)
     assert (len(third.session.steps), len(third.session.undone)) == (1, 2)
+    assert "1 step of the session is done again; go on" in third.page.channel.latest["text"]
     assert third.ask("redo")["steps"] == 2
     third.ask("redo")
     assert is_same(third.scene, begun.scene)

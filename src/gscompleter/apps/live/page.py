@@ -30,7 +30,8 @@ from gscompleter.system.errors import InputError
 from gscompleter.system.progress import notify_of_stages
 from gscompleter.types import Camera
 
-GOES_ON = "{} of the session are done again; go on, or undo them."
+GOES_ON = "{} steps of the session are done again; go on, or undo them."
+GOES_ON_ONE = "1 step of the session is done again; go on, or undo it."
 ALL_UNDONE = "All steps are undone: there is nothing to save, and the last Save stays as it is."
 NOT_KEPT = "This step is not kept on the disk: {}"
 WELCOME = "Fly to a hole and press “Complete here”, or paint over what is wrong and press “Repair”."
@@ -103,8 +104,8 @@ class LivePage:
             "save": self.save,
         }
         self._describe_scene()
-        done = f"{count} step{'s' if count > 1 else ''}"
-        self.tell(WELCOME if count == 0 else GOES_ON.format(done), is_busy=False)
+        greetings = {0: WELCOME, 1: GOES_ON_ONE}
+        self.tell(greetings.get(count, GOES_ON.format(count)), is_busy=False)
 
     def get_chunk(self, name: str) -> bytes | None:
         """Return Gaussians that a step brought, as .spz; None if there is no such chunk."""
@@ -139,7 +140,7 @@ class LivePage:
         request.check_box()
         box = request.box
         if box is not None:
-            # The page counts from the origin of the result.
+            # The page counts from the origin of the result, a step from that of the splat's file.
             origin = self.session.splat_origin
             box = tuple((np.array(box) + np.tile(origin, 2)).tolist())
         camera = save_camera(self.session, request.read_camera())

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import webbrowser
 from contextlib import suppress
+from pathlib import Path
 
 from PIL import Image
 from rich.console import Console
@@ -97,8 +99,9 @@ def build_page(
     console: Console,
     journal: Journal,
 ) -> LivePage:
-    """Build the page of a session."""
+    """Build the page of a session, and print notes on what it cannot show."""
     ready = prepared.scene
+    # Without what was added or changed: the page gets the steps as differences.
     scene = session.latest.context
     kind = "Photograph" if ready.opened.renders_from is None else "View"
     shots = [
@@ -110,9 +113,8 @@ def build_page(
         )
         for view in session.latest.views
     ]
-    splat = ready.work.splat
-    title = ready.source.scene.folder if splat is None else splat.path
-    content = ViewerContent(title.name, scene, scene, tuple(shots))
+    # At first the states before and after are the same.
+    content = ViewerContent(name_session(ready), scene, scene, tuple(shots))
     page, notes = make_page(content, libraries, is_live=True)
     print_lines(console, *notes)
     return LivePage(
@@ -123,6 +125,14 @@ def build_page(
         lambda session: save_session(prepared, session),
         journal,
     )
+
+
+def name_session(ready: Prepared) -> str:
+    """Name a session by its splat, or by the folder of its photographs."""
+    splat = ready.work.splat
+    path = ready.source.scene.folder if splat is None else splat.path
+    # "." has no name of its own. A link keeps its name.
+    return Path(os.path.abspath(path)).name
 
 
 def serve(request: LiveRequest, page: LivePage) -> None:
