@@ -132,7 +132,7 @@ class StoredPhotograph:
 def read_lens(exif: Image.Exif) -> str:
     """Read the key of camera, lens and zoom, which share intrinsics at one size.
 
-    All photographs without EXIF have the same key, since most come from one camera.
+    All photographs without EXIF have the same key.
     """
     detail = exif.get_ifd(EXIF)
     values = (
