@@ -18,7 +18,7 @@ from gscompleter.apps.requests.models import ModelRequest
 from gscompleter.apps.requests.splat import SplatRequest
 from gscompleter.splats.edits import EditDraft, Edits, read_edits, record_edit
 from gscompleter.splats.row_kinds import count_row_kinds
-from gscompleter.stages.add_observed import MAX_RECONSTRUCTED, MAX_STEREO_PIXELS
+from gscompleter.stages.add_observed import MAX_RECONSTRUCTED, MAX_STEREO_PHOTOS, MAX_STEREO_PIXELS
 from scenes import camera_at, photographed, random_gaussians
 
 CAMERAS = [camera_at(x=0.25 * k - 0.875, y=0.1 * (k % 3), size=128) for k in range(8)]
@@ -77,7 +77,10 @@ def test_photographs_are_joined_if_they_are_not_too_many():
     assert join_photographs((0, 1, 2), (1, 2), set(), 640 * 360) == ()
     many = tuple(range(MAX_RECONSTRUCTED + 1))
     assert join_photographs((0,), many, set(), 1) == ()
-    assert join_photographs((0,), (1, 2, 3), set(), MAX_STEREO_PIXELS // 3) == ()
+    # Large ones are as many as a first command reconstructs.
+    large = tuple(range(MAX_STEREO_PHOTOS))
+    assert join_photographs((0,), large, set(), MAX_STEREO_PIXELS) == large
+    assert join_photographs((0,), (*large, 8), set(), MAX_STEREO_PIXELS) == ()
 
 
 @pytest.mark.parametrize(

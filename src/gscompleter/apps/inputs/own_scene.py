@@ -14,7 +14,7 @@ from gscompleter.apps.requests.completion import WorkRequest
 from gscompleter.splats.edits import Edit, read_edits
 from gscompleter.splats.formats import detect_splat_format
 from gscompleter.splats.row_kinds import tells_kinds
-from gscompleter.stages.add_observed import MAX_RECONSTRUCTED, MAX_STEREO_PIXELS
+from gscompleter.stages.add_observed import limit_part_photos
 
 ADDING_COMMANDS = ("complete", "update")
 """Commands that only add. What others took out, photographs still show: Ψ would bring it back."""
@@ -68,7 +68,6 @@ def join_photographs(
     none if there is nothing new, or too much for one reconstruction.
     """
     joined = sorted({*own, *chosen} - scoring)
-    most = min(MAX_RECONSTRUCTED, MAX_STEREO_PIXELS // pixels)
-    if set(joined) <= set(own) or len(joined) > most:
+    if set(joined) <= set(own) or len(joined) > limit_part_photos(pixels):
         return ()
     return tuple(joined)
