@@ -293,8 +293,24 @@ def test_a_shard_is_told_or_found_in_an_array(text, array, shard):
 
 
 def test_an_array_that_is_none_is_a_sentence():
-    with pytest.raises(InputError, match="SLURM_ARRAY_TASK_ID and .* are not set"):
+    with pytest.raises(InputError, match="SLURM_ARRAY_TASK_ID and .*_COUNT are not set to a num"):
         parse_shard("auto", {})
+    array = {"SLURM_ARRAY_TASK_ID": "2", "SLURM_ARRAY_TASK_COUNT": "3"}
+    with pytest.raises(InputError, match="^SLURM_ARRAY_TASK_MIN is not set to a number"):
+        parse_shard("auto", array)
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", "null", '"a"', '{"state": "done"}'])
+def test_a_row_of_other_content_is_a_sentence(tmp_path, text):
+    (tmp_path / "rows").mkdir()
+    (tmp_path / "rows" / "one.json").write_text(text)
+    with pytest.raises(InputError, match=r"one\.json is no row of a job; delete it and run again"):
+        find_missing_jobs([Job("one")], tmp_path, rerun_failed=False)
+
+
+def test_a_single_loss_is_told_as_one(tmp_path):
+    run_job(Job("one", lost=1), tmp_path, dict, retries=0)
+    assert row_of(tmp_path, "one")["reason"].startswith("its process was killed once, perhaps")
 
 
 def test_manifests_of_all_kinds_name_the_same_jobs(tmp_path):

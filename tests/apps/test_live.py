@@ -868,6 +868,15 @@ def test_only_an_address_of_this_machine_alone_is_local(host, is_local):
     own = address.make_url(80).removeprefix("http://").removesuffix("/")
     assert address.knows_host(own)
     assert address.knows_host("evil.example:80") != is_local
+    assert address.knows_host("[evil]:80") != is_local
+
+
+def test_an_address_is_known_as_browsers_spell_it():
+    address = Address(socket.AF_INET6, "::ffff:127.0.0.1")
+    for host in ("[::ffff:7f00:1]:80", "[::FFFF:7F00:1]", "[::ffff:127.0.0.1]:80"):
+        assert address.knows_host(host)
+    for host in ("[::ffff:7f00:2]:80", "[::ffff:7f00:1]:80]", "::ffff:7f00:1", "[]:80"):
+        assert not address.knows_host(host)
 
 
 def test_a_port_that_is_taken_is_refused(server, page):

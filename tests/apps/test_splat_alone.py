@@ -11,6 +11,7 @@ import torch
 
 from command import run
 from gscompleter import load_cameras, load_ply, save_ply
+from gscompleter.apps.inputs.captures import choose_side
 from gscompleter.data.scene import write_cameras
 from gscompleter.system.files.image import read_image, write_image
 from gscompleter.trust.lifted import find_pixel_center
@@ -322,3 +323,10 @@ def test_what_a_mask_marks_goes_and_is_filled_and_strip_puts_it_back(folder, tmp
     back = tmp_path / "back.ply"
     assert run(monkeypatch, "strip", out / "completed.ply", "--out", back, "--quiet") == 0
     assert back.read_bytes() == (folder / "splat.ply").read_bytes()
+
+
+@pytest.mark.parametrize(
+    ("resolution", "side"), [(None, 640), (96, 96), ((48, 64), 48), ((64, 48), 48)]
+)
+def test_images_of_found_cameras_are_squares_in_the_size_that_was_asked_for(resolution, side):
+    assert choose_side(resolution) == side

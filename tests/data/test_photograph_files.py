@@ -298,7 +298,7 @@ def test_heic_is_read_with_pillow_heif(tmp_path):
 
 def test_raw_photographs_are_refused_by_name(tmp_path):
     (tmp_path / "IMG_1.DNG").write_bytes(b"II*\0")
-    with pytest.raises(InputError, match=r"holds 1 photographs such as IMG_1.DNG.*export JPEG"):
+    with pytest.raises(InputError, match=r"holds the photograph IMG_1.DNG, .*export JPEG"):
         open_photographs(tmp_path)
 
 

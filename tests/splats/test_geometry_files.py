@@ -1,5 +1,7 @@
 """Meshes and points from files: all hold the same room."""
 
+import struct
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from room_mesh import (
     write_ply_triangles,
 )
 from scenes import Room, camera_at, cast, random_gaussians
+from splat_files import parse_glb, write_glb
 
 CAMERA = camera_at(0.7, yaw=12, size=64)
 WRITERS = {
@@ -66,6 +69,40 @@ def test_a_file_that_was_cut_is_refused(name, tmp_path):
     data = path.read_bytes()
     path.write_bytes(data[: len(data) - 40])
     with pytest.raises(InputError, match="ends"):
+        load_geometry(path)
+
+
+def test_a_glb_that_was_cut_lacks_corners_and_not_gaussians(tmp_path):
+    path = write_glb_mesh(tmp_path / "room.glb", mesh_of())
+    table, binary = parse_glb(path.read_bytes())
+    write_glb(path, table, binary[:-40])
+    with pytest.raises(InputError, match=r"it ends after \d+ of \d+ corners"):
+        load_geometry(path)
+
+
+@pytest.mark.parametrize(
+    "part",
+    [
+        {"nodes": ["a"]},
+        {"meshes": [{"primitives": ["a"]}]},
+        {"nodes": [{"mesh": 0, "matrix": [1.0, 2.0, 3.0]}]},
+        {"nodes": [{"mesh": 0, "scale": [1.0, 2.0]}]},
+    ],
+)
+def test_a_glb_of_other_json_is_one_sentence(part, tmp_path):
+    path = write_glb_mesh(tmp_path / "room.glb", mesh_of())
+    table, binary = parse_glb(path.read_bytes())
+    write_glb(path, table | part, binary)
+    with pytest.raises(InputError, match=r"room\.glb cannot be read"):
+        load_geometry(path)
+
+
+def test_a_glb_that_nests_without_end_is_one_sentence(tmp_path):
+    path = write_glb(tmp_path / "room.glb", {}, b"")
+    text = b"[" * 200_000
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    path.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks)
+    with pytest.raises(InputError, match="cannot be read"):
         load_geometry(path)
 
 

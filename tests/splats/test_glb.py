@@ -1,8 +1,6 @@
 """Written .glb files: nothing is rounded, and the bytes follow glTF and its extension."""
 
-import json
 import os
-import struct
 
 import numpy as np
 import pytest
@@ -10,21 +8,9 @@ import torch
 
 from gscompleter import InputError, load_splat, save_splat
 from gscompleter.splats import glb
-from splat_files import covariances, plausible, write_glb, write_spz_2
+from splat_files import covariances, parse_glb, plausible, write_glb, write_spz_2
 
 NAME = "KHR_gaussian_splatting:"
-
-
-def parse(data: bytes) -> tuple[dict, bytes]:
-    """Parse the header and both chunks of a .glb by the words of its specification."""
-    magic, version, length = struct.unpack_from("<4sII", data)
-    assert (magic, version, length) == (b"glTF", 2, len(data))
-    text_size, text_kind = struct.unpack_from("<I4s", data, 12)
-    size, kind = struct.unpack_from("<I4s", data, 20 + text_size)
-    assert (text_kind, kind) == (b"JSON", b"BIN\0")
-    assert text_size % 4 == size % 4 == 0
-    assert 28 + text_size + size == length
-    return json.loads(data[20 : 20 + text_size]), data[28 + text_size :]
 
 
 def read_columns(table: dict, binary: bytes) -> dict[str, np.ndarray]:
@@ -60,7 +46,7 @@ def test_a_glb_keeps_every_number(tmp_path, degree):
 def test_a_glb_follows_the_specification(tmp_path, degree):
     gaussians = plausible(33, degree)
     save_splat(tmp_path / "scene.glb", gaussians)
-    table, binary = parse((tmp_path / "scene.glb").read_bytes())
+    table, binary = parse_glb((tmp_path / "scene.glb").read_bytes())
     columns = read_columns(table, binary)
     assert table["asset"]["version"] == "2.0"
     assert table["extensionsUsed"] == ["KHR_gaussian_splatting"]
@@ -87,7 +73,7 @@ def test_a_glb_is_in_the_axes_of_gltf_with_linear_colours_for_points(tmp_path):
     gaussians.sh[0, 0] = torch.tensor([0.0, 9.0, -9.0])  # sRGB 0.5, above 1, below 0
     gaussians.opacities[0] = 0.25
     save_splat(tmp_path / "scene.glb", gaussians)
-    columns = read_columns(*parse((tmp_path / "scene.glb").read_bytes()))
+    columns = read_columns(*parse_glb((tmp_path / "scene.glb").read_bytes()))
     assert columns["POSITION"].tolist() == [[-1, -2, 3]]
     assert np.allclose(columns["COLOR_0"], [[0.21404, 1, 0, 0.25]], atol=1e-4)
 
@@ -172,7 +158,7 @@ def test_a_spz_of_another_size_than_its_accessors_is_refused(tmp_path, count):
 
 def test_a_damaged_spz_within_gltf_is_one_sentence(tmp_path):
     path = pack(tmp_path / "scene.glb", plausible(300, 1))
-    table, binary = parse(path.read_bytes())
+    table, binary = parse_glb(path.read_bytes())
     for cut in (0, 10, 200):
         write_glb(path, table, binary[:cut] + b"\xff" * (len(binary) - cut))
         with pytest.raises(InputError, match="cannot be read"):
@@ -185,7 +171,7 @@ def test_a_damaged_spz_within_gltf_is_one_sentence(tmp_path):
 def test_many_primitives_cannot_unpack_one_spz_without_end(tmp_path):
     """A bomb: a thousand primitives that each name the same megabytes."""
     path = pack(tmp_path / "scene.glb", plausible(30, 0))
-    table, binary = parse(path.read_bytes())
+    table, binary = parse_glb(path.read_bytes())
     table["meshes"][0]["primitives"] *= 20_000
     table["accessors"][0]["count"] = 30
     with pytest.raises(InputError, match="claims to hold more than 10,000 primitives"):
@@ -196,3 +182,23 @@ def test_many_primitives_cannot_unpack_one_spz_without_end(tmp_path):
     table["accessors"][0]["count"] = 10**6
     with pytest.raises(InputError, match="bytes claim to hold 5,000,000 Gaussians"):
         load_splat(write_glb(path, table, binary))
+
+
+@pytest.mark.parametrize(
+    "transform",
+    [
+        {"matrix": [1.0, 2.0, 3.0]},
+        {"scale": [2.0]},
+        {"scale": [2.0, 2.0]},
+        {"translation": [1.0, 2.0]},
+        {"rotation": [[0.0, 0.0, 0.0, 1.0]]},
+    ],
+)
+def test_a_transform_of_too_few_numbers_is_one_sentence(tmp_path, transform):
+    path = tmp_path / "scene.glb"
+    save_splat(path, plausible(5))
+    table, binary = parse_glb(path.read_bytes())
+    table["nodes"][0] = {"mesh": 0, **transform}
+    write_glb(path, table, binary)
+    with pytest.raises(InputError, match="a node has other than .* for a part of its transform"):
+        load_splat(path)

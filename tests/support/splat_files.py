@@ -276,6 +276,18 @@ def glb_table(gaussians: Gaussians) -> tuple[dict, bytes]:
     return table, binary
 
 
+def parse_glb(data: bytes) -> tuple[dict, bytes]:
+    """Parse the header and both chunks of a .glb by the words of its specification."""
+    magic, version, length = struct.unpack_from("<4sII", data)
+    assert (magic, version, length) == (b"glTF", 2, len(data))
+    text_size, text_kind = struct.unpack_from("<I4s", data, 12)
+    size, kind = struct.unpack_from("<I4s", data, 20 + text_size)
+    assert (text_kind, kind) == (b"JSON", b"BIN\0")
+    assert text_size % 4 == size % 4 == 0
+    assert 28 + text_size + size == length
+    return json.loads(data[20 : 20 + text_size]), data[28 + text_size :]
+
+
 def write_glb(path: Path, table: dict, binary: bytes) -> Path:
     text = json.dumps(table).encode()
     text += b" " * (-len(text) % 4)

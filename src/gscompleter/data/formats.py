@@ -1,6 +1,6 @@
 """Detection and opening of posed photographs in all formats.
 
-A format is a module of this package and a line in `FORMATS`.
+A format is a module of this package and a row in `SCENE_FORMATS`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,8 @@ class SceneFormat:
     detect: Callable[[Path], object]
     """Detects the format of a file or folder by names and first bytes; may return its files."""
     open: Callable[[Path], Iterable[Photographs]]
-    """Opens the scenes in such a file or folder one at a time; reads only cameras."""
+    """Opens the scenes in such a file or folder one at a time, at least one; reads only cameras.
+    Raises InputError where it is damaged, at once or while iterating."""
     unit: str | None = None
     """Unit of the coordinates, or None if the format does not define it."""
 
@@ -64,7 +65,7 @@ UNREAD = (
 # fmt: on
 """Endings of photographs that are not read: raw data of cameras, and formats of other programs."""
 MAX_NAMED_SCENES = 4
-"""Most scenes that the message names."""
+"""Most scenes that the sentence names which refuses a folder of scenes."""
 MAX_SEARCHED_FOLDERS = 1000
 """Most folders below a path that are searched for scenes to name."""
 
@@ -99,7 +100,12 @@ def open_photographs(
     """Open the photographs of one scene; reads only its cameras.
 
     The format is detected if None. `near` and `far` are the smallest and largest z-depth in scene
-    units; those of the files if None.
+    units; those of the files if None. Masks beside the photographs, and what tells the vehicle that
+    carries the camera, are attached; they are read when they are needed.
+
+    Raises:
+        InputError: There are no posed photographs, several scenes, or damaged files; or the planes
+            are impossible.
     """
     check_planes(near, far)
     path = require_path(path)
@@ -118,6 +124,7 @@ def open_photographs(
     unposed = describe_unposed(scene.frames, scene.title)
     notes = (*scene.notes, *unposed, *describe_moved(scene.frames, scene.title))
     frames = scene.frames
+    # Photographs for which our own search found no camera keep their numbers.
     unplaced = list_unplaced(scene, path)
     if unplaced:
         frames = tuple(sorted([*frames, *unplaced], key=lambda frame: frame.name))
@@ -139,7 +146,10 @@ def open_photographs(
 
 
 def detect_format(path: Path, name: str | None = None) -> str:
-    """Return the given format name after checking it, or detect the format of `path`."""
+    """Return the given format name after checking it, or detect the format of `path`.
+
+    InputError is raised if there are no such photographs.
+    """
     formats = ", ".join(SCENE_FORMATS)
     advice = "name photographs with cameras, such as colmap, nerfstudio or others (docs/formats.md)"
     require(
@@ -198,10 +208,13 @@ def refuse_unread(path: Path) -> None:
     names = sorted(os.listdir(path)) if os.path.isdir(path) else [path.name]
     unread = [name for name in names if not is_hidden_name(name) and name.lower().endswith(UNREAD)]
     if unread:
+        example = quote_value(unread[0])
+        count = f"the photograph {example}"
+        if len(unread) > 1:
+            count = f"{len(unread)} photographs such as {example}"
         raise InputError(
-            f"{quote_value(path)} holds {len(unread)} photographs such as "
-            f"{quote_value(unread[0])}, whose format is not read; export JPEG or PNG from the "
-            "program that develops them."
+            f"{quote_value(path)} holds {count}, whose format is not read; export JPEG or PNG from "
+            "the program that develops them."
         )
 
 

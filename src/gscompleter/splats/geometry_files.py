@@ -6,7 +6,6 @@ Coordinates are taken as they stand in a file, in the axes of the scene; colours
 from __future__ import annotations
 
 import re
-import struct
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from jaxtyping import Float, Int
 from numpy import ndarray
 
 from gscompleter.numerics.given_geometry import GivenGeometry, make_geometry
+from gscompleter.splats.formats import DECODING_ERRORS, JSON_ERRORS
 from gscompleter.splats.glb import read_glb_meshes
 from gscompleter.splats.packing import UnsupportedError
 from gscompleter.splats.ply import MEANS
@@ -54,7 +54,7 @@ def load_geometry(path: Path | str) -> GivenGeometry:
         raise InputError(f"{quote_value(path)} {error}.", "geometry") from error
     except InputError:
         raise
-    except (ValueError, LookupError, TypeError, struct.error, ArithmeticError) as error:
+    except (*DECODING_ERRORS, *JSON_ERRORS) as error:
         raise InputError(
             f"{quote_value(path)} cannot be read: {describe_damage(error)}; export it again.",
             "geometry",

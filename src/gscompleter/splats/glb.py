@@ -5,6 +5,9 @@ rotations, and a `SH_DEGREE_d_COEF_i` of three channels for each SH coefficient.
 transform to the scene. Axes are x left, y up, z forward. All numbers are written as float32, with
 linear colours for viewers that show points only. KHR_gaussian_splatting_compression_spz, whose
 buffer holds a .spz in place of the attributes, is read.
+
+Of a damaged file the readers raise `DECODING_ERRORS` and `JSON_ERRORS` (`splats/formats.py`), among
+them `DamagedError`; of an intact one that they do not know, `UnsupportedError`.
 """
 
 from __future__ import annotations
@@ -205,13 +208,23 @@ def _read_similarity(node: dict[str, Any]) -> Float[Tensor, "4 4"]:
 def _read_transform(node: dict[str, Any]) -> Float[Tensor, "4 4"]:
     """Read the transform of a node."""
     if "matrix" in node:
-        return torch.tensor(node["matrix"], dtype=torch.float64).reshape(4, 4).T
-    x, y, z, w = (float(value) for value in node.get("rotation", (0, 0, 0, 1)))
+        # Stored column by column.
+        return _read_vector(node["matrix"], 16).reshape(4, 4).T
+    # From xyzw to wxyz.
+    quat = _read_vector(node.get("rotation", (0, 0, 0, 1)), 4).roll(1)
     place = torch.eye(4, dtype=torch.float64)
-    place[:3, :3] = quats_to_rotations(torch.tensor([w, x, y, z], dtype=torch.float64))
-    place[:3, :3] *= torch.tensor(node.get("scale", (1, 1, 1)), dtype=torch.float64)
-    place[:3, 3] = torch.tensor(node.get("translation", (0, 0, 0)), dtype=torch.float64)
+    place[:3, :3] = quats_to_rotations(quat)
+    place[:3, :3] *= _read_vector(node.get("scale", (1, 1, 1)), 3)
+    place[:3, 3] = _read_vector(node.get("translation", (0, 0, 0)), 3)
     return place
+
+
+def _read_vector(numbers: Any, length: int) -> Float[Tensor, "k"]:
+    """Read `length` numbers of the JSON part, in float64."""
+    vector = torch.tensor(numbers, dtype=torch.float64)
+    if vector.shape != (length,):
+        raise DamagedError(f"a node has other than {length} numbers for a part of its transform")
+    return vector
 
 
 def read_glb_meshes(path: Path) -> tuple[Float[ndarray, "n 3"], Int[ndarray, "m 3"]]:
@@ -231,12 +244,13 @@ def read_glb_meshes(path: Path) -> tuple[Float[ndarray, "n 3"], Int[ndarray, "m 
                 raise UnsupportedError("holds Gaussians; name a mesh or points as geometry")
             if primitive.get("extensions", {}).get("KHR_draco_mesh_compression"):
                 raise UnsupportedError("holds a mesh compressed by Draco; export it without that")
-            points = _read_accessor(document, _get_accessor(document, primitive, "POSITION"))
+            accessor = _get_accessor(document, primitive, "POSITION")
+            points = _read_accessor(document, accessor, "vertices")
             linear, shift = place[:3, :3].numpy(), place[:3, 3].numpy()
             vertices.append(points.astype(np.float64) @ linear.T + shift)
             faces.append(count + _read_triangles(document, primitive, len(points)))
             count += len(points)
-            check_count(count, len(document.binary))
+            check_count(count, len(document.binary), "vertices")
     if count == 0:
         raise UnsupportedError("holds neither a mesh nor points")
     return np.concatenate(vertices), np.concatenate(faces)
@@ -245,11 +259,14 @@ def read_glb_meshes(path: Path) -> tuple[Float[ndarray, "n 3"], Int[ndarray, "m 
 def _read_triangles(
     document: GlbDocument, primitive: dict[str, Any], count: int
 ) -> Int[ndarray, "m 3"]:
-    """Read the triangles of a primitive of `count` vertices, as indices of these."""
+    """Read the triangles of a primitive of `count` vertices, as indices of these.
+
+    Whether there are such vertices is checked where triangles are used (`GivenGeometry`).
+    """
     order = np.arange(count, dtype=np.int64)
     if "indices" in primitive:
         accessor = document.table["accessors"][primitive["indices"]]
-        order = _read_numbers(document, accessor)[:, 0].astype(np.int64)
+        order = _read_numbers(document, accessor, "corners")[:, 0].astype(np.int64)
     mode = primitive.get("mode", TRIANGLES)
     if mode == TRIANGLES:
         return order[: len(order) // 3 * 3].reshape(-1, 3)
@@ -318,9 +335,14 @@ def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gauss
     return with_labels(gaussians, read_attribute(LABELS_ATTRIBUTE, "SCALAR")[:, 0])
 
 
-def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[ndarray, "n k"]:
-    """Read the numbers of an accessor as float32; integers may stand for fractions."""
-    values = _read_numbers(document, accessor)
+def _read_accessor(
+    document: GlbDocument, accessor: dict[str, Any], what: str = "Gaussians"
+) -> Float[ndarray, "n k"]:
+    """Read the numbers of an accessor as float32; integers may stand for fractions.
+
+    `what` its rows are is for errors.
+    """
+    values = _read_numbers(document, accessor, what)
     kind = values.dtype
     if kind.kind == "f":
         return values.astype(np.float32)
@@ -331,8 +353,13 @@ def _read_accessor(document: GlbDocument, accessor: dict[str, Any]) -> Float[nda
     return np.maximum(values.astype(np.float32) / largest, -1 if largest > 1 else -np.inf)
 
 
-def _read_numbers(document: GlbDocument, accessor: dict[str, Any]) -> Shaped[ndarray, "n k"]:
-    """Read the numbers of an accessor from the binary part, as they are stored."""
+def _read_numbers(
+    document: GlbDocument, accessor: dict[str, Any], what: str
+) -> Shaped[ndarray, "n k"]:
+    """Read the numbers of an accessor from the binary part, as they are stored.
+
+    `what` its rows are is for errors.
+    """
     view = {} if "sparse" in accessor else document.table["bufferViews"][accessor["bufferView"]]
     if view.get("buffer") != 0 or view.get("extensions"):
         raise UnsupportedError("holds its numbers sparse, compressed or in another file")
@@ -343,7 +370,7 @@ def _read_numbers(document: GlbDocument, accessor: dict[str, Any]) -> Shaped[nda
     shape = (int(accessor["count"]), width)
     # The last row may be shorter than the distance between two.
     num_bytes = len(document.binary) - start + max(stride - width * kind.itemsize, 0)
-    check_rows(num_bytes, stride, shape[0])
+    check_rows(num_bytes, stride, shape[0], what)
     return np.ndarray(shape, kind, document.binary, start, (stride, kind.itemsize))
 
 

@@ -82,17 +82,17 @@ def drop_largest(
     return largest, np.take_along_axis(unit, places, axis=1)
 
 
-def check_count(count: int, stored: int) -> None:
+def check_count(count: int, stored: int, what: str = "Gaussians") -> None:
     """Raise DamagedError if `stored` bytes claim more Gaussians than any file would hold in them.
+
+    Anything else that is counted is named by `what`.
 
     What is equal for all Gaussians, such as their size, takes hardly a byte in a packed format, so
     that no ratio of sizes tells a bomb. Only where a count would fill the memory has each further
     Gaussian to be a byte: what tells Gaussians apart, such as their positions, takes several.
     """
     if count > FREE_GAUSSIANS + stored:
-        raise DamagedError(
-            f"its {stored:,} bytes claim to hold {quote_value(f'{count:,}')} Gaussians"
-        )
+        raise DamagedError(f"its {stored:,} bytes claim to hold {quote_value(f'{count:,}')} {what}")
 
 
 def build_gaussians(

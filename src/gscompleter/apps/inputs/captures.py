@@ -99,6 +99,7 @@ class Capture:
 
     cameras: Sequence[Camera]
     names: Sequence[str]
+    """Their names as photographs, which the user sees and may give."""
     source: CaptureSource
     where: str
     """Clause that says which cameras they are."""
@@ -123,7 +124,7 @@ def find_cameras_beside(splat: Path) -> Path | None:
 
 
 def take_from_file(path: Path, known: Photographs, request: RenderRequest) -> Capture:
-    """Take all cameras of a file."""
+    """Take all cameras of a file, which are those of `known`."""
     where = f"cameras of {quote_value(path)}"
     more = ""
     if request.cameras is None:
@@ -144,6 +145,10 @@ def find_cameras_alone(
 
     That of a pixel-aligned splat, at `pixel_center`, is taken with small moves of it; a trained
     splat tells no more than from where it looks well.
+
+    Raises:
+        InputError: The camera of a pixel-aligned splat sees too little of it, or a trained splat
+            looks like a photograph from nowhere.
     """
     upward = request.find_up(scene, renderer)
     if pixel_center is None:
@@ -151,8 +156,7 @@ def find_cameras_alone(
     # Two photographs are the fewest, so that no image had more pixels than half of the Gaussians.
     side = max(MIN_FOUND_SIDE, round((len(scene) / 2) ** 0.5))
     if request.reading.resolution is not None:
-        # The image is square, so that it is as large as the shorter side that was asked for.
-        side = min(side, int(np.min(request.reading.resolution)))
+        side = min(side, choose_side(request.reading.resolution))
     camera = aim_pixel_camera(scene, pixel_center, upward.direction, side)
     ranged = add_near_plane(camera, scene.means)
     seen = renderer.render(scene, ranged).depth_map()
@@ -175,7 +179,7 @@ def find_cameras_alone(
 def find_standing_cameras(
     scene: Gaussians, renderer: Renderer, upward: Upward, request: RenderRequest
 ) -> Capture:
-    """Find cameras from which a trained splat looks like a photograph."""
+    """Find cameras from which a trained splat looks like a photograph; InputError for none."""
     side = choose_side(request.reading.resolution)
     cameras = find_standpoints(scene, upward.direction, side, renderer, MAX_WITNESSES)
     if not cameras:
@@ -195,7 +199,11 @@ def search_around_place(
     renderer: Renderer,
     request: RenderRequest,
 ) -> Capture:
-    """Search for cameras around what is to be removed."""
+    """Search for cameras around what is to be removed.
+
+    `scene` is relative to `origin`, which is in the coordinates of the file. InputError is raised
+    if nothing is selected, or no camera sees it.
+    """
     assert request.place is not None
     chosen = select_without_masks(request.place, scene, origin)
     upward = request.find_up(scene, renderer)
@@ -210,13 +218,14 @@ def search_around_place(
 
 
 def choose_side(resolution: tuple[int, int] | int | None) -> int:
-    """Choose the width and height of the square cameras that are found for a trained splat.
+    """Choose the width and height of the square cameras that are found.
 
-    A splat has no full size, for which None stands: they then have the usual one.
+    They are the largest square in the size that was asked for. A trained splat has no full size,
+    for which None stands: they then have the usual one.
     """
     if resolution is None:
         return DEFAULT_LONG_SIDE
-    return resolution if isinstance(resolution, int) else max(resolution)
+    return resolution if isinstance(resolution, int) else min(resolution)
 
 
 def search_around(
@@ -225,7 +234,7 @@ def search_around(
     scene: Gaussians,
     renderer: Renderer,
 ) -> Capture:
-    """Search for cameras around the holes of all targets."""
+    """Search for cameras around the holes of all targets; InputError for none."""
     # Fewer around each of many targets, and one at least.
     count = max(1, min(MAX_CHOSEN_CAMERAS, MAX_AROUND // max(len(targets), 1)))
     cameras: list[Camera] = []

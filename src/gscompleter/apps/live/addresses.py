@@ -14,6 +14,8 @@ from gscompleter.system.errors import InputError, quote_value
 
 LOCAL_HOST = re.compile(r"(127(\.\d{1,3}){3}|\[::1\]|localhost)(:\d+)?", re.IGNORECASE)
 """Names of this machine in a request; any other may be a DNS rebinding attack by a website."""
+IPV6_HOST = re.compile(r"\[([^]]+)\](:\d+)?")
+"""An IPv6 address in a request, in brackets, with or without a port."""
 
 
 @dataclass(frozen=True)
@@ -22,33 +24,41 @@ class Address:
 
     family: socket.AddressFamily
     host: str
-    """Number of the address, in which all spellings of it are the same."""
+    """Number of the address, which is the same for all its spellings, without the zone of an IPv6
+    address: `getaddrinfo` leaves that out."""
 
     @property
     def is_local(self) -> bool:
         """Return True if only programs of this machine can reach it."""
-        # An IPv4 address may be written as IPv6, "::ffff:127.0.0.1"; a zone follows after "%".
-        number = ipaddress.ip_address(self.host.partition("%")[0])
+        number = ipaddress.ip_address(self.host)
+        # An IPv4 address may be written as IPv6, "::ffff:127.0.0.1".
         return (getattr(number, "ipv4_mapped", None) or number).is_loopback
 
     def make_url(self, port: int) -> str:
-        """Return the address of a page."""
+        """Return the address of the page at a port."""
         host = f"[{self.host}]" if self.family == socket.AF_INET6 else self.host
         return f"http://{host}:{port}/"
 
     def knows_host(self, host: str) -> bool:
-        """Return True if a request for `host` may be meant for this address."""
-        if not self.is_local:
+        """Return True if a request for `host`, a name with or without a port, may be meant for it.
+
+        An address that other machines can reach has names that are not known here.
+        """
+        if not self.is_local or LOCAL_HOST.fullmatch(host) is not None:
             return True
-        own = self.make_url(0).removeprefix("http://").removesuffix(":0/")
-        name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
-        return LOCAL_HOST.fullmatch(host) is not None or name.lower() == own.lower()
+        # What is left is an IPv4 address in IPv6, which browsers spell "::ffff:7f00:1".
+        written = IPV6_HOST.fullmatch(host)
+        try:
+            number = ipaddress.ip_address("" if written is None else written[1])
+        except ValueError:  # no address at all
+            return False
+        return number == ipaddress.ip_address(self.host)
 
     def knows_origin(self, host: str, origin: str | None) -> bool:
         """Return True if a request for `host` comes from the page itself, or from a program.
 
-        Any page in a browser may send requests here; only `Origin` shows its source. Programs send
-        none.
+        Any page in a browser may send requests here; only the header `Origin` shows its source.
+        Programs send none, for which None stands.
         """
         if origin is None:
             return True
@@ -59,7 +69,10 @@ class Address:
 
 
 def resolve_host(host: str) -> Address:
-    """Find the address that a host name stands for, or any spelling of an address."""
+    """Find the address that a host name stands for, or any spelling of an address.
+
+    InputError is raised if there is none; whether it is of this machine, `check_bindable` tells.
+    """
     try:
         family, *_, place = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)[0]
     except (OSError, UnicodeError) as error:

@@ -45,7 +45,8 @@ class Likeness:
 def shrink_view(view: View, side: int = JUDGED_SIDE) -> View:
     """Shrink a photograph and its camera to a longer side of `side` pixels, by areas.
 
-    A smaller one stays.
+    Its depths and the mask of what moves are left out, as nothing that is judged at this size reads
+    them. A photograph that is not larger is returned as it is.
     """
     camera = shrink_camera(view.camera, side)
     size = camera.width, camera.height
@@ -59,7 +60,10 @@ def shrink_view(view: View, side: int = JUDGED_SIDE) -> View:
 
 
 def resize_by_area(pixels: Float[Tensor, "h w *c"], size: tuple[int, int]) -> Float[Tensor, "..."]:
-    """Resize an image or a mask to a width and height, averaging over areas."""
+    """Resize an image or a mask to a width and height, averaging over areas.
+
+    The proportions may change. An image that is not larger is interpolated.
+    """
     resized = cv2.resize(pixels.cpu().numpy(), size, interpolation=cv2.INTER_AREA)
     return torch.from_numpy(resized).to(pixels)
 
@@ -69,7 +73,9 @@ def measure_likeness(
 ) -> Likeness | None:
     """Measure the likeness of a render to a photograph, beside that of photographs in use.
 
-    Returns None if less than `MIN_COVERED` is covered.
+    The render has the size of the photograph. `used` are images of any size, at least about as
+    large; each is stretched to that of the photograph. Returns None if less than `MIN_COVERED` is
+    covered.
     """
     covered = (render.alpha >= COVERED) & photograph.valid_mask
     if covered.float().mean().item() < MIN_COVERED:

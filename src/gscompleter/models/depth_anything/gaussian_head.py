@@ -24,11 +24,12 @@ SH = 9
 CHANNELS = (2, 3, 4, 3 * SH, 1, 1)
 """Channels of offset, scale, rotation, SH, depth offset, opacity."""
 SCALES = (1e-5, 30.0)
-"""Smallest and largest standard deviation, in tenths of the sum of pixel width and height."""
+"""Smallest and largest standard deviation, in multiples of the size that `compute_pixel_scales`
+calls that of a pixel, as in training."""
 
 
 class GaussianDpt(Dpt):
-    """Head for the raw Gaussian channels of each pixel."""
+    """Predict the raw Gaussian channels of each pixel (`CHANNELS`)."""
 
     scratch: ImageScratch
 
@@ -44,7 +45,7 @@ class GaussianDpt(Dpt):
     def forward(
         self, tokens: Sequence[Tokens], images: Float[Tensor, "b v 3 h w"]
     ) -> Float[Tensor, "b v h w c"]:
-        """Predict raw channels from tokens and normalised images."""
+        """Predict raw channels from the tokens of the output blocks and normalised images."""
         size = (images.shape[3], images.shape[4])
         pyramid = self.compute_pyramid(tokens, size[0] // PATCH, size[1] // PATCH)
         x = resize_bilinear(self.scratch.output_conv1(self.scratch(pyramid)), size)
@@ -61,7 +62,8 @@ def create_camera_gaussians(
 ) -> PixelGaussians:
     """Create Gaussians in the frame of `poses`, with centres and depths multiplied by `factors`.
 
-    As in training, the predicted z-depth is used as distance along the ray.
+    `depth` is z-depth in the unit of `poses`, both as predicted. As in training it is used as
+    distance along the ray, and so it is returned.
     """
     offset, scale, rotation, sh, depth_offset, opacity = raw.split(CHANNELS, dim=-1)
     factor = factors[:, None, None, None]
@@ -73,12 +75,12 @@ def create_camera_gaussians(
     rays = F.normalize(torch.einsum("bvij,bvhwj->bvhwi", turns, local_rays), dim=-1)
     centers = factor[..., None] * poses.centers[:, :, None, None]
     return PixelGaussians(
-        distance,
-        centers + rays * distance[..., None],
-        rotate_quats_as_trained(rotation, turns),
-        compute_pixel_scales(scale, poses.K) * distance[..., None],
-        opacity[..., 0].sigmoid(),
-        rotate_3dgs_sh(damp_sh(sh), turns),
+        depth=distance,
+        means=centers + rays * distance[..., None],
+        quats=rotate_quats_as_trained(rotation, turns),
+        scales=compute_pixel_scales(scale, poses.K) * distance[..., None],
+        opacities=opacity[..., 0].sigmoid(),
+        sh=rotate_3dgs_sh(damp_sh(sh), turns),
     )
 
 
@@ -97,9 +99,10 @@ def compute_offset_rays(
 def compute_pixel_scales(
     scale: Float[Tensor, "b v h w 3"], K: Float[Tensor, "b v 3 3"]
 ) -> Float[Tensor, "b v h w 3"]:
-    """Compute standard deviations at a distance of 1."""
+    """Compute standard deviations at a distance of 1 from raw scales."""
     low, high = SCALES
-    # A tenth of the size of a pixel at a distance of 1, along x and y together.
+    # The size of a pixel as the authors have it: a tenth of its width and height at a distance of
+    # 1, added up.
     pixel = 0.1 * (1 / K[..., 0, 0] + 1 / K[..., 1, 1])
     return (low + (high - low) * scale.sigmoid()) * pixel[..., None, None, None]
 

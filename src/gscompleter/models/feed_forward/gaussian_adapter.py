@@ -33,7 +33,7 @@ class PixelGaussians:
     """One Gaussian per pixel of a batch of views, with the conventions of `Gaussians`."""
 
     depth: Float[Tensor, "b v h w"]
-    """z-depth (DepthSplat) or distance along the ray (MVSplat), in scene units."""
+    """z-depth (DepthSplat) or distance along the ray (MVSplat, Depth Anything), in scene units."""
     means: Float[Tensor, "b v h w 3"]
     quats: Float[Tensor, "b v h w 4"]
     scales: Float[Tensor, "b v h w 3"]

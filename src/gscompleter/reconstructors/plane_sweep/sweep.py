@@ -4,6 +4,8 @@ A plane is one inverse depth, parallel to the image of the reference view (Colli
 gets a cost at each plane, from the other views; semi-global matching (Hirschmüller 2008) smooths
 the costs, and the cheapest plane wins. Large images are swept at half size first, so that each tile
 of the full size is matched only near the planes found there.
+
+Lengths are in widest baselines (`Rig.unit`), so that inverse depths are in their inverse.
 """
 
 from __future__ import annotations
@@ -27,7 +29,7 @@ from gscompleter.reconstructors.plane_sweep.rig import Rig, Transform
 Map = Float32[np.ndarray, "_ _"]
 Mask = Bool[np.ndarray, "_ _"]
 Neighbour = tuple[Map, Transform, Transform]
-"""Inverse depths of another view, and the transforms to its pixels and back."""
+"""Inverse depths of another view, and the transforms to its pixels and back (`Transforms`)."""
 
 MAX_RETURN_ERROR = 1.5
 """Largest error, in pixels, of a match that is reprojected to the other view and back."""
@@ -49,6 +51,11 @@ MAX_PLANE_MOTION = 0.5
 """Largest image motion between neighbouring planes, in pixels."""
 MIN_PLANES, MAX_PLANES = 48, 256
 """Smallest and largest number of planes."""
+MIN_SEEN_GRID = 0.02
+"""Share of a grid of pixels that some source has to see at the nearest plane."""
+MIN_USED_SAMPLES = 8
+"""Fewest of the sampled steps of inverse depth that the planes reach over, so that they have an
+extent where no source sees more than the farthest."""
 
 MEDIAN_SIZE = 5
 """Size in pixels of the median filter that removes outliers from a first guess."""
@@ -64,7 +71,7 @@ class Sweep:
 
     planes: Planes
     index: Map
-    """Best plane, to a fraction."""
+    """Number of the best plane, to a fraction."""
     margin: Map
     """Cost gap to the second best plane."""
 
@@ -80,6 +87,7 @@ class Measurement:
 
     planes: Planes
     index: Map
+    """As of `Sweep`; pixels that are occluded in the other views have that of the background."""
     weight: Map
     """Weight for the surface fit, in [0, 1]."""
     confidence: Map
@@ -263,9 +271,10 @@ def place_planes(
         motion = np.maximum(motion, usual)
         overlap = np.maximum(overlap, seen.mean(axis=1))
 
-    # The sweep ends at the nearest depth at which some source still shows 2 % of the grid.
-    useful = np.flatnonzero(overlap >= 0.02)
-    last = max(int(useful[-1]), 8) if len(useful) else 256
+    # The sweep ends at the nearest depth at which some source still shows enough of the grid. Where
+    # none shows any, as without sources, all depths stay.
+    useful = np.flatnonzero(overlap >= MIN_SEEN_GRID)
+    last = max(int(useful[-1]), MIN_USED_SAMPLES) if len(useful) else 256
     num_steps = float(motion[:last].sum()) / MAX_PLANE_MOTION
     num_planes = int(np.clip(np.ceil(num_steps), MIN_PLANES, MAX_PLANES))
     return np.linspace(samples[0], samples[last], num_planes).astype(np.float32)
@@ -321,14 +330,17 @@ def make_bands(
 
 
 def compute_inverse_depth(planes: Planes, index: Map) -> Map:
-    """Convert plane indices to inverse depths, at most twice as far as the last plane."""
+    """Convert plane indices to inverse depths, at most twice as far as the farthest plane.
+
+    Indices are taken up to half a step beyond the first and the last plane.
+    """
     step = planes[1] - planes[0]
     within = index.clip(-0.5, len(planes) - 0.5)
     return np.maximum(planes[0] + within * step, planes[0] / 2).astype(np.float32)
 
 
 def compute_plane_index(planes: Planes, inverse: Map) -> Map:
-    """Convert inverse depths to plane indices."""
+    """Convert inverse depths to plane indices, below 0 and beyond the last plane, too."""
     return ((inverse - planes[0]) / (planes[1] - planes[0])).astype(np.float32)
 
 

@@ -1,11 +1,13 @@
-"""Jobs, their rows in the folder of a batch, and workers that run them until each has a row.
+"""Jobs, and workers that run them until each has a row; the rows of a batch, and its folder.
 
-batch.json          kind and version of the folder
+batch.json          kind and version of the folder (`claim_folder`)
 jobs/NAME/          output of `complete`
 rows/NAME.json      outcome of the job: state, reason, scores, cost; written last
 
 A worker runs its share of the jobs in order. If it is killed, it was at the first job without a
 row: the loss of that job is counted, and the rest of the share is run again.
+
+`evaluate` runs its jobs here, too; its folder and rows are others (`evaluation/store.py`).
 """
 
 from __future__ import annotations
@@ -37,8 +39,12 @@ JOBS = "jobs"
 """Folder of the results of jobs, in the folder of a batch."""
 ROWS = "rows"
 """Folder of the rows of jobs, in the folder of a batch."""
+ROW_KEYS = {"job", "options", "state"}
+"""Keys without which a file is no row; rows have further ones."""
+ROW_ADVICE = "delete it and run again"
+"""End of each sentence about a damaged row."""
 RETRY_SECONDS = 1.0
-"""Delay before the first retry after an error not caused by the input; doubled for the next."""
+"""Delay before a retry after an error not caused by the input, for each attempt so far."""
 POLL_SECONDS = 0.1
 """Interval between checks of the workers and of the rows."""
 SLURM_VARIABLES = ("SLURM_ARRAY_TASK_ID", "SLURM_ARRAY_TASK_MIN", "SLURM_ARRAY_TASK_COUNT")
@@ -61,7 +67,7 @@ def run_job(job: Job, out: Path, work: Callable[[], Mapping[str, Any]], retries:
 
     `work` returns further entries of the row. It is repeated after a killed worker or any error
     other than InputError, at most `retries` times. A full disk, or one that still cannot be written
-    after as many attempts, ends the run and is no fault of the job.
+    after as many attempts, is no fault of the job: it raises OutputError, which ends the run.
     """
     if not has_row(job, out):
         row = {"job": job.name, "options": dict(job.options)}
@@ -84,7 +90,10 @@ def write_row(path: Path, row: Mapping[str, Any], retries: int) -> None:
 def run_with_retries(
     work: Callable[[], Mapping[str, Any]], lost: int, retries: int
 ) -> dict[str, Any]:
-    """Run `work` with retries and return its part of a row; `lost` attempts have been killed."""
+    """Run `work` with retries and return its part of a row; `lost` attempts have been killed.
+
+    It raises OutputError alone, as `run_job` does.
+    """
     # Attempts that killed their process count, too.
     reason = describe_loss(lost)
     for number in range(lost + 1, retries + 2):
@@ -105,7 +114,8 @@ def run_with_retries(
 
 def describe_loss(lost: int) -> str:
     """Describe why a job whose workers were killed has no result."""
-    return f"its process was killed {lost} times, perhaps because memory ran out"
+    times = "once" if lost == 1 else f"{lost} times"
+    return f"its process was killed {times}, perhaps because memory ran out"
 
 
 def get_row_path(job: Job, out: Path) -> Path:
@@ -119,14 +129,24 @@ def has_row(job: Job, out: Path) -> bool:
 
 
 def read_row(job: Job, out: Path) -> dict[str, Any] | None:
-    """Read the row of a job, or return None if there is none."""
+    """Read the row of a job, or return None if there is none; raise InputError if it is damaged."""
     if not has_row(job, out):
         return None
-    return dict(read_json(get_row_path(job, out), "delete it and run again"))
+    path = get_row_path(job, out)
+    row = read_json(path, ROW_ADVICE)
+    if not isinstance(row, dict) or not row.keys() >= ROW_KEYS:
+        raise InputError(f"{quote_value(path)} is no row of a job; {ROW_ADVICE}.")
+    return row
 
 
 def find_missing_jobs(jobs: Sequence[Job], out: Path, rerun_failed: bool) -> list[Job]:
-    """Return jobs without a row, and remove the failed rows to repeat (new options, or `rerun`)."""
+    """Return the jobs to run: those without a row, and failed ones whose rows are then removed.
+
+    A failed job is run again with `rerun_failed`, or if it has other options than before.
+
+    Raises:
+        InputError: A job is done with other options, or its row is damaged.
+    """
     left = []
     for job in jobs:
         row = read_row(job, out)
@@ -242,8 +262,9 @@ def run_jobs(
 ) -> Iterator[Job]:
     """Run jobs until each has a row, and yield them in the order in which they end.
 
-    Without an engine they run in this process. The row of a job that cost its worker more than
-    `retries` times is a failure.
+    Without an engine they run in this process. A job that cost its worker more than `retries` times
+    is performed once more with this number in `lost`, and then has to write a row of a failure.
+    Whatever ended a worker's share is raised, and WorkerError if none can start.
     """
     if engine is None:
         for job in jobs:
@@ -271,6 +292,7 @@ def run_jobs(
                 if rest:
                     waiting.append(rest)
                 else:
+                    # Nothing, unless a network disk shows rows of another machine later.
                     yield from share
 
 
@@ -300,16 +322,20 @@ def collect_rest(future: Any, share: list[Job], retries: int) -> list[Job]:
 def parse_shard(text: str | None, environment: Mapping[str, str]) -> tuple[int, int]:
     """Parse `i/n` (the jobs i, i + n, …), or `auto` in a SLURM array; None means all jobs.
 
-    The numbers of the array have to be consecutive.
+    `environment` has the variables of SLURM. The numbers of the array have to be consecutive.
+
+    Raises:
+        InputError: There is no such shard, or no array.
     """
     if text is None:
         return 0, 1
     if text == "auto":
         numbers = [environment.get(name, "") for name in SLURM_VARIABLES]
-        if not all(number.isdecimal() for number in numbers):
+        named = zip(SLURM_VARIABLES, numbers, strict=True)
+        if lacking := [name for name, number in named if not number.isdecimal()]:
             raise InputError(
-                f"{SLURM_VARIABLES[0]} and {SLURM_VARIABLES[2]} are not set, so this is no SLURM "
-                "array; give the shard as i/n.",
+                f"{' and '.join(lacking)} {'is' if len(lacking) == 1 else 'are'} not set to a "
+                "number, so this is no SLURM array; give the shard as i/n.",
                 "shard",
             )
         task, first, count = map(int, numbers)
