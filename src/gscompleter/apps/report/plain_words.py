@@ -188,7 +188,7 @@ def list_shared_warnings(summary: CompletionSummary) -> Iterator[str]:
 
 
 def name_targets(numbers: Sequence[int], total: int) -> str:
-    """Name targets by their numbers."""
+    """Name two or more of `total` targets by their numbers, which begin with 1."""
     if len(numbers) == total:
         return f"All {total} targets"
     first = ", ".join(str(number) for number in numbers[:-1])
@@ -348,7 +348,7 @@ def describe_wanted_photographs(targets: Sequence[TargetRow]) -> str:
 
 
 def describe_alignment(affine: AlignmentRow, unit: str) -> str:
-    """Describe the depth alignment of a target."""
+    """Describe the depth alignment of a target; `unit` is the name of the unit of depths."""
     text = ALIGNMENTS.get(affine.method, "The depths are aligned by an unknown method.")
     inliers = format_percent(affine.inliers, 0)
     fit = text.format(scale=affine.scale, shift=affine.shift, unit=unit, inliers=inliers)
