@@ -519,6 +519,19 @@ def test_only_what_changed_is_sent(splat_begun, repaired_spot, tmp_path):
     assert (sent.means - expected).abs().max() < 1e-3
 
 
+def test_equal_gaussians_are_all_shown(splat_begun, repaired_spot):
+    """Two Gaussians of opacity 0.5 in one place cover more than one does."""
+    given = splat_begun.latest.context
+    repaired, _ = repaired_spot
+    parts = repaired.latest.added_parts
+    twice = replace(repaired.latest, added_parts=(*parts, parts[-1]))
+    scene = PageScene(given)
+    for completion in (repaired.latest, twice, repaired.latest, twice):
+        assert shown_in(scene, completion, given) == len(completion.scene)
+    # The second ones are sent, and the first are not sent again.
+    assert len(scene._chunks) == 2
+
+
 # ------------------------------------------------------------------------------ the connection
 
 

@@ -327,7 +327,12 @@ def test_bad_poses_are_a_warning_that_says_what_to_do(completed_room):
     summary = read_summary(completed_room)
     rows = tuple(replace(row, pose_error=7.0) for row in summary.context)
     (note,) = [note for note in list_notes(replace(summary, context=rows)) if note.is_warning]
+    assert note.text.startswith("The poses of photographs ")
     assert "by up to 7.0 pixels" in note.text
+    alone = replace(summary, context=(rows[0], *summary.context[1:]))
+    (note,) = [note for note in list_notes(alone) if note.is_warning]
+    assert note.text.startswith(f"The pose of photograph {rows[0].photograph} contradicts the ")
+    assert "leave it out" in note.text
     assert "gscompleter poses" in note.text
 
 

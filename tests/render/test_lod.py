@@ -90,6 +90,16 @@ def test_runs_lie_within_half_a_pixel():
     assert (CROWD.scales.amax(dim=1) <= 1.001 * MAX_RUN_DEVIATION * pixel)[shared].all()
 
 
+def test_runs_are_as_short_where_pixels_are_no_squares():
+    tall, wide = torch.ones(3, 3), torch.ones(3, 3)
+    tall[1], wide[0] = 4, 4
+    for factor in (tall, wide):
+        cameras = [replace(camera, K=camera.K * factor) for camera in CAMERAS]
+        both = [replace(camera, K=camera.K * tall * wide) for camera in CAMERAS]
+        scene, expected = (simplify_scene(CROWD, some).rendered for some in (cameras, both))
+        assert len(scene) == len(expected) > len(PROXY.rendered)
+
+
 def test_what_is_large_or_alone_stays_to_the_bit():
     scene = in_order(random_gaussians(500, sh_degree=1))
     huge = replace(scene, scales=scene.scales + 100 * MAX_RUN_DEVIATION * pixel_at(scene)[:, None])

@@ -30,6 +30,12 @@ def test_a_file_is_run_once_and_imports_its_neighbours(tmp_path):
     assert load_from_file(f"{file}:f", "depth") == [1]
 
 
+def test_a_file_that_two_options_name_is_run_once(tmp_path):
+    file = write(tmp_path, "class Model: pass\n")
+    depth = load_from_file(f"{file}:Model", "depth")
+    assert type(load_from_file(f"{file}:Model", "generator")) is type(depth)
+
+
 def test_two_files_of_one_name_are_two_modules(tmp_path):
     words = []
     for number in (1, 2):
@@ -47,7 +53,11 @@ def test_two_files_of_one_name_are_two_modules(tmp_path):
         ("import none_such_module\n", "f", "ModuleNotFoundError, line 1"),
         ("x = 1\ny = x / 0\n", "f", "ZeroDivisionError, line 2"),
         ("def f(:\n", "f", "SyntaxError, line 1"),
+        ("import json\njson.loads('{\\n\\n!')\n", "f", "JSONDecodeError, line 2"),
+        ("def f(): pass\nraise SystemExit(0)\n", "f", "SystemExit, line 2"),
         ("class C:\n    def __init__(self, n): pass\n", "C", "without arguments"),
+        ("class C:\n    def __init__(self): self.f = 1 / 0\n", "C", "ZeroDivisionError, line 2"),
+        ("class C:\n    def __init__(self): self.f = len(1)\n", "C", "made (TypeError, line 2"),
     ],
 )
 def test_mistakes_are_one_sentence(tmp_path, text, name, sentence):

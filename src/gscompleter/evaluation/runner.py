@@ -91,11 +91,17 @@ Rerun = Literal["nothing", "failures", "scores"]
 
 @dataclass(frozen=True)
 class RowCounts:
-    """Numbers of rows of a call of `evaluate`, and of those that earlier calls wrote."""
+    """Numbers of rows that a call of `evaluate` found missing, and of those that stood already.
+
+    A missing row counts even if a simultaneous call wrote it.
+    """
 
     done: int
+    """Missing rows that have scores now."""
     failed: int
+    """Missing rows that hold an error now."""
     skipped: int
+    """Rows that stood already, with scores or errors."""
     failures: Sequence[str] = field(default=(), compare=False)
     """Rows without a score, of this call and earlier ones, with the reasons."""
 
@@ -112,7 +118,9 @@ def evaluate(
     """Run methods on tasks and write a row of scores, or of an error, for each pair.
 
     Existing rows and completed steps in `out` are kept; simultaneous calls share the tasks.
-    `shard` (i, n) selects the tasks i, i + n, i + 2n, ….
+    `shard` (i, n) selects the tasks i, i + n, i + 2n, …. Without an `engine` the tasks run in this
+    process. Raises InputError for tasks, methods or settings with which nothing can be run; an
+    error of a task is in its rows.
     """
     check_methods(methods, max((len(task.targets) for task in tasks), default=0))
     check_shard(*shard)
@@ -161,7 +169,7 @@ def has_failed(row: Path) -> bool:
 
 @dataclass(frozen=True)
 class TaskRunner:
-    """Runs the jobs of an evaluation and writes their rows."""
+    """Run the jobs of an evaluation, whose option `task` is a `Task`, and write their rows."""
 
     out: Path
     methods: tuple[str, ...]

@@ -117,7 +117,8 @@ def merge_nearby(scene: Gaussians, max_gaussians: int) -> Gaussians:
     """Merge adjacent Gaussians of one provenance until about so many are left; on the CPU.
 
     A run lies within a distance of its first Gaussian, the smallest that is enough. The scene has
-    to be sorted along a Morton curve. More are left where provenances alternate along it.
+    to be sorted along a Morton curve, and not to be empty. More are left where provenances
+    alternate along it.
     """
     # No run reaches beyond a block. Of few runs the blocks would decide what is merged, and one of
     # each would be left, so that a first pass merges many blocks into one.
@@ -171,10 +172,10 @@ def find_run_starts(
     """Find the first row of each of m runs, and append the number of Gaussians: m + 1 bounds.
 
     `means` are in the world frame; `generated` is the provenance, which is the same within a run.
-    A pixel is that of the camera in which a Gaussian appears largest.
+    A pixel is that of the camera in which a Gaussian appears largest, by its shorter side.
     """
     centers = to_float32(torch.stack([camera.center for camera in cameras]))
-    focals = to_float32(torch.stack([camera.K[0, 0] for camera in cameras]))
+    focals = to_float32(torch.stack([camera.K.diagonal()[:2].max() for camera in cameras]))
     begins = np.empty(len(means), np.bool_)
     max_runs = count_fitting_gaussians(len(cameras))
     num_blocks = -(-len(means) // kernels.RUN_BLOCK)

@@ -1,7 +1,7 @@
 """Stage 1 with geometry from elsewhere: photographs get its depth (not in the paper).
 
-Before Ψ makes a scene of them, so that it uses the depth. A scene that is given tells first where
-the geometry belongs.
+They get it before Ψ makes a scene of them, so that Ψ uses the depth. A scene that is given tells
+first where the geometry belongs.
 """
 
 from __future__ import annotations
@@ -47,6 +47,7 @@ def init_with_geometry(
     except ContradictedError:
         # It may be in a frame of its own, which the scene that Ψ makes without it tells.
         placed, _ = place_in_context(geometry, init(views), scenes)
+        # The same object, if the scene shows it where it stands: the contradiction remains.
         if placed is geometry:
             raise
         return init_from_depth(placed, views, init)

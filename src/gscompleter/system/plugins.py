@@ -47,13 +47,23 @@ def is_in_file(word: object) -> bool:
 def load_from_file(word: str, option: str) -> Any:
     """Return what `file.py:name` names; of a class, an instance that takes no arguments.
 
-    The file is run once in a process, with its folder on `sys.path` for what it imports. Raise
-    InputError, with the name of the option, if it cannot be run or has no such name.
+    The file is run once in a process, whatever options name it, with its folder on `sys.path` for
+    what it imports. Raise InputError, with the name of the option, if it cannot be run or has no
+    such name, or if no instance can be made.
     """
     found = re.match(FILE_PATTERN, word)
     assert found is not None
     file, name = found.groups()
-    module = _run_file(Path(file).absolute(), option)
+    path = Path(file).absolute()
+    if not path.is_file():
+        raise InputError(f"There is no file {quote_value(path)}; name a file of Python.", option)
+    try:
+        module = _run_file(path)
+    except (Exception, SystemExit) as error:  # code of users raises any kind
+        raise InputError(
+            f"{quote_value(path)} cannot be run ({_describe_error(error, path)}); correct it.",
+            option,
+        ) from error
     if not hasattr(module, name):
         own = [key for key, value in vars(module).items() if _is_own(value, module)]
         known = ", ".join(own) or "nothing that can be called"
@@ -63,19 +73,25 @@ def load_from_file(word: str, option: str) -> Any:
         return value
     try:
         return value()
-    except TypeError as error:
+    except (Exception, SystemExit) as error:
+        # Arguments that lack are an error of the call itself, before any line of the file.
+        if isinstance(error, TypeError) and _find_line(error, path) is None:
+            raise InputError(
+                f"The class {name} of {quote_value(Path(file))} cannot be made without arguments "
+                f"({quote_value(str(error))}); name a function, an object, or a class with "
+                "defaults.",
+                option,
+            ) from error
         raise InputError(
-            f"The class {name} of {quote_value(Path(file))} cannot be made without arguments "
-            f"({quote_value(str(error))}); name a function, an object, or a class with defaults.",
+            f"The class {name} of {quote_value(Path(file))} cannot be made "
+            f"({_describe_error(error, path)}); correct it.",
             option,
         ) from error
 
 
 @cache
-def _run_file(path: Path, option: str) -> ModuleType:
-    """Run a file as a module of its own."""
-    if not path.is_file():
-        raise InputError(f"There is no file {quote_value(path)}; name a file of Python.", option)
+def _run_file(path: Path) -> ModuleType:
+    """Run a file as a module of its own; what it raises is raised."""
     # A name that no other file has; dataclasses look their module up by it.
     name = f"gscompleter_user_{path.stem}_{abs(hash(path)):x}"
     spec = spec_from_file_location(name, path)
@@ -87,15 +103,9 @@ def _run_file(path: Path, option: str) -> ModuleType:
         sys.path.append(str(path.parent))
     try:
         spec.loader.exec_module(module)
-    except Exception as error:  # code of users raises any kind
+    except BaseException:
         del sys.modules[name]
-        line = getattr(error, "lineno", None) or _find_line(error, path)
-        place = "" if line is None else f", line {line}"
-        raise InputError(
-            f"{quote_value(path)} cannot be run ({type(error).__name__}{place}: "
-            f"{quote_value(str(error))}); correct it.",
-            option,
-        ) from error
+        raise
     return module
 
 
@@ -104,8 +114,17 @@ def _is_own(value: object, module: ModuleType) -> bool:
     return callable(value) and getattr(value, "__module__", None) == module.__name__
 
 
+def _describe_error(error: BaseException, path: Path) -> str:
+    """Describe an error by its kind, its line in a file if it has one, and its message."""
+    line = _find_line(error, path)
+    place = "" if line is None else f", line {line}"
+    return f"{type(error).__name__}{place}: {quote_value(str(error))}"
+
+
 def _find_line(error: BaseException, path: Path) -> int | None:
-    """Find the last line of a file that an error passed through."""
+    """Find the last line of a file that an error passed through, or that is no Python."""
+    if isinstance(error, SyntaxError) and error.filename == str(path):
+        return error.lineno
     line = None
     trace = error.__traceback__
     while trace is not None:

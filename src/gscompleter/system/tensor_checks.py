@@ -18,7 +18,7 @@ from gscompleter.system.errors import InputError, quote_value
 
 FLOATS = (torch.float32, torch.float64)
 """Types of numbers that are stored; float64 is for files and comparisons. Errors ask for the first
-type of a group."""
+type of a group. Forms take this object, by which tensors of one float type are known."""
 BOOLS = (torch.bool,)
 BYTE_DTYPES = (torch.uint8,)
 INTEGERS = (torch.int32, torch.int64)
@@ -99,7 +99,7 @@ def iterate_tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:
 
 
 def describe(value: object) -> str:
-    """Describe a value by its type, and a tensor by its dtype and shape."""
+    """Describe a tensor by its dtype and shape, a string or number by itself, the rest by type."""
     if value is None:
         return "None"
     if isinstance(value, str):

@@ -23,7 +23,10 @@ _record: ContextVar[dict[str, float] | None] = ContextVar("record", default=None
 
 @contextmanager
 def record_seconds(stages: Sequence[str] = STAGES) -> Iterator[dict[str, float]]:
-    """Record the wall time of each stage that runs inside, and of everything as `total`."""
+    """Record the wall time in seconds of each stage that runs inside, and of everything as `total`.
+
+    What a GPU was given inside counts, with or without a stage around it.
+    """
     seconds = dict.fromkeys(stages, 0.0)
     start = time.perf_counter()
     token = _record.set(seconds)
@@ -31,6 +34,7 @@ def record_seconds(stages: Sequence[str] = STAGES) -> Iterator[dict[str, float]]
         yield seconds
     finally:
         _record.reset(token)
+        wait_for_gpu()
         seconds["total"] = time.perf_counter() - start
 
 

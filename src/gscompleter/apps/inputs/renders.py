@@ -68,8 +68,9 @@ from gscompleter.virtual_capture.witnesses import choose_witnesses
 
 RENDERS_FORMAT = "renders"
 """Format of photographs that are renders of the splat."""
-MAX_SURFACE_POINTS = 10_000
-"""Gaussians that stand for the surfaces of the scene where cameras are compared."""
+SURFACE_POINTS = 10_000
+"""Gaussians that stand for the surfaces of the scene where cameras are compared: as many, if there
+are, and fewer than twice as many."""
 MIN_POINT_OPACITY = 0.5
 """Least opacity of such a Gaussian."""
 
@@ -98,7 +99,12 @@ def open_renders(
     renderer: Renderer,
     device: str,
 ) -> OpenedAlone:
-    """Choose cameras, and render the splat there in place of photographs."""
+    """Choose cameras, and render the splat there in place of photographs.
+
+    `scene` is in the coordinates of `splat_file`, or relative to an origin of its own, and the task
+    is relative to an origin near it. Raises InputError for words, cameras or masks that cannot be
+    used, and for targets without a hole.
+    """
     reading = request.reading
     check_planes(reading.near, reading.far)
     check_resolution(reading.resolution)
@@ -304,7 +310,7 @@ def sample_surface_points(
 ) -> Float[np.ndarray, "n 3"]:
     """Sample the means of opaque Gaussians, in the coordinates of the file."""
     means = scene.means[scene.opacities >= MIN_POINT_OPACITY]
-    step = max(1, len(means) // MAX_SURFACE_POINTS)
+    step = max(1, len(means) // SURFACE_POINTS)
     return means[::step].double().cpu().numpy() + origin
 
 

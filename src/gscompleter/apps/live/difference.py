@@ -8,6 +8,7 @@ of each chunk, so that undo and redo send no Gaussian again.
 from __future__ import annotations
 
 import base64
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,9 @@ from gscompleter.types import Gaussians, merge
 MAX_SH = 16
 """Spherical harmonics of the highest degree, to which all others are padded in a comparison."""
 
+Key = tuple[bytes, int]
+"""Bytes of a Gaussian, and the number of equal ones before it."""
+
 
 class PageScene:
     """Keep what the pages of a session hold, which grows with each step that adds Gaussians."""
@@ -33,9 +37,8 @@ class PageScene:
         """Begin with the scene as it was given, in the layers in which the viewer's page has it."""
         self.frame: PageFrame = compute_page_frame(given)
         self._chunks: dict[str, bytes] = {}
-        # Where each Gaussian that was sent is: its chunk and its number there, by its bytes. Equal
-        # ones are one, as they are in a picture.
-        self._places: dict[bytes, tuple[str, int]] = {}
+        # Where each Gaussian that was sent is: its chunk and its number there, by its key.
+        self._places: dict[Key, tuple[str, int]] = {}
         self._counts: dict[str, int] = {}
         is_near = is_within_page(given, self.frame)
         layers = {"observed": given.generated == 0, "generated": given.generated > 0}
@@ -61,8 +64,7 @@ class PageScene:
         new = merge([completion.recolored[~gone[recolored]], *completion.parts[1:]])
         shown = self._place(new[is_within_page(new, self.frame)].to("cpu").detach())
         for name, count in self._counts.items():
-            numbers = shown.get(name, set())
-            left = np.setdiff1d(np.arange(count), np.fromiter(numbers, int, len(numbers)))
+            left = np.setdiff1d(np.arange(count), np.array(shown.get(name, []), int))
             hidden[name] = None if len(left) == count else encode_numbers(left)
         return {"chunks": [{"name": name, "hidden": text} for name, text in hidden.items()]}
 
@@ -70,27 +72,29 @@ class PageScene:
         """List the numbers, within a layer of the given scene, of what a mask of all hides."""
         return encode_numbers(torch.nonzero(mask[rows])[:, 0].cpu().numpy())
 
-    def _place(self, gaussians: Gaussians) -> Mapping[str, set[int]]:
-        """Return the numbers of Gaussians within their chunks; new ones make a chunk."""
+    def _place(self, gaussians: Gaussians) -> Mapping[str, list[int]]:
+        """Return the numbers of Gaussians on the CPU within their chunks; new ones make a chunk."""
         keys = list_keys(gaussians)
         unknown = [number for number, key in enumerate(keys) if key not in self._places]
         if unknown:
             name = f"added-{len(self._chunks) + 1}"
-            # The numbers of the chunk, in which equal Gaussians are all of them.
             for number, row in enumerate(unknown):
-                self._places.setdefault(keys[row], (name, number))
+                self._places[keys[row]] = name, number
             chunk = gaussians[torch.tensor(unknown)]
             self._chunks[name] = encode_spz(Path(name), self.frame.normalize(chunk))
             self._counts[name] = len(chunk)
-        shown: dict[str, set[int]] = {}
+        shown: dict[str, list[int]] = {}
         for key in keys:
             name, number = self._places[key]
-            shown.setdefault(name, set()).add(number)
+            shown.setdefault(name, []).append(number)
         return shown
 
 
-def list_keys(gaussians: Gaussians) -> list[bytes]:
-    """List the bytes of each Gaussian, which tell it from all that differ."""
+def list_keys(gaussians: Gaussians) -> list[Key]:
+    """List a key of each Gaussian, by which it is known again; they are on the CPU.
+
+    Equal Gaussians have keys of their own: two of them in one place hide more than one does.
+    """
     n = len(gaussians)
     sh = torch.nn.functional.pad(gaussians.sh, (0, 0, 0, MAX_SH - gaussians.sh.shape[1]))
     columns = (
@@ -102,7 +106,13 @@ def list_keys(gaussians: Gaussians) -> list[bytes]:
         gaussians.generated[:, None],
     )
     rows = torch.cat([column.float() for column in columns], dim=1).numpy()
-    return [row.tobytes() for row in rows]
+    counts: Counter[bytes] = Counter()
+    keys = []
+    for row in rows:
+        content = row.tobytes()
+        keys.append((content, counts[content]))
+        counts[content] += 1
+    return keys
 
 
 def encode_numbers(numbers: np.ndarray) -> str:

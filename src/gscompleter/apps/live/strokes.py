@@ -70,7 +70,10 @@ class StrokeRow:
         return SessionStep(self.action, self.make_camera(), mask, self.box, self.box_rotation)
 
     def make_camera(self) -> Camera:
-        """Make the camera in float64, as it was written; InputError if there is no such camera."""
+        """Make the camera in float64, in the frame of the photographs, as it was written.
+
+        Raises InputError if there is no such camera.
+        """
         # `load_cameras` rounds to float32 before large coordinates are brought to their origin.
         c2w = np.array(self.transform_matrix) @ OPENCV_FROM_OPENGL
         K = [[self.fl_x, 0.0, self.cx], [0.0, self.fl_y, self.cy], [0.0, 0.0, 1.0]]
@@ -79,7 +82,7 @@ class StrokeRow:
 
 @dataclass(frozen=True)
 class StrokesFile:
-    """The part of `strokes.json` that is read besides the cameras."""
+    """What a session reads of `strokes.json`; other entries of it are for other readers."""
 
     version: str
     frames: tuple[StrokeRow, ...]

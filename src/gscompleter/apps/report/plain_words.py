@@ -11,6 +11,7 @@ import numpy as np
 from gscompleter.apps.report.schema import (
     AlignmentRow,
     CompletionSummary,
+    ContextRow,
     RemovalRow,
     TargetRow,
     UnfilledRow,
@@ -188,7 +189,7 @@ def list_shared_warnings(summary: CompletionSummary) -> Iterator[str]:
 
 
 def name_targets(numbers: Sequence[int], total: int) -> str:
-    """Name targets by their numbers."""
+    """Name two or more of `total` targets by their numbers, which begin with 1."""
     if len(numbers) == total:
         return f"All {total} targets"
     first = ", ".join(str(number) for number in numbers[:-1])
@@ -221,15 +222,7 @@ def list_photograph_notes(summary: CompletionSummary) -> Iterator[Note]:
 
     displaced = [row for row in context if (row.pose_error or 0) >= MIN_POSE_ERROR]
     if displaced:
-        named = ", ".join(str(row.photograph) for row in displaced)
-        worst = max(row.pose_error or 0 for row in displaced)
-        yield Note(
-            "poses",
-            f"The poses of photographs {named} contradict the other photographs by up to "
-            f"{format_number(worst, 1)} pixels, which blurs what they show together; leave them "
-            "out (--context names the others), or find all cameras anew (gscompleter poses).",
-            is_warning=True,
-        )
+        yield Note("poses", describe_displaced(displaced), is_warning=True)
 
     factors = [factor for row in context for factor in row.exposure_gain or ()]
     if factors:
@@ -239,6 +232,21 @@ def list_photograph_notes(summary: CompletionSummary) -> Iterator[Note]:
             f"{max(factors) / min(factors):.2f}; the scene has the mean exposure, at which these "
             "photographs are scored. Target photographs are scored as they are.",
         )
+
+
+def describe_displaced(rows: Sequence[ContextRow]) -> str:
+    """Describe photographs whose poses the others contradict, and what to do about them."""
+    named = ", ".join(str(row.photograph) for row in rows)
+    worst = max(row.pose_error or 0 for row in rows)
+    if len(rows) == 1:
+        subject, whom = f"The pose of photograph {named} contradicts", "it"
+    else:
+        subject, whom = f"The poses of photographs {named} contradict", "them"
+    return (
+        f"{subject} the other photographs by up to {format_number(worst, 1)} pixels, which blurs "
+        f"what they show together; leave {whom} out (--context names the others), or find all "
+        "cameras anew (gscompleter poses)."
+    )
 
 
 def describe_given_depth(share: float, summary: CompletionSummary) -> str:
@@ -348,7 +356,7 @@ def describe_wanted_photographs(targets: Sequence[TargetRow]) -> str:
 
 
 def describe_alignment(affine: AlignmentRow, unit: str) -> str:
-    """Describe the depth alignment of a target."""
+    """Describe the depth alignment of a target; `unit` is the name of the unit of depths."""
     text = ALIGNMENTS.get(affine.method, "The depths are aligned by an unknown method.")
     inliers = format_percent(affine.inliers, 0)
     fit = text.format(scale=affine.scale, shift=affine.shift, unit=unit, inliers=inliers)

@@ -2,6 +2,11 @@
 
 Splats are listed in the 16 × 16 tiles that they touch (`tiles.py`). Two lists are merged by
 depth: the frozen `context`, and `new`, which gets gradients.
+
+Kernels work on tiles[begin:end], the numbers of tiles row by row. Of one tile they keep `state`
+[row, value, column], whose values the functions of `simd.py` name, and `row_limit` [row]: a splat
+behind the limit of a row, by its position in the merged list, is skipped there. Front to back
+it only tells full rows, -1, from others; back to front it is the last contribution of a row.
 """
 
 from typing import NamedTuple
@@ -23,6 +28,7 @@ class Layer(NamedTuple):
     splats: np.ndarray
     """[n, 9] float32, columns X to BLUE."""
     opacities: np.ndarray
+    """[n] float32."""
     boxes: np.ndarray
     """Pixels that a splat may touch, int16 or int32 [n, 4]: x from, to; y from, to (excluded)."""
     tile_start: np.ndarray
@@ -35,9 +41,11 @@ class RasterFrame(NamedTuple):
     """A rendered image, and the state that the backward pass needs."""
 
     image: np.ndarray
+    """Colours over black [h, w, 3] float32."""
     depth: np.ndarray
     """z-depth [h, w] float32, 0 for empty pixels."""
     alpha: np.ndarray
+    """1 - transmittance [h, w] float32."""
     transmittance: np.ndarray
     """Transmittance behind the last contribution [h, w] float32."""
     last: np.ndarray
@@ -60,8 +68,9 @@ def _get_depth(splats, entries, place, begin, end, beyond):
 def merge_lists(begin, end, context, new, used, full, tile_start, entries, depth_limits):
     """Merge the lists of the tiles begin..end of two layers, as far as they were composited.
 
-    Splats of `new` are numbered after those of the context. depth_limits [tiles] receives the
-    z-depth behind which a tile shows nothing.
+    `used` and `full` are those of their frame. `entries` receives the lists, each from its
+    tile_start on; splats of `new` are numbered after those of the context. depth_limits [tiles]
+    receives the z-depth behind which a tile shows nothing.
     """
     c_splats, _, _, c_start, c_entries = context
     n_splats, _, _, n_start, n_entries = new
@@ -196,7 +205,9 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
     """Composite tiles[begin:end] and backproject the residual to the entries of `new`.
 
     A splat's weights stay in the cache until the image of its tile is finished.
-    sums [slots, 4]: over the tile, weight times (photograph - image) per colour, and weight.
+    photograph [h, w, 3] float32. slots [e] int32: slot of each entry of `new`.
+    sums [slots, 4]: over the tile, weight times (photograph - image) per colour, and weight; set,
+    as written [slots], for visited entries only.
     """
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
     n_splats, n_opacities, n_boxes, n_start, n_entries = new
@@ -205,7 +216,8 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
     most = 1
     for index in range(begin, end):
         most = max(most, n_start[tiles[index] + 1] - n_start[tiles[index]] + 1)
-    # Rows of weights, up to TILE for each splat; those never written take no memory.
+    # Rows of weights, up to TILE for each splat, and for one of the context after them. Those never
+    # written take no memory.
     kept = np.empty((most * TILE, TILE), np.float32)
     row_limit = np.empty(TILE, np.int32)
     totals = np.zeros(TILE, np.float32)
@@ -268,7 +280,8 @@ def composite_backward(
     """Traverse tiles[begin:end] back to front and sum the gradients of the entries of `new`.
 
     d_frame: gradients of image, depth and alpha. slots [e] int32: slot of each entry of `new`.
-    gradients [slots, columns] and written [slots] are set for visited entries only.
+    gradients [slots, columns] has the columns of `project.py`, or three colours if `wanted` is
+    WANT_COLOR; it is set, as written [slots], for visited entries only.
     """
     c_splats, c_opacities, c_boxes, c_start, c_entries = context
     n_splats, n_opacities, n_boxes, n_start, n_entries = new

@@ -9,7 +9,8 @@ PRIMAL_STEP = np.float32(0.25)
 GRADIENT_STEP = np.float32(0.2)
 DUAL_STEP = np.float32(1 / 3)
 GRADIENT_DUAL_STEP = np.float32(0.5)
-"""Steps of the four variables: inverse row sums of the operator (Pock and Chambolle 2011)."""
+"""Steps of heights, gradients and the duals of both: inverse sums of absolute values in the columns
+of the operator for the first two, in its rows for the duals (Pock and Chambolle 2011)."""
 ITERATIONS_PER_PASS = 10
 """Iterations per pass over the image, each one row behind the last, with rows in the cache."""
 MIN_BAND_ROWS = 4 * ITERATIONS_PER_PASS
@@ -17,7 +18,7 @@ MIN_BAND_ROWS = 4 * ITERATIONS_PER_PASS
 
 
 def fit(heights, gradients, data, weight, across, down, bend, tolerance, iterations, threads=None):
-    """Fit heights u and their gradients v by the first-order primal-dual algorithm.
+    """Fit heights u and their gradients v in place by the first-order primal-dual algorithm.
 
         min sum weight * huber(u - data) + across |u_x - v_x| + down |u_y - v_y| + bend |grad v|
 
@@ -25,7 +26,8 @@ def fit(heights, gradients, data, weight, across, down, bend, tolerance, iterati
     covers fewer rows of the band than the one before; the seams follow. The result is the same to
     the bit.
 
-    heights [h, w], gradients [2, h, w] (x, y): initial values, updated in place.
+    All arrays and numbers are float32, heights in any one unit, and `iterations` an int.
+    heights [h, w], gradients [2, h, w] (x, y): initial values, which the result replaces.
     data, weight [h, w]: measured heights and their weights; 0 without measurement.
     across, down [h, w]: cost of a step to the right and to the pixel below.
     bend: cost of a change of gradient. tolerance: deviation from `data` of quadratic loss.
@@ -107,7 +109,8 @@ def _lower_primals(y, state, given):
     two = np.float32(2)
     none = np.float32(0)
     for x in range(heights.shape[1]):
-        # Negative divergence of the duals, with nothing beyond the border.
+        # Divergence of the duals, against which the gradient of the energy points, with nothing
+        # beyond the border.
         push = steps[0, y, x] + steps[1, y, x]
         turn0 = bends[0, y, x] + bends[1, y, x]
         turn1 = bends[2, y, x] + bends[3, y, x]

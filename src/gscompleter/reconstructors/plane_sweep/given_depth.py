@@ -63,7 +63,10 @@ def add_given(measured: Measurement, image: StereoImage) -> Measurement:
 
 
 def measure_nothing(image: StereoImage, near: float, far: float) -> Measurement:
-    """Space planes for a photograph without stereo, between depths in units of the image."""
+    """Space planes for a photograph without stereo, with weight 0 everywhere.
+
+    `near` and `far` are z-depths in the unit of lengths of the image, as `given` has it.
+    """
     planes = np.linspace(1 / far, 1 / near, MAX_PLANES, dtype=np.float32)
     none = np.zeros(image.size, np.float32)
     return Measurement(planes, none, none, none)

@@ -80,24 +80,27 @@ def has_baseline(poses: Sequence[Matrix]) -> bool:
 
 
 def fit_pose_similarity(before: Sequence[Matrix], after: Sequence[Matrix]) -> Matrix:
-    """Fit the similarity between two sets of poses of the same cameras, robust to outliers.
+    """Fit the similarity that moves poses to others of the same cameras, robust to outliers.
 
-    The rotation is the one closest to most, scale and shift are medians; both `has_baseline`. Least
-    squares (`fit_center_similarity`, `move_to_given_frame`) would follow the poses that were found
-    in a wrong place of a splat.
+    It is such that `transform_pose(before[i], similarity)` is near `after[i]`. The rotation is the
+    one closest to most, scale and shift are medians; both sets `has_baseline`. Least squares
+    (`fit_center_similarity`, `move_to_given_frame`) would follow the poses that were found in a
+    wrong place of a splat.
     """
-    turns = np.stack([b[:3, :3] @ a[:3, :3].T for a, b in zip(before, after, strict=True)])
+    pairs = zip(before, after, strict=True)
+    turns = np.stack([new[:3, :3] @ old[:3, :3].T for old, new in pairs])
     # trace(R_iᵀ R_j) grows as the angle between two rotations falls; each pair of poses gives one
     # rotation, and the one with the largest median trace is the closest to most.
     closeness = np.einsum("iab,jab->ij", turns, turns)
     rotation = turns[np.median(closeness, axis=1).argmax()]
-    old = np.stack(before)[:, :3, 3]
-    new = np.stack(after)[:, :3, 3]
+    starts = np.stack(before)[:, :3, 3]
+    ends = np.stack(after)[:, :3, 3]
     # Scale: the median over cameras of the median ratio of its distances to the others, since pairs
     # with a camera that is an outlier are wrong altogether.
-    apart = np.linalg.norm(old[:, None] - old, axis=-1)
+    apart = np.linalg.norm(starts[:, None] - starts, axis=-1)
     # Every camera is far enough from at least one of the two that are farthest apart.
     apart[apart < 0.3 * apart.max()] = np.nan
-    ratios = np.linalg.norm(new[:, None] - new, axis=-1) / apart
+    ratios = np.linalg.norm(ends[:, None] - ends, axis=-1) / apart
     scale = float(np.median(np.nanmedian(ratios, axis=1)))
-    return make_similarity(scale, rotation, np.median(new - scale * old @ rotation.T, axis=0))
+    shift = np.median(ends - scale * starts @ rotation.T, axis=0)
+    return make_similarity(scale, rotation, shift)

@@ -49,9 +49,11 @@ class TrainingSize:
 def find_training_size(
     splat: Path, folder: Path, photographs: Photographs, frames: Sequence[int]
 ) -> TrainingSize | None:
-    """Find the size that a splat was trained at; None if no file says it or if it is theirs.
+    """Find the size that a splat was trained at; None if no file names one other than theirs.
 
-    `folder` is that of the photographs, and `frames` are some of those whose size is compared.
+    `folder` is that of the photographs, and `frames` are some of those whose size is compared. The
+    first record of another size counts: a folder may hold files of several trainers. What cannot be
+    read is no record, and leaves photographs the working size that they have without a splat.
     """
     sizes = [photographs.frame(frame).size() for frame in frames]
     if not sizes:
@@ -75,7 +77,10 @@ Record = tuple[float, str]
 
 
 def read_inria_scale(splat: Path, folder: Path, width: int) -> Record | None:
-    """Read the scale of Inria's trainer: of its folder of images, and of what it makes of them."""
+    """Read the scale of Inria's trainer: of its folder of images, and of what it makes of them.
+
+    `width` is that of the photographs in pixels.
+    """
     text = read_trainer_settings(splat, folder, INRIA_FILE)
     resolution = re.search(r"\bresolution=(-?\d{1,5})\b", text)
     if resolution is None:
@@ -103,7 +108,10 @@ def read_gsplat_scale(splat: Path, folder: Path) -> Record | None:
 def read_listed_scale(
     splat: Path, folder: Path, photographs: Photographs, own: float
 ) -> Record | None:
-    """Read the scale of a list of cameras whose names are those of the photographs."""
+    """Read the scale of the first list of cameras whose names are those of the photographs.
+
+    `own` is the longer side of most photographs in pixels.
+    """
     names = [frame.name for frame in photographs.frames]
     for file in find_camera_lists(splat, folder):
         with suppress(InputError):

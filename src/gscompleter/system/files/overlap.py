@@ -29,11 +29,11 @@ def refuse_overlap(
     of its folders that are results of their own: a completion is cleaned in place, or completed
     from the cameras that were found for it.
     """
-    # Photographs may be links to a folder elsewhere, which is an input as well.
     chain = list(_identify_chain(out))
     for given in inputs:
         if may_continue and _is_earlier_result(given, out):
             continue
+        # Photographs may be links to a folder elsewhere, which is an input as well.
         for path in [given, *_list_linked(given)]:
             relation = _relate(out, chain, path)
             if relation is not None:
@@ -124,9 +124,9 @@ def _list_linked(folder: Path, depth: int = MAX_LINK_DEPTH) -> Iterator[Path]:
 
 def _is_earlier_result(given: Path, out: Path) -> bool:
     """Return True for a result of an earlier run in `out`, or a folder of results of its own."""
-    listed = read_listing(out)
     if os.path.realpath(given.parent) != os.path.realpath(out):
         return False
+    listed = read_listing(out)
     if os.path.isdir(given):
         is_listed = any(name.startswith(f"{given.name}/") for name in listed)
         return not is_listed and holds_results(given)
