@@ -24,6 +24,12 @@ MAX_SPACING = 2.0
 """Largest spacing relative to the median of the neighbours, so that a stray point stays small."""
 MAX_POINTS = 4_000_000
 """Most points that are kept; a denser cloud tells no more at the size of an image."""
+MAX_DEVIATION = 0.05
+"""Largest deviation of depth, relative, that still counts as the same surface."""
+MIN_COMPARED = 0.001
+"""Smallest share of the photographs' pixels that has to be compared."""
+FRAME_ADVICE = "give it in the frame and unit of the scene"
+"""What to do about geometry that is not what the scene shows, as a clause of a sentence."""
 
 
 @dataclass(frozen=True)
