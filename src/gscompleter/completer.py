@@ -11,8 +11,6 @@ import torch
 
 from gscompleter.config import CompleterConfig
 from gscompleter.config.settings import validate
-from gscompleter.editing.remaking import remake_scene
-from gscompleter.editing.replacing import find_contested, let_step_aside, return_needed
 from gscompleter.generators import (
     FunctionGenerator,
     Generator,
@@ -70,6 +68,8 @@ from gscompleter.stages.refine import keep_as_it_is, refine
 from gscompleter.stages.refusals import explain_skip
 from gscompleter.stages.register import register_along_rays
 from gscompleter.stages.register_paper import register_as_paper
+from gscompleter.stages.remake_scene import remake_scene
+from gscompleter.stages.replace_contested import find_contested, let_step_aside, return_needed
 from gscompleter.stages.result import count_outside, make_unchanged_result
 from gscompleter.stages.select_anchor import choose_anchor
 from gscompleter.stages.synthesize import GeneratedView, make_generator_input, synthesize
