@@ -20,9 +20,8 @@ from gscompleter.config import GapConfig
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.generators import GeneratorOutput
 from gscompleter.guards.free_space import respect_free_space
-from gscompleter.numerics.geometry import pad_camera, project, rotations_to_quats
+from gscompleter.numerics.geometry import adapt_to_mode, pad_camera, project, rotations_to_quats
 from gscompleter.render.cpu import CpuRenderer
-from gscompleter.render.reference import adapt_to_mode
 from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.stages.lift import lift_pair
 from gscompleter.stages.register import apply_affine

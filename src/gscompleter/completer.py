@@ -19,7 +19,7 @@ from gscompleter.generators import (
     load_generator,
 )
 from gscompleter.guards import accept_at, prepare_guards
-from gscompleter.numerics.geometry import pad_camera, pad_like
+from gscompleter.numerics.geometry import count_outside, pad_camera, pad_like
 from gscompleter.numerics.given_geometry import GivenGeometry
 from gscompleter.numerics.image_ops import is_enclosed
 from gscompleter.numerics.value_checks import (
@@ -70,7 +70,7 @@ from gscompleter.stages.register import register_along_rays
 from gscompleter.stages.register_paper import register_as_paper
 from gscompleter.stages.remake_scene import remake_scene
 from gscompleter.stages.replace_contested import find_contested, let_step_aside, return_needed
-from gscompleter.stages.result import count_outside, make_unchanged_result
+from gscompleter.stages.result import make_unchanged_result
 from gscompleter.stages.select_anchor import choose_anchor
 from gscompleter.stages.synthesize import GeneratedView, make_generator_input, synthesize
 from gscompleter.stages.target_view import TargetView, render_target

@@ -18,11 +18,10 @@ from torch.nn.functional import max_pool2d
 
 from gscompleter.config import GapConfig
 from gscompleter.generators.smooth import continue_smoothly
-from gscompleter.numerics.geometry import pad_camera
+from gscompleter.numerics.geometry import adapt_to_mode, pad_camera
 from gscompleter.numerics.image_ops import dilate, keep_thin
 from gscompleter.reconstructors.plane_sweep.gaussians import DISC_SIGMA, compute_normals, make_discs
 from gscompleter.render.cache import SceneRenderer
-from gscompleter.render.reference import adapt_to_mode
 from gscompleter.stages.select_anchor import find_nearest_view
 from gscompleter.stages.synthesize import GeneratedView
 from gscompleter.stages.target_view import TargetView, render_target

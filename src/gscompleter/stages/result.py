@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from gscompleter.numerics.geometry import is_inside, project
 from gscompleter.stages.refusals import explain_no_need, explain_refusal
 from gscompleter.stages.select_anchor import Anchor
 from gscompleter.stages.target_view import TargetView
 from gscompleter.target_result import TargetResult
-from gscompleter.types import Camera, Gaussians
 
 
 def make_unchanged_result(view: TargetView, anchor: Anchor) -> TargetResult:
@@ -27,8 +25,3 @@ def make_unchanged_result(view: TargetView, anchor: Anchor) -> TargetResult:
         skip_reason=refusal or explain_no_need(view),
         target_id=view.state.next_target_id,
     )
-
-
-def count_outside(added: Gaussians, target: Camera) -> int:
-    """Count the Gaussians outside of the image of a target, in its padding."""
-    return len(added) - int(is_inside(*project(added.means, target), target).sum())
