@@ -210,8 +210,8 @@ class GSCompleter:
 
         The LOD proxy of a large scene is made fine enough for photographs and known targets.
         `earlier` marks what earlier commands made of `scene`. `has_scene_range` is True if near and
-        far of the views are those that `stages.context.find_scene_range` found, so that they are
-        not looked for again.
+        far of the views are those that `find_scene_range` found, so that they are not looked for
+        again.
         """
         check_inputs(views, scene, check_views or (), targets)
         check_row_mask(earlier.invented, scene, "The mask of what was invented")

@@ -17,9 +17,9 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from gscompleter.config import GapConfig
-from gscompleter.generators.smooth import continue_smoothly
 from gscompleter.numerics.geometry import adapt_to_mode, pad_camera
 from gscompleter.numerics.image_ops import dilate, keep_thin
+from gscompleter.numerics.smooth import continue_smoothly
 from gscompleter.reconstructors.plane_sweep.gaussians import DISC_SIGMA, compute_normals, make_discs
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.stages.select_anchor import find_nearest_view
