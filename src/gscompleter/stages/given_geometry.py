@@ -15,7 +15,6 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import CompleterConfig
-from gscompleter.numerics.geometry import compute_z_depths, look_up
 from gscompleter.numerics.given_geometry import (
     FRAME_ADVICE,
     MAX_DEVIATION,
@@ -32,7 +31,7 @@ from gscompleter.stages.target_view import TargetView
 from gscompleter.system.errors import InputError
 from gscompleter.system.tensor_checks import describe
 from gscompleter.target_result import GeometryUse
-from gscompleter.types import DepthMap, Gaussians, View
+from gscompleter.types import DepthMap, View
 
 MIN_AGREEING = 0.5
 """Smallest share of the compared pixels around one that has to agree."""
@@ -182,16 +181,3 @@ def add_geometry_depth(image: GeneratedView, view: TargetView) -> tuple[Generate
         contradicted=int((view.holes & fit.contradicted).sum()) / num_holes,
     )
     return replace(image, given_depth=fit.depth.where(~seen.valid, 0.0)), use
-
-
-def count_on_geometry(use: GeometryUse, added: Gaussians, image: View) -> GeometryUse:
-    """Count the added Gaussians that stand at the depth of the geometry.
-
-    Some are moved away from it: by guards, and before what is left in a forced hole.
-    """
-    if image.given_depth is None:
-        return use
-    given = look_up(image.given_depth, added, image.camera)
-    z = compute_z_depths(added.means, image.camera)
-    stands_there = (given > 0) & ((z - given).abs() <= MAX_DEVIATION * given)
-    return replace(use, added=int(stands_there.sum()))

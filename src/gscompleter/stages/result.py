@@ -2,10 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+from gscompleter.parts import Part
 from gscompleter.stages.refusals import explain_no_need, explain_refusal
 from gscompleter.stages.select_anchor import Anchor
 from gscompleter.stages.target_view import TargetView
+from gscompleter.state import Completion
 from gscompleter.target_result import TargetResult
+
+
+@dataclass(frozen=True)
+class TargetOutcome:
+    """What came of a target."""
+
+    state: Completion
+    """The scene in its new colours, without what was added for the target."""
+    result: TargetResult
+    parts: tuple[Part, ...] = ()
+    """What was added for it, in the order of addition."""
 
 
 def make_unchanged_result(view: TargetView, anchor: Anchor) -> TargetResult:
