@@ -233,6 +233,14 @@ def test_targets_are_synthesized_together_where_the_generator_can():
     assert torch.equal(together.scene.opacities, one_by_one.scene.opacities)
 
 
+def test_the_time_of_a_target_that_is_skipped_counts():
+    completer = knowing()
+    begun = completer.begin(photographs())
+    done = completer.advance(begun, photographs()[0].camera)
+    assert done.targets[0].skip_reason
+    assert done.seconds["total"] > begun.seconds["total"]
+
+
 def test_numbers_of_targets_go_on_where_the_given_scene_ends():
     first = completed(CompleterConfig())
     second = knowing()(photographs(), camera_at(-0.9, yaw=-12, size=SIZE), first.scene)
