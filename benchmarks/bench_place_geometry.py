@@ -25,8 +25,8 @@ from gscompleter import InputError, View
 from gscompleter.data.formats import open_photographs
 from gscompleter.numerics.geometry import unproject
 from gscompleter.numerics.given_geometry import GivenGeometry
-from gscompleter.stages.place_geometry import place_geometry
-from gscompleter.types import Render
+from gscompleter.numerics.place_geometry import place_geometry
+from gscompleter.types import DepthMap
 
 SIZE = (256, 256)
 NEAR, FAR = 0.5, 10.0
@@ -47,7 +47,7 @@ class Shown:
 
     name: str
     views: list[View]
-    renders: list[Render]
+    surfaces: list[DepthMap]
     mesh: GivenGeometry
 
 
@@ -61,14 +61,14 @@ def read_shown(word: str) -> Shown:
     first, last = max(0, min(context) - NUM_SCANNED), max(context) + NUM_SCANNED
     around = [n for n in range(first, min(last + 1, len(photographs))) if n not in context]
     scanned = photographs.views(around[:: -(-len(around) // NUM_SCANNED)], SIZE)
-    renders = [render_sensor(view) for view in views]
-    return Shown(word, views, renders, join([make_mesh(view) for view in scanned], word))
+    surfaces = [sense_surface(view) for view in views]
+    return Shown(word, views, surfaces, join([make_mesh(view) for view in scanned], word))
 
 
-def render_sensor(view: View) -> Render:
-    """Return what an exact splat of a photograph would show."""
+def sense_surface(view: View) -> DepthMap:
+    """Return the surface that an exact splat of a photograph would show."""
     depth = get_depth(view)
-    return Render(view.image, depth, (depth > 0).float())
+    return DepthMap(depth, depth > 0)
 
 
 def get_depth(view: View) -> Float[torch.Tensor, "h w"]:
@@ -155,7 +155,8 @@ def find_plane(
 def judge(geometry: GivenGeometry, shown: Shown, truth: GivenGeometry | None) -> str:
     """Place geometry, and say in a word what became of it."""
     try:
-        placed = place_geometry(geometry, shown.views, shown.renders)
+        cameras = [view.camera for view in shown.views]
+        placed = place_geometry(geometry, cameras, shown.surfaces)
     except InputError as error:
         return f"refused: {error}"
     how = "kept" if placed is geometry else "moved"

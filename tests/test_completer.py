@@ -20,9 +20,8 @@ from gscompleter.config import GapConfig
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.generators import GeneratorOutput
 from gscompleter.guards.free_space import respect_free_space
-from gscompleter.numerics.geometry import pad_camera, project, rotations_to_quats
+from gscompleter.numerics.geometry import adapt_to_mode, pad_camera, project, rotations_to_quats
 from gscompleter.render.cpu import CpuRenderer
-from gscompleter.render.reference import adapt_to_mode
 from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.stages.lift import lift_pair
 from gscompleter.stages.register import apply_affine
@@ -232,6 +231,14 @@ def test_targets_are_synthesized_together_where_the_generator_can():
     one_by_one = knowing()(views, targets)
     assert torch.equal(together.scene.means, one_by_one.scene.means)
     assert torch.equal(together.scene.opacities, one_by_one.scene.opacities)
+
+
+def test_the_time_of_a_target_that_is_skipped_counts():
+    completer = knowing()
+    begun = completer.begin(photographs())
+    done = completer.advance(begun, photographs()[0].camera)
+    assert done.targets[0].skip_reason
+    assert done.seconds["total"] > begun.seconds["total"]
 
 
 def test_numbers_of_targets_go_on_where_the_given_scene_ends():

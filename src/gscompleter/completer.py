@@ -11,8 +11,6 @@ import torch
 
 from gscompleter.config import CompleterConfig
 from gscompleter.config.settings import validate
-from gscompleter.editing.remaking import remake_scene
-from gscompleter.editing.replacing import find_contested, let_step_aside, return_needed
 from gscompleter.generators import (
     FunctionGenerator,
     Generator,
@@ -21,8 +19,8 @@ from gscompleter.generators import (
     load_generator,
 )
 from gscompleter.guards import accept_at, prepare_guards
-from gscompleter.numerics.geometry import pad_camera, pad_like
-from gscompleter.numerics.given_geometry import GivenGeometry
+from gscompleter.numerics.geometry import count_outside, pad_camera, pad_like
+from gscompleter.numerics.given_geometry import GivenGeometry, count_at_given_depth
 from gscompleter.numerics.image_ops import is_enclosed
 from gscompleter.numerics.value_checks import (
     check_camera,
@@ -58,11 +56,7 @@ from gscompleter.stages.context_geometry import init_with_geometry
 from gscompleter.stages.fade_border import fade_border
 from gscompleter.stages.filter_holes import filter_holes
 from gscompleter.stages.find_unfilled import find_unfilled
-from gscompleter.stages.given_geometry import (
-    add_geometry_depth,
-    check_geometry,
-    count_on_geometry,
-)
+from gscompleter.stages.given_geometry import add_geometry_depth, check_geometry
 from gscompleter.stages.lift import lift
 from gscompleter.stages.new_photos import find_new_photos, recolor_to_photos
 from gscompleter.stages.recolor import recolor
@@ -70,8 +64,10 @@ from gscompleter.stages.refine import keep_as_it_is, refine
 from gscompleter.stages.refusals import explain_skip
 from gscompleter.stages.register import register_along_rays
 from gscompleter.stages.register_paper import register_as_paper
-from gscompleter.stages.result import count_outside, make_unchanged_result
-from gscompleter.stages.select_anchor import choose_anchor
+from gscompleter.stages.remake_scene import remake_scene
+from gscompleter.stages.replace_contested import find_contested, let_step_aside, return_needed
+from gscompleter.stages.result import TargetOutcome, make_unchanged_result
+from gscompleter.stages.select_anchor import Anchor, choose_anchor
 from gscompleter.stages.synthesize import GeneratedView, make_generator_input, synthesize
 from gscompleter.stages.target_view import TargetView, render_target
 from gscompleter.state import Completion, Photo
@@ -80,6 +76,7 @@ from gscompleter.system.progress import show_in_notebook, track
 from gscompleter.system.tensor_checks import describe, is_whole_number
 from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.system.torch_modes import run_in_plain_torch
+from gscompleter.target_result import TargetResult
 from gscompleter.trust import Trust
 from gscompleter.trust.photometric import load_trust
 from gscompleter.types import Camera, DepthAffine, Gaussians, PaddedCamera, View, merge
@@ -210,8 +207,8 @@ class GSCompleter:
 
         The LOD proxy of a large scene is made fine enough for photographs and known targets.
         `earlier` marks what earlier commands made of `scene`. `has_scene_range` is True if near and
-        far of the views are those that `stages.context.find_scene_range` found, so that they are
-        not looked for again.
+        far of the views are those that `find_scene_range` found, so that they are not looked for
+        again.
         """
         check_inputs(views, scene, check_views or (), targets)
         check_row_mask(earlier.invented, scene, "The mask of what was invented")
@@ -311,52 +308,65 @@ class GSCompleter:
         """
         check_state(state)
         check_target_ids(state.context, len(state.targets) + 1)
-        # Seeded anew for each target, so that its result does not depend on how many came before.
-        rng = torch.Generator().manual_seed(self.seed)
         with record_seconds() as seconds:
-            # Stages 2 to 4 of the paper, an equation a line.
             view = self.observe(state, target, reference)
             anchor = choose_anchor(view)  # Sec. III-D
             unchanged = make_unchanged_result(view, anchor)
-            if unchanged.skip_reason:
-                return state.extended(unchanged, seconds)
-            image = reference or self.synthesize([view])[0]  # Eq. 6
-            image, use = add_geometry_depth(image, view)
-            lifted = lift(self.reconstructor, image, anchor, view)  # Eq. 7
-            affine = align_depth(lifted, anchor, view, rng)  # Eq. 8
-            register = REGISTRATIONS[state.config.registration_method]
-            moved = register(lifted, affine, image, anchor, view)  # Eq. 9 to 11
-            in_holes = filter_holes(moved, view)  # Eq. 12
-            origin = PartOrigin("target", state.next_target_id)
-            candidates = Additions.begin(origin, "lift", lifted.gaussians)
-            candidates = candidates.then("register", moved.gaussians).then("filter", in_holes)
-            filled = accept_at(view, candidates, image, affine, refine)  # Eq. 13
-            part = make_part(origin, fade_border(filled.gaussians, view))
+            outcome = TargetOutcome(state, unchanged)
+            if not unchanged.skip_reason:
+                outcome = self.fill_holes(anchor, reference, unchanged)
+        return outcome.state.extended(outcome.result, seconds, outcome.parts)
 
-            # Not in the paper: what covers the target without being trusted takes new colours, and
-            # gaps that a camera beside the target would see are closed.
-            recolored = recolor(image, view, origin)
-            closing = self.close_gaps(recolored.state, view, part)
-            added = merge([part.gaussians, closing.gaussians])
-            after = recolored.frozen.composite(added)
-            result = replace(
-                unchanged,
-                after=after.crop(view.camera),
-                added=added,
-                unfilled=find_unfilled(after, filled.steps, view),
-                reference=image.crop(view.camera),
-                affine=affine,
-                losses={"register": moved.losses, "refine": filled.losses},
-                registered=moved.gaussians if self.keep_registered else None,
-                num_outside=count_outside(added, target) if state.is_given else 0,
-                num_recolored=len(recolored.rows),
-                synthesis_notes=image.notes,
-                lift_notes=lifted.notes,
-                geometry=count_on_geometry(use, added, image),
-                painter=image.painter,
-                rejection=filled.rejection,
-            )
-        return recolored.state.extended(result, seconds, (part, closing))
+    def fill_holes(
+        self, anchor: Anchor, reference: GeneratedView | None, unchanged: TargetResult
+    ) -> TargetOutcome:
+        """Fill the holes of the target of an anchor; `reference` is as in `advance`.
+
+        `unchanged` is the result of a target that stays as it is.
+        """
+        view = anchor.target
+        state = view.state
+        # Seeded anew for each target, so that its result does not depend on how many came before.
+        rng = torch.Generator().manual_seed(self.seed)
+        # Stages 2 to 4 of the paper, an equation a line.
+        image = reference or self.synthesize([view])[0]  # Eq. 6
+        image, use = add_geometry_depth(image, view)
+        lifted = lift(self.reconstructor, image, anchor, view)  # Eq. 7
+        affine = align_depth(lifted, anchor, view, rng)  # Eq. 8
+        register = REGISTRATIONS[state.config.registration_method]
+        moved = register(lifted, affine, image, anchor, view)  # Eq. 9 to 11
+        in_holes = filter_holes(moved, view)  # Eq. 12
+        origin = PartOrigin("target", state.next_target_id)
+        candidates = Additions.begin(origin, "lift", lifted.gaussians)
+        candidates = candidates.then("register", moved.gaussians).then("filter", in_holes)
+        filled = accept_at(view, candidates, image, affine, refine)  # Eq. 13
+        faded = fade_border(filled.gaussians, view)
+        part = make_part(origin, faded)
+
+        # Not in the paper: what covers the target without being trusted takes new colours, and gaps
+        # that a camera beside the target would see are closed.
+        recolored = recolor(image, view, origin)
+        closing = self.close_gaps(recolored.state, view, part)
+        added = merge([part.gaussians, closing.gaussians])
+        after = recolored.frozen.composite(added)
+        result = replace(
+            unchanged,
+            after=after.crop(view.camera),
+            added=added,
+            unfilled=find_unfilled(after, filled.steps, view),
+            reference=image.crop(view.camera),
+            affine=affine,
+            losses={"register": moved.losses, "refine": filled.losses},
+            registered=moved.gaussians if self.keep_registered else None,
+            num_outside=count_outside(added, view.camera.target) if state.is_given else 0,
+            num_recolored=len(recolored.rows),
+            synthesis_notes=image.notes,
+            lift_notes=lifted.notes,
+            geometry=replace(use, added=count_at_given_depth(added, image)),
+            painter=image.painter,
+            rejection=filled.rejection,
+        )
+        return TargetOutcome(recolored.state, result, (part, closing))
 
     def close_gaps(self, state: Completion, target: TargetView, added: Part) -> Part:
         """Return what closes the thin gaps beside a target, for which `added` is added.
@@ -419,24 +429,24 @@ class GSCompleter:
         """
         check_state(state)
         check_camera(target, "The target")
-        if reference:
-            ranged = state.with_depth_range(target)
-            return render_target(state, pad_like(ranged, reference.camera), self.scenes)
-
+        camera = self.pad_target(state, target, reference)
+        view = render_target(state, camera, self.scenes)
         # A camera that moves on from the target meets the next hole at the border of its image
         # (decision 001). Holes that do not reach it need no padding.
-        camera = self.pad_target(state, target)
-        view = render_target(state, camera, self.scenes)
-        if camera.is_padded and is_enclosed(camera.crop(view.holes)):
+        if reference is None and camera.is_padded and is_enclosed(camera.crop(view.holes)):
             view = render_target(state, pad_camera(camera.target, 0.0), self.scenes)
         return view
 
-    def pad_target(self, state: Completion, target: Camera) -> PaddedCamera:
-        """Pad a target camera by as much as the settings and Φ allow."""
+    def pad_target(
+        self, state: Completion, target: Camera, reference: View | None = None
+    ) -> PaddedCamera:
+        """Pad a target camera as its reference, else by as much as the settings and Φ allow."""
+        ranged = state.with_depth_range(target)
+        if reference is not None:
+            return pad_like(ranged, reference.camera)
         # `begin` has chosen the margin.
         margin = state.config.margin or 0.0
         can_pad = as_generator(self.generator).supports_padding
-        ranged = state.with_depth_range(target)
         return pad_camera(ranged, margin if can_pad else 0.0)
 
     @timed_stage("generate")

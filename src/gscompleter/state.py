@@ -77,7 +77,7 @@ class Completion(Displayed):
     """Geometry from elsewhere, whose depth is used in holes; None for none."""
     confirmation: Trust | None = None
     """How far photographs confirm what a removal left, although all of it has full trust; None if
-    they do not decide what stays (`keeps_confirmed`)."""
+    they do not decide what stays (`forces_removed` and `keeps_confirmed`)."""
     trust_elsewhere: Trust | None = None
     """Trust in `rendered_context` where nothing was removed: that from before a removal, of which
     the rest has full trust; None before one."""

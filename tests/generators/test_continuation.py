@@ -5,8 +5,8 @@ import torch
 
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.generators.lines import continue_lines
-from gscompleter.generators.smooth import fit_membrane
 from gscompleter.generators.warp import WarpedImage, continue_image, fill_background_first
+from gscompleter.numerics.smooth import fit_membrane
 from gscompleter.types import GeneratorInput, Render, View
 from scenes import camera_at
 

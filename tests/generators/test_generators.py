@@ -10,7 +10,6 @@ import torch
 from gscompleter import InputError, load_generator, load_renderer
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.generators.exposure import match_exposures
-from gscompleter.generators.smooth import compute_distance_to_known, continue_smoothly
 from gscompleter.generators.warp import WarpedImage, fill_background_first, warp_photographs
 from gscompleter.generators.warp_inpaint import (
     Sources,
@@ -18,6 +17,7 @@ from gscompleter.generators.warp_inpaint import (
     fill_by_patches,
     remove_cracks,
 )
+from gscompleter.numerics.smooth import compute_distance_to_known, continue_smoothly
 from gscompleter.types import Camera, GeneratorInput, Render, View, merge
 from known_room import SIZE, TARGET, known_room
 from scenes import Room, answer, camera_at, gaussians_of, view_of

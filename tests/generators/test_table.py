@@ -21,7 +21,7 @@ from gscompleter.config.generators import (
 )
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.generators import GeneratorRequest
-from gscompleter.generators.smooth import compute_distance_to_known
+from gscompleter.numerics.smooth import compute_distance_to_known
 from known_room import TARGET, known_room
 from paths import ROOT
 from scenes import Room, view_of

@@ -51,7 +51,7 @@ def measure_error(similarity, moved: GivenGeometry) -> float:
     return float(np.linalg.norm(gaps, axis=1).mean()) / 6
 
 
-# `tests/stages/test_place_geometry.py` finds one.
+# `tests/numerics/test_place_geometry.py` finds one.
 @pytest.mark.slow
 @pytest.mark.parametrize("scale", [0.2, 30.0])
 def test_a_mesh_in_a_frame_of_its_own_is_found(scale):

@@ -8,7 +8,7 @@ import torch
 from gscompleter import View, load_reconstructor
 from gscompleter.reconstructors.features.given_range import find_depth_range
 from gscompleter.reconstructors.plane_sweep.near_plane import find_near_plane
-from gscompleter.stages.context import find_scene_range
+from gscompleter.reconstructors.scene_range import find_scene_range
 from scenes import Room, camera_at, view_of
 
 FRONT = 2.2

@@ -10,16 +10,14 @@ import pytest
 import torch
 
 from gscompleter import CompleterConfig, GSCompleter, InputError, TargetResult
-from gscompleter.numerics.given_geometry import make_geometry
+from gscompleter.numerics.given_geometry import count_at_given_depth, make_geometry
 from gscompleter.stages.given_geometry import (
     ContradictedError,
     check_geometry,
-    count_on_geometry,
     fit_to_surface,
     give_depth_before_scene,
     require_uncontradicted,
 )
-from gscompleter.target_result import GeometryUse
 from gscompleter.types import DepthMap
 from room_mesh import mesh_of, points_of, triangles_of
 from scenes import Room, camera_at, cast, gaussians_of, merge, view_of
@@ -155,7 +153,5 @@ def test_a_gaussian_that_was_moved_away_does_not_stand_where_the_geometry_says()
     depth = view.depth
     assert depth is not None
     image = replace(view, depth=None, given_depth=depth)
-    use = GeometryUse("room.ply", share=1.0)
-    standing = count_on_geometry(use, gaussians_of(view), image).added
-    assert standing > 0.9 * SIZE**2
-    assert count_on_geometry(use, gaussians_of(view, 0.8 * depth), image).added == 0
+    assert count_at_given_depth(gaussians_of(view), image) > 0.9 * SIZE**2
+    assert count_at_given_depth(gaussians_of(view, 0.8 * depth), image) == 0

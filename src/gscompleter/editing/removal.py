@@ -110,7 +110,8 @@ def remove_gaussians(
         for photo, view, scene in zip(state.photos, views, shown, strict=True)
     )
     changed = replace(changed, photos=photos)
-    if state.config.holes.keeps_confirmed:
+    holes = state.config.holes
+    if holes.forces_removed and holes.keeps_confirmed:
         # As a trained splat is trusted: a part of the hole may show a wall that photographs know.
         config = replace(state.config, trust="photometric")
         painted = [photo.view for photo in photos]

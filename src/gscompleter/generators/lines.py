@@ -14,9 +14,9 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.generators.smooth import compute_distance_to_known, continue_smoothly
 from gscompleter.numerics.image_ops import blur_gaussian, dilate
 from gscompleter.numerics.kernels.streamlines import trace_lines
+from gscompleter.numerics.smooth import compute_distance_to_known, continue_smoothly
 
 GRADIENT_SIGMA = 1.0
 """Standard deviation in pixels of the blur before gradients are taken."""

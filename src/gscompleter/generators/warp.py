@@ -11,9 +11,9 @@ from torch import Tensor
 from gscompleter.config.settings import COVERED
 from gscompleter.generators.exposure import match_exposures
 from gscompleter.generators.lines import continue_lines
-from gscompleter.generators.smooth import continue_smoothly, fit_membrane
 from gscompleter.numerics.geometry import is_inside, measure_baseline, project, sample, unproject
 from gscompleter.numerics.image_ops import dilate, smooth_masked
+from gscompleter.numerics.smooth import continue_smoothly, fit_membrane
 from gscompleter.types import Camera, GeneratorInput, Render, TensorDataclass, View
 
 WARP_DEPTH_TOLERANCE = 0.03

@@ -21,7 +21,6 @@ from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from gscompleter.config.generators import GeneratorSettings
-from gscompleter.generators.smooth import average_trusted, compute_distance_to_known
 from gscompleter.generators.warp import (
     BORDER_WIDTH,
     WarpedImage,
@@ -31,6 +30,7 @@ from gscompleter.generators.warp import (
 from gscompleter.numerics.image_ops import dilate, smooth_masked
 from gscompleter.numerics.kernels import patchmatch
 from gscompleter.numerics.kernels.patchmatch import PATCHMATCH_RADIUS, PATCHMATCH_SIDE
+from gscompleter.numerics.smooth import average_trusted, compute_distance_to_known
 from gscompleter.types import Camera, GeneratorInput, View
 
 STRUCTURE_REACH = 0.15

@@ -96,6 +96,19 @@ def compute_z_depths(points: Float[Tensor, "n 3"], camera: Camera) -> Float[Tens
     return (points - camera.center) @ camera.forward
 
 
+def adapt_to_mode(scene: Gaussians, gaussians: Gaussians, camera: Camera) -> Gaussians:
+    """Adapt Gaussians made for the pixels of `camera` to the rendering mode of `scene`.
+
+    Classic rendering widens each splat by the low-pass and keeps its opacity; antialiased rendering
+    lowers it. So the low-pass becomes part of the Gaussians' size, with the same total coverage.
+    """
+    if gaussians.is_antialiased or not scene.is_antialiased:
+        return gaussians
+    pixel = compute_z_depths(gaussians.means, camera) * 2 / (camera.K[0, 0] + camera.K[1, 1])
+    scales = torch.hypot(gaussians.scales, math.sqrt(camera.blur) * pixel[:, None])
+    return replace(gaussians, scales=scales, encoded=None, is_antialiased=True)
+
+
 def measure_rotation(a: Camera, b: Camera) -> float:
     """Compute the angle of the rotation between two cameras, in degrees.
 
@@ -356,3 +369,8 @@ def look_up(
     x, y = pixels.where(seen[:, None], 0.0).long().unbind(-1)
     looked_up = values[y, x]
     return looked_up.where(seen, torch.zeros_like(looked_up))
+
+
+def count_outside(gaussians: Gaussians, camera: Camera) -> int:
+    """Count the Gaussians outside of an image, such as those in the padding of a target."""
+    return len(gaussians) - int(is_inside(*project(gaussians.means, camera), camera).sum())

@@ -9,9 +9,10 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from gscompleter.numerics.geometry import compute_z_depths, look_up
 from gscompleter.numerics.kernels import surface_depth as kernels
 from gscompleter.system.errors import InputError
-from gscompleter.types import Camera
+from gscompleter.types import Camera, Gaussians, View
 
 NUM_PLANE_POINTS = 8
 """Neighbours of a point that tell the plane of its surface: in a grid, those all around."""
@@ -24,6 +25,12 @@ MAX_SPACING = 2.0
 """Largest spacing relative to the median of the neighbours, so that a stray point stays small."""
 MAX_POINTS = 4_000_000
 """Most points that are kept; a denser cloud tells no more at the size of an image."""
+MAX_DEVIATION = 0.05
+"""Largest deviation of depth, relative, that still counts as the same surface."""
+MIN_COMPARED = 0.001
+"""Smallest share of the photographs' pixels that has to be compared."""
+FRAME_ADVICE = "give it in the frame and unit of the scene"
+"""What to do about geometry that is not what the scene shows, as a clause of a sentence."""
 
 
 @dataclass(frozen=True)
@@ -164,3 +171,16 @@ def move_points(
 ) -> Float[np.ndarray, "n 3"]:
     """Move points by a similarity."""
     return points @ similarity[:3, :3].T + similarity[:3, 3]
+
+
+def count_at_given_depth(gaussians: Gaussians, view: View) -> int:
+    """Count the Gaussians that stand at the given depth of a view; none if it has none.
+
+    Some additions are moved away from it: by guards, and before what is left in a forced hole.
+    """
+    if view.given_depth is None:
+        return 0
+    given = look_up(view.given_depth, gaussians, view.camera)
+    z = compute_z_depths(gaussians.means, view.camera)
+    stands_there = (given > 0) & ((z - given).abs() <= MAX_DEVIATION * given)
+    return int(stands_there.sum())

@@ -17,7 +17,9 @@ from torch import Tensor
 
 from gscompleter.completer import GSCompleter
 from gscompleter.config import NextBestViewConfig
+from gscompleter.numerics.enclosed_holes import keep_enclosed
 from gscompleter.numerics.geometry import (
+    adapt_to_mode,
     compute_field_of_view,
     compute_spacing,
     is_same_camera,
@@ -31,9 +33,7 @@ from gscompleter.numerics.image_ops import dilate, fill_smoothly
 from gscompleter.parts import Part, PartOrigin
 from gscompleter.planning.candidates import Candidate, is_close, propose_candidates
 from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, choose_thinned_rows, thin_gaussians
-from gscompleter.render.reference import adapt_to_mode
 from gscompleter.render.view_map import get_view_map
-from gscompleter.stages.enclosed_holes import keep_enclosed
 from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.stages.select_anchor import compute_overlap, select_anchor
 from gscompleter.stages.target_view import compute_distrust

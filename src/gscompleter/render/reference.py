@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Float
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint
 
-from gscompleter.numerics.geometry import compute_z_depths, quats_to_rotations
+from gscompleter.numerics.geometry import quats_to_rotations
 from gscompleter.render.padding import compute_tangent_limits
 from gscompleter.render.redraw import RedrawnScene
 from gscompleter.render.spherical_harmonics import evaluate_colors
@@ -156,16 +155,3 @@ def composite_splats(
     before = torch.cat([torch.ones_like(behind[:1]), behind[:-1]])
     weights = alpha * before
     return weights.T @ splats.colors, weights.T @ splats.depths, weights.sum(dim=0)
-
-
-def adapt_to_mode(scene: Gaussians, gaussians: Gaussians, camera: Camera) -> Gaussians:
-    """Adapt Gaussians made for the pixels of `camera` to the rendering mode of `scene`.
-
-    Classic rendering widens each splat by the low-pass and keeps its opacity; antialiased rendering
-    lowers it. So the low-pass becomes part of the Gaussians' size, with the same total coverage.
-    """
-    if gaussians.is_antialiased or not scene.is_antialiased:
-        return gaussians
-    pixel = compute_z_depths(gaussians.means, camera) * 2 / (camera.K[0, 0] + camera.K[1, 1])
-    scales = torch.hypot(gaussians.scales, math.sqrt(camera.blur) * pixel[:, None])
-    return replace(gaussians, scales=scales, encoded=None, is_antialiased=True)

@@ -3,9 +3,10 @@
 Those of the paper, in its order: `context`, `synthesize`, `select_anchor`, `lift`, `align_paper`,
 `register_paper`, `hole_masks`, `filter_holes` and `refine`. Ours are `align_depth`, `register` (and
 `extrapolate_registration`), `recolor` and `new_photos`, for splats that somebody trained, and
-`find_unfilled`, for the report; `context_geometry`, `place_geometry` and `given_geometry` use
-a scan or a mesh. `target_view` is the scene as one target sees it, which all of them read;
-`additions` is what they hand on, and the one way into the scene.
+`find_unfilled`, for the report; `context_geometry` and `given_geometry` use a scan or a mesh;
+`replace_contested` and `remake_scene` change what earlier commands made. `target_view` is the scene
+as one target sees it, which all of them read; `additions` is what they hand on, and the one way
+into the scene.
 """
 
 from __future__ import annotations

@@ -19,6 +19,7 @@ from torch import Tensor
 
 from gscompleter.config import HoleConfig
 from gscompleter.numerics.geometry import (
+    adapt_to_mode,
     find_at_depth,
     look_up,
     measure_baseline,
@@ -34,7 +35,6 @@ from gscompleter.reconstructors import (
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.fit_colors import RELAXATION, fit_colors
 from gscompleter.render.protocols import FrozenScene
-from gscompleter.render.reference import adapt_to_mode
 from gscompleter.stages.additions import Additions, Refined, accept
 from gscompleter.stages.align_photographs import align_photographs
 from gscompleter.stages.error_budgets import meet_error_budgets, share_budgets

@@ -17,12 +17,11 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from gscompleter.config import GapConfig
-from gscompleter.generators.smooth import continue_smoothly
-from gscompleter.numerics.geometry import pad_camera
+from gscompleter.numerics.geometry import adapt_to_mode, pad_camera
 from gscompleter.numerics.image_ops import dilate, keep_thin
+from gscompleter.numerics.smooth import continue_smoothly
 from gscompleter.reconstructors.plane_sweep.gaussians import DISC_SIGMA, compute_normals, make_discs
 from gscompleter.render.cache import SceneRenderer
-from gscompleter.render.reference import adapt_to_mode
 from gscompleter.stages.select_anchor import find_nearest_view
 from gscompleter.stages.synthesize import GeneratedView
 from gscompleter.stages.target_view import TargetView, render_target
@@ -73,7 +72,7 @@ def view_gaps(
     """
     holes = replace(state.config.holes, max_alpha=config.max_alpha, dilation=GAP_RIM)
     strict = replace(state, config=replace(state.config, holes=holes))
-    return render_target(strict, pad_camera(state.with_depth_range(camera), 0.0), scenes)
+    return render_target(strict, pad_camera(camera, 0.0), scenes)
 
 
 def find_gaps(view: TargetView) -> Bool[Tensor, "h w"]:
@@ -126,9 +125,8 @@ def collect_layers(view: TargetView) -> tuple[Float[Tensor, "h w 4"], Bool[Tenso
     """
     render = view.render
     max_alpha = view.state.config.holes.max_alpha
-    surface = render.depth_map(max_alpha)
-    known = surface.valid & ~dilate(view.empty, GAP_RIM)
+    known = (render.alpha >= max_alpha) & ~dilate(view.empty, GAP_RIM)
     # The render is over black: its colours are divided by alpha.
     colors = render.image / render.alpha.clamp_min(max_alpha)[..., None]
-    depth = surface.depth.where(known, 1.0)
+    depth = render.depth.where(known, 1.0)
     return torch.cat([colors, depth.log()[..., None]], dim=-1), known

@@ -17,22 +17,19 @@ from gscompleter.numerics.given_geometry import GivenGeometry
 from gscompleter.numerics.image_ops import MIN_CONTRAST
 from gscompleter.reconstructors import (
     DepthAware,
-    NearPlaneFinder,
     Reconstructor,
-    get_trained_range,
-    keeps_given_range,
     run_fitting_reconstructor,
 )
 from gscompleter.reconstructors.depth_predictors import give_prediction
 from gscompleter.reconstructors.features.depth_range import (
     get_depth_range,
-    get_given_range,
     set_depth_range,
 )
-from gscompleter.reconstructors.features.given_range import DepthRange, find_depth_range
+from gscompleter.reconstructors.features.given_range import DepthRange
+from gscompleter.reconstructors.scene_range import find_scene_range
 from gscompleter.render.lod import build_proxy
 from gscompleter.render.protocols import Renderer
-from gscompleter.system.errors import InputError, format_rounded
+from gscompleter.system.errors import InputError
 from gscompleter.trust.lifted import is_lifted
 from gscompleter.types import Camera, ContextScene, Gaussians, Reconstruction, View
 
@@ -152,26 +149,6 @@ def drop_contradicted(views: Sequence[View], reconstruction: Reconstruction) -> 
         replace(view, given_depth=None) if number in wrong else view
         for number, view in enumerate(views)
     ]
-
-
-def find_scene_range(reconstructor: Reconstructor, views: Sequence[View]) -> DepthRange:
-    """Find near and far z-depth of the photographs from which Ψ reconstructs the scene."""
-    keeps = keeps_given_range(reconstructor)
-    views = [view.to("cpu") for view in views]  # copied from a GPU once for all that follows
-    found = find_depth_range(views, get_trained_range(reconstructor), keeps)
-    if keeps or not isinstance(reconstructor, NearPlaneFinder):
-        return found
-    near = reconstructor.find_near_plane(views, found.near, found.far)
-    notes = found.notes
-    is_given = found.near == get_given_range(views)[0]
-    if is_given and near < found.near:
-        note = (
-            "Surfaces of the photographs stand nearer than the near plane at "
-            f"{format_rounded(found.near)}: the depth range was widened to "
-            f"{format_rounded(near, 2)} to {format_rounded(found.far)}."
-        )
-        notes = (*notes, note)
-    return DepthRange(near, found.far, notes)
 
 
 def check_texture(views: Sequence[View]) -> None:

@@ -10,6 +10,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from gscompleter.numerics.given_geometry import GivenGeometry
+from gscompleter.numerics.place_geometry import place_geometry
+from gscompleter.numerics.sky import mask_out_sky
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.stages.context import InitialContext
 from gscompleter.stages.given_geometry import (
@@ -18,8 +20,7 @@ from gscompleter.stages.given_geometry import (
     give_photographs_depth,
     require_uncontradicted,
 )
-from gscompleter.stages.place_geometry import place_geometry
-from gscompleter.types import Render, View
+from gscompleter.types import DepthMap, View
 
 InitFrom = Callable[[Sequence[View]], InitialContext]
 """Initializes the context from photographs."""
@@ -39,8 +40,8 @@ def init_with_geometry(
     """
     if has_scene:
         context = init(views)
-        placed, renders = place_in_context(geometry, context, scenes)
-        given = give_photographs_depth(placed, context.views, renders)
+        placed, surfaces = place_in_context(geometry, context, scenes)
+        given = give_photographs_depth(placed, context.views, surfaces)
         return replace(context, views=given, geometry=placed)
     try:
         return init_from_depth(geometry, views, init)
@@ -66,12 +67,15 @@ def init_from_depth(placed: GivenGeometry, views: Sequence[View], init: InitFrom
 
 def place_in_context(
     geometry: GivenGeometry, context: InitialContext, scenes: SceneRenderer
-) -> tuple[GivenGeometry, list[Render]]:
-    """Move geometry to where the photographs of a context show it; return their renders, too.
+) -> tuple[GivenGeometry, list[DepthMap]]:
+    """Move geometry to where the photographs of a context show it.
 
-    Raises InputError if they show something else.
+    Also returns the surfaces that they show, without the sky. Raises InputError if they show
+    something else.
     """
     cameras = [view.camera for view in context.views]
     frozen = scenes.freeze_at((context.source.rendered,), cameras)
-    renders = [scene.render for scene in frozen]
-    return place_geometry(geometry, context.views, renders), renders
+    surfaces = [
+        mask_out_sky(scene.render, camera) for scene, camera in zip(frozen, cameras, strict=True)
+    ]
+    return place_geometry(geometry, cameras, surfaces), surfaces

@@ -15,10 +15,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config import CompleterConfig
-from gscompleter.numerics.geometry import compute_z_depths, look_up
-from gscompleter.numerics.given_geometry import GivenGeometry
+from gscompleter.numerics.given_geometry import (
+    FRAME_ADVICE,
+    MAX_DEVIATION,
+    MIN_COMPARED,
+    GivenGeometry,
+)
 from gscompleter.numerics.image_ops import fill_smoothly, smooth_masked
-from gscompleter.numerics.sky import mask_out_sky
 from gscompleter.reconstructors.features.depth_factor import (
     compare_with_matches,
     fit_depth_factor,
@@ -28,18 +31,13 @@ from gscompleter.stages.target_view import TargetView
 from gscompleter.system.errors import InputError
 from gscompleter.system.tensor_checks import describe
 from gscompleter.target_result import GeometryUse
-from gscompleter.types import DepthMap, Gaussians, Render, View
+from gscompleter.types import DepthMap, View
 
-MAX_DEVIATION = 0.05
-"""Largest deviation of depth, relative, that still counts as the same surface."""
-MIN_COMPARED = 0.001
-"""Smallest share of the photographs' pixels that has to be compared."""
 MIN_AGREEING = 0.5
 """Smallest share of the compared pixels around one that has to agree."""
 COMPARED_AROUND = 1 / 64
 """Half the side of that neighbourhood, relative to the longer side of the image. At the edges of
 surfaces a render mixes the depth of two, and agrees with neither."""
-ADVICE = "give it in the frame and unit of the scene"
 
 
 class ContradictedError(InputError):
@@ -62,18 +60,17 @@ def check_geometry(geometry: object, config: CompleterConfig) -> None:
 
 
 def give_photographs_depth(
-    geometry: GivenGeometry, views: Sequence[View], renders: Sequence[Render]
+    geometry: GivenGeometry, views: Sequence[View], surfaces: Sequence[DepthMap]
 ) -> tuple[View, ...]:
     """Give photographs of a scene the depth of geometry, where it agrees with what is around.
 
-    Photographs that have a measured depth keep that.
+    `surfaces` are those of the scene at the photographs, without the sky. Photographs that have a
+    measured depth keep that.
     """
     given = []
-    for view, render in zip(views, renders, strict=True):
+    for view, surface in zip(views, surfaces, strict=True):
         if view.depth is None and len(view.known_depths) == 0:
-            fit = fit_to_surface(
-                geometry.draw_depth(view.camera), mask_out_sky(render, view.camera)
-            )
+            fit = fit_to_surface(geometry.draw_depth(view.camera), surface)
             view = replace(view, given_depth=fit.depth.where(view.valid_mask, 0.0))
         given.append(view)
     return tuple(given)
@@ -93,7 +90,7 @@ def give_depth_before_scene(
         raise ContradictedError(
             f"{geometry.name} covers hardly anything that the photographs show ({num_drawn:,} of "
             f"{num_pixels:,} pixels), so that nothing tells whether they belong together; "
-            f"{ADVICE}.",
+            f"{FRAME_ADVICE}.",
             "geometry",
         )
     given = []
@@ -115,7 +112,7 @@ def give_depth_before_scene(
         raise ContradictedError(
             f"The depth of {geometry.name} differs{scale} from what the photographs measure at "
             f"{len(samples):,} compared pixels ({fit.agreement:.0%} agree"
-            f"{' with that factor' if scale else ''}); {ADVICE}.",
+            f"{' with that factor' if scale else ''}); {FRAME_ADVICE}.",
             "geometry",
         )
     return given, ()
@@ -134,7 +131,7 @@ def require_uncontradicted(
     if num_given and 2 * num_dropped >= num_given:
         raise ContradictedError(
             f"The surfaces of {geometry.name} contradict what stereo measures in {num_dropped} of "
-            f"{num_given} photographs; {ADVICE}.",
+            f"{num_given} photographs; {FRAME_ADVICE}.",
             "geometry",
         )
 
@@ -184,16 +181,3 @@ def add_geometry_depth(image: GeneratedView, view: TargetView) -> tuple[Generate
         contradicted=int((view.holes & fit.contradicted).sum()) / num_holes,
     )
     return replace(image, given_depth=fit.depth.where(~seen.valid, 0.0)), use
-
-
-def count_on_geometry(use: GeometryUse, added: Gaussians, image: View) -> GeometryUse:
-    """Count the added Gaussians that stand at the depth of the geometry.
-
-    Some are moved away from it: by guards, and before what is left in a forced hole.
-    """
-    if image.given_depth is None:
-        return use
-    given = look_up(image.given_depth, added, image.camera)
-    z = compute_z_depths(added.means, image.camera)
-    stands_there = (given > 0) & ((z - given).abs() <= MAX_DEVIATION * given)
-    return replace(use, added=int(stands_there.sum()))

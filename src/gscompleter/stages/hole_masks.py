@@ -20,8 +20,8 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from gscompleter.config import HoleConfig
+from gscompleter.numerics.enclosed_holes import keep_enclosed
 from gscompleter.numerics.image_ops import dilate
-from gscompleter.stages.enclosed_holes import keep_enclosed
 from gscompleter.types import Camera, PaddedCamera, Render
 
 RenderAt = Callable[[Camera], Render]

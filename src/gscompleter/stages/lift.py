@@ -7,9 +7,8 @@ from dataclasses import replace
 from jaxtyping import Bool
 from torch import Tensor
 
-from gscompleter.numerics.geometry import is_inside, project
+from gscompleter.numerics.geometry import adapt_to_mode, is_inside, project
 from gscompleter.reconstructors import Reconstructor, run_reconstructor
-from gscompleter.render.reference import adapt_to_mode
 from gscompleter.stages.select_anchor import Anchor
 from gscompleter.stages.target_view import TargetView
 from gscompleter.system.timing import timed_stage

@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
-from gscompleter.numerics.geometry import is_inside, project
+from dataclasses import dataclass
+
+from gscompleter.parts import Part
 from gscompleter.stages.refusals import explain_no_need, explain_refusal
 from gscompleter.stages.select_anchor import Anchor
 from gscompleter.stages.target_view import TargetView
+from gscompleter.state import Completion
 from gscompleter.target_result import TargetResult
-from gscompleter.types import Camera, Gaussians
+
+
+@dataclass(frozen=True)
+class TargetOutcome:
+    """What came of a target."""
+
+    state: Completion
+    """The scene in its new colours, without what was added for the target."""
+    result: TargetResult
+    parts: tuple[Part, ...] = ()
+    """What was added for it, in the order of addition."""
 
 
 def make_unchanged_result(view: TargetView, anchor: Anchor) -> TargetResult:
@@ -27,8 +40,3 @@ def make_unchanged_result(view: TargetView, anchor: Anchor) -> TargetResult:
         skip_reason=refusal or explain_no_need(view),
         target_id=view.state.next_target_id,
     )
-
-
-def count_outside(added: Gaussians, target: Camera) -> int:
-    """Count the Gaussians outside of the image of a target, in its padding."""
-    return len(added) - int(is_inside(*project(added.means, target), target).sum())

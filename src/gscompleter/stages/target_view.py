@@ -147,17 +147,25 @@ def render_target(state: Completion, camera: PaddedCamera, scenes: SceneRenderer
 
     frozen = scenes.freeze(state.parts, camera.padded)
     alpha = state.trust.compute_alpha(frozen, camera.padded)
-    edits = find_hole_edits(state, camera, frozen, scenes)
+    confirmed_alpha = None
+    if state.confirmation is not None:
+        confirmed_alpha = state.confirmation.compute_alpha(frozen, camera.padded)
+    edits = find_hole_edits(state, camera, frozen.render.alpha, confirmed_alpha, scenes)
     masks = find_hole_masks(frozen.render, alpha, camera, state.config.holes, edits, render_at)
     return TargetView(state, scenes, camera, frozen, alpha, masks)
 
 
 def find_hole_edits(
-    state: Completion, camera: PaddedCamera, frozen: FrozenScene, scenes: SceneRenderer
+    state: Completion,
+    camera: PaddedCamera,
+    alpha: Float[Tensor, "h w"],
+    confirmed_alpha: Float[Tensor, "h w"] | None,
+    scenes: SceneRenderer,
 ) -> HoleEdits:
     """Find where a removal may have opened holes, and where the user marked the scene as wrong.
 
-    Both are masks of the padded image. `frozen` is the scene at the padded camera.
+    Both are masks of the padded image, as is `alpha` of the scene. `confirmed_alpha` is that
+    weighted by what photographs confirm; None if they do not decide.
     """
     config = state.config
     if len(state.source.removed) == 0:
@@ -168,14 +176,13 @@ def find_hole_edits(
     opened = add_border(removed) if config.completes_removals_only else None
     if not config.holes.forces_removed:
         return HoleEdits(opened)
-    if state.confirmation is not None:
-        trusted_alpha = state.confirmation.compute_alpha(frozen, camera.padded)
-        is_covered = ~compute_hole_mask(frozen.render.alpha, config.holes)
+    if confirmed_alpha is not None:
+        is_covered = ~compute_hole_mask(alpha, config.holes)
         # A surface that photographs confirm shows the place as it is: there is nothing to fill.
-        removed = removed & ~(is_covered & (trusted_alpha >= COVERED))
+        removed = removed & ~(is_covered & (confirmed_alpha >= COVERED))
     # What an earlier target filled is no hole any more.
     filled = [part.gaussians for part in state.added_parts if part.origin.is_invented]
     if sum(map(len, filled)) == 0:
         return HoleEdits(opened, removed)
-    alpha = scenes.renderer.render(merge(filled), camera.padded).alpha
-    return HoleEdits(opened, removed & compute_hole_mask(alpha, config.holes))
+    filled_alpha = scenes.renderer.render(merge(filled), camera.padded).alpha
+    return HoleEdits(opened, removed & compute_hole_mask(filled_alpha, config.holes))

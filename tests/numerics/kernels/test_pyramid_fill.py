@@ -4,8 +4,8 @@ import cv2
 import numpy as np
 import pytest
 
-from gscompleter.generators.smooth import build_sum_pyramid
 from gscompleter.numerics.kernels.pyramid_fill import MIN_LEVEL_WEIGHT, build_pyramid, compute_means
+from gscompleter.numerics.smooth import build_sum_pyramid
 
 
 def whole_images(levels):

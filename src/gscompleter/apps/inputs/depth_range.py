@@ -7,8 +7,9 @@ from dataclasses import replace
 from gscompleter.apps.inputs.task import CompletionTask
 from gscompleter.reconstructors import Reconstructor, get_trained_range
 from gscompleter.reconstructors.features.depth_range import set_depth_range
+from gscompleter.reconstructors.scene_range import find_scene_range
 from gscompleter.render.protocols import Renderer
-from gscompleter.stages.context import find_scene_range, find_splat_range
+from gscompleter.stages.context import find_splat_range
 from gscompleter.types import Gaussians
 
 

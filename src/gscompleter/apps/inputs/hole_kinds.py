@@ -17,10 +17,10 @@ from gscompleter.config import HoleConfig
 from gscompleter.data.cameras import has_same_aspect
 from gscompleter.data.mask_checks import read_selected
 from gscompleter.data.mask_reading import MaskReading
+from gscompleter.numerics.enclosed_holes import keep_enclosed
 from gscompleter.numerics.geometry import add_near_plane
 from gscompleter.render.protocols import Renderer
 from gscompleter.render.removed import mark_shown
-from gscompleter.stages.enclosed_holes import keep_enclosed
 from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.stages.refusals import explain_little_covered
 from gscompleter.system.errors import InputError, quote_value

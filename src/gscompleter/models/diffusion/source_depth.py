@@ -11,7 +11,6 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.generators.smooth import continue_smoothly
 from gscompleter.models.depth_predictors import DEPTH_PREDICTORS
 from gscompleter.models.diffusion.complete import load_transformers_model
 from gscompleter.models.diffusion.published import (
@@ -21,6 +20,7 @@ from gscompleter.models.diffusion.published import (
     parse_source,
 )
 from gscompleter.numerics.robust import fit_robust_affine
+from gscompleter.numerics.smooth import continue_smoothly
 from gscompleter.reconstructors.depth_predictors import DepthPredictor
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.types import Render, View

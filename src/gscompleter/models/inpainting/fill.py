@@ -10,10 +10,10 @@ from jaxtyping import Bool, Float
 from numpy import ndarray
 from torch import Tensor
 
-from gscompleter.generators.smooth import fit_membrane
 from gscompleter.generators.warp import BORDER_WIDTH, complete_warp
 from gscompleter.models.onnx_network import ADVICE, OnnxNetwork
 from gscompleter.numerics.image_ops import dilate
+from gscompleter.numerics.smooth import fit_membrane
 from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, GeneratorInput, View
 

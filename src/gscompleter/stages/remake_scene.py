@@ -16,13 +16,18 @@ from jaxtyping import Float
 from torch import Tensor
 
 from gscompleter.config.settings import COVERED
-from gscompleter.editing.replacing import Contested, drop_rows, mark_rendered, render_at_views
 from gscompleter.generators.exposure import compute_median_ratio
 from gscompleter.parts import EarlierWork, PartOrigin, make_part
 from gscompleter.reconstructors import Reconstructor
 from gscompleter.render.protocols import Renderer
 from gscompleter.stages.context import InitialContext, reconstruct_context, sort_by_frame
 from gscompleter.stages.new_photos import compute_error
+from gscompleter.stages.replace_contested import (
+    Contested,
+    drop_rows,
+    mark_rendered,
+    render_at_views,
+)
 from gscompleter.state import Completion, Photo
 from gscompleter.types import SH_C0, ContextScene, Render, View, merge
 

@@ -16,8 +16,13 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.numerics.geometry import unproject
-from gscompleter.numerics.given_geometry import GeometryPlacement, GivenGeometry
-from gscompleter.numerics.sky import mask_out_sky
+from gscompleter.numerics.given_geometry import (
+    FRAME_ADVICE,
+    MAX_DEVIATION,
+    MIN_COMPARED,
+    GeometryPlacement,
+    GivenGeometry,
+)
 from gscompleter.numerics.surface_alignment import (
     SeenPoints,
     SurfacePoints,
@@ -30,9 +35,8 @@ from gscompleter.numerics.surface_alignment import (
     move_least_determined,
     sample_surface,
 )
-from gscompleter.stages.given_geometry import ADVICE, MAX_DEVIATION, MIN_COMPARED
 from gscompleter.system.errors import InputError
-from gscompleter.types import Camera, DepthMap, Render, View
+from gscompleter.types import Camera, DepthMap
 
 MAX_COMPARED_VIEWS = 8
 """Most photographs, at even steps, at which places are compared."""
@@ -99,12 +103,10 @@ class SeenScene:
     surfaces: tuple[DepthMap, ...]
 
     @classmethod
-    def make(cls, views: Sequence[View], renders: Sequence[Render]) -> SeenScene:
+    def make(cls, cameras: Sequence[Camera], surfaces: Sequence[DepthMap]) -> SeenScene:
         """Take photographs at even steps."""
-        step = -(-len(views) // MAX_COMPARED_VIEWS)
-        cameras = tuple(view.camera for view in views[::step])
-        pairs = zip(renders[::step], cameras, strict=True)
-        return cls(cameras, tuple(mask_out_sky(render, camera) for render, camera in pairs))
+        step = -(-len(cameras) // MAX_COMPARED_VIEWS)
+        return cls(tuple(cameras[::step]), tuple(surfaces[::step]))
 
     def compare(self, geometry: GivenGeometry) -> SurfaceComparison:
         """Compare geometry with what is seen, where it was kept back."""
@@ -140,13 +142,14 @@ def keep_back(camera: Camera) -> Bool[Tensor, "h w"]:
 
 
 def place_geometry(
-    geometry: GivenGeometry, views: Sequence[View], renders: Sequence[Render]
+    geometry: GivenGeometry, cameras: Sequence[Camera], surfaces: Sequence[DepthMap]
 ) -> GivenGeometry:
     """Move geometry to where photographs of a scene show the same; it may stand there already.
 
+    `surfaces` are those of the scene at the cameras of the photographs, without the sky.
     Raises InputError if there is no such place, or if several are as good.
     """
-    scene = SeenScene.make(views, renders)
+    scene = SeenScene.make(cameras, surfaces)
     seen = scene.choose_points()
     # Fixed, so that the place does not change with the seed of the images.
     rng = np.random.default_rng(0)
@@ -179,7 +182,7 @@ def search_place(
         raise InputError(
             f"{geometry.name} is not what the scene shows, neither where it stands nor moved, "
             f"turned and scaled: in the best place {100 * share:.0f} % of the compared pixels show "
-            f"the same surface, and {100 * MIN_PLACED:.0f} % have to; {ADVICE}.",
+            f"the same surface, and {100 * MIN_PLACED:.0f} % have to; {FRAME_ADVICE}.",
             "geometry",
         )
     # Furniture tells which of several walls is the right one, and the median how well it fits.
@@ -192,8 +195,8 @@ def search_place(
     ):
         raise InputError(
             f"{geometry.name} fits the scene in several places alike, as in a symmetric room, "
-            f"along a single wall or in a corner; {ADVICE}, or photographs that show opposite "
-            f"walls and furniture.",
+            f"along a single wall or in a corner; {FRAME_ADVICE}, or photographs that show "
+            f"opposite walls and furniture.",
             "geometry",
         )
     return move_to(geometry, places[best], compared[best])

@@ -9,16 +9,16 @@ import torch
 
 from gscompleter import GSCompleter, load_renderer
 from gscompleter.config import CompleterConfig
-from gscompleter.editing.replacing import (
+from gscompleter.evaluation.metrics.image import psnr
+from gscompleter.parts import OBSERVED, EarlierWork, PartOrigin, make_part
+from gscompleter.render.cache import SceneRenderer
+from gscompleter.stages.replace_contested import (
     Contested,
     fade_before_returned,
     find_contested,
     let_step_aside,
     return_needed,
 )
-from gscompleter.evaluation.metrics.image import psnr
-from gscompleter.parts import OBSERVED, EarlierWork, PartOrigin, make_part
-from gscompleter.render.cache import SceneRenderer
 from gscompleter.stages.superfluous import limit_errors
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError

@@ -9,8 +9,8 @@ import torch
 
 from gscompleter import GSCompleter, InputError
 from gscompleter.numerics.given_geometry import GivenGeometry, make_geometry
-from gscompleter.stages.place_geometry import place_geometry
-from gscompleter.types import Camera, Render
+from gscompleter.numerics.place_geometry import place_geometry
+from gscompleter.types import Camera, DepthMap
 from room_mesh import OTHER_ROOM, mesh_of, points_of, triangles_of
 from scenes import Room, camera_at, cast, gaussians_of, merge, view_of
 
@@ -42,12 +42,11 @@ def place(
     geometry: GivenGeometry, room: Room = Room(), cameras: Sequence[Camera] = CAMERAS
 ) -> GivenGeometry:
     """Place geometry by the true depth of what two cameras see of a room."""
-    views = [view_of(room, camera, frame) for frame, camera in enumerate(cameras)]
-    renders = [
-        Render(view.image, cast(room, view.camera)[1], torch.ones_like(view.image[..., 0]))
-        for view in views
-    ]
-    return place_geometry(geometry, views, renders)
+    surfaces = []
+    for camera in cameras:
+        depth = cast(room, camera)[1]
+        surfaces.append(DepthMap(depth, torch.ones_like(depth, dtype=torch.bool)))
+    return place_geometry(geometry, cameras, surfaces)
 
 
 def measure_move(geometry: GivenGeometry, truth: GivenGeometry) -> float:

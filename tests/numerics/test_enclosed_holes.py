@@ -9,6 +9,7 @@ import torch
 import gscompleter as gsc
 from gscompleter.config import CompleterConfig, HoleConfig
 from gscompleter.config.settings import COVERED
+from gscompleter.numerics.enclosed_holes import keep_enclosed
 from gscompleter.numerics.geometry import (
     add_near_plane,
     look_along,
@@ -18,7 +19,6 @@ from gscompleter.numerics.geometry import (
 )
 from gscompleter.numerics.image_ops import dilate, label_regions
 from gscompleter.render.loading import load_renderer
-from gscompleter.stages.enclosed_holes import keep_enclosed
 from gscompleter.stages.hole_masks import HoleEdits, compute_hole_mask, find_hole_masks
 from gscompleter.stages.synthesize import make_generator_input
 from gscompleter.types import Camera, Gaussians, make_observed, merge
