@@ -109,14 +109,18 @@ def parse_provenance(table: object, name: str) -> Provenance:
 
 
 def make_comment_lines(runs: Sequence[RunRecord], ending: bytes = b"\n") -> bytes:
-    """Make the lines for the header of a .ply, one for each run."""
+    """Make the lines for the header of a .ply, one for each run; `ending` is that of its lines."""
     texts = [json.dumps(asdict(run), separators=(",", ":")) for run in runs]
     return b"".join(f"comment {SCHEMA} {text}".encode("ascii") + ending for text in texts)
 
 
 def parse_comments(header: bytes, name: str) -> object:
-    """Parse the comments of the .ply file `name` to values of JSON; None if none is a record."""
+    """Parse the comments of the .ply file `name` to values of JSON; None if none is a record.
+
+    Raise InputError if one is no JSON. `parse_provenance` checks the values.
+    """
     runs = []
+    # A later run adds its line behind the others. So the last one tells the version of the file.
     schema = SCHEMA
     for found, text in _LINE.findall(header):
         schema = found.decode()
@@ -128,6 +132,6 @@ def parse_comments(header: bytes, name: str) -> object:
 
 
 def add_comments(header: bytes, made_by: Provenance) -> bytes:
-    """Add the comments at the end of a header."""
+    r"""Add the comments at the end of a header that was made here, whose lines end in \n."""
     start, end, rest = header.rpartition(b"end_header")
     return start + make_comment_lines(made_by.runs) + end + rest

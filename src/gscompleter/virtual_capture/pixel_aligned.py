@@ -39,9 +39,9 @@ def aim_pixel_camera(
     """
     rays = normalize(scene.means - center, dim=1)
     forward = normalize(rays.mean(dim=0), dim=0)
-    camera = Camera(torch.eye(4).to(rays), torch.eye(3).to(rays), side, side)
-    c2w = camera.c2w.clone()
+    c2w = torch.eye(4).to(rays)
     c2w[:3, 3] = center
+    # The field of view follows from the direction: any intrinsics do until then.
     posed = look_along(Camera(c2w, make_intrinsics(side, 1.0).to(rays), side, side), forward, up)
 
     # The field of view holds most directions: of several photographs it is that of all together.
