@@ -30,6 +30,7 @@ def make_run_record(
     A model is None where none took part. Of several painters the first is named.
     """
     labels = [part.origin.label for part in completion.added_parts if len(part)]
+    # What is recoloured has the number of its target: none of these is 0.
     labels += completion.recolored.generated.unique().tolist()
     # What photographs show was added as well, and nobody invented it.
     invented = [label for label in labels if label != NOT_INVENTED]
