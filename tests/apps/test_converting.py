@@ -35,7 +35,7 @@ def test_a_ply_is_edited_some_rows_at_a_time_as_all_at_once(tmp_path, monkeypatc
     words = ("convert", given, tmp_path / "streamed.ply", *options, "--quiet")
     monkeypatch.setattr("gscompleter.splats.ply.CHUNK_ROWS", 64)
     assert run(monkeypatch, *words) == 0
-    monkeypatch.setattr(converting, "can_be_streamed", lambda *_: False)
+    monkeypatch.setattr(converting, "can_convert_rows", lambda *_: False)
     assert run(monkeypatch, "convert", given, tmp_path / "whole.ply", *options, "--quiet") == 0
     streamed, whole = (load_splat(tmp_path / name) for name in ("streamed.ply", "whole.ply"))
     assert 0 < len(streamed) < len(SCENE)
@@ -43,6 +43,19 @@ def test_a_ply_is_edited_some_rows_at_a_time_as_all_at_once(tmp_path, monkeypatc
     for name in ("means", "quats", "scales", "opacities", "sh"):
         ours, theirs = getattr(streamed, name), getattr(whole, name)
         assert (ours - theirs).abs().max() <= 1e-6 * theirs.abs().max()
+
+
+def test_small_gaussians_are_shifted_exactly(tmp_path, monkeypatch):
+    """Float32 would round their new positions by more than a hundredth of their size."""
+    small = replace(SCENE, means=SCENE.means * 1e-3, scales=SCENE.scales * 1e-3, encoded=None)
+    given, out = tmp_path / "given.ply", tmp_path / "out.ply"
+    save_ply(given, small)
+    assert run(monkeypatch, "convert", given, out, "--translate", 900.5, 0, 0, "--quiet") == 0
+    moved = load_splat(out)
+    assert moved.origin is not None
+    shift = torch.tensor([900.5, 0, 0], dtype=torch.float64) - torch.tensor(moved.origin)
+    wanted = load_splat(given).means.double() + shift
+    assert (moved.means.double() - wanted).abs().max() < 1e-2 * moved.scales.amax(dim=1).median()
 
 
 def test_a_cut_keeps_the_rows_of_a_ply_bit_for_bit(tmp_path, monkeypatch):
@@ -80,6 +93,20 @@ def test_targets_of_joined_splats_are_numbered_on(tmp_path, monkeypatch, capsys)
         ("one", (1, 2)),
         ("two", (3, 3)),
     ]
+
+
+def test_a_target_whose_gaussians_are_gone_gives_its_number_to_no_other(tmp_path, monkeypatch):
+    first, made_first = labelled_scene(30, [0, 1, 2], "one")
+    second, made_second = labelled_scene(20, [0, 1], "two")
+    save_splat(tmp_path / "a.ply", first[first.generated != 2], made_first)
+    save_splat(tmp_path / "b.ply", second[second.generated != 1], made_second)
+    save_splat(tmp_path / "c.ply", second, made_second)
+    out = tmp_path / "all.ply"
+    parts = ("--merge", tmp_path / "b.ply", tmp_path / "c.ply")
+    assert run(monkeypatch, "convert", tmp_path / "a.ply", out, *parts, "--quiet") == 0
+    assert load_splat(out).generated.unique().tolist() == [0, 1, 4]
+    labels = [run_record.labels for run_record in read_provenance(out).runs]
+    assert labels == [(1, 2), (3, 3), (4, 4)]
 
 
 def test_too_many_targets_are_refused_and_go_without_labels(tmp_path, monkeypatch, capsys):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -124,7 +125,9 @@ def test_a_photograph_is_hidden_where_its_mask_is_black(tmp_path, write, way):
     view, other = photographs.views([0, 1])
     assert torch.equal(~view.ignore_mask, torch.from_numpy(upper_quarter() > 0))
     assert other.ignore_mask is None
-    assert photographs.describe_masks([0, 1]) is not None
+    said = photographs.describe_masks([0, 1])
+    assert said is not None
+    assert re.search(r"\bof 1 photograph\b", said)
     assert photographs.describe_masks([1, 2]) is None
 
 

@@ -198,6 +198,23 @@ def test_a_project_that_cannot_be_read_is_a_sentence(tmp_path):
         load_cameras(path, (SIZE, SIZE))
 
 
+@pytest.mark.parametrize("document", [{"version": 0, "splats": []}, [], 3])
+def test_a_project_without_poses_says_so(tmp_path, document):
+    path = tmp_path / "scene.ssproj"
+    with zipfile.ZipFile(path, "w") as project:
+        project.writestr("document.json", json.dumps(document))
+    with pytest.raises(InputError, match="holds no poses"):
+        load_cameras(path, (SIZE, SIZE))
+
+
+@pytest.mark.parametrize("resolution", [(0, 5), (20, -1)])
+def test_poses_of_supersplat_refuse_an_impossible_resolution(tmp_path, resolution):
+    path = tmp_path / "poses.json"
+    path.write_text(json.dumps([supersplat_pose(CAMERAS[0])]))
+    with pytest.raises(InputError, match=r"resolution .* is impossible"):
+        load_cameras(path, resolution)
+
+
 @pytest.mark.parametrize(
     ("content", "sentence"),
     [

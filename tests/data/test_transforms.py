@@ -331,6 +331,13 @@ def test_an_impossible_resolution_is_refused(tmp_path, resolution):
         load_views(scene, resolution=resolution)
 
 
+def test_a_resolution_may_be_a_whole_number_of_numpy(tmp_path):
+    scene = write_scene(tmp_path / "s", {"a.png": noise()})
+    (wanted,) = load_views(scene, resolution=8)
+    (view,) = load_views(scene, resolution=np.int64(8))
+    assert torch.equal(view.image, wanted.image)
+
+
 def test_one_frame_needs_no_choice_and_several_do(tmp_path):
     one = write_scene(tmp_path / "one", {"a.png": noise()})
     assert torch.equal(load_camera(one / "transforms.json").c2w, load_camera(one, 0).c2w)

@@ -155,9 +155,21 @@ def test_a_damaged_record_beside_a_file_is_refused(tmp_path, table):
 
 def test_names_that_users_choose_are_short_enough_for_a_line(tmp_path):
     """Readers of .ply bound the length of a line, ours at 4096 bytes."""
-    long = shorten("☃" * 500)
-    assert len(long) == MAX_NOTE_LENGTH
-    model = ModelRecord(long, long, long)
-    run_of_all = RunRecord("gscompleter", "0.1.0", (1, 254), model, None, model, None, 1, "f" * 64)
-    save_ply(tmp_path / "a.ply", random_gaussians(5), made_by=Provenance((run_of_all,)))
-    assert len(load_splat(tmp_path / "a.ply")) == 5
+    assert shorten("x" * 500) == "x" * (MAX_NOTE_LENGTH - 1) + "…"
+    assert shorten("x" * MAX_NOTE_LENGTH) == "x" * MAX_NOTE_LENGTH
+    for character in ("☃", "🦊", "\0", "x"):
+        long = shorten(500 * character)
+        assert len(long) <= MAX_NOTE_LENGTH
+        model = ModelRecord(long, long, long)
+        run = RunRecord("gscompleter", "0.1.0", (1, 254), model, model, model, long, 1, "f" * 64)
+        save_ply(tmp_path / "a.ply", random_gaussians(5), made_by=Provenance((run,)))
+        assert len(load_splat(tmp_path / "a.ply")) == 5
+        assert read_provenance(tmp_path / "a.ply").runs == (run,)
+
+
+def test_names_of_others_that_are_too_long_for_a_line_are_refused(tmp_path):
+    """A .ply that is made of the file would have a header that nobody reads."""
+    record = replace(RECORD.runs[0], painter="x" * 5000)
+    save_splat(tmp_path / "a.spz", labelled(), Provenance((record,)))
+    with pytest.raises(InputError, match=r"names that are too long for a \.ply"):
+        read_provenance(tmp_path / "a.spz")

@@ -7,7 +7,13 @@ import torch
 
 from gscompleter.trust.lifted import find_pixel_center, measure_core
 from gscompleter.types import merge
-from gscompleter.virtual_capture.pixel_aligned import aim_pixel_camera, move_beside
+from gscompleter.virtual_capture.pixel_aligned import (
+    INNER,
+    MAX_DIRECTIONS,
+    aim_pixel_camera,
+    find_inner_limit,
+    move_beside,
+)
 from scenes import Room, camera_at, gaussians_of, view_of
 
 SIZE = 48
@@ -29,6 +35,10 @@ def test_the_camera_is_where_sizes_are_proportional_to_distances(places, unit):
     assert found.forward @ cameras[0].forward > 0.98
     assert found.c2w[1, 0].abs() < 1e-4
     assert 0.6 < found.K[0, 0] / cameras[0].K[0, 0] < 1.5
+
+
+def test_a_splat_of_more_gaussians_than_a_quantile_takes_has_a_field_of_view():
+    assert find_inner_limit(torch.linspace(0, 1, MAX_DIRECTIONS + 9)) == pytest.approx(INNER, 1e-4)
 
 
 def test_small_moves_keep_the_view():

@@ -37,8 +37,6 @@ from gscompleter.system.files.writing import REMOVED_FILE
 from gscompleter.system.progress import stage
 from gscompleter.types import Gaussians
 
-MAX_EXACT_SHIFT = 1000.0
-"""Longest shift, in scene units, after which coordinates certainly fit float32."""
 MIN_LOGGED_BYTES = 50_000_000
 """Size of the files, in bytes, from which on a log says that they are converted."""
 CAMERAS_FILE = "cameras.json"
@@ -81,12 +79,12 @@ def show_conversion(sources: Sequence[Path]) -> AbstractContextManager[object]:
 def convert_sources(
     sources: Sequence[Path], request: ConversionRequest, operations: Operations
 ) -> Conversion:
-    """Convert splats whose folders are resolved."""
+    """Convert splats that `convert` has checked, row by row if that is possible."""
     plain = [source for source in sources if not is_streamed(source)]
     oddities = [line for source in plain for line in describe_oddities(source)]
     notes = (*oddities, *describe_left_behind(sources, request.out, operations))
     keep_labels = not request.plain
-    if can_be_streamed(sources, request, operations):
+    if can_convert_rows(sources, request, operations):
 
         def edit(rows: Gaussians) -> Gaussians:
             edited = operations.apply_to_rows(rows)
@@ -133,15 +131,16 @@ def make_operations(request: ConversionRequest) -> Operations:
     )
 
 
-def can_be_streamed(
+def can_convert_rows(
     sources: Sequence[Path], request: ConversionRequest, operations: Operations
 ) -> bool:
     """Check whether some Gaussians can be in memory at a time: from one .ply to another."""
     if len(sources) > 1 or request.level is not None or not operations.is_by_rows:
         return False
-    # The origin of a moved splat is chosen by all of its Gaussians.
     if operations.similarity is not None:
-        if max(map(abs, operations.translate)) > MAX_EXACT_SHIFT:
+        # The sizes of all Gaussians decide whether a shifted splat gets an origin, and so whether
+        # its positions are written as double. What stays about zero has none.
+        if any(operations.translate):
             return False
         if find_origin(sources[0], leaves_out_band_4=request.bands is not None) is not None:
             return False
@@ -171,7 +170,9 @@ def read_all(sources: Sequence[Path], request: ConversionRequest) -> tuple[Gauss
             made_by = read_provenance(source) if not request.plain else NOTHING_KNOWN
         if not request.plain:
             part, made_by = move_labels(part, made_by, labels_used, source)
-            labels_used = max(labels_used, find_last_target_id(part))
+            # A target whose Gaussians are all gone keeps its number in the record.
+            recorded = [run.labels[1] for run in made_by.runs if run.labels is not None]
+            labels_used = max(labels_used, find_last_target_id(part), *recorded)
         parts.append(part)
         runs += made_by.runs
     return merge_placed(parts) if len(parts) > 1 else parts[0], Provenance(tuple(runs))
@@ -180,12 +181,16 @@ def read_all(sources: Sequence[Path], request: ConversionRequest) -> tuple[Gauss
 def move_labels(
     part: Gaussians, made_by: Provenance, labels_used: int, source: Path
 ) -> tuple[Gaussians, Provenance]:
-    """Move the numbers of the targets of a splat behind those of the splats before it."""
-    is_target = (part.generated > 0) & (part.generated < NOT_INVENTED)
-    if labels_used == 0 or not is_target.any():
+    """Move the numbers of the targets of a splat behind those of the splats before it.
+
+    `labels_used` is the last number of these. Raises InputError where a number of a Gaussian
+    becomes larger than `MAX_TARGET_ID`.
+    """
+    if labels_used == 0:
         return part, made_by
+    is_target = (part.generated > 0) & (part.generated < NOT_INVENTED)
     moved = part.generated.int() + labels_used * is_target
-    if moved[is_target].max() > MAX_TARGET_ID:
+    if is_target.any() and moved[is_target].max() > MAX_TARGET_ID:
         raise InputError(
             f"With {quote_value(source)} there are more than {MAX_TARGET_ID} targets; leave the "
             "labels out (--plain)."

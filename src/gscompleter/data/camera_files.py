@@ -39,7 +39,12 @@ from gscompleter.data.json_fields import (
     get_text,
 )
 from gscompleter.data.limits import require
-from gscompleter.data.photographs import Photographs, Resolution, build_photographs
+from gscompleter.data.photographs import (
+    Photographs,
+    Resolution,
+    build_photographs,
+    check_resolution,
+)
 from gscompleter.data.transforms import TRANSFORMS_FILE, read_frames
 from gscompleter.system.damage import describe_damage
 from gscompleter.system.errors import InputError, quote_value
@@ -87,8 +92,7 @@ def read_cameras(path: Path, resolution: Resolution = None) -> list[Frame]:
     refuse_other_exports(path)
     content = read_document(path)
 
-    # A JSON file does not name its program; the keys tell it.
-    if _is_supersplat(content):
+    if _is_supersplat(path, content):
         return _parse_supersplat(content, path, resolution)
     if is_camera_path(content):
         return parse_camera_path(content, path)
@@ -119,7 +123,7 @@ def is_in_splat_frame(path: Path) -> bool:
     if path.suffix.lower() not in (".json", PROJECT_ENDING) or not os.path.isfile(path):
         return False
     content = read_document(path)
-    return _is_supersplat(content) or (is_camera_path(content) and find_world(path) is None)
+    return _is_supersplat(path, content) or (is_camera_path(content) and find_world(path) is None)
 
 
 def has_camera_list(path: Path) -> bool:
@@ -162,7 +166,10 @@ def _parse_inria_camera(entry: Any, number: int, path: Path) -> Frame:
     return Frame(name, title, c2w, Intrinsics(size, focal), None).with_rigid_pose()
 
 
-def _is_supersplat(content: Any) -> bool:
+def _is_supersplat(path: Path, content: Any) -> bool:
+    if path.suffix.lower() == PROJECT_ENDING:
+        return True
+    # A JSON file does not name its program; the keys tell it.
     first = content[0] if isinstance(content, list) and content else content
     keys = first if isinstance(first, dict) else {}
     # An entry of Inria's cameras.json has a rotation where SuperSplat has a target.
@@ -170,8 +177,12 @@ def _is_supersplat(content: Any) -> bool:
 
 
 def _parse_supersplat(content: Any, path: Path, resolution: Resolution) -> list[Frame]:
-    """Read SuperSplat's poses as cameras in the frame of the splat; `resolution` must be given."""
-    if not isinstance(resolution, tuple):
+    """Read SuperSplat's poses as cameras in the frame of the splat.
+
+    `resolution` has to be height and width; raises InputError otherwise, or if there are no poses.
+    """
+    check_resolution(resolution)
+    if not isinstance(resolution, (tuple, list)):
         raise InputError(
             f"The poses of SuperSplat in {quote_value(path)} have no image size; give a resolution "
             "(height and width).",
@@ -181,7 +192,10 @@ def _parse_supersplat(content: Any, path: Path, resolution: Resolution) -> list[
         # A project may hold several sets of poses; the first is read.
         sets = get_part(content, "poseSets", list)
         content = get_part(sets[0] if sets else None, "poses", list)
-    require(content, f"{quote_value(path)} holds no poses; {CAMERAS_ADVICE}.")
+    require(
+        isinstance(content, list) and content,
+        f"{quote_value(path)} holds no poses; {CAMERAS_ADVICE}.",
+    )
     return [
         _parse_supersplat_pose(pose, f"pose {number} of {quote_value(path)}", resolution)
         for number, pose in enumerate(content)
@@ -204,7 +218,7 @@ def _build_upright_c2w(
 ) -> Float[np.ndarray, "4 4"]:
     """Build camera-to-world of an upright camera that points at a target.
 
-    NaN if it looks along y, where nothing tells what is upright.
+    NaN if it looks along y, where nothing tells what is upright, or stands at the target.
     """
     # In the splat y points down, as in the camera: x is level, and y completes the axes.
     with np.errstate(all="ignore"):

@@ -214,12 +214,12 @@ def load_mask(
     """Read the ignored pixels of a mask at the `size` (width, height) of its upright photograph.
 
     A mask of another size is scaled if its aspect ratio is the same. `orientation` is how EXIF
-    turned the photograph: a mask of the stored pixels is turned likewise. Any other mask raises an
-    InputError, in which `photograph` names its photograph. An inverted mask is white where pixels
-    are ignored.
+    turned the photograph: a mask of the stored pixels is turned likewise, which its aspect ratio
+    tells. Where turning does not change that, as half a turn, a mask counts as upright. Any other
+    mask raises an InputError, in which `photograph` names its photograph. An inverted mask is white
+    where pixels are ignored.
     """
     ignored = read_ignored(path, is_inverted)
-    # A mask drawn on the upright photograph has its shape; another may be of the stored pixels.
     is_stored = not has_same_aspect((ignored.shape[1], ignored.shape[0]), size)
     if is_stored and orientation != 1:
         ignored = turn_upright(ignored, orientation)

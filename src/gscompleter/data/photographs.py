@@ -90,6 +90,7 @@ class Photographs:
     unused: tuple[str, ...] = ()
     """Phrases on depth, poses and photographs that lie there and are not used."""
     format: str | None = None
+    """Name of the format in `formats.py`; None for photographs that came in none of them."""
     sparse: Callable[[], Float[np.ndarray, "n 3"]] | None = None
     """Reads sparse points on the scene's surfaces, in the frame of the files."""
     front: str | None = None
@@ -185,10 +186,10 @@ class Photographs:
         if named:
             places = list(dict.fromkeys(path.parent for path in named))
             kinds.append(
-                f"masks of {len(named)} photographs ({join_names(places, MAX_NAMED_PATHS)})"
+                f"masks of {_name_count(len(named))} ({join_names(places, MAX_NAMED_PATHS)})"
             )
         if num_transparent:
-            kinds.append(f"the alpha channel of {num_transparent} photographs")
+            kinds.append(f"the alpha channel of {_name_count(num_transparent)}")
         return " and ".join(kinds) if kinds else None
 
     def ignore_moving(self) -> Photographs:
@@ -479,6 +480,10 @@ def _ends_alike(one: Sequence[str], other: Sequence[str]) -> bool:
     return shorter > 0 and one[-shorter:] == other[-shorter:]
 
 
+def _name_count(count: int) -> str:
+    return "1 photograph" if count == 1 else f"{count} photographs"
+
+
 def _has_alpha_channel(frame: Frame) -> bool:
     return frame.file is not None and frame.file.has_alpha
 
@@ -512,8 +517,8 @@ class Framing:
 def compute_framing(width: int, height: int, resolution: Resolution) -> Framing:
     """Compute the framing of a width × height image for a resolution."""
     check_resolution(resolution)
-    # Shrink to a longer side, without a crop.
-    if resolution is None or isinstance(resolution, int):
+    # Shrink to a longer side, without a crop. Whole numbers of NumPy are no `int`.
+    if not isinstance(resolution, (AuthorsCrop, tuple, list)):
         scale = 1.0 if resolution is None else min(1.0, resolution / max(width, height))
         size = max(round(width * scale), 1), max(round(height * scale), 1)
         return Framing(size, (0, 0), size)

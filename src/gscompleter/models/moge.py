@@ -21,6 +21,9 @@ from gscompleter.system.errors import InputError
 from gscompleter.types import Camera, DepthMap, View
 
 SIGNATURE = {"image": ("tensor(float)", 3), "num_tokens": ("tensor(int64)", None)}
+"""Inputs of the network: the type of each, and the channels of the one that is an image."""
+NUM_OUTPUTS = 4
+"""Points in the axes of the camera, normals, scores of the mask, and metres per unit of points."""
 NUM_TOKENS = np.array(1800, np.int64)
 """Patches of the transformer per image, as in the authors' export; they train with 1200 to 3600."""
 MIN_MASK = 0.5
@@ -42,7 +45,6 @@ class MoGe:
         of the camera determines.
         """
         pixels = view.image.detach().cpu().float().permute(2, 0, 1)[None].contiguous().numpy()
-        # Points in the axes of the camera, normals, scores of the mask, and metres per unit.
         points, _, mask, scale = self.network(image=pixels, num_tokens=NUM_TOKENS)
         size = pixels.shape[2:]
         if points.shape != (1, *size, 3) or mask.shape != (1, *size) or scale.size != 1:
@@ -62,10 +64,11 @@ class MoGe:
 def fit_shift(
     points: Float[ndarray, "h w 3"], valid: Bool[ndarray, "h w"], camera: Camera
 ) -> float:
-    """Fit the shift along z after which the points project to their pixels.
+    """Fit the shift along z, in the unit of the points, after which they project to their pixels.
 
-    It is NaN where fewer than two points tell it: their depths are then unknown, and 0 would pass
-    for a measurement.
+    `points` are in the axes of the camera, and `valid` are those that have a depth. It is NaN where
+    fewer than two points tell it: their depths are then unknown, and 0 would pass for a
+    measurement.
     """
     h, w = valid.shape
     # A grid of some pixels is enough for one number. A small image has fewer than that.
@@ -92,5 +95,7 @@ def fit_shift(
 
 def load_moge(name: str, weights: Path | None = None, device: str = "cpu") -> MoGe:
     """Load a published size, or a file; raises the errors of `load_network`."""
-    network = load_network(PUBLISHED[name], SIGNATURE, weights, device, "depth_weights", 4)
+    network = load_network(
+        PUBLISHED[name], SIGNATURE, weights, device, "depth_weights", NUM_OUTPUTS
+    )
     return MoGe(network)

@@ -15,6 +15,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.ply import MAX_HEADER_LINE
 from gscompleter.system.files.typed_json import validate_typed
 
 SCHEMA = "gscompleter-provenance/1"
@@ -22,7 +23,10 @@ SCHEMA = "gscompleter-provenance/1"
 KEY = "provenance"
 """Name of the record in JSON and in OpenUSD."""
 MAX_NOTE_LENGTH = 100
-"""Longest name or licence, in characters; readers of .ply bound the length of a line."""
+"""Longest name or licence, in characters."""
+MAX_NOTE_BYTES = 300
+"""Most bytes of a name or licence in JSON, where a character beyond ASCII takes 6 or 12: the ten of
+a run fit into a line of `MAX_HEADER_LINE`."""
 DROP = "drop the record (`gscompleter convert --plain`)"
 PROVENANCE_ADVICE = f"export the file again, or {DROP}"
 _LINE = re.compile(rb"^comment (gscompleter-provenance/\d+) (.*?)\r?\n", re.MULTILINE)
@@ -82,14 +86,25 @@ NOTHING_KNOWN = Provenance(())
 
 
 def shorten(text: str) -> str:
-    """Shorten a name that a user chose to `MAX_NOTE_LENGTH` characters."""
-    return text if len(text) <= MAX_NOTE_LENGTH else f"{text[: MAX_NOTE_LENGTH - 1]}…"
+    """Shorten a name that a user chose to `MAX_NOTE_LENGTH` characters and `MAX_NOTE_BYTES`."""
+    if _is_short(text):
+        return text
+    kept = text[: MAX_NOTE_LENGTH - 1]
+    while not _is_short(f"{kept}…"):
+        kept = kept[:-1]
+    return f"{kept}…"
+
+
+def _is_short(text: str) -> bool:
+    num_bytes = len(json.dumps(text)) - len('""')
+    return len(text) <= MAX_NOTE_LENGTH and num_bytes <= MAX_NOTE_BYTES
 
 
 def parse_provenance(table: object, name: str) -> Provenance:
     """Parse the record of the file `name` from values of JSON; an absent one is None.
 
-    Raise InputError if the record is of another version or damaged.
+    Raise InputError if the record is of another version or damaged, or has a run that no line of a
+    .ply holds.
     """
     if table is None:
         return NOTHING_KNOWN
@@ -105,18 +120,27 @@ def parse_provenance(table: object, name: str) -> Provenance:
             f"{name} says who made it by the schema {quote_value(str(schema))}, and {SCHEMA} is "
             f"read; {PROVENANCE_ADVICE}."
         )
-    return validate_typed(Provenance, table, f"The record of {name}", PROVENANCE_ADVICE)
+    made_by = validate_typed(Provenance, table, f"The record of {name}", PROVENANCE_ADVICE)
+    if any(len(make_comment_lines([run], b"\r\n")) > MAX_HEADER_LINE for run in made_by.runs):
+        raise InputError(
+            f"The record of {name} has names that are too long for a .ply; {PROVENANCE_ADVICE}."
+        )
+    return made_by
 
 
 def make_comment_lines(runs: Sequence[RunRecord], ending: bytes = b"\n") -> bytes:
-    """Make the lines for the header of a .ply, one for each run."""
+    """Make the lines for the header of a .ply, one for each run; `ending` is that of its lines."""
     texts = [json.dumps(asdict(run), separators=(",", ":")) for run in runs]
     return b"".join(f"comment {SCHEMA} {text}".encode("ascii") + ending for text in texts)
 
 
 def parse_comments(header: bytes, name: str) -> object:
-    """Parse the comments of the .ply file `name` to values of JSON; None if none is a record."""
+    """Parse the comments of the .ply file `name` to values of JSON; None if none is a record.
+
+    Raise InputError if one is no JSON. `parse_provenance` checks the values.
+    """
     runs = []
+    # A later run adds its line behind the others. So the last one tells the version of the file.
     schema = SCHEMA
     for found, text in _LINE.findall(header):
         schema = found.decode()
@@ -128,6 +152,6 @@ def parse_comments(header: bytes, name: str) -> object:
 
 
 def add_comments(header: bytes, made_by: Provenance) -> bytes:
-    """Add the comments at the end of a header."""
+    r"""Add the comments at the end of a header that was made here, whose lines end in \n."""
     start, end, rest = header.rpartition(b"end_header")
     return start + make_comment_lines(made_by.runs) + end + rest

@@ -35,6 +35,7 @@ from gscompleter.system.files.writing import EDITS_FILE
 Keys = Int64[ndarray, "_n"]
 """Number of the edit that appended each row, and its place among these in the lower 40 bits."""
 PLACE_BITS = 40
+"""Bits of the place in a key: enough for any file, and 23 are left for the number of the edit."""
 NO_KEYS = np.empty(0, np.int64)
 
 
@@ -68,6 +69,9 @@ def strip_edits(path: Path, out: Path, numbers: Collection[int] | None = None) -
 
     If all edits go, a splat with at most one, or whose earlier states are not known, is stripped by
     its labels. They do not tell what edits before the last one left out, which is then missing.
+
+    `numbers` has one at least. Raises InputError if there is no such edit, or if the states before
+    it are not known.
     """
     path = resolve_splat(path)
     edits = read_edits(path)
@@ -90,7 +94,7 @@ def can_undo(edits: Edits, first: int) -> bool:
 
 
 def undo_edits(path: Path, edits: Edits, numbers: Collection[int], out: Path) -> Undone:
-    """Write a splat without some of its edits, which are numbered from 1."""
+    """Write a splat without some of its edits, row by row; errors as those of `strip_edits`."""
     check_undone(path, edits, numbers, out)
     layout = read_scene(path)
     all_edits = edits.edits

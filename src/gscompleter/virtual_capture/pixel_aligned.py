@@ -6,6 +6,8 @@ of view from where they lie.
 
 from __future__ import annotations
 
+import math
+
 import torch
 from jaxtyping import Float
 from torch import Tensor
@@ -17,6 +19,8 @@ from gscompleter.types import Camera, Gaussians
 
 INNER = 0.93
 """Share of the directions, along each axis of the image, that the camera shows."""
+MAX_DIRECTIONS = 2**24
+"""Most directions that tell the field of view; `torch.quantile` takes no more."""
 SIDEWAYS_MOVES = (
     (0.08, 0.0, 0.0),
     (-0.08, 0.0, 0.0),
@@ -39,18 +43,22 @@ def aim_pixel_camera(
     """
     rays = normalize(scene.means - center, dim=1)
     forward = normalize(rays.mean(dim=0), dim=0)
-    camera = Camera(torch.eye(4).to(rays), torch.eye(3).to(rays), side, side)
-    c2w = camera.c2w.clone()
+    c2w = torch.eye(4).to(rays)
     c2w[:3, 3] = center
+    # The field of view follows from the direction: any intrinsics do until then.
     posed = look_along(Camera(c2w, make_intrinsics(side, 1.0).to(rays), side, side), forward, up)
 
     # The field of view holds most directions: of several photographs it is that of all together.
     x, y, z = ((scene.means - center) @ posed.c2w[:3, :3]).unbind(1)
     ahead = z > 0
-    halves = torch.stack(
-        [(x / z)[ahead].abs().quantile(INNER), (y / z)[ahead].abs().quantile(INNER)]
-    )
-    return Camera(posed.c2w, make_intrinsics(side, halves.max().item()).to(rays), side, side)
+    half = max(find_inner_limit((axis / z)[ahead].abs()) for axis in (x, y))
+    return Camera(posed.c2w, make_intrinsics(side, half).to(rays), side, side)
+
+
+def find_inner_limit(slopes: Float[Tensor, "n"]) -> float:
+    """Find the slope up to which `INNER` of the slopes lie."""
+    spacing = math.ceil(len(slopes) / MAX_DIRECTIONS)
+    return slopes[::spacing].quantile(INNER).item()
 
 
 def move_beside(camera: Camera, depth: float) -> list[Camera]:

@@ -15,6 +15,7 @@ TOOL = "gscompleter"
 LICENCE = "Apache-2.0"
 """Licence of gscompleter, whose own models have no weights."""
 OWN_MODELS = ("plane-sweep", *(name for name, entry in GENERATORS.items() if entry.is_own))
+"""Names of the models that are part of gscompleter."""
 
 
 def make_run_record(
@@ -24,8 +25,12 @@ def make_run_record(
     generator: ModelRecord | None,
     given: Path | None,
 ) -> RunRecord:
-    """Make the record of a completion with its models; `given` is the file of a given scene."""
+    """Make the record of a completion with its models; `given` is the file of a given scene.
+
+    A model is None where none took part. Of several painters the first is named.
+    """
     labels = [part.origin.label for part in completion.added_parts if len(part)]
+    # What is recoloured has the number of its target: none of these is 0.
     labels += completion.recolored.generated.unique().tolist()
     # What photographs show was added as well, and nobody invented it.
     invented = [label for label in labels if label != NOT_INVENTED]
@@ -56,7 +61,7 @@ def describe_python_run(completion: Completion, given: Path | None) -> RunRecord
 
 
 def record_model_by_name(name: str | None) -> ModelRecord | None:
-    """Record a model by its name; None if there is none."""
+    """Record a model by its name, without its weights; None if there is none."""
     if not name:
         return None
     return ModelRecord(shorten(name), None, LICENCE if name in OWN_MODELS else None)

@@ -274,17 +274,23 @@ class CompletionSummary:
 
     version: str
     settings: Mapping[str, Any]
+    """Options of the command by name, and below `config` all of `CompleterConfig`; shown as they
+    are."""
     seed: int
     device: str
     scene: OpenedSceneRow
     outcome: OutcomeRow
     frame: ResultFrame
     depth_range: Mapping[str, Any]
+    """Planes `near` and `far` in scene units, and `from`: what told each of them."""
     coverage: Coverage
     context: tuple[ContextRow, ...]
     targets: tuple[TargetRow, ...]
     gaussians: Mapping[str, int]
+    """Numbers of Gaussians: `context` and `added` always, others where they apply
+    (`count_changes`)."""
     seconds: Mapping[str, float]
+    """Time by stage, and `total`."""
     held_out: tuple[HeldOutRow, ...] = ()
     checks: tuple[ContextRow, ...] = ()
     """Further photographs that guarded an input splat, in low resolution; empty with targets."""

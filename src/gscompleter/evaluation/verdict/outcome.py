@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from math import isinf
 from statistics import median
 
 from gscompleter.evaluation.metrics.unused_photographs import shrink_view
@@ -125,7 +124,10 @@ def explain_unreconstructed(completion: Completion, held_out: Sequence[HeldOutRo
 
 
 def is_like(compared: Sequence[HeldOutRow]) -> bool:
-    """Return True if a scene shows what the unused photographs show."""
+    """Return True if a scene shows what the unused photographs show.
+
+    `compared` are those that have both scores of likeness (`Likeness`).
+    """
     gains = [row.above_photograph for row in compared if row.above_photograph is not None]
     margins = [row.above_color for row in compared if row.above_color is not None]
     # Either is enough: a scene that hardly changes between photographs is no better than one of
@@ -216,6 +218,7 @@ def describe_gain(
 
     Unused photographs tell it best, then those of the `context` of a given scene that gained.
     """
+    # A photograph has both scores or none: they are of the same pixels.
     scored = [row for row in held_out if row.psnr_after is not None]
     better = [row for row in context if compute_psnr_gain(row) >= MIN_BETTER_GAIN]
     has_unused = any(not row.is_check for row in scored)
@@ -257,8 +260,8 @@ def describe_lost_photographs(context: Sequence[ScoreRow]) -> str:
 
 
 def compute_psnr_gain(row: ScoreRow) -> float:
-    """Return the gain of PSNR of a photograph in dB; none without a score or of an equal image."""
-    if row.psnr_before is None or row.psnr_after is None or isinf(row.psnr_before):
+    """Return the gain of PSNR of a photograph in dB; 0 without a score."""
+    if row.psnr_before is None or row.psnr_after is None:
         return 0.0
     return row.psnr_after - row.psnr_before
 

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from gscompleter.reconstructors.features.matches import (
     MAX_EPIPOLAR_DISTANCE,
     Pixels,
-    fit_poses,
+    find_fitting_matches,
     measure_match_errors,
 )
 from gscompleter.reconstructors.features.neighbours import find_neighbours
@@ -55,7 +55,7 @@ def count_consistent_matches(views: Sequence[View]) -> MatchCount:
     for (i, j), (in_i, in_j) in find_neighbours(images).matches.items():
         if len(in_i) > 0:
             total += len(in_i)
-            consistent += int(fit_poses(images[i], images[j], in_i, in_j).sum())
+            consistent += int(find_fitting_matches(images[i], images[j], in_i, in_j).sum())
     return MatchCount(total, consistent)
 
 

@@ -18,18 +18,19 @@ Features = tuple[Float[np.ndarray, "_ 2"], UInt8[np.ndarray, "_ 128"]]
 Pixels = Float[np.ndarray, "m 2"]
 
 CACHE_SIZE = 128
-"""Images whose features are cached, 0.3 MB each: poses, stereo, each target and the report match
-the same photographs."""
+"""Images whose features are cached, each 0.3 MB and a byte for each pixel: poses, stereo, each
+target and the report match the same photographs."""
 MAX_EPIPOLAR_DISTANCE = 3.0
 """Largest distance of a match from its epipolar line, in pixels; poses are noisy."""
 MIN_DEPTH = 1e-6
-"""Smallest z in the source, per z in the reference, that lies in front of it."""
+"""Smallest z in the source, per z in the reference, that lies in front of it; of rays to infinity,
+per their z in the reference as well."""
 MIN_PARALLAX = 1.0
 """Smallest parallax that gives a depth, in pixels."""
 
 
 def detect_features(view: StereoImage) -> Features:
-    """Detect the features of a view outside its ignored pixels."""
+    """Detect the features of a view outside its ignored pixels; the same image is cached."""
     grey = cv2.cvtColor((view.image * 255).clip(0, 255).astype(np.uint8), cv2.COLOR_RGB2GRAY)
     pixels, descriptors = _detect_features(grey.tobytes(), grey.shape)
     if view.ignore_mask is None:
@@ -51,7 +52,7 @@ def _detect_features(grey: bytes, size: tuple[int, int]) -> Features:
 
 
 def match_features(a: Features, b: Features) -> tuple[Pixels, Pixels]:
-    """Match mutual nearest neighbours that pass the ratio test."""
+    """Match mutual nearest neighbours that pass the ratio test; return pixels in a and in b."""
     if len(a[0]) < 2 or len(b[0]) < 2:
         return np.zeros((0, 2)), np.zeros((0, 2))
     # Squared distances of all descriptors [features of a, features of b]. Their length is about
@@ -93,7 +94,7 @@ def triangulate(
     # A match is valid if its point lies in front of both cameras, close to the match in the image,
     # and moves between the images by more than the noise.
     at_depth = at_infinity + inverse[:, None] * b
-    ahead = (at_depth[:, 2] > 1e-6) & (at_infinity[:, 2] > 1e-6)
+    ahead = (at_depth[:, 2] > MIN_DEPTH) & (at_infinity[:, 2] > MIN_DEPTH)
     scale = np.where(ahead, at_depth[:, 2], 1.0)[:, None]
     error = np.linalg.norm(at_depth[:, :2] / scale - matched, axis=1)
     infinite = at_infinity[:, :2] / np.where(ahead, at_infinity[:, 2], 1.0)[:, None]
@@ -103,7 +104,7 @@ def triangulate(
     )
 
 
-def fit_poses(
+def find_fitting_matches(
     reference: StereoImage, source: StereoImage, pixels: Pixels, matched: Pixels
 ) -> Bool[np.ndarray, "n"]:
     """Find matches that a point before both cameras explains to `MAX_EPIPOLAR_DISTANCE` px."""

@@ -20,7 +20,7 @@ from gscompleter.numerics.two_views import find_near_pairs
 from gscompleter.reconstructors.features.matches import (
     Pixels,
     detect_features,
-    fit_poses,
+    find_fitting_matches,
     match_features,
     triangulate_valid,
 )
@@ -103,7 +103,7 @@ def find_covering(
     for (i, j), (in_i, in_j) in sorted(matches.items()):
         if number in (i, j):
             other, pixels = (j, in_i) if number == i else (i, in_j)
-            is_true = fit_poses(images[i], images[j], in_i, in_j)
+            is_true = find_fitting_matches(images[i], images[j], in_i, in_j)
             covered[other] = find_covered_cells(images[number], pixels[is_true])
     if not covered:
         return []

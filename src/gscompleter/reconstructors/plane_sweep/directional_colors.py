@@ -94,11 +94,13 @@ def fit_directional_colors(
 ) -> Gaussians:
     """Fit colours that are linear in the direction to two photographs and two virtual ones.
 
-    `depths` are those of the scene at the photographs.
+    `views` are the two photographs, and `depths` those of the scene at them. Returns the scene with
+    harmonics of degree 1, which are made of its colours by degree 0 alone.
     """
     line = ColorLine.between(scene, views[0].camera, views[1].camera)
 
     def weigh(view: View, weight: float) -> WeightedImage:
+        # Nothing is frozen around the scene: the colours of all of it vary.
         errors = renderer.freeze(scene[:0], view.camera).vary_colors(scene)
         return WeightedImage(errors, view.image, weight, line.locate(scene, view.camera))
 

@@ -33,6 +33,8 @@ PLY_SCALARS = {
     **dict.fromkeys(("float", "float32"), "f4"),
     **dict.fromkeys(("double", "float64"), "f8"),
 }
+MAX_HEADER_LINE = 4096
+"""Longest line of a header that is read, in bytes with its ending."""
 _NAMES = {"<f4": "float", "<f8": "double", "<u4": "uint", "|u1": "uchar"}
 _BYTE_ORDERS = {"ascii": "=", "binary_little_endian": "<", "binary_big_endian": ">"}
 _COUNT_LINE = re.compile(rb"^(element\s+vertex\s+)\d+", re.M)
@@ -70,7 +72,7 @@ def read_header(file: BinaryIO, path: Path) -> tuple[bytes, list[Element]]:
             f"{quote_value(path)} is empty or not a PLY file (it does not begin with 'ply')."
         )
     while lines[-1].split() != [b"end_header"]:
-        lines.append(file.readline(4096))
+        lines.append(file.readline(MAX_HEADER_LINE))
         if not lines[-1].endswith(b"\n"):
             raise InputError(
                 f"{quote_value(path)} is truncated: its header has no end; fetch the file again."
