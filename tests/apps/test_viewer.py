@@ -420,6 +420,16 @@ def test_photographs_of_an_unknown_format_are_left_out(tmp_path, name):
     assert "moved" not in exhibit.notes[0]
 
 
+@pytest.mark.parametrize("path", ["x" * 5000, "\0", "\ud800", ""])
+def test_photographs_at_an_impossible_path_are_left_out(tmp_path, monkeypatch, path):
+    """Another program wrote the summary."""
+    folder = completion_in(tmp_path / "out", np.eye(4), np.zeros(3))
+    change_summary(folder, "settings", "folder", path)
+    monkeypatch.chdir(tmp_path)
+    exhibit = load_viewer_completion(folder, False)
+    assert "are not shown" in exhibit.notes[0]
+
+
 def test_a_note_names_the_photograph_that_is_damaged(tmp_path):
     folder = completion_in(tmp_path / "out", np.eye(4), np.zeros(3))
     (folder / "gone").mkdir()

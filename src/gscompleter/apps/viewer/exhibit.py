@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -157,7 +158,7 @@ def load_known_cameras(
     source = Path(str(summary.settings.get("folder")))
     if summary.scene.format == "photographs":
         source = folder / FOUND_POSES_FOLDER
-    if not source.exists():
+    if not os.path.exists(source):  # also for names that no file can have
         # A path is as the command was given it, and leads elsewhere from another folder.
         cause = "is not in this folder, and was named from another"
         if source.is_absolute():
