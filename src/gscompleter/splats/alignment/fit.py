@@ -46,8 +46,9 @@ class ImageFit(NamedTuple):
     psnr: float = 0.0
     """PSNR in dB over the covered pixels, after matching the exposure."""
     margin: float = 0.0
-    """PSNR above that of the best flat image, in dB."""
+    """PSNR above that of the best image of one grey, in dB."""
     coverage: float = 0.0
+    """Share of the valid pixels of the photograph that the splat covers."""
     drift: float = math.inf
     """Displacement of corners from render to photograph, in pixels; infinity if unknown."""
 
