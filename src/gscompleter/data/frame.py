@@ -268,7 +268,8 @@ def list_image_folders(roots: Sequence[Path]) -> list[Path]:
 def locate_images(frames: Sequence[Frame], roots: Sequence[Path]) -> list[Frame]:
     """Return the frames with the paths of their photographs and masks, if they exist.
 
-    Raise InputError if a mask may be of several photographs.
+    Only a mask that is named as the photograph is written is found here; `attach_masks` looks for
+    the others. Raise InputError if a mask may be of several photographs.
     """
     folders = list_image_folders(roots)
     listings = FolderListings()
