@@ -330,7 +330,7 @@ def describe_run_row(row: MadeRow) -> str:
     used += [] if run.seed is None else [f"seed {run.seed}"]
     used += [] if run.given is None else [f"given SHA-256 {run.given}"]
     tool = f"{quote_value(run.tool)} {quote_value(run.version)}"
-    return f"{tool} ({part}; {'; '.join(used)})"
+    return f"{tool} ({'; '.join([part, *used])})"
 
 
 def describe_model(model: ModelRecord | None) -> str:
