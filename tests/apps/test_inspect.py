@@ -13,6 +13,7 @@ from command import run
 from gscompleter import load_ply, save_ply, save_splat
 from gscompleter.apps.completing.keeping import save_compactly
 from gscompleter.apps.completing.maker import record_model
+from gscompleter.apps.inspection import MadeRow, describe_run_row
 from gscompleter.data.scene import write_cameras
 from gscompleter.splats.formats import read_provenance
 from gscompleter.splats.provenance import ModelRecord, Provenance, RunRecord
@@ -128,6 +129,12 @@ def test_rows_that_are_not_finite_are_counted_and_left_out(tmp_path, monkeypatch
         found = inspected(monkeypatch, capsys, tmp_path / name)
         assert (found["gaussians"], found["nonfinite"]) == (30, count)
         assert np.isfinite(found["extent"]).all()
+
+
+def test_a_run_that_names_neither_models_nor_a_seed_is_one_clause():
+    assert describe_run_row(MadeRow(0, None, RunRecord("mine", "2", None))) == (
+        "mine 2 (nothing invented)"
+    )
 
 
 def test_a_damaged_record_does_not_hide_the_rest(tmp_path, monkeypatch, capsys):

@@ -18,6 +18,7 @@ from gscompleter.apps.report.schema import read_summary
 from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.system.errors import InputError
 from gscompleter.types import ContextScene
+from splat_files import sog_files, write_sog
 
 NEAR_FAR = {"near": 0.5, "far": 20.0}
 
@@ -166,6 +167,13 @@ def test_a_scene_whose_values_were_changed_is_another_one(completion, saved):
         values[-1] *= 0.5
         with pytest.raises(InputError, match="holds another scene"):
             find(replace(scene, **{name: values}))
+
+
+def test_a_scene_of_an_unpacked_sog_is_that_of_its_folder(completion, saved, tmp_path):
+    folder = tmp_path / "room"
+    write_sog(folder, sog_files(gsc.load_splat(saved / "context.ply")))
+    scene = replace(completion, source=ContextScene.whole(gsc.load_splat(folder)))
+    assert find_splat_file(folder, scene).path == folder
 
 
 def test_a_scene_of_which_gaussians_were_dropped_is_that_of_its_file(completion, saved, tmp_path):

@@ -417,6 +417,30 @@ def test_photographs_of_an_unknown_format_are_left_out(tmp_path, name):
     exhibit = load_viewer_completion(folder, False)
     assert [shot.name for shot in exhibit.cameras] == ["target-1"]
     assert "are not shown" in exhibit.notes[0]
+    assert "moved" not in exhibit.notes[0]
+
+
+@pytest.mark.parametrize("path", ["x" * 5000, "\0", "\ud800", ""])
+def test_photographs_at_an_impossible_path_are_left_out(tmp_path, monkeypatch, path):
+    """Another program wrote the summary."""
+    folder = completion_in(tmp_path / "out", np.eye(4), np.zeros(3))
+    change_summary(folder, "settings", "folder", path)
+    monkeypatch.chdir(tmp_path)
+    exhibit = load_viewer_completion(folder, False)
+    assert "are not shown" in exhibit.notes[0]
+
+
+def test_a_note_names_the_photograph_that_is_damaged(tmp_path):
+    folder = completion_in(tmp_path / "out", np.eye(4), np.zeros(3))
+    (folder / "gone").mkdir()
+    write_image(folder / "gone" / "0.png", torch.rand(SIDE, SIDE, 3))
+    write_cameras(folder / "gone" / "transforms.json", [LEFT], ["0.png"])
+    data = (folder / "gone" / "0.png").read_bytes()
+    (folder / "gone" / "0.png").write_bytes(data[: len(data) // 2])
+    (note,) = load_viewer_completion(folder, False).notes
+    assert "are not shown" in note
+    assert "0.png" in note
+    assert "moved" not in note
 
 
 def completion_of_photographs_in(folder: Path) -> Path:

@@ -12,6 +12,7 @@ from gscompleter.apps.report.plain_words import list_notes
 from gscompleter.apps.report.schema import read_summary
 from gscompleter.reconstructors import RECONSTRUCTORS
 from gscompleter.reconstructors.depth_predictors import predict_nothing
+from gscompleter.reconstructors.features.given_range import find_depth_range
 from gscompleter.reconstructors.from_depth import FromDepth
 from gscompleter.reconstructors.plane_sweep import PlaneSweep, reconstructor
 from gscompleter.reconstructors.plane_sweep.hidden_blocks import WEIGHT
@@ -22,6 +23,7 @@ from gscompleter.reconstructors.plane_sweep.predicted_depth import (
     add_prediction,
 )
 from gscompleter.reconstructors.plane_sweep.sweep import Measurement
+from gscompleter.stages.context import prepare_single
 from gscompleter.types import DepthMap, Reconstruction, View
 from scenes import Room, camera_at, view_of
 
@@ -36,6 +38,18 @@ GREY = np.full((SIZE, SIZE, 3), 0.5, np.float32)
 NO_SKY = np.zeros((SIZE, SIZE), bool)
 WAVES = (2.5 + np.sin(12 * Y) * np.cos(18 * X)).astype(np.float32)
 """Depth of no room."""
+
+
+def test_a_single_photograph_of_a_surface_before_an_infinite_sky_is_reconstructed():
+    view = view_of(Room(), camera_at(size=32))
+    bare = View(view.image, replace(view.camera, near=None, far=None), 0)
+    depth = torch.full((32, 32), 3.0)
+    depth[:8] = torch.inf
+    answer = DepthMap(depth, torch.ones_like(depth, dtype=torch.bool))
+    (given,) = prepare_single(PlaneSweep(predict_depth=lambda view: answer), [bare])
+    assert given.given_depth.tolist() == depth.where(depth == 3.0, 0.0).tolist()
+    found = find_depth_range([given])
+    assert found.near < 3.0 < found.far
 
 
 def predict(inverse) -> DepthMap:

@@ -72,6 +72,7 @@ def test_a_level_that_is_not_there_is_refused(streamed):
     ("change", "sentence"),
     [
         ({"tree": 3}, "is no index of levels"),
+        ({"lodLevels": float("inf")}, "is no index of levels"),
         ({"filenames": ["0_0/meta.json"]}, "names no Gaussians of level 0"),
         ({"filenames": ["../0_0/meta.json"] * 3}, "names a file outside of its folder"),
     ],

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from jaxtyping import Float, UInt8
+from jaxtyping import Bool, Float, UInt8
 from rich.table import Table
 from torch import Tensor
 
@@ -58,7 +58,7 @@ ORIGINS = {
 """Words for a person about each kind of rows."""
 
 Bounds = tuple[tuple[float, float], ...]
-"""Smallest and largest x, y and z."""
+"""Smallest and largest x, y and z of centres, in the frame and unit of the file."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,11 @@ class Inspection:
 
 
 def inspect_splat(request: InspectionRequest) -> Inspection:
-    """Inspect a file, and the pictures of it at the cameras that are known."""
+    """Inspect a file, and the pictures of it at the cameras that are known.
+
+    Raises InputError for a file that is no splat or holds nothing finite, and for cameras that
+    cannot be read.
+    """
     path, folder = locate_inspected(request.file)
     # Other readers refuse a file with NaN; here those Gaussians are counted, and left out.
     decoded = decode_splat(path)
@@ -140,22 +144,22 @@ def inspect_splat(request: InspectionRequest) -> Inspection:
         notes = (other_name, *notes)
     low, high = gaussians.means.amin(0), gaussians.means.amax(0)
     return Inspection(
-        str(path),
-        detect_splat_format(path),
-        None if path.is_dir() else path.stat().st_size,
-        len(decoded),
-        len(decoded) - len(gaussians),
-        gaussians.sh_degree,
-        gaussians.is_antialiased,
-        make_bounds(low, high, gaussians.origin),
-        make_bounds(*compute_middle(gaussians.means), gaussians.origin),
-        int(find_invented(labels).sum()),
-        int((labels == NOT_INVENTED).sum()),
-        origins,
-        tuple(list_runs(labels, runs)),
-        defect,
-        measure_pictures(gaussians, cameras, request.device) if cameras else (),
-        (*describe_oddities(path), *notes),
+        file=str(path),
+        format=detect_splat_format(path),
+        bytes=None if path.is_dir() else path.stat().st_size,
+        gaussians=len(decoded),
+        nonfinite=len(decoded) - len(gaussians),
+        sh_degree=gaussians.sh_degree,
+        antialiased=gaussians.is_antialiased,
+        extent=make_bounds(low, high, gaussians.origin),
+        extent_of_98_percent=make_bounds(*compute_middle(gaussians.means), gaussians.origin),
+        invented=int(find_invented(labels).sum()),
+        from_photographs=int((labels == NOT_INVENTED).sum()),
+        origins=origins,
+        runs=tuple(list_runs(labels, runs)),
+        record_defect=defect,
+        pictures=measure_pictures(gaussians, cameras, request.device) if cameras else (),
+        notes=(*describe_oddities(path), *notes),
     )
 
 
@@ -186,7 +190,7 @@ def compute_middle(means: Float[Tensor, "n 3"]) -> tuple[Float[Tensor, "3"], Flo
     return torch.from_numpy(low), torch.from_numpy(high)
 
 
-def find_invented(labels: UInt8[Tensor, "n"]) -> Tensor:
+def find_invented(labels: UInt8[Tensor, "n"]) -> Bool[Tensor, "n"]:
     """Mark the Gaussians that were added or recoloured for a target, by their labels."""
     return (labels > 0) & (labels != NOT_INVENTED)
 
@@ -326,7 +330,7 @@ def describe_run_row(row: MadeRow) -> str:
     used += [] if run.seed is None else [f"seed {run.seed}"]
     used += [] if run.given is None else [f"given SHA-256 {run.given}"]
     tool = f"{quote_value(run.tool)} {quote_value(run.version)}"
-    return f"{tool} ({part}; {'; '.join(used)})"
+    return f"{tool} ({'; '.join([part, *used])})"
 
 
 def describe_model(model: ModelRecord | None) -> str:

@@ -50,6 +50,8 @@ class Frame:
     """One camera of a scene; its photograph is read on demand."""
 
     name: str
+    """Path of the photograph as its file of cameras writes it: below a folder of photographs, or as
+    of another machine until `locate_images` finds it; it may lack its ending, or be empty."""
     title: str
     """Name in error messages, such as "frame 3 of room.json"."""
     c2w: Float[np.ndarray, "4 4"]
@@ -258,14 +260,16 @@ def list_image_folders(roots: Sequence[Path]) -> list[Path]:
     # Beside a model with distortion, `images` may hold undistorted photographs.
     has_lens = any(root.name.casefold() == DISTORTED for root in roots)
     order = (ORIGINALS, *FOLDERS) if has_lens else FOLDERS
-    folders = [find_path(root, name) for root in roots for name in order]
+    listings = FolderListings()
+    folders = [listings.find(root, name) for root in roots for name in order]
     return [folder for folder in folders if folder is not None and folder.is_dir()] + [*roots]
 
 
 def locate_images(frames: Sequence[Frame], roots: Sequence[Path]) -> list[Frame]:
     """Return the frames with the paths of their photographs and masks, if they exist.
 
-    Raise InputError if a mask may be of several photographs.
+    Only a mask that is named as the photograph is written is found here; `attach_masks` looks for
+    the others. Raise InputError if a mask may be of several photographs.
     """
     folders = list_image_folders(roots)
     listings = FolderListings()
@@ -276,7 +280,7 @@ def locate_images(frames: Sequence[Frame], roots: Sequence[Path]) -> list[Frame]
         images = [name + ending for name in names for ending in TRIED_ENDINGS]
         located.append(replace(frame, image=find_file(folders, images, listings)))
 
-    found_masks = [find_path(root, MASKS) for root in roots]
+    found_masks = [listings.find(root, MASKS) for root in roots]
     mask_folders = [folder for folder in found_masks if folder is not None]
 
     def find_mask_of(end: str) -> Path | None:

@@ -29,7 +29,8 @@ CUT_BLOCK = 4096
 MIN_LENGTH = 0.25
 """Length, relative to the longest axis, from which on the second axis is divided as well."""
 MAX_DIVIDED_OPACITY = 0.99
-"""Largest opacity that is divided, as a logarithm is taken."""
+"""Largest opacity that is divided: every power of a transmittance of 0 is 0, so that each piece of
+an opaque Gaussian would be opaque."""
 MIN_PIECE_OPACITY = 1 / 255
 """Smallest opacity that is rendered."""
 
@@ -49,6 +50,7 @@ def cut(gaussians: Gaussians, contains: Region) -> tuple[Gaussians, Gaussians]:
     divided = gaussians[~is_whole]
     inner = [gaussians[is_whole]]
     outer = []
+    # There is a block even without any, so that there is something to merge.
     for start in range(0, max(len(divided), 1), CUT_BLOCK):
         pieces = split(divided[start : start + CUT_BLOCK])
         is_piece_inside = contains(pieces.means)

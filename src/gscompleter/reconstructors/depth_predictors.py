@@ -53,11 +53,13 @@ def give_prediction(views: Sequence[View], predict: DepthPredictor) -> list[View
     """Give a single photograph the predicted depth, in the scale of the predictor.
 
     Without stereo nothing else measures; several photographs and a given depth stay as they are.
+    Pixels at infinity, such as the sky, get none: no surface is there.
     """
     if len(views) != 1 or len(views[0].known_depths):
         return list(views)
     predicted = predict_depth(predict, views[0])
-    return [replace(views[0], given_depth=predicted.depth.where(predicted.valid, 0.0))]
+    is_surface = predicted.valid & predicted.depth.isfinite()
+    return [replace(views[0], given_depth=predicted.depth.where(is_surface, 0.0))]
 
 
 DEPTH_PREDICTORS: dict[str, Callable[[Path | None, str], DepthPredictor]] = {

@@ -39,8 +39,9 @@ from gscompleter.types import Gaussians
 EDITS = (EDITS_FILE, f"{EDITS_FOLDER}/*.ply", REFINED_POSES_FILE)
 """Globs of the files that are written, with the poses that the splat was made with."""
 EDITS_ADVICE = "take all files of its folder again, or move it away to do without the record"
-_EDITS_FILE = re.compile(r"removed\.ply|edits/\d{1,5}_(originals|taken_out)\.ply")
-
+"""End of each sentence about a damaged record."""
+# Names of the files of edits.
+_FILE_PATTERN = re.compile(r"removed\.ply|edits/\d{1,5}_(originals|taken_out)\.ply")
 
 RowKind = Literal["recolored", PartKind]
 """Origin of rows: given and recoloured since, or that of an addition."""
@@ -83,7 +84,8 @@ class Edit:
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Place, cameras, masks and photographs, as options of the command."""
     can_be_undone: bool = True
-    """False if another program changed the splat after it, so that its rows are not known."""
+    """False if its rows are not known: another program changed the splat after it, or rows that it
+    changed stand where they stood."""
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -136,7 +138,10 @@ class EditDraft:
 
 
 def read_edits(splat: Path) -> Edits:
-    """Read the edits of a splat; none without a record beside it that is about this splat."""
+    """Read the edits of a splat; none without a record beside it that is about this splat.
+
+    Raises InputError for a record that is damaged or names files that are not those of edits.
+    """
     path = splat.with_name(EDITS_FILE)
     if not path.is_file() or not splat.is_file():
         return Edits(splat.parent)
@@ -144,7 +149,7 @@ def read_edits(splat: Path) -> Edits:
     # Names of a file that may come from elsewhere lead to nothing outside of its folder.
     for edit in content.edits:
         for name in edit.files:
-            if not _EDITS_FILE.fullmatch(name):
+            if not _FILE_PATTERN.fullmatch(name):
                 raise InputError(f"{quote_value(path)} names {quote_value(name)}; {EDITS_ADVICE}.")
     is_unchanged = content.sha256 == hash_file(splat)
     if not is_unchanged and splat.name != content.file:
@@ -249,6 +254,8 @@ def write_edits(folder: Path, splat: Path, earlier: Edits, edit: Edit) -> None:
     """
     edits = []
     for number, known in enumerate(earlier.edits, start=1):
+        # Rows have no place any more in a splat that another program changed. What a person took
+        # out still stays out.
         if not earlier.is_unchanged:
             known = replace(known, originals=None, can_be_undone=False)
         originals = copy_file(earlier, known.originals, folder, f"{number}_originals")

@@ -32,9 +32,8 @@ FileRange = tuple[int, int, int]
 
 def is_streamed(path: Path) -> bool:
     """Check whether a path names a streamed scene: its folder, or its index."""
-    return (path / LOD_META if path.is_dir() else path).name.lower() == LOD_META and (
-        (path / LOD_META).is_file() or path.is_file()
-    )
+    index = locate_index(path)
+    return index.name.lower() == LOD_META and index.is_file()
 
 
 def list_streamed_files(path: Path) -> list[Path]:
@@ -57,6 +56,10 @@ def load_level(path: Path, level: int, drop_nonfinite: bool = False) -> Gaussian
     """Load the Gaussians of one level of a streamed scene, a folder or its `lod-meta.json`.
 
     `drop_nonfinite` drops those with NaN, infinity or a zero quaternion instead of refusing them.
+
+    Raises:
+        InputError: The scene has no such level, its index or a file of this level is missing,
+            damaged or outside of the folder, or what is not finite is not dropped.
     """
     index = locate_index(path)
     name = quote_value(index)
@@ -66,12 +69,13 @@ def load_level(path: Path, level: int, drop_nonfinite: bool = False) -> Gaussian
         files = [str(file) for file in table[FILES_KEY]]
         parts = sorted(set(_list_parts(table["tree"], level)))
         fits = all(0 <= file < len(files) and first >= 0 < count for file, first, count in parts)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise InputError(f"{name} is no index of levels; export the scene again.") from error
+    # An infinity, which JSON may write as 1e999, overflows.
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
+        raise InputError(f"{name} is no index of levels; {INDEX_ADVICE}.") from error
     if not 0 <= level < levels:
         raise InputError(f"{name} has levels 0 to {levels - 1}, 0 the finest.", "level")
     if not fits or not parts:
-        raise InputError(f"{name} names no Gaussians of level {level}; export the scene again.")
+        raise InputError(f"{name} names no Gaussians of level {level}; {INDEX_ADVICE}.")
 
     gaussians = []
     by_file: dict[int, list[FileRange]] = {}
@@ -85,14 +89,17 @@ def load_level(path: Path, level: int, drop_nonfinite: bool = False) -> Gaussian
         if any(first + count > len(scene) for _, first, count in wanted):
             raise InputError(
                 f"{quote_value(place)} has {len(scene):,} Gaussians, fewer than {name} says; "
-                "export the scene again."
+                f"{INDEX_ADVICE}."
             )
         gaussians += [scene[first : first + count] for _, first, count in wanted]
     return require_finite(merge(gaussians), index, drop_nonfinite)
 
 
 def _list_parts(tree: Mapping[str, Any], level: int) -> Iterator[FileRange]:
-    """List what the boxes of a tree name for a level."""
+    """List what the boxes of a tree name for a level.
+
+    What is no tree leaves as one of the errors that `load_level` converts.
+    """
     nodes = [tree]
     for _ in range(MAX_NODES):
         if not nodes:

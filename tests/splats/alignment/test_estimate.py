@@ -143,6 +143,14 @@ def test_a_photograph_in_another_exposure_fits_as_well(views, splat):
     assert even.margin == pytest.approx(plain.margin, abs=0.2)
 
 
+def test_depth_planes_of_photographs_say_nothing_of_a_splat_in_another_unit(views, splat):
+    enlarge = torch.from_numpy(make_similarity(1000.0, np.eye(3), np.zeros(3))).float()
+    large = transform_gaussians(splat, enlarge)
+    bare = [replace(view, camera=replace(view.camera, near=None, far=None)) for view in views]
+    assert views[0].camera.far is not None
+    assert score_splat(large, views, RENDERER) == score_splat(large, bare, RENDERER)
+
+
 def test_opensplat_centres_the_cameras_within_one():
     poses = np.stack([make_similarity(1.0, np.eye(3), np.array([x, 4.0, 0.0])) for x in (1.0, 3.0)])
     expected = [[1, 0, 0, -2], [0, 1, 0, -4], [0, 0, 1, 0], [0, 0, 0, 1]]

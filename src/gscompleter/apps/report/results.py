@@ -243,12 +243,12 @@ def describe_judged(judged: Judged, splat_file: InputSplatFile | None) -> Mappin
 
 
 def find_splat_file(path: Path, completion: Completion) -> InputSplatFile:
-    """Describe the file of a given scene; raise InputError if it holds another one.
+    """Describe the file of a given scene, or the folder of a .sog; refuse that of another scene.
 
     All values count, since the file's own rows are written again. Rows that are not finite may have
     been dropped when it was loaded.
     """
-    if not os.path.isfile(path):
+    if not os.path.exists(path):
         raise InputError(f"There is no splat {quote_value(path)}; name the file of the scene.")
     context = completion.context
     # It was completed as it is, and perhaps relative to another origin.

@@ -27,7 +27,7 @@ class CasesRequest:
     resolution: Size | None = None
     """Working size; None for that of each case, or the default of scenes."""
     near: float | None = None
-    """Smallest depth; None for that of each case or of the data."""
+    """Smallest depth in the unit of the cameras; None for that of each case or of the data."""
     far: float | None = None
     """Largest depth, likewise."""
     uses_masks: bool = True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -97,7 +98,10 @@ def move_scene_camera(
 def load_viewer_files(
     after: Path, before: Path | None, drop_nonfinite: bool, ignore_properties: bool = False
 ) -> ViewerContent:
-    """Load a splat to compare with `before`, or with its observed part if that is None."""
+    """Load a splat to compare with `before`, or with its observed part if that is None.
+
+    What later commands added from photographs, which has a label, is no part of the observed one.
+    """
     scene = load_splat(after, drop_nonfinite, ignore_properties)
     if before is not None:
         other = load_splat(before, drop_nonfinite, ignore_properties).move_origin(scene.origin)
@@ -138,7 +142,10 @@ def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:
 def load_known_cameras(
     folder: Path, summary: CompletionSummary, content: ViewerContent
 ) -> tuple[tuple[ViewerCamera, ...], tuple[str, ...]]:
-    """Load the targets and the photographs of a completion, with notes on what is missing."""
+    """Load the targets and the photographs of a completion, with notes on what is missing.
+
+    Without photographs that can be read, the notes say why they are not shown.
+    """
     targets = load_target_cameras(folder, summary, content)
     # The poses of photographs that had none lie in the folder; others stay where the user has them.
     if summary.scene.renders_from is not None:
@@ -151,15 +158,17 @@ def load_known_cameras(
     source = Path(str(summary.settings.get("folder")))
     if summary.scene.format == "photographs":
         source = folder / FOUND_POSES_FOLDER
-    try:
-        photographs = load_context_cameras(folder, source, summary, content)
-    except InputError:
+    if not os.path.exists(source):  # also for names that no file can have
         # A path is as the command was given it, and leads elsewhere from another folder.
         cause = "is not in this folder, and was named from another"
         if source.is_absolute():
             cause = "was moved"
         note = f"The context photographs are not shown, because {quote_value(source)} {cause}."
         return targets, (note,)
+    try:
+        photographs = load_context_cameras(folder, source, summary, content)
+    except InputError as error:
+        return targets, (f"The context photographs are not shown. {error}",)
     return (*targets, *photographs), ()
 
 
@@ -203,7 +212,8 @@ def load_context_cameras(
 ) -> tuple[ViewerCamera, ...]:
     """Load the photographs of a completion's context, with the poses that it used.
 
-    Raises InputError if they were moved.
+    `source` is the scene of the photographs. Raises InputError if one of them cannot be read, or is
+    not in it any more.
     """
     name = summary.settings.get("format")
     photographs = open_photographs(source, None if name is None else str(name))
@@ -211,12 +221,11 @@ def load_context_cameras(
     if summary.scene.refined_poses is not None and refined.is_file():
         taken = take_refined(photographs, refined)
         photographs = photographs if taken is None else taken[0]
-    relative = content.transform @ compute_frame_from_photographs(-photographs.origin)
     return tuple(
         ViewerCamera(
             f"photograph-{number}",
             f"Photograph {name_photograph(number, photographs.frame(number).file_name)}",
-            transform_camera(photographs.camera(number), relative),
+            move_scene_camera(photographs.camera(number), content.transform, photographs.origin),
             make_frame_thumbnail(photographs.frame(number)),
         )
         for number in [row.frame for row in summary.context if row.frame is not None]
@@ -253,6 +262,6 @@ def make_thumbnail(stored: Path, orientation: int = 1) -> bytes | None:
 
 
 def shrink_image(image: Image.Image) -> bytes:
-    """Make a small JPEG of an image."""
+    """Make a small JPEG of an image, which shrinks itself."""
     image.thumbnail((THUMBNAIL_SIDE, THUMBNAIL_SIDE))
     return encode_jpeg(image, THUMBNAIL_QUALITY)

@@ -97,7 +97,8 @@ class AnyViewVit(nn.Module):
 
     The first blocks process single views. From `first_multi_view_block` on, a camera token replaces
     the class token, and odd blocks process all views jointly. If that is None (monocular models),
-    all blocks process single views.
+    all blocks process single views. Names of parameters and modules are the keys of the published
+    weights, and layers are normalised as there: blocks with another epsilon than the rest.
     """
 
     def __init__(self, config: VitConfig) -> None:
@@ -128,7 +129,11 @@ class AnyViewVit(nn.Module):
     def forward(
         self, images: Float[Tensor, "b v 3 h w"], cameras: Float[Tensor, "b v c"] | None = None
     ) -> list[Tokens]:
-        """Compute the tokens of the output blocks; `cameras` are encoded poses, None if unknown."""
+        """Compute the tokens of the output blocks, in the order of the views.
+
+        Images are normalised, with sides in multiples of `PATCH`. `cameras` are tokens of encoded
+        poses, None if these are unknown.
+        """
         scenes, views = images.shape[:2]
         x = self.embed_views(images)
         size = (images.shape[3] // PATCH, images.shape[4] // PATCH)

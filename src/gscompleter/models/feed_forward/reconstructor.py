@@ -38,6 +38,7 @@ class FeedForward:
     range is estimated from matched features."""
 
     keeps_range: ClassVar[bool] = True
+    """A range that is given is not widened to what features show (see `Reconstructor`)."""
 
     def __post_init__(self) -> None:
         check_precision(self.device, self.dtype)

@@ -1,4 +1,7 @@
-"""Trust in Gaussians, from how far photographs agree with their render, block by block."""
+"""Trust in Gaussians, from how far photographs agree with their render, block by block.
+
+The last arguments of a kernel are the arrays that it writes. Lengths are in scene units.
+"""
 
 import math
 from typing import NamedTuple
@@ -11,7 +14,8 @@ SUPPORT_BLOCK = 256
 """Gaussians per block."""
 MIN_ANGLE_WEIGHT = np.float32(1e-6)
 """Smallest angular weight: opposite photographs count if there are no others."""
-MIN_CAP_DIVISOR = np.float32(1e-20)
+SMALLEST_DIVISOR = np.float32(1e-20)
+"""Takes the place of a sum or a squared length of 0, which would be divided by."""
 
 # Abramowitz and Stegun 4.4.46: acos(x) = sqrt(1 - x) p(x) from 0 to 1, to 2e-8.
 _A0, _A1, _A2, _A3 = map(np.float32, (1.5707963050, -0.2145988016, 0.0889789874, -0.0501743046))
@@ -73,7 +77,9 @@ def _compute_pixel_area(means, i, place):
 def measure_photo_agreement(begin, end, sums, means, place, areas, agreement):
     """Compute the visible area of the Gaussians begin..end in a photograph, and its agreement.
 
-    sums [n, 3] float32: compositing weights, and their products with agreement, summed over pixels.
+    sums [n, 3] float32: compositing weights, and their products with agreement, summed over pixels;
+    the third column is not read. means [n, 3] float32: centres. place: `CameraPose` of the
+    photograph. areas, agreement [n] float32: written.
     """
     for i in range(begin, end):
         areas[i] = sums[i, 0] * _compute_pixel_area(means, i, place)
@@ -81,8 +87,12 @@ def measure_photo_agreement(begin, end, sums, means, place, areas, agreement):
 
 
 @njit(nogil=True, fastmath={"contract"}, error_model="numpy")
-def _add_agreement(x, y, z, rays, center, turn, areas, agreement, totals):
-    """Add the weighted agreement of the photograph at `center` to the sums of a block."""
+def _add_agreement(x, y, z, rays, center, per_turn, areas, agreement, totals):
+    """Add the weighted agreement of the photograph at `center` to the sums of a block.
+
+    x, y, z: centres of the Gaussians; rays: unit vectors to them from the camera that asks. Where a
+    photograph looks along another ray, its weight falls with that angle times `per_turn`.
+    """
     one = np.float32(1)
     ray_x, ray_y, ray_z = rays
     agreeing, weights, largest = totals
@@ -91,8 +101,9 @@ def _add_agreement(x, y, z, rays, center, turn, areas, agreement, totals):
         dx = x[j] - center_x
         dy = y[j] - center_y
         dz = z[j] - center_z
-        inverse = one / math.sqrt(max(dx * dx + dy * dy + dz * dz, MIN_CAP_DIVISOR))
-        turned = _acos((dx * ray_x[j] + dy * ray_y[j] + dz * ray_z[j]) * inverse) * turn
+        inverse = one / math.sqrt(max(dx * dx + dy * dy + dz * dz, SMALLEST_DIVISOR))
+        angle = _acos((dx * ray_x[j] + dy * ray_y[j] + dz * ray_z[j]) * inverse)
+        turned = angle * per_turn
         weight = areas[j] * (_exp_negative(turned * turned) + MIN_ANGLE_WEIGHT)
         agreeing[j] += weight * agreement[j]
         weights[j] += weight
@@ -106,34 +117,37 @@ def accumulate_trust(
     """Compute the trust of the Gaussians begin..end as seen from a camera; 1 if it sees nothing.
 
     centers [k, 3], areas [k, n], agreement [k, n] float32, see `PhotoObservations`.
-    sums [n] float32: compositing weights at the camera. place: its `CameraPose`.
+    means [n, 3] float32: centres. sums [n] float32: compositing weights at the camera, summed over
+    pixels. place: its `CameraPose`.
     max_turn: angle at which the weight of a photograph has fallen to 1/e, in radians.
     enough: share of the area seen by the camera that a photograph has to see for full trust.
+    values [n] float32: trust in [0, 1], written.
     """
     one = np.float32(1)
-    turn = np.float32(1) / max_turn
+    per_turn = one / max_turn
     known = np.empty((6, SUPPORT_BLOCK), np.float32)
     x, y, z, ray_x, ray_y, ray_z = known
-    agreeing, weights, largest = totals = np.empty((3, SUPPORT_BLOCK), np.float32)
+    rays = ray_x, ray_y, ray_z
+    sums_of_block = np.empty((3, SUPPORT_BLOCK), np.float32)
+    agreeing, weights, largest = sums_of_block
+    totals = agreeing, weights, largest
     for start in range(begin, end, SUPPORT_BLOCK):
         count = min(SUPPORT_BLOCK, end - start)
-        totals[:] = 0
+        sums_of_block[:] = 0
         for j in range(count):
             x[j], y[j], z[j] = means[start + j, 0], means[start + j, 1], means[start + j, 2]
             dx = x[j] - place.center[0]
             dy = y[j] - place.center[1]
             dz = z[j] - place.center[2]
-            inverse = one / math.sqrt(max(dx * dx + dy * dy + dz * dz, MIN_CAP_DIVISOR))
+            inverse = one / math.sqrt(max(dx * dx + dy * dy + dz * dz, SMALLEST_DIVISOR))
             ray_x[j], ray_y[j], ray_z[j] = dx * inverse, dy * inverse, dz * inverse
         for k in range(len(centers)):
             center = centers[k, 0], centers[k, 1], centers[k, 2]
             shown = areas[k, start : start + count], agreement[k, start : start + count]
-            _add_agreement(
-                x, y, z, (ray_x, ray_y, ray_z), center, turn, *shown, (agreeing, weights, largest)
-            )
+            _add_agreement(x, y, z, rays, center, per_turn, *shown, totals)
         for j in range(count):
             i = start + j
-            needed = max(sums[i] * _compute_pixel_area(means, i, place), MIN_CAP_DIVISOR)
+            needed = max(sums[i] * _compute_pixel_area(means, i, place), SMALLEST_DIVISOR)
             share = min(largest[j] / (enough * needed), one)
-            supported = share * agreeing[j] / max(weights[j], MIN_CAP_DIVISOR)
+            supported = share * agreeing[j] / max(weights[j], SMALLEST_DIVISOR)
             values[i] = supported if sums[i] > 0 else one

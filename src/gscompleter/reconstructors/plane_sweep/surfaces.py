@@ -66,10 +66,11 @@ def fit_surfaces(
     iterations: int = SMOOTHING_ITERATIONS,
     choose_fit: Callable[[int], FitHeights] = lambda _: tgv.fit,
 ) -> LevelMap:
-    """Fit inverse depths to measurements with weights in [0, 1].
+    """Fit inverse depths, in planes of the sweep, to measurements with weights in [0, 1].
 
-    Without a positive weight or an iteration they stay as measured. `choose_fit` returns
-    the fit of a level with so many pixels.
+    `measured` is finite also where `confidence` is 0, and counts for nothing there. `image` has
+    colours in [0, 1], at whose edges surfaces may step. Without a positive weight or an iteration
+    depths stay as measured. `choose_fit` returns the fit of a level with so many pixels.
     """
     if iterations == 0 or not (confidence > 0).any():
         return measured

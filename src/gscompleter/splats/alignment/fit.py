@@ -46,8 +46,9 @@ class ImageFit(NamedTuple):
     psnr: float = 0.0
     """PSNR in dB over the covered pixels, after matching the exposure."""
     margin: float = 0.0
-    """PSNR above that of the best flat image, in dB."""
+    """PSNR above that of the best image of one grey, in dB."""
     coverage: float = 0.0
+    """Share of the valid pixels of the photograph that the splat covers."""
     drift: float = math.inf
     """Displacement of corners from render to photograph, in pixels; infinity if unknown."""
 
@@ -100,12 +101,12 @@ def score_splat(scene: Gaussians, views: Sequence[View], renderer: Renderer) -> 
 
 
 def render_from(scene: Gaussians, camera: Camera, renderer: Renderer) -> Render:
-    """Render `scene`, with a near plane derived from its own depths."""
+    """Render `scene`, with a near plane derived from its own depths, and without a far plane."""
     z = compute_z_depths(scene.means, camera)
-    # The near plane of the photographs is in their unit, and the splat may have another.
+    # The planes of the photographs are in their unit, and the splat may have another.
     unit = z[z > 0].median().item() if (z > 0).any() else 1.0
     with torch.no_grad():
-        return renderer.render(scene, replace(camera, near=0.1 * unit))
+        return renderer.render(scene, replace(camera, near=0.1 * unit, far=None))
 
 
 def score_image(render: Render, view: View) -> ImageFit:
