@@ -40,6 +40,7 @@ def lens(row: int, column: int, value: float) -> torch.Tensor:
         ({"c2w": torch.eye(4).double()}, "numbers of a camera have to be of one type"),
         ({"c2w": torch.eye(4).to_sparse()}, "is a sparse tensor"),
         ({"c2w": torch.eye(4, device="meta")}, "without values"),
+        ({"c2w": torch.nn.Parameter(torch.eye(4, device="meta"))}, "without values"),
         ({"c2w": torch.eye(4).requires_grad_()}, "its pose requires a gradient"),
         ({"c2w": changed((0, 3), 1e10)}, "from the origin"),
         ({"K": torch.zeros(3, 3)}, "its focal lengths are 0 and 0"),

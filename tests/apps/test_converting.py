@@ -157,15 +157,28 @@ def test_what_does_not_fit_the_result_any_more_is_said(tmp_path, monkeypatch, ca
     out = tmp_path / "out.ply"
     assert run(monkeypatch, "convert", given, out, "--rotate", 90, 0, 0) == 0
     said = capsys.readouterr().out
-    assert "cameras.json beside given.ply is for the splat as it was" in said
+    assert "The cameras.json of given.ply is for the splat as it was" in said
     # z, turned about x by a quarter, is -y, which is up in most files: nothing to be said.
     assert "--up" not in said
     assert run(monkeypatch, "convert", given, out, "--overwrite") == 0
     said = capsys.readouterr().out
     assert (
-        "given.ply says which way is up, which out.ply does not: name it with --up 0 0 1." in said
+        "given.ply says which way is up, which out.ply does not keep: name it with --up 0 0 1."
+        in said
     )
     assert "cameras.json" not in said
+
+
+def test_cameras_of_a_trainer_lie_above_its_iterations(tmp_path, monkeypatch, capsys):
+    iteration = tmp_path / "point_cloud" / "iteration_7000"
+    iteration.mkdir(parents=True)
+    save_ply(iteration / "point_cloud.ply", SCENE)
+    (tmp_path / "cameras.json").write_text("[]")
+    words = ("convert", iteration / "point_cloud.ply", tmp_path / "out.ply", "--scale", 2)
+    assert run(monkeypatch, *words) == 0
+    assert "The cameras.json of point_cloud.ply is for the splat as it was" in (
+        capsys.readouterr().out
+    )
 
 
 def test_a_result_that_is_changed_says_that_strip_cannot_undo_it(tmp_path, monkeypatch, capsys):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -57,6 +58,12 @@ def test_the_longest_end_of_a_path_that_exists_counts(tmp_path):
     scene = write_transforms(tmp_path, CAMERAS, NAMES, paths=WINDOWS["drive"])
     (scene / "photo_000.png").write_bytes(b"another one")
     assert open_photographs(scene).frame(0).image == scene / NAMES[0]
+    # In whichever folder it lies, though `images` is looked into first.
+    (scene / "photos").mkdir()
+    shutil.copyfile(scene / NAMES[0], scene / "photos" / "photo_000.png")
+    change(scene, file_path="D:\\x\\photos\\photo_000.png")
+    images = [frame.image for frame in open_photographs(scene).frames]
+    assert scene / "photos" / "photo_000.png" in images
     assert list_endings("C:\\a\\b.png") == ["a/b.png", "b.png"]
     assert list_endings("../a/b.png") == ["../a/b.png"]
 

@@ -113,6 +113,21 @@ def test_faces_of_missing_vertices_are_refused(tmp_path):
         load_geometry(path)
 
 
+def test_a_corner_of_another_primitive_is_refused(tmp_path):
+    path = write_glb_mesh(tmp_path / "room.glb", mesh_of())
+    table, binary = parse_glb(path.read_bytes())
+    primitives = table["meshes"][0]["primitives"]
+    # A second primitive has the vertices that the indices of the first one lead to.
+    accessor = table["accessors"][primitives[0]["attributes"]["POSITION"]]
+    few = {**accessor, "count": accessor["count"] // 2}
+    table["accessors"].append(few)
+    primitives[0]["attributes"]["POSITION"] = len(table["accessors"]) - 1
+    primitives.append({"attributes": {"POSITION": len(table["accessors"]) - 1}})
+    write_glb(path, table, binary)
+    with pytest.raises(InputError, match="a triangle has a corner beyond its"):
+        load_geometry(path)
+
+
 def test_a_line_that_is_no_vertex_is_named(tmp_path):
     path = tmp_path / "room.obj"
     path.write_text("v 0 0 0\nv 1 zero 0\n")

@@ -202,3 +202,29 @@ def test_a_transform_of_too_few_numbers_is_one_sentence(tmp_path, transform):
     write_glb(path, table, binary)
     with pytest.raises(InputError, match="a node has other than .* for a part of its transform"):
         load_splat(path)
+
+
+def test_without_scenes_the_nodes_below_no_other_are_the_roots(tmp_path):
+    path = tmp_path / "scene.glb"
+    save_splat(path, plausible(5))
+    table, binary = parse_glb(path.read_bytes())
+    whole = load_splat(path)
+    del table["scenes"], table["scene"]
+    table["nodes"] = [{"children": [1]}, {"mesh": 0}]
+    again = load_splat(write_glb(path, table, binary))
+    assert torch.equal(again.means, whole.means)
+
+
+@pytest.mark.parametrize("is_normalized", [True, False])
+def test_labels_may_be_bytes(tmp_path, is_normalized):
+    path = tmp_path / "scene.glb"
+    save_splat(path, plausible(4))
+    table, binary = parse_glb(path.read_bytes())
+    view = {"buffer": 0, "byteOffset": len(binary), "byteLength": 4}
+    table["bufferViews"].append(view)
+    labels = {"componentType": 5121, "count": 4, "type": "SCALAR", "normalized": is_normalized}
+    table["accessors"].append({"bufferView": len(table["bufferViews"]) - 1, **labels})
+    attributes = table["meshes"][0]["primitives"][0]["attributes"]
+    attributes[glb.LABELS_ATTRIBUTE] = len(table["accessors"]) - 1
+    read = load_splat(write_glb(path, table, binary + bytes([0, 1, 2, 255])))
+    assert read.generated.tolist() == [0, 1, 2, 255]

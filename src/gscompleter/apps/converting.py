@@ -12,6 +12,7 @@ import torch
 from gscompleter.apps.requests.conversion import ConversionRequest
 from gscompleter.numerics.value_checks import check_gaussians
 from gscompleter.parts import MAX_TARGET_ID, NOT_INVENTED, find_last_target_id
+from gscompleter.splats.alignment.trainer_frames import list_model_folders
 from gscompleter.splats.conversion import (
     Conversion,
     convert_rows,
@@ -40,7 +41,7 @@ from gscompleter.types import Gaussians
 MIN_LOGGED_BYTES = 50_000_000
 """Size of the files, in bytes, from which on a log says that they are converted."""
 CAMERAS_FILE = "cameras.json"
-"""File of a trainer with the cameras of its splat, which lies beside it."""
+"""File of a trainer with the cameras of its splat, in a folder of its model."""
 UP_TOLERANCE = 1e-3
 """Difference of a component of two upward directions that count as one."""
 
@@ -219,14 +220,16 @@ def describe_left_behind(
         if up is not None:
             turned = turn @ torch.tensor(up, dtype=torch.float64)
             if (turned - torch.tensor(USUAL, dtype=torch.float64)).abs().max() > UP_TOLERANCE:
+                # A sum with zero is never -0.
                 words = " ".join(f"{x:.4g}" for x in (turned + 0.0).tolist())
                 yield (
                     f"{quote_value(source.name)} says which way is up, which "
-                    f"{quote_value(out.name)} does not: name it with --up {words}."
+                    f"{quote_value(out.name)} does not keep: name it with --up {words}."
                 )
-        if similarity is not None and (source.parent / CAMERAS_FILE).is_file():
+        folders = list_model_folders(source)
+        if similarity is not None and any((home / CAMERAS_FILE).is_file() for home in folders):
             yield (
-                f"{CAMERAS_FILE} beside {quote_value(source.name)} is for the splat as it was, and "
+                f"The {CAMERAS_FILE} of {quote_value(source.name)} is for the splat as it was, and "
                 f"does not fit {quote_value(out.name)}."
             )
         changes = operations.changes or len(sources) > 1

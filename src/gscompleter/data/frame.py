@@ -275,10 +275,13 @@ def locate_images(frames: Sequence[Frame], roots: Sequence[Path]) -> list[Frame]
     listings = FolderListings()
     located = []
     for frame in frames:
-        # A name may be a path of another machine, or lack its ending.
-        names = list(dict.fromkeys([frame.name, *list_endings(frame.name)]))
-        images = [name + ending for name in names for ending in TRIED_ENDINGS]
-        located.append(replace(frame, image=find_file(folders, images, listings)))
+        # A name may be a path of another machine, of which the longest end that exists is meant,
+        # in whichever folder; and it may lack its ending.
+        ends = dict.fromkeys([frame.name, *list_endings(frame.name)])
+        images = (
+            find_file(folders, [end + ending for ending in TRIED_ENDINGS], listings) for end in ends
+        )
+        located.append(replace(frame, image=next(filter(None, images), None)))
 
     found_masks = [listings.find(root, MASKS) for root in roots]
     mask_folders = [folder for folder in found_masks if folder is not None]

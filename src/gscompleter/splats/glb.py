@@ -96,8 +96,11 @@ class GlbDocument(NamedTuple):
     binary: bytes
 
 
-def read_glb(path: Path) -> Gaussians:
-    """Read all Gaussians of the scene in a .glb, in the axes of a .ply."""
+def read_glb(path: Path, leaves_out_band_4: bool = False) -> Gaussians:
+    """Read all Gaussians of the scene in a .glb, in the axes of a .ply.
+
+    A .spz in it may have harmonics of degree 4, which are refused or read without the fourth band.
+    """
     document = _parse_document(read_bytes(path))
     # Nodes and primitives may share bytes, so that a small file can claim any number.
     placed = []
@@ -111,7 +114,7 @@ def read_glb(path: Path) -> Gaussians:
     if not placed:
         raise UnsupportedError(_describe_other_content(document.table))
     parts = [
-        place_gaussians(_decode_primitive(document, primitive), place)
+        place_gaussians(_decode_primitive(document, primitive, leaves_out_band_4), place)
         for primitive, place in placed
     ]
     return rotate_half_turn(merge_placed(parts), HALF_TURN_Z)
@@ -182,7 +185,12 @@ def _walk_nodes(
     """Walk through the nodes of the scene, each with its transform to the scene."""
     table = document.table
     scenes = table.get("scenes")
-    roots = scenes[table.get("scene", 0)]["nodes"] if scenes else range(len(table["nodes"]))
+    if scenes:
+        roots = scenes[table.get("scene", 0)]["nodes"]
+    else:
+        # All trees of nodes are shown.
+        below = {child for node in table["nodes"] for child in node.get("children", ())}
+        roots = [index for index in range(len(table["nodes"])) if index not in below]
     # Breadth first, with the transform of each node's parent to the scene. In a tree no node comes
     # twice.
     waiting = [(index, torch.eye(4, dtype=torch.float64)) for index in roots]
@@ -259,14 +267,14 @@ def read_glb_meshes(path: Path) -> tuple[Float[ndarray, "n 3"], Int[ndarray, "m 
 def _read_triangles(
     document: GlbDocument, primitive: dict[str, Any], count: int
 ) -> Int[ndarray, "m 3"]:
-    """Read the triangles of a primitive of `count` vertices, as indices of these.
-
-    Whether there are such vertices is checked where triangles are used (`GivenGeometry`).
-    """
+    """Read the triangles of a primitive of `count` vertices, as indices of these."""
     order = np.arange(count, dtype=np.int64)
     if "indices" in primitive:
         accessor = document.table["accessors"][primitive["indices"]]
         order = _read_numbers(document, accessor, "corners")[:, 0].astype(np.int64)
+        # An index that is too large would be a vertex of the next primitive.
+        if order.size and not 0 <= order.min() <= order.max() < count:
+            raise DamagedError(f"a triangle has a corner beyond its {count:,} vertices")
     mode = primitive.get("mode", TRIANGLES)
     if mode == TRIANGLES:
         return order[: len(order) // 3 * 3].reshape(-1, 3)
@@ -289,7 +297,10 @@ def _find_compression(primitive: dict[str, Any]) -> dict[str, Any] | None:
 
 
 def _decode_packed(
-    document: GlbDocument, primitive: dict[str, Any], compression: dict[str, Any]
+    document: GlbDocument,
+    primitive: dict[str, Any],
+    compression: dict[str, Any],
+    leaves_out_band_4: bool,
 ) -> Gaussians:
     """Decode the .spz of a primitive, in the frame of its node."""
     view = document.table["bufferViews"][compression["bufferView"]]
@@ -297,17 +308,20 @@ def _decode_packed(
         raise UnsupportedError("holds its Gaussians in another file")
     start = int(view.get("byteOffset", 0))
     # Its own axes are converted to those of glTF, as the extension demands.
-    gaussians = decode_spz(document.binary[start : start + int(view["byteLength"])])
+    packed = document.binary[start : start + int(view["byteLength"])]
+    gaussians = decode_spz(packed, 4 if leaves_out_band_4 else 3)
     if len(gaussians) != _get_accessor(document, primitive, "POSITION")["count"]:
         raise DamagedError("its .spz has another number of Gaussians than its accessors")
     return rotate_half_turn(gaussians, HALF_TURN_Z)
 
 
-def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gaussians:
+def _decode_primitive(
+    document: GlbDocument, primitive: dict[str, Any], leaves_out_band_4: bool
+) -> Gaussians:
     """Decode the Gaussians of a primitive, in the frame of its node."""
     compression = _find_compression(primitive)
     if compression is not None:
-        return _decode_packed(document, primitive, compression)
+        return _decode_packed(document, primitive, compression, leaves_out_band_4)
     extension = primitive["extensions"][EXTENSION]
     packed = ", ".join({**extension.get("extensions", {}), **primitive["extensions"]})
     stored = (packed, extension.get("kernel", "ellipse"), extension.get("colorSpace", COLOR_SPACE))
@@ -316,11 +330,14 @@ def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gauss
     if f"{EXTENSION}:ROTATION" not in primitive["attributes"]:
         raise UnsupportedError(f"stores Gaussians as a draft of {EXTENSION} did")
 
-    def read_attribute(name: str, kind: str = "VEC3") -> Float[ndarray, "n k"]:
+    def find_attribute(name: str, kind: str) -> dict[str, Any]:
         accessor = _get_accessor(document, primitive, name)
         if accessor["type"] != kind:
             raise DamagedError(f"its attribute {name} is no {kind}")
-        return _read_accessor(document, accessor)
+        return accessor
+
+    def read_attribute(name: str, kind: str = "VEC3") -> Float[ndarray, "n k"]:
+        return _read_accessor(document, find_attribute(name, kind))
 
     sh = [read_attribute(name) for name in SH_NAMES if name in primitive["attributes"]]
     gaussians = build_gaussians(
@@ -332,7 +349,9 @@ def _decode_primitive(document: GlbDocument, primitive: dict[str, Any]) -> Gauss
     )
     if LABELS_ATTRIBUTE not in primitive["attributes"]:
         return gaussians
-    return with_labels(gaussians, read_attribute(LABELS_ATTRIBUTE, "SCALAR")[:, 0])
+    # Labels are whole numbers, of whatever type: here bytes do not stand for fractions.
+    accessor = find_attribute(LABELS_ATTRIBUTE, "SCALAR")
+    return with_labels(gaussians, _read_numbers(document, accessor, "Gaussians")[:, 0])
 
 
 def _read_accessor(
@@ -463,4 +482,5 @@ GLB = SplatFormat(
     holds_origin=True,
     is_y_up=True,
     has_json=True,
+    can_leave_out_band_4=True,
 )

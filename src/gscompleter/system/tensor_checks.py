@@ -13,6 +13,7 @@ from numbers import Integral, Real
 
 import torch
 from torch import Tensor
+from torch.nn import Parameter
 
 from gscompleter.system.errors import InputError, quote_value
 
@@ -80,9 +81,9 @@ def _has_form(
 def _lacks_values(tensor: Tensor) -> bool:
     """Return True for a tensor on the device "meta", a shape without values.
 
-    A subclass may say that it is there and keep values of its own, as fake tensors do.
+    Other subclasses may say that they are there and keep values of their own, as fake tensors do.
     """
-    return type(tensor) is Tensor and tensor.is_meta
+    return type(tensor) in (Tensor, Parameter) and tensor.is_meta
 
 
 def iterate_tensors(value: object, name: str) -> Iterator[tuple[str, Tensor]]:

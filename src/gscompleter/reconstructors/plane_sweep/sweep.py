@@ -35,8 +35,8 @@ MAX_RETURN_ERROR = 1.5
 """Largest error, in pixels, of a match that is reprojected to the other view and back."""
 FULL_MARGIN = 40.0
 """Cost gap between the best and the second best plane that gives full confidence."""
-MIN_PATCH_AREA = 60
-"""Smallest patch of similar depth that is not a speckle, in pixels."""
+MAX_SPECKLE_AREA = 60
+"""Largest patch of similar depth that is a speckle, in pixels."""
 MAX_PATCH_STEP = 2.0
 """Largest step between neighbouring pixels of one patch, in planes."""
 UNKNOWN = np.float32(1e-9)
@@ -176,12 +176,12 @@ def compute_confidence(index: Map, margin: Map, confirmed: Mask) -> Map:
 
 
 def remove_speckles(index: Map, mask: Mask) -> Mask:
-    """Remove patches of similar depth smaller than `MIN_PATCH_AREA` pixels from `mask`."""
+    """Remove patches of similar depth of at most `MAX_SPECKLE_AREA` pixels from `mask`."""
     # OpenCV takes 16-bit fixed-point disparities; 0 marks masked pixels. Without the offset by
     # one plane, a pixel of the farthest plane would count as masked.
     scale = min(16.0, 30000.0 / max(float(index.max()), 1.0))
     levels = np.where(mask, index.clip(0) * scale + scale, 0).astype(np.int16)
-    cv2.filterSpeckles(levels, 0, MIN_PATCH_AREA, MAX_PATCH_STEP * scale)
+    cv2.filterSpeckles(levels, 0, MAX_SPECKLE_AREA, MAX_PATCH_STEP * scale)
     return levels > 0
 
 
@@ -272,7 +272,7 @@ def place_planes(
         overlap = np.maximum(overlap, seen.mean(axis=1))
 
     # The sweep ends at the nearest depth at which some source still shows enough of the grid. Where
-    # none shows any, as without sources, all depths stay.
+    # none shows any, all depths stay.
     useful = np.flatnonzero(overlap >= MIN_SEEN_GRID)
     last = max(int(useful[-1]), MIN_USED_SAMPLES) if len(useful) else 256
     num_steps = float(motion[:last].sum()) / MAX_PLANE_MOTION

@@ -62,10 +62,15 @@ class InputSplat:
 
 def list_trainer_folders(splat: Path, photographs: Path) -> list[Path]:
     """List the folders where trainers leave files, the nearest to the splat first."""
+    scene = photographs if photographs.is_dir() else photographs.parent
+    return list(dict.fromkeys([*list_model_folders(splat), scene.resolve()]))
+
+
+def list_model_folders(splat: Path) -> list[Path]:
+    """List the folders of the model that a splat belongs to, the nearest to the splat first."""
     near = list_homes_of(splat)
     model = [home.parent.parent for home in near if home.name.startswith(ITERATION_PREFIX)]
-    scene = photographs if photographs.is_dir() else photographs.parent
-    return list(dict.fromkeys([*near, *model, scene.resolve()]))
+    return [*near, *model]
 
 
 def read_trainer_frames(
