@@ -45,6 +45,7 @@ PHOTOGRAPH_OPTIONS = {
     "no_refine_poses": False,
     "no_masks": False,
     "ignore": None,
+    # Edits matter to photographs, which still show what was taken out.
     "forget_edits": False,
 }
 """Options that only photographs can follow, with their defaults. A default that is typed all the
@@ -304,7 +305,8 @@ def check_context(context: Names | None) -> None:
     if len(context) == 0 or len(set(context)) < len(context):
         raise InputError(
             "--context names no frame, or one twice; name different ones, as in --context 0 4, or "
-            "leave it out."
+            "leave it out.",
+            "context",
         )
 
 
