@@ -100,7 +100,10 @@ def select_greedily(
     # `pairs` [c, c, p] are the scores of all pairs at each point. A point counts by the best pair
     # of chosen candidates, `best` [p].
     pairs = torch.stack([score_pairs(i, worth, rays) for i in range(len(worth))])
-    first, second = divmod(int(pairs.sum(-1).argmax()), len(worth))
+    totals = pairs.sum(-1)
+    # A candidate is no pair with itself, also where all stand in one place and no pair scores.
+    totals.fill_diagonal_(-1.0)
+    first, second = divmod(int(totals.argmax()), len(worth))
     chosen = [first, second]
     best = pairs[first, second]
     shows_enough = worth.sum(-1) >= MIN_NEAR_WORTH * worth.sum(-1).amax()
