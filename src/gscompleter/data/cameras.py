@@ -111,6 +111,9 @@ def _compute_radius(r: Float[np.ndarray, "*n"], distortion: Distortion) -> Float
     if distortion.projection == "field-of-view":
         # The "FOV" model of Devernay and Faugeras (2001).
         (omega,) = distortion.shape
+        # The limit for small angles, which bends nothing.
+        if omega == 0:
+            return r
         return np.arctan(2 * r * np.tan(omega / 2)) / omega
     if distortion.projection == "division":
         # The smaller root of the quadratic equation, in the form that is stable for small k.
