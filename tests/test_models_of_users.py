@@ -82,6 +82,7 @@ def with_depth(change: Callable[[DepthMap], DepthMap]):
     ("reconstructor", "sentence"),
     [
         (with_value("means", math.nan), "positions that are NaN"),
+        (with_value("means", 1e19), r"positions that are NaN or beyond 1e\+18"),
         (with_value("quats", 0.0), "rotations of zeros"),
         (with_value("scales", -1.0), "scales that are negative"),
         (with_value("opacities", 1e20), "opacities outside of"),

@@ -28,6 +28,7 @@ class Rejection:
     """The guard that removed everything that was generated for a target, if one did."""
 
     guard: str = ""
+    """Name of the guard; empty if none did."""
     reason: str = ""
     """Sentence for the report; empty if the notes of Φ say it."""
 
@@ -44,7 +45,8 @@ class Unfilled:
     share: float = 0.0
     """Share of the pixels of the mask."""
     lost_by: Mapping[str, float] = field(default_factory=dict)
-    """The same by the step that emptied them for the first time; empty if there is little."""
+    """Share of the mask that each step emptied for the first time, by the name of the step; none
+    if little stays empty."""
     regions: tuple[tuple[int, int, int, int], ...] = ()
     """Bounding boxes (left, top, right, bottom) of the largest regions, in pixels of the target
     image; its padding has coordinates below 0 and beyond its size."""
@@ -97,6 +99,7 @@ class TargetResult(Displayed):
     before: Render
     """The scene without what this target changed, rendered at the target."""
     after: Render
+    """The scene with what this target changed, rendered at it."""
     hole_mask: Bool[Tensor, "h w"]
     """True where the scene had a hole or was not trusted, before dilation."""
     trusted_alpha: Float[Tensor, "h w"]
@@ -106,6 +109,7 @@ class TargetResult(Displayed):
     anchor_fallback: bool
     """True if every view exceeded the rotation limit, so that the smallest rotation won."""
     added: Gaussians
+    """All that this target added, also to close gaps beside its hole."""
     reference: View | None = None
     """The synthesized view, or None if there was nothing to complete."""
     affine: DepthAffine = DepthAffine()
@@ -181,8 +185,10 @@ class TargetResult(Displayed):
         """Those of the notes that ask for a look at the result."""
         if self.skip_reason:
             return ()
-        found = [self.rejection.reason or " ".join(self.synthesis_notes), NOTHING_ADDED]
-        found = found if self.rejection.guard else []
+        found = []
+        if self.rejection.guard:
+            # A guard without a reason of its own rejected the image for what Φ says of it.
+            found += [self.rejection.reason or " ".join(self.synthesis_notes), NOTHING_ADDED]
         if self.unfilled.share >= self.unfilled.LARGE_SHARE:
             found.append(self.unfilled.describe())
         return tuple(filter(None, found))

@@ -2,14 +2,18 @@
 
 import json
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from PIL import Image
 
 from command import run
 from gscompleter import load_ply, save_ply
+from gscompleter.apps.completing import update
+from gscompleter.apps.completing.preparation import Loaded
 from gscompleter.apps.completing.update import hold_out
 from gscompleter.apps.inputs.task import Opened
+from gscompleter.apps.requests.completion import WorkRequest
 from gscompleter.apps.requests.scene import SceneRequest
 from gscompleter.data.formats import open_photographs
 from gscompleter.evaluation.verdict import held_out
@@ -157,6 +161,29 @@ def test_a_photograph_that_a_mask_hides_wholly_is_not_kept_back(tmp_path):
     assert not {2, 4} & set(held)
     with pytest.raises(InputError, match="there are 6 to choose from, and at least 2 of 6"):
         hold_out(open_room(folder), 6, None, ())
+
+
+def test_new_photographs_leave_room_for_those_of_the_scene_that_show_a_lack(monkeypatch):
+    context = (0, 1)
+    new = list(range(30, 50))
+    # All lack something, and new photographs and the context most.
+    shares = {frame: 0.1 + 0.001 * frame for frame in range(50)} | dict.fromkeys(context, 0.9)
+    asked = []
+
+    def make_task(opened, frames, *others, **options):
+        asked.append(frames)
+        raise InputError("enough is known")
+
+    monkeypatch.setattr(update, "measure_lacks", lambda loaded: shares)
+    monkeypatch.setattr(update, "count_pixels", lambda photographs, resolution: SIZE * SIZE)
+    monkeypatch.setattr(update, "make_task", make_task)
+    opened = Mock(held_out=())
+    work = Mock(spec=WorkRequest, config=Mock(add_observed=False))
+    loaded = Mock(spec=Loaded, opened=opened, task=Mock(context_frames=context))
+    with pytest.raises(InputError, match="enough is known"):
+        update.choose_evidence(work, None, loaded, new)
+    joined = range(30 - update.MAX_LACKING, 30)
+    assert asked == [(*context, *joined, *new)]
 
 
 def test_a_photograph_that_cannot_be_read_is_not_kept_back_in_silence(tmp_path):

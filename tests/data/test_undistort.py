@@ -83,6 +83,14 @@ def test_without_distortion_nothing_changes():
     assert undistort_pinhole(PINHOLE, Distortion()) is PINHOLE
 
 
+def test_a_field_of_view_of_zero_bends_nothing():
+    """COLMAP's model FOV with an angle of 0 is a lens without distortion."""
+    lens = Distortion("field-of-view", (0.0,))
+    points = np.array([[0.0, 0.0], [0.3, -0.2]])
+    assert np.array_equal(distort(points, lens), points)
+    assert undistort_pinhole(PINHOLE, lens) is not None
+
+
 def test_the_principal_point_stays_and_pixels_keep_their_shape():
     new = undistort_pinhole(PINHOLE, LENSES["pincushion"])
     assert (new.cx, new.cy, new.width, new.height) == (81.5, 59.0, 160, 120)

@@ -100,21 +100,33 @@ def test_a_gain_that_widens_is_compared_within_scenes_between_spans(last, verdic
     assert found.measured.startswith(f"PSNR {last - 1:+.2f}")
 
 
+def total(method: str, value: float, protocol: str = "") -> dict:
+    cells = {"fid": {"value": value, "cases": None}}
+    return {"model": "x", "protocol": protocol, "method": method, "cells": cells}
+
+
 def test_one_number_for_all_cases_has_no_test(tmp_path):
-    rows = [
-        {
-            "model": "x",
-            "protocol": "",
-            "method": method,
-            "cells": {"fid": {"value": v, "cases": None}},
-        }
-        for method, v in (("paper", 60.95), ("context", 65.21))
-    ]
+    rows = [total("paper", 60.95), total("context", 65.21)]
     save(tmp_path, rows, "spans")
     lower = Claim("-", "", "spans", "fid", "paper", "context", "lower")
     assert judge_claim(tmp_path, lower).verdict == "as claimed, without a test"
     higher = Claim("-", "", "spans", "fid", "paper", "context", "higher")
     assert judge_claim(tmp_path, higher).verdict == "opposite, without a test"
+
+
+def test_one_number_for_all_cases_is_compared_within_a_protocol(tmp_path):
+    """A harder span that only the method has is no fault of the method."""
+    rows = [total("paper", 60.0, "n-2"), total("context", 65.0, "n-2"), total("paper", 120, "n-4")]
+    save(tmp_path, rows, "spans")
+    found = judge_claim(tmp_path, Claim("-", "", "spans", "fid", "paper", "context", "lower"))
+    assert found.verdict == "as claimed, without a test"
+    assert found.measured == "FID -5.00"
+
+
+def test_one_number_for_all_cases_that_stays_is_no_difference(tmp_path):
+    save(tmp_path, [total("paper", 60.0), total("context", 60.0)], "spans")
+    found = judge_claim(tmp_path, Claim("-", "", "spans", "fid", "paper", "context", "lower"))
+    assert found.verdict == "no difference"
 
 
 def test_every_claim_of_the_paper_has_a_row(tmp_path):

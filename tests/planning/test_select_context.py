@@ -32,6 +32,12 @@ def test_two_that_stand_in_one_place_are_no_pair():
     assert measure_baseline(first, second) > 0.1
 
 
+def test_no_photograph_is_chosen_twice_where_all_stand_in_one_place():
+    """A camera that only turns, or the parts of a panorama: no pair has any parallax."""
+    cameras = [camera_at(yaw=30 * turn) for turn in range(12)]
+    assert chosen(cameras, 3) == [0, 1, 11]
+
+
 def test_a_photograph_that_looks_away_loses_to_one_farther_off():
     away, turned, far = camera_at(0.1, yaw=180), camera_at(-0.1, yaw=75), camera_at(0.9)
     assert chosen([away, turned, far, camera_at(-0.3)]) == [2, 3]

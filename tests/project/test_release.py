@@ -39,6 +39,7 @@ from gscompleter.apps.warmup import PARTS, compile_kernels
 from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.numerics.kernels.cache import KernelCache
 from gscompleter.numerics.kernels.compiled import get_cache_folder
+from gscompleter.render.gsplat_kernels import explain_missing_gpu
 from release_check import (
     IMPORT_EXTRA,
     ROOT,
@@ -342,6 +343,15 @@ def test_torch_for_cuda_without_a_gpu_is_told(monkeypatch):
     # There may be one, which torch does not see.
     assert "or its driver is older than CUDA 13.0" in told
     assert describe_build(Requirement("numpy"), "2.0") == "2.0"
+
+
+def test_torch_for_rocm_without_a_gpu_names_no_cuda(monkeypatch):
+    monkeypatch.setattr("torch.version.cuda", None)
+    monkeypatch.setattr("torch.version.hip", "6.4")
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    told = explain_missing_gpu()
+    assert told is not None
+    assert told.endswith("or its driver is older than ROCm 6.4")
 
 
 def test_a_version_that_is_too_old_will_not_do():

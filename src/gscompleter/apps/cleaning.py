@@ -75,7 +75,8 @@ class Cleaning:
     removed: Bool[Tensor, "n"]
     splat_file: InputSplatFile
     run_info: Mapping[str, Any]
-    """Further entries of `summary.json`."""
+    """Further entries of `summary.json`: the settings, the reasons with their numbers, the seconds,
+    and what photographs, or cameras from outside, say of what goes."""
     cameras: Sequence[Camera]
     """Cameras that see most of what goes."""
     renderer: Renderer
@@ -90,7 +91,12 @@ class Cleaning:
 
 
 def clean_splat(request: CleaningRequest) -> None:
-    """Clean the splat, write the result, and print a summary."""
+    """Clean the splat, write the result, and print a summary.
+
+    Raises:
+        InputError: The splat or the photographs cannot be used, all of the splat would go, or the
+            output folder holds something else.
+    """
     results = request.results
     console = make_console(stderr=True, quiet=results.answer.quiet)
     with (
@@ -162,7 +168,7 @@ def clean_by_photographs(
         with stage("reading photographs"):
             task = read_photographs(opened, photographs.context, device)
         compile_kernels([device])
-        with stage("aligning the scene"):
+        with stage("aligning the scene"):  # on the device of the task
             return move_to_splat(task, loaded, splat_file, opened)
 
     if photographs.scene.refines_poses:

@@ -23,6 +23,7 @@ from gscompleter.types import FOCAL_RANGE, MAX_CENTER, MAX_COORDINATE, MAX_RIGID
 MAX_ZOOM_OUT = 0.5
 """Smallest share of the central resolution that undistortion keeps."""
 MAX_ZOOM_IN = 4.0
+"""Largest factor on the central resolution from which undistortion begins to zoom out."""
 FRACTIONS = (1, 1)
 """`Intrinsics.size` of values in image widths and heights."""
 
@@ -110,6 +111,9 @@ def _compute_radius(r: Float[np.ndarray, "*n"], distortion: Distortion) -> Float
     if distortion.projection == "field-of-view":
         # The "FOV" model of Devernay and Faugeras (2001).
         (omega,) = distortion.shape
+        # The limit for small angles, which bends nothing.
+        if omega == 0:
+            return r
         return np.arctan(2 * r * np.tan(omega / 2)) / omega
     if distortion.projection == "division":
         # The smaller root of the quadratic equation, in the form that is stable for small k.
@@ -215,16 +219,21 @@ class Intrinsics:
     """Intrinsics as stored in a file; None for values that it omits."""
 
     size: tuple[int, int] | None
-    """Width and height of the image that the values refer to; None for the photograph's."""
+    """Width and height in pixels of the image that the values refer to; None for the photograph's.
+    It is `FRACTIONS` for values in image widths and heights, which then has both focal lengths."""
     focal: tuple[float | None, float | None]
+    """Focal lengths in x and y, in pixels of that image; the other one if None."""
     center: tuple[float | None, float | None] = (None, None)
-    """Principal point; the image centre if None."""
+    """Principal point in pixels of that image; the image centre if None."""
     angle: tuple[float | None, float | None] = (None, None)
     """Full fields of view in radians, for files without focal lengths."""
     distortion: Distortion = Distortion()
 
     def compute_pinhole(self, width: int, height: int) -> Pinhole:
-        """Compute the intrinsics of an image of this size, before undistortion."""
+        """Compute the intrinsics of an image of this size, before undistortion.
+
+        A focal length or a field of view is known in x or y.
+        """
         w, h = self.size or (width, height)
         fl_x = _compute_focal(self.focal[0], self.angle[0], w)
         fl_y = _compute_focal(self.focal[1], self.angle[1], h)

@@ -98,7 +98,7 @@ def judge_claim(folder: Path, claim: Claim) -> Judgement:
     column = BY_KEY[claim.column]
     sign = 1 if claim.better == "higher" else -1
     differences = compare_spans(rows, claim) if claim.over_spans else compare_rows(rows, claim)
-    # FID and the like are of all images at once: without a value per case there is nothing to pair.
+    # FID and the like are of all images at once: there are no cases to pair.
     if not differences:
         return compare_totals(rows, claim, column, sign)
     return judge_differences(differences, column, sign)
@@ -196,19 +196,29 @@ def compare_spans(rows: Rows, claim: Claim) -> dict[str, float]:
 
 
 def compare_totals(rows: Rows, claim: Claim, column: Column, sign: int) -> Judgement:
-    """Judge a column with one number for all cases, such as FID; it has no error and no test."""
-    ours = list_totals(rows, claim.method, claim.column)
-    theirs = list_totals(rows, claim.baseline, claim.column)
-    if not ours or not theirs or claim.over_spans:
+    """Judge a column with one number for all cases, such as FID; it has no error and no test.
+
+    The difference is averaged over the models and protocols that have both methods: means over
+    different ones would compare these, and not the methods.
+    """
+    ours = find_totals(rows, claim.method, claim.column)
+    theirs = find_totals(rows, claim.baseline, claim.column)
+    differences = [value - theirs[place] for place, value in ours.items() if place in theirs]
+    if not differences or claim.over_spans:
         return Judgement("not measured")
-    difference = statistics.fmean(ours) - statistics.fmean(theirs)
+    difference = statistics.fmean(differences)
     measured = f"{column.title} {difference:+.{column.digits}f}"
-    is_favourable = sign * difference > 0
-    verdict = "as claimed" if is_favourable else "opposite"
+    if difference == 0:
+        return Judgement("no difference", measured)
+    verdict = "as claimed" if sign * difference > 0 else "opposite"
     return Judgement(f"{verdict}, without a test", measured)
 
 
-def list_totals(rows: Rows, method: str, key: str) -> list[float]:
-    """List the numbers of a method that belong to no single case."""
-    cells = [row["cells"][key] for row in rows if row["method"] == method]
-    return [c["value"] for c in cells if c["cases"] is None and c["value"] is not None]
+def find_totals(rows: Rows, method: str, key: str) -> dict[tuple[str, str], float]:
+    """Find the numbers of a method that belong to no single case, by model and protocol."""
+    totals = {}
+    for row in rows:
+        cell = row["cells"][key]
+        if row["method"] == method and cell["cases"] is None and cell["value"] is not None:
+            totals[row["model"], row["protocol"]] = cell["value"]
+    return totals

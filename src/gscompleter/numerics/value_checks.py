@@ -107,11 +107,11 @@ def check_row_mask(mask: object, scene: Gaussians | None, name: str) -> None:
 def _describe_defect(gaussians: Gaussians) -> str:
     """Describe the first property that holds numbers which no scene can have."""
     if _find_infinite(gaussians.means, LARGEST).any():
-        return "positions that are NaN or infinite"
+        return f"positions that are NaN or beyond {LARGEST:g}"
     if _find_infinite(gaussians.quats, LARGEST).any():
-        return "rotations that are NaN or of infinite length"
+        return f"rotations that are NaN or beyond {LARGEST:g}"
     if _find_infinite(gaussians.scales, LARGEST).any() or (gaussians.scales < 0).any():
-        return "scales that are negative, NaN or infinite"
+        return f"scales that are negative, NaN or beyond {LARGEST:g}"
     if _find_infinite(gaussians.sh, LARGEST_SH).any():
         return f"spherical harmonics that are NaN or beyond {LARGEST_SH:g}"
     if not ((gaussians.opacities >= 0) & (gaussians.opacities <= 1)).all():
@@ -175,8 +175,8 @@ def check_views(views: object, name: str) -> None:
     """Raise InputError unless these are photographs to work on.
 
     They are a list of `View`, at least `MIN_PHOTOGRAPH_SIDE` pixels wide and high, with colours
-    in [0, 1], depths of at least 0, and some pixel that is not ignored. `name` is for the
-    sentences, such as "context".
+    in [0, 1] and depths of at least 0. Some of them may be ignored everywhere, but not all. `name`
+    is for the sentences, such as "context".
     """
     check_view_list(views, name)
     assert isinstance(views, (list, tuple))

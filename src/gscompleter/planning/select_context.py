@@ -24,7 +24,7 @@ from gscompleter.types import Camera
 MAX_TARGET_POINTS = 1000
 """Points that are scored for all targets together."""
 MAX_NEAR_PHOTOGRAPHS = 32
-"""Photographs closest to the targets whose pairs are scored."""
+"""Photographs that score best on their own, whose pairs are scored; no others are selected."""
 MIN_TARGET_POINTS = 20
 """Fewest visible points of a target; with fewer, a plane in the middle of the scene is used."""
 GRID_SIDE = 8
@@ -57,9 +57,10 @@ def select_context(
     points: Float[Tensor, "n 3"],
     count: int,
 ) -> list[int]:
-    """Select up to `count` of the candidates; return sorted indices.
+    """Select up to `count` of the candidates, and no more than `MAX_NEAR_PHOTOGRAPHS`.
 
-    `points` are on or near surfaces, in world coordinates; at least one.
+    `points` are on or near surfaces, in world coordinates. There is at least one target, candidate
+    and point. Returns sorted indices.
     """
     num_points = max(MAX_TARGET_POINTS // len(targets), 1)
     seen = [find_visible_points(target, points, num_points) for target in targets]
@@ -73,11 +74,11 @@ def select_context(
     )
 
     # Pairs are scored for the best candidates alone: their number grows with the square.
-    closest = worth.sum(1).argsort(descending=True, stable=True)[:MAX_NEAR_PHOTOGRAPHS]
-    near = [candidates[i] for i in closest.tolist()]
-    rays = compute_directions(near, torch.cat(seen))
-    chosen = select_greedily(worth[closest], rays, measure_distances(near, targets), count)
-    return sorted(closest[chosen].tolist())
+    ranked = worth.sum(1).argsort(descending=True, stable=True)[:MAX_NEAR_PHOTOGRAPHS]
+    paired = [candidates[i] for i in ranked.tolist()]
+    rays = compute_directions(paired, torch.cat(seen))
+    chosen = select_greedily(worth[ranked], rays, measure_distances(paired, targets), count)
+    return sorted(ranked[chosen].tolist())
 
 
 def select_greedily(
@@ -88,16 +89,21 @@ def select_greedily(
 ) -> list[int]:
     """Choose the best pair, then repeatedly the candidate that improves the pair scores most.
 
-    The nearest candidates that show enough follow the first `NUM_SCORED_FIRST`.
+    The nearest candidates that show enough follow the first `NUM_SCORED_FIRST`. Candidates come in
+    descending order of their summed `worth`; `distances` are those to the targets, in scene units.
     """
     count = min(count, len(worth))
+    # One alone forms no pair: the first candidate is the best on its own.
     if count < 2:
         return list(range(count))
 
     # `pairs` [c, c, p] are the scores of all pairs at each point. A point counts by the best pair
     # of chosen candidates, `best` [p].
     pairs = torch.stack([score_pairs(i, worth, rays) for i in range(len(worth))])
-    first, second = divmod(int(pairs.sum(-1).argmax()), len(worth))
+    totals = pairs.sum(-1)
+    # A candidate is no pair with itself, also where all stand in one place and no pair scores.
+    totals.fill_diagonal_(-1.0)
+    first, second = divmod(int(totals.argmax()), len(worth))
     chosen = [first, second]
     best = pairs[first, second]
     shows_enough = worth.sum(-1) >= MIN_NEAR_WORTH * worth.sum(-1).amax()

@@ -30,9 +30,10 @@ def explain_missing_gpu() -> str | None:
         return None
     if torch.version.cuda is None and torch.version.hip is None:
         return f"torch {torch.__version__} is built for the CPU alone"
-    return (
-        f"torch sees no GPU; there is none, or its driver is older than CUDA {torch.version.cuda}"
-    )
+    # A build is for the GPUs of one maker, and has the version of that maker's platform alone.
+    cuda = torch.version.cuda
+    platform = f"ROCm {torch.version.hip}" if cuda is None else f"CUDA {cuda}"
+    return f"torch sees no GPU; there is none, or its driver is older than {platform}"
 
 
 @cache

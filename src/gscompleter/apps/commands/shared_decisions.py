@@ -34,21 +34,17 @@ from gscompleter.apps.requests.splat import SplatRequest
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.data.mask_reading import MaskReading
-from gscompleter.data.sfm import NUM_VIDEO_FRAMES
 from gscompleter.system.errors import InputError, quote_value
 
 # Functions import what needs torch when they are called, so that no help page waits for it.
 
-PHOTOGRAPH_OPTIONS = {
-    "format": None,
-    "frames": NUM_VIDEO_FRAMES,
-    "no_refine_poses": False,
-    "no_masks": False,
-    "ignore": None,
-    "forget_edits": False,
-}
-"""Options that only photographs can follow, with their defaults. A default that is typed all the
-same cannot be told from one that is not."""
+PHOTOGRAPH_OPTIONS = (
+    *("format", "frames", "no_refine_poses", "no_masks", "ignore"),
+    # Edits matter to photographs, which still show what was taken out.
+    "forget_edits",
+)
+"""Options that only photographs can follow. A default that is typed all the same cannot be told
+from one that is not."""
 SPLAT_OPTIONS = ("drop_nonfinite", "ignore_properties", "forget_edits")
 """Switches that only a splat can follow."""
 
@@ -265,8 +261,8 @@ def check_options_alone(options: CompletingOptions, has_marks: bool) -> None:
             "Nothing is named that is to be completed; name SCENE, the folder of photographs, or "
             "a splat."
         )
-    for name, default in PHOTOGRAPH_OPTIONS.items():
-        if getattr(options, name) != default:
+    for name in PHOTOGRAPH_OPTIONS:
+        if getattr(options, name) != getattr(SceneOptions, name):
             raise InputError(
                 "There are no photographs to apply this to; name their folder as SCENE.", name
             )
@@ -304,7 +300,8 @@ def check_context(context: Names | None) -> None:
     if len(context) == 0 or len(set(context)) < len(context):
         raise InputError(
             "--context names no frame, or one twice; name different ones, as in --context 0 4, or "
-            "leave it out."
+            "leave it out.",
+            "context",
         )
 
 

@@ -37,7 +37,7 @@ class StripOptions(WritingOptions):
 
     def check_overlap(self) -> None:
         """Refuse to write over an input."""
-        # What lies beside the completed scene is read, too.
+        # What lies beside the completed scene is read, too. If that is a folder, all in it counts.
         folder = self.completed.parent
         beside = [folder / name for name in (REMOVED_FILE, EDITS_FILE, EDITS_FOLDER)]
         refuse_input_file(self.out, [*list_inputs(self), *beside])

@@ -49,7 +49,7 @@ from gscompleter.system.progress import show_preparation, track
 
 MAX_LACKING = 16
 """Most photographs of SCENE that join the context because they show what the splat lacks; of more,
-those that show most."""
+those that show most. New ones, and those of the context, do not count."""
 MIN_LEFT = 2
 """Fewest usable photographs that `--hold-out` has to leave."""
 NO_TARGETS = TargetRequest(max_found=0)
@@ -155,12 +155,18 @@ def choose_evidence(
     task = loaded.task
     opened = loaded.opened
     added = [frame for frame in new if frame not in opened.held_out]
+    own = find_own_photographs(work, opened.files) if work.config.add_observed else ()
     if context is None:
         shares = measure_lacks(loaded)
-        lacking = [frame for frame, share in shares.items() if share >= MIN_ADDED_SHARE]
+        # A scene that is made anew has its own photographs in place of the context.
+        joining = {*added, *(own or task.context_frames)}
+        lacking = [
+            frame
+            for frame, share in shares.items()
+            if share >= MIN_ADDED_SHARE and frame not in joining
+        ]
         lacking.sort(key=lambda frame: -shares[frame])
         added += lacking[:MAX_LACKING]
-    own = find_own_photographs(work, opened.files) if work.config.add_observed else ()
     pixels = count_pixels(opened.photographs, opened.request.resolution)
     joined = join_photographs(own, added, set(opened.held_out), pixels) if own else ()
     frames = joined or tuple(sorted({*task.context_frames, *added}))

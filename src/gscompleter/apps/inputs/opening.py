@@ -49,10 +49,14 @@ def open_scene(
     console: Console,
     check: Callable[[], object] = lambda: None,
 ) -> Opened:
-    """Open the photographs or video. If they have no cameras, `search` finds and keeps them.
+    """Open the photographs or video. If they have no cameras, these are found and kept.
 
-    `check` is called before that search, which takes minutes, and raises what would end the command
-    after it.
+    `search` says where they are kept. `check` is called before the search, which takes minutes, and
+    raises what would end the command after it.
+
+    Raises:
+        InputError: Options exclude each other, or there are no photographs, cameras or masks as
+            asked for.
     """
     folder = request.folder
     is_folder = os.path.isdir(folder)
@@ -100,10 +104,10 @@ def open_scene(
         # A folder of poses with a summary was written by us, and may be continued or replaced.
         kept = search.out / FOUND_POSES_FOLDER
         refuse_link(kept)
-        is_ours = search.overwrite or os.path.isfile(kept / SUMMARY_FILE)
+        may_replace = search.overwrite or os.path.isfile(kept / SUMMARY_FILE)
         # Masks that are not used hide nothing, whatever they are.
         searched = reading if request.uses_masks else replace(reading, may_be_large=True)
-        poses = find_poses(folder, kept, is_ours, search.num_frames, searched)
+        poses = find_poses(folder, kept, may_replace, search.num_frames, searched)
         # The masks of the copies are black where something is hidden, and their masks were checked.
         reading = MaskReading(may_be_large=True)
         print_lines(console, *poses.notes)
