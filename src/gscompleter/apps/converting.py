@@ -208,7 +208,7 @@ def move_labels(
 def describe_left_behind(
     sources: Sequence[Path], out: Path, operations: Operations
 ) -> Iterator[str]:
-    """Describe what lies beside the splats or is said in them, and does not hold for the result."""
+    """Describe what belongs to the splats or is said in them, and does not hold for the result."""
     similarity = operations.similarity
     turn = torch.eye(3, dtype=torch.float64)
     if similarity is not None:

@@ -369,7 +369,7 @@ def find_file(
 
 
 def keep_existing(frames: Sequence[Frame], title: str) -> tuple[tuple[Frame, ...], tuple[str, ...]]:
-    """Keep the frames whose photograph exists, sorted by name, and note the missing ones."""
+    """Keep the frames whose photograph `locate_images` found, sorted, and note the missing ones."""
     there = sorted((frame for frame in frames if frame.image), key=lambda frame: frame.name)
     missing = sorted(frame.name for frame in frames if not frame.image)
     if not there:
