@@ -1,6 +1,8 @@
 """Reader of meshes and points: .ply, .obj, and .glb without Gaussians.
 
 Coordinates are taken as they stand in a file, in the axes of the scene; colours are not read.
+Readers raise UnsupportedError for content that is not read, and of damaged files DamagedError and
+errors of `splats/formats.py`; `load_geometry` makes an InputError of all.
 """
 
 from __future__ import annotations
