@@ -144,6 +144,16 @@ def test_an_archive_that_was_tampered_with_is_refused_and_not_kept(registry):
     assert not get_archive_path(three).exists()
 
 
+def test_a_connection_that_ends_midway_is_one_sentence(registry, monkeypatch):
+    class CutAnswer(io.BytesIO):
+        def read(self):
+            raise http.client.IncompleteRead(self.getvalue(), 1000)
+
+    monkeypatch.setattr("urllib.request.urlopen", lambda *_, **__: CutAnswer(b"1f8b"))
+    with pytest.raises(InputError, match="it cannot be fetched"):
+        get_archive(three_of(registry))
+
+
 def test_a_damaged_archive_in_the_cache_is_fetched_again(registry):
     three = three_of(registry)
     archive = get_archive(three)

@@ -139,3 +139,78 @@ def test_a_few_points_are_no_surface(tmp_path):
     path = write_ply_points(tmp_path / "few.ply", np.eye(3))
     with pytest.raises(InputError, match="neither triangles nor points"):
         load_geometry(path)
+
+
+OBJ_CORNERS = "v 0 0 1\nv 1 0 1\nv 0 1 1\nv 1 1 1\n"
+
+
+@pytest.mark.parametrize(
+    ("lines", "message"),
+    [
+        ("f 0 1 2\n" + OBJ_CORNERS, "line 5 has the index 0"),
+        ("v 1 2\nv 1 1 1\nf 1 2 3\n", "line 5 is no vertex"),
+    ],
+)
+def test_a_line_that_would_shift_indices_is_refused(lines, message, tmp_path):
+    path = tmp_path / "room.obj"
+    path.write_text(OBJ_CORNERS + lines)
+    with pytest.raises(InputError, match=message):
+        load_geometry(path)
+
+
+@pytest.mark.parametrize("character", "\x0b\x0c\x85\u2028")
+def test_only_line_feeds_and_carriage_returns_end_lines_of_obj(character, tmp_path):
+    path = tmp_path / "room.obj"
+    path.write_bytes(f"# by{character}v 9 9 9\r\n{OBJ_CORNERS}f 1 2 3\n".encode())
+    assert load_geometry(path).vertices.max() == 1
+
+
+PLY_HEADER = (
+    "ply\nformat {} 1.0\ncomment once binary_big_endian\nelement vertex 4\nproperty float x\n"
+    "property float y\nproperty float z\n{}element face 1\n{}"
+    "property list char int vertex_indices\nend_header\n"
+)
+PLY_CORNERS = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 1]], "<f4")
+
+
+def write_faces(path, kind, row, before="", beside=""):
+    header = PLY_HEADER.format(kind, before, beside).encode()
+    if kind == "ascii":
+        text = "".join(f"{x} {y} {z}\n" for x, y, z in PLY_CORNERS)
+        path.write_bytes(header + text.encode() + row)
+    else:
+        path.write_bytes(header + PLY_CORNERS.tobytes() + row)
+    return path
+
+
+@pytest.mark.parametrize("beside", ["obj_info by a scanner\n", "comment corners\nobj_info of it\n"])
+def test_a_header_with_remarks_beside_faces_is_read(beside, tmp_path):
+    path = write_faces(tmp_path / "room.ply", "ascii", b"3 0 1 2\n", beside=beside)
+    assert load_geometry(path).faces.tolist() == [[0, 1, 2]]
+
+
+def test_a_byte_order_in_a_comment_does_not_count(tmp_path):
+    row = b"\3" + np.array([0, 1, 2], "<i4").tobytes()
+    path = write_faces(tmp_path / "room.ply", "binary_little_endian", row)
+    assert load_geometry(path).faces.tolist() == [[0, 1, 2]]
+
+
+def test_another_element_before_faces_is_refused_by_any_name(tmp_path):
+    before = "element edge-loop 1\nproperty int start\n"
+    path = write_faces(tmp_path / "room.ply", "ascii", b"3 0 1 2\n3 0 1 2\n", before=before)
+    with pytest.raises(InputError, match="other elements between"):
+        load_geometry(path)
+
+
+@pytest.mark.parametrize(
+    ("kind", "row"),
+    [
+        ("ascii", b"4 0 1 2\n"),
+        ("ascii", b"-1 0 1 2 3\n"),
+        ("binary_little_endian", b"\xff" + np.array([0, 1, 2], "<i4").tobytes()),
+    ],
+)
+def test_a_face_without_the_corners_that_it_counts_is_refused(kind, row, tmp_path):
+    path = write_faces(tmp_path / "room.ply", kind, row)
+    with pytest.raises(InputError, match="face 1 has not the corners that it counts"):
+        load_geometry(path)

@@ -109,7 +109,10 @@ class WarpInpaint:
     def add_structure(
         self, tone: Float[Tensor, "h w 3"], warped: WarpedImage, context: GeneratorInput
     ) -> Float[Tensor, "h w 3"]:
-        """Add structure to the smooth image `tone` along the borders of its holes."""
+        """Add structure to the smooth image `tone` along the borders of its holes.
+
+        `tone`, `warped` and the result lie on the CPU, as the patches do.
+        """
         reach = STRUCTURE_REACH * max(warped.known.shape)
         distance = compute_distance_to_known(warped.known)
         undecided = remove_cracks(~warped.known, CRACK_WIDTH) & (distance <= reach)
@@ -288,11 +291,10 @@ def search_and_vote(
     )
 
     # Every pixel of the hole is the mean of what the patches over it show there, each with its
-    # colour shift and weighted by its vote. Before the first search all votes are equally likely.
-    votes = weight[centres]
-    shift = np.zeros((len(queries), 3), np.float32)
-
-    def vote_colors() -> Float32[ndarray, "p 3"]:
+    # colour shift and weighted by its vote.
+    def vote_colors(
+        votes: Float32[ndarray, "q"], shift: Float32[ndarray, "q 3"]
+    ) -> Float32[ndarray, "p 3"]:
         return patchmatch.vote(query_at, votes, images, matches, shift)[0][~known]
 
     # The matches of a coarser level are nearly right, so that they are searched around alone. The
@@ -300,7 +302,9 @@ def search_and_vote(
     current = level.image.numpy().copy()
     reach = max(usable.shape)
     if coarse_field is not None:
-        current[~known] = vote_colors()
+        # Before the first search all matches are equally likely.
+        no_shift = np.zeros((len(queries), 3), np.float32)
+        current[~known] = vote_colors(weight[centres], no_shift)
         reach = FINE_REACH
     for number in range(rounds):
         problem = patchmatch.PatchProblem(
@@ -314,9 +318,9 @@ def search_and_vote(
             usable_mask=usable,
             log_depth=log_depth,
         )
+        # Improves `matches` in place.
         cost, shift = patchmatch.search(problem, costs, matches, reach, seed + 31 * number)
-        votes = weight[centres] * compute_likelihood(cost)
-        current[~known] = vote_colors()
+        current[~known] = vote_colors(weight[centres] * compute_likelihood(cost), shift)
 
     field = np.full((h, w, 3), -1, np.int64)
     field[centres] = matches

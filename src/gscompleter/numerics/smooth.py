@@ -1,4 +1,7 @@
-"""Smooth continuation of colours into unknown pixels."""
+"""Smooth continuation of colours into unknown pixels.
+
+Tensors lie on the CPU, since OpenCV and SciPy compute; only `average_trusted` takes any device.
+"""
 
 from __future__ import annotations
 
@@ -43,7 +46,10 @@ def compute_distance_to_known(known: Bool[Tensor, "h w"]) -> Float[Tensor, "h w"
 def continue_smoothly(
     values: Float[Tensor, "h w c"], weight: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w c"]:
-    """Fill pixels of zero `weight` with weighted means over a radius that grows inwards."""
+    """Fill pixels of zero `weight` with weighted means over a radius that grows inwards.
+
+    Weights are not negative, in any unit; without a positive one all values are 0.
+    """
     known = weight > 0
     if not known.any():
         return torch.zeros_like(values)
@@ -81,11 +87,12 @@ def build_sum_pyramid(weighted: Float32[ndarray, "h w c"]) -> list[Float32[ndarr
 def fit_membrane(
     values: Float[Tensor, "h w c"], weight: Float[Tensor, "h w"]
 ) -> Float[Tensor, "h w c"]:
-    """Fit a membrane to `values` by `weight`; some pixel must have one.
+    """Fit a membrane to `values` by `weight`, in [0, 1]; some pixel must have one.
 
     It is the likeliest continuation of an image whose spectrum falls with the squared frequency. It
     minimizes Σ FIDELITY w (m - v)² + MEAN_WEIGHT (m - mean)² + Σ (m - m')² over its cells m, where
-    v are the values, w their weights, and m' the right and the lower neighbour of m.
+    v are the values, w their weights, and m' the right and the lower neighbour of m. `values` have
+    at most three channels: OpenCV resizes four together, and the weights are one of them.
     """
     # Imported here, since SciPy is slow to import.
     from scipy.sparse import diags, kronsum

@@ -27,7 +27,7 @@ def find_near_pairs(
     """Pair each camera with the `count` most similar in place and direction; i < j, sorted.
 
     `centers` are in any unit, and `forward` are unit vectors along which cameras look. Rotations
-    about these do not count, since features are matched in spite of them.
+    about these do not count, since features are matched in spite of them. There has to be a camera.
     """
     distance = np.linalg.norm(centers[:, None] - centers[None], axis=-1)
     turned = np.degrees(np.arccos((forward @ forward.T).clip(-1, 1)))

@@ -1,6 +1,8 @@
 """Reader of meshes and points: .ply, .obj, and .glb without Gaussians.
 
 Coordinates are taken as they stand in a file, in the axes of the scene; colours are not read.
+Readers raise UnsupportedError for content that is not read, and of damaged files DamagedError and
+errors of `splats/formats.py`; `load_geometry` makes an InputError of all.
 """
 
 from __future__ import annotations
@@ -20,16 +22,19 @@ from gscompleter.splats.packing import UnsupportedError
 from gscompleter.splats.ply import MEANS
 from gscompleter.system.damage import DamagedError, describe_damage
 from gscompleter.system.errors import InputError, quote_value, require_path
-from gscompleter.system.files.ply import PLY_SCALARS, PlyFile, read_ply_file
+from gscompleter.system.files.ply import (
+    PLY_SCALARS,
+    Element,
+    PlyFile,
+    parse_elements,
+    read_ply_file,
+)
 from gscompleter.system.files.reading import read_bytes
 
 Mesh = tuple[Float[ndarray, "n 3"], Int[ndarray, "m 3"]]
 """Vertices, and the triangles between them; none for points."""
 
 NO_FACES = np.empty((0, 3), np.int64)
-_FACE_ELEMENT = re.compile(
-    rb"^element\s+(\w+)\s+(\d+)\s*\n((?:(?:property|comment)\s[^\n]*\n)*)", re.MULTILINE
-)
 _FACE_LISTS = ("vertex_indices", "vertex_index")
 """Names of the list of a face's corners."""
 
@@ -73,41 +78,50 @@ def read_ply_geometry(path: Path) -> Mesh:
 
 def _read_ply_faces(path: Path, file: PlyFile) -> Int[ndarray, "m 3"]:
     """Read the faces of a .ply, which have to follow its vertices."""
-    elements = list(_FACE_ELEMENT.finditer(file.header))[1:]
-    faces = [number for number, found in enumerate(elements) if found[1] == b"face"]
-    if not faces or int(elements[faces[0]][2]) == 0:
+    following = parse_elements(file.header)[1:]
+    names = [element.name for element in following]
+    number = names.index("face") if "face" in names else None
+    if number is None or following[number].count == 0:
         return NO_FACES
-    if faces[0] != 0:
+    if any(element.count for element in following[:number]):
         raise UnsupportedError("has other elements between its vertices and its faces")
-    count = int(elements[0][2])
-    properties = [line.split() for line in elements[0][3].splitlines()]
-    properties = [words for words in properties if words[0] == b"property"]
-    lists = [words for words in properties if words[1] == b"list"]
-    if len(lists) != 1 or lists[0][4].decode("latin-1") not in _FACE_LISTS:
+    face = following[number]
+    if len(face.lists) != 1 or next(iter(face.lists)) not in _FACE_LISTS:
         raise UnsupportedError("has faces without one list of vertex indices")
-    place = properties.index(lists[0])
     if file.is_ascii:
-        lines = read_bytes(path)[len(file.header) :].split(b"\n")
-        rows = [line.split() for line in lines if line.strip()]
-        rows = rows[len(file.rows) : len(file.rows) + count]
-        if len(rows) < count:
-            raise DamagedError(f"it ends after {len(rows):,} of {count:,} faces")
-        return cut_polygons([int(i) for i in row[place + 1 :][: int(row[place])]] for row in rows)
-    return _read_binary_faces(file, count, properties, place)
+        return _read_ascii_faces(path, file, face)
+    return _read_binary_faces(file, face)
 
 
-def _read_binary_faces(
-    file: PlyFile, count: int, properties: list[list[bytes]], place: int
-) -> Int[ndarray, "m 3"]:
-    """Read the faces of a binary .ply, whose list is the property number `place`."""
-    order = ">" if b"binary_big_endian" in file.header else "<"
+def _read_ascii_faces(path: Path, file: PlyFile, face: Element) -> Int[ndarray, "m 3"]:
+    """Read the faces of an ASCII .ply, whose rows follow those of its vertices."""
+    place = list(face.dtype.names or ()).index(next(iter(face.lists)))
+    lines = read_bytes(path)[len(file.header) :].split(b"\n")
+    rows = [line.split() for line in lines if line.strip()]
+    rows = rows[len(file.rows) : len(file.rows) + face.count]
+    if len(rows) < face.count:
+        raise DamagedError(f"it ends after {len(rows):,} of {face.count:,} faces")
+    polygons = []
+    for number, row in enumerate(rows, start=1):
+        sides = int(row[place])
+        corners = row[place + 1 :][: max(sides, 0)]
+        if len(corners) != sides:
+            raise DamagedError(f"face {number:,} has not the corners that it counts")
+        polygons.append([int(corner) for corner in corners])
+    return cut_polygons(polygons)
 
-    def get_type(word: bytes) -> np.dtype:
-        return np.dtype(order + PLY_SCALARS[word.decode("latin-1")])
 
-    before = sum(get_type(words[1]).itemsize for words in properties[:place])
-    after = sum(get_type(words[1]).itemsize for words in properties[place + 1 :])
-    number, index = get_type(properties[place][2]), get_type(properties[place][3])
+def _read_binary_faces(file: PlyFile, face: Element) -> Int[ndarray, "m 3"]:
+    """Read the faces of a binary .ply, whose rows follow those of its vertices."""
+    is_big_endian = re.search(rb"^format\s+binary_big_endian", file.header, re.MULTILINE)
+    order = ">" if is_big_endian else "<"
+    [(name, types)] = face.lists.items()
+    number, index = (np.dtype(order + PLY_SCALARS[word]) for word in types)
+    names = face.dtype.names or ()
+    place = names.index(name)
+    before = sum(face.dtype[column].itemsize for column in names[:place])
+    after = sum(face.dtype[column].itemsize for column in names[place + 1 :])
+    count = face.count
     data = np.asarray(file.trailer)
 
     # Nearly all files have triangles alone, whose rows are equally long.
@@ -132,6 +146,8 @@ def _read_binary_faces(
             raise DamagedError(f"it ends after {len(polygons):,} of {count:,} faces")
         sides = int(np.frombuffer(data, number, 1, start)[0])
         start += number.itemsize
+        if sides < 0:
+            raise DamagedError(f"face {len(polygons) + 1:,} has not the corners that it counts")
         if start + sides * index.itemsize + after > len(data):
             raise DamagedError(f"it ends after {len(polygons):,} of {count:,} faces")
         polygons.append(np.frombuffer(data, index, sides, start).tolist())
@@ -143,18 +159,24 @@ def read_obj_geometry(path: Path) -> Mesh:
     """Read the vertices (v) and faces (f) of a .obj; all else is for looks."""
     vertices: list[list[float]] = []
     polygons: list[list[int]] = []
-    for number, line in enumerate(read_bytes(path).decode("utf-8", "replace").splitlines(), 1):
+    # As bytes, whose lines end with line feeds and carriage returns alone: comments may hold
+    # other characters that Python takes for ends of a line.
+    for number, line in enumerate(read_bytes(path).splitlines(), 1):
         match line.split():
-            case ["v", x, y, z, *_]:
+            case [b"v", *coordinates]:
+                # A short one cannot be left out: the indices after it would mean other vertices.
                 try:
-                    vertices.append([float(x), float(y), float(z)])
+                    x, y, z = map(float, coordinates[:3])
                 except ValueError as error:
                     raise DamagedError(f"line {number} is no vertex") from error
-            case ["f", *corners]:
+                vertices.append([x, y, z])
+            case [b"f", *corners]:
                 try:
-                    indices = [int(corner.partition("/")[0]) for corner in corners]
+                    indices = [int(corner.partition(b"/")[0]) for corner in corners]
                 except ValueError as error:
                     raise DamagedError(f"line {number} is no face") from error
+                if 0 in indices:
+                    raise DamagedError(f"line {number} has the index 0, and indices begin with 1")
                 # Indices count from 1, or back from the last vertex so far.
                 polygons.append([i - 1 if i > 0 else len(vertices) + i for i in indices])
     if not vertices:

@@ -264,8 +264,8 @@ def compute_trust(
 
 def convert_camera(camera: Camera) -> CameraPose:
     """Convert a camera to the form that the kernels read."""
-    focal = (camera.K[0, 0] * camera.K[1, 1]).item()
-    return CameraPose(to_float32(camera.center), to_float32(camera.forward), np.float32(focal))
+    focal_product = np.float32((camera.K[0, 0] * camera.K[1, 1]).item())
+    return CameraPose(to_float32(camera.center), to_float32(camera.forward), focal_product)
 
 
 def sum_weights(frozen: FrozenScene) -> Float[Tensor, "n"]:

@@ -43,7 +43,8 @@ class Target:
     reason: str = ""
     """Sentence why a planned camera was chosen; empty for one that the user gave."""
     is_in_splat_frame: bool = False
-    """True if the camera is in the frame of the input splat's file."""
+    """True if the camera was given in the frame of the input splat's file, and not in that of the
+    photographs."""
     painting: Painting | None = None
     """Image that was painted for the target, with the camera as it was read."""
 
@@ -85,6 +86,7 @@ class Opened:
     request: SceneRequest
     photographs: Photographs
     format: str
+    """Name of the format of the photographs, or of renders in their place."""
     num_photographs: int
     """Number of photographs, with those whose camera was not found."""
     held_out: tuple[int, ...] = ()
@@ -124,6 +126,7 @@ class CompletionTask:
     """Input of a completion."""
 
     views: Sequence[View]
+    """Photographs of the context, at least one, in the frame of the result."""
     targets: Sequence[Target]
     frame: Float[np.ndarray, "4 4"]
     """Similarity from the frame of the photographs to that of the result."""
@@ -135,7 +138,9 @@ class CompletionTask:
     """Input splat, or None to reconstruct the context."""
     splat_file: InputSplatFile | None = None
     method: str = "given"
+    """How the frame of the input splat was found (`AlignmentMethod`)."""
     frame_description: str = "the frame of the photographs"
+    """What was found about that frame, in words for people."""
     check_views: Sequence[View] | None = None
     """Photographs that check the input splat, at low resolution; without one, those to which the
     reconstructed scene is fitted besides the context."""

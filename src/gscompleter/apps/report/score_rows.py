@@ -155,7 +155,10 @@ def score_photographs(
     renderer: Renderer,
     draw: Drawing,
 ) -> list[ContextRow]:
-    """Make the rows of photographs of the context, or of those that checked a splat."""
+    """Make the rows of photographs of the context, or of those that checked a splat.
+
+    `exposure_gains` are three factors (R, G, B) for each photograph, or None for it.
+    """
     scores = score_views(completion, views, renderer, draw)
     return [
         ContextRow(
@@ -213,9 +216,9 @@ def fit_targets(
     scene = merge(completion.parts)
     rows: list[FittedRow | None] = []
     for photograph, pair in zip(photographs, pairs, strict=True):
-        holes = compute_hole_mask(pair.before.alpha)
         fitted = None
         if photograph is not None:
+            holes = compute_hole_mask(pair.before.alpha)
             fitted = measure_fitted(scene, photograph, holes, renderer)
         rows.append(None if fitted is None else FittedRow(**asdict(fitted)))
     return rows
@@ -296,6 +299,7 @@ def count_changes(completion: Completion) -> dict[str, Any]:
     num_replaced = int(completion.source.replaced_mask.sum())
     if num_replaced:
         counts["replaced"] = num_replaced
+    # Under full trust no photograph is compared with the splat, so that none is new to it.
     if completion.config.trust == "full":
         return {"gaussians": counts}
     counts["recolored"] = int(completion.recolored_mask.sum())

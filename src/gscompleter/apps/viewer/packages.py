@@ -14,6 +14,7 @@ import tarfile
 import urllib.request
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from http.client import HTTPException
 from pathlib import Path
 
 from gscompleter.system.errors import InputError
@@ -108,7 +109,7 @@ def read_lock(lock: Path) -> list[NpmPackage]:
 
 
 def get_archive(package: NpmPackage) -> bytes:
-    """Get the archive of a package from the cache, or fetch and cache it."""
+    """Get the archive of a package from the cache, or fetch and cache it (`fetch_archive`)."""
     place = get_archive_path(package)
     # What was cached is checked as well: it may be damaged, or put there by hand.
     if place.is_file():
@@ -128,7 +129,10 @@ def get_archive_path(package: NpmPackage) -> Path:
 
 
 def fetch_archive(package: NpmPackage) -> bytes:
-    """Fetch an archive from the npm registry and compare its hash."""
+    """Fetch an archive from the npm registry and compare its hash.
+
+    Raises InputError without a connection, and if the hash differs.
+    """
     url = f"{REGISTRY}/{package.path}"
     try:
         with urllib.request.urlopen(url, timeout=TIMEOUT_SECONDS) as answer:
@@ -136,7 +140,8 @@ def fetch_archive(package: NpmPackage) -> bytes:
         if package.is_intact(archive):
             return archive
         reason = "its SHA-512 differs"
-    except OSError as error:
+    except (OSError, HTTPException) as error:
+        # A connection that ends midway raises an HTTPException, which is no OSError.
         reason = f"it cannot be fetched ({error})"
     raise InputError(
         f"The page needs {url}, but {reason}; install gscompleter from its wheel, which contains "

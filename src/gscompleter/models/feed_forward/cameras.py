@@ -54,13 +54,13 @@ def select_sources(
 
 
 def list_other_views(scenes: int, views: int, device: torch.device) -> Int[Tensor, "b v s"]:
-    """List all other views for each view, in ascending order."""
+    """List all other views for each of two or more `views`, in ascending order."""
     others = [[j for j in range(views) if j != i] for i in range(views)]
     return torch.tensor(others, device=device).expand(scenes, -1, -1)
 
 
 def find_nearest_views(cameras: Cameras, count: int) -> Int[Tensor, "b v s"]:
-    """Find the `count` nearest other views of each view, the nearest first."""
+    """Find the `count` nearest other views of each view by their centres, the nearest first."""
     centers = cameras.c2w[..., :3, 3]
     # Relative to their middle: distances between them would cancel far from the origin.
     centers = centers - centers.mean(dim=-2, keepdim=True)

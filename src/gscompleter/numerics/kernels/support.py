@@ -28,13 +28,13 @@ _PI = np.float32(math.pi)
 
 
 class CameraPose(NamedTuple):
-    """The position and viewing direction of a camera, float32."""
+    """The position, viewing direction and focal lengths of a camera, float32."""
 
     center: np.ndarray
     """Camera centre in the world [3]."""
     forward: np.ndarray
     """Unit viewing direction [3]."""
-    focal: np.float32
+    focal_product: np.float32
     """Product of fx and fy, in squared pixels."""
 
 
@@ -70,7 +70,7 @@ def _compute_pixel_area(means, i, place):
     z += (means[i, 1] - center[1]) * forward[1]
     z += (means[i, 2] - center[2]) * forward[2]
     z = max(z, np.float32(0))
-    return z * z / place.focal
+    return z * z / place.focal_product
 
 
 @njit(nogil=True, fastmath={"contract"}, error_model="numpy")

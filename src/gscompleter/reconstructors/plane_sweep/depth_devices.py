@@ -24,8 +24,8 @@ from gscompleter.system.errors import InputError, quote_value
 
 MIN_DEVICE_PIXELS = 2**17
 """Pixels from which a level of the surfaces is fitted on a GPU. A coarser level has twice as many
-iterations, each of `LAUNCHES_PER_ITERATION` launches, for a quarter of the pixels: of 2 million the
-finest two are three quarters of the work, and a tenth of the launches."""
+iterations, each of as many launches (`numerics/tensor_tgv.py`), for a quarter of the pixels: of 2
+million the finest two are three quarters of the work, and a tenth of the launches."""
 
 
 @runtime_checkable

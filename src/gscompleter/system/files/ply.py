@@ -48,6 +48,8 @@ class Element:
     count: int
     dtype: np.dtype
     """Type of a row; lists are objects, and such rows cannot be read."""
+    lists: Mapping[str, tuple[str, str]]
+    """Words of the header for the types of the count and of the values of each list, by name."""
 
 
 @dataclass(frozen=True)
@@ -78,7 +80,8 @@ def read_header(file: BinaryIO, path: Path) -> tuple[bytes, list[Element]]:
                 f"{quote_value(path)} is truncated: its header has no end; fetch the file again."
             )
     try:
-        return b"".join(lines), _parse_elements(lines[1:-1])
+        header = b"".join(lines)
+        return header, parse_elements(header)
     except DamagedError as error:
         raise InputError(
             f"{quote_value(path)} has a broken header ({quote_value(describe_damage(error))}); "
@@ -86,10 +89,12 @@ def read_header(file: BinaryIO, path: Path) -> tuple[bytes, list[Element]]:
         ) from error
 
 
-def _parse_elements(lines: Iterable[bytes]) -> list[Element]:
-    tables: list[tuple[str, int, list[tuple[str, str]]]] = []
+def parse_elements(header: bytes) -> list[Element]:
+    """Parse the elements of a header that ends with `end_header`; DamagedError for a broken one."""
+    tables: list[tuple[str, int, list[tuple[str, str]], dict[str, tuple[str, str]]]] = []
     byte_order: str | None = None
-    for line in lines:
+    # Without the first line, `ply`, and the last one.
+    for line in header.split(b"\n")[1:-2]:
         words = line.decode("latin-1").split()
         # The header is changed by expressions that look for words at the beginnings of lines.
         if words and line[:1].isspace():
@@ -103,9 +108,10 @@ def _parse_elements(lines: Iterable[bytes]) -> list[Element]:
                 case ["format", name, *_] if byte_order is None:
                     byte_order = _BYTE_ORDERS[name]
                 case ["element", name, count] if count.isdecimal():
-                    tables.append((name, int(count), []))
-                case ["property", "list", _, _, name]:
+                    tables.append((name, int(count), [], {}))
+                case ["property", "list", count_type, value_type, name]:
                     tables[-1][2].append((name, "O"))
+                    tables[-1][3][name] = (count_type, value_type)
                 case ["property", kind, name]:
                     tables[-1][2].append((name, f"{byte_order}{PLY_SCALARS[kind]}"))
                 case _:
@@ -114,10 +120,12 @@ def _parse_elements(lines: Iterable[bytes]) -> list[Element]:
             # An unknown format or a second one, an unknown type, a property of no element, or other
             # words.
             raise DamagedError(" ".join(words)) from error
-    for name, _, columns in tables:
+    for name, _, columns, _ in tables:
         if len({column for column, _ in columns}) < len(columns):
             raise DamagedError(f"'{name}' has a property more than once")
-    return [Element(name, count, np.dtype(columns)) for name, count, columns in tables]
+    return [
+        Element(name, count, np.dtype(columns), lists) for name, count, columns, lists in tables
+    ]
 
 
 def read_ply_file(
