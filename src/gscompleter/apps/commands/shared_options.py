@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,7 +30,8 @@ NumFrames = Annotated[int, Interval(ge=3, le=1000)]
 OUTPUTS = ("out", "save", "export_holes")
 """Options that name what a command writes."""
 WORDS_OR_PATHS = ("target", "protocol", "generator_weights", "generator_depth")
-"""Options whose words may be paths of files or folders that are read."""
+"""Options whose words may be paths of files or folders that are read. Other words are counted as
+paths, too, which do not exist. Functions (file.py:function) are not: nothing writes over code."""
 ADDRESS = re.compile(r"\w\w+:/")
 """Beginning of an address such as s3://bucket; a path makes one of its two slashes. It has two
 letters at least, since `C:/results` is a path of Windows."""
@@ -264,19 +266,27 @@ class EngineOptions(Options):
 def list_inputs(options: Settings) -> list[Path]:
     """List the paths that a command reads: those of its options but the outputs.
 
-    A number is a photograph, whatever the working folder holds.
+    A number is a photograph, and what is no file is the name of a protocol, whatever the working
+    folder holds.
     """
     inputs: list[Path] = []
     for name, value in vars(options).items():
         values = value if isinstance(value, tuple) else (value,)
         if name in WORDS_OR_PATHS:
             words = [word for word in values if isinstance(word, str)]
-            inputs += [Path(word) for word in words if not FRAME_NUMBER.fullmatch(word)]
+            inputs += [Path(word) for word in words if may_be_path(name, word)]
         elif isinstance(value, Settings):
             inputs += list_inputs(value)
         elif name not in OUTPUTS:
             inputs += [path for path in values if isinstance(path, Path)]
     return inputs
+
+
+def may_be_path(name: str, word: str) -> bool:
+    """Return True if a word of one of `WORDS_OR_PATHS` may be a path."""
+    if name == "protocol":
+        return os.path.isfile(word)
+    return FRAME_NUMBER.fullmatch(word) is None
 
 
 def refuse_size_alone(resolution: tuple[int, int] | None, cameras: Path | None) -> None:

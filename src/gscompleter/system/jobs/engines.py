@@ -68,7 +68,10 @@ def check_processes() -> None:
 
 @contextlib.contextmanager
 def open_local(workers: int) -> Iterator[Pool]:
-    """Open a pool of local processes, which end with this one."""
+    """Open a pool of local processes, which end with this one.
+
+    They compute with as many threads as this one, whose limit is in the environment.
+    """
     # One executor for each process: a killed process breaks its whole executor. A broken one, whose
     # future has an exception, is not used again.
     futures: dict[ProcessPoolExecutor, Future[Exception | None]] = {}
