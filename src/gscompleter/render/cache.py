@@ -101,7 +101,9 @@ def replace_first(frozen: FrozenScene, known: Parts, first: Gaussians) -> Frozen
     if differ_in_color(before, first):
         rows = find_changed_rows(before.sh, first.sh).nonzero()[:, 0]
         return frozen.repaint(rows, first[rows])
-    hidden = find_hidden(before, first) if isinstance(frozen, HidingScene) else None
+    if not isinstance(frozen, HidingScene):
+        return None
+    hidden = find_hidden(before, first)
     if hidden is None:
         return None
     # Of the later parts nothing is hidden.
