@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import tyro
 from annotated_types import Interval
@@ -15,6 +15,7 @@ from annotated_types import Interval
 from gscompleter.apps.command_line.chosen_config import ChosenConfig
 from gscompleter.apps.requests.answer import AnswerRequest
 from gscompleter.apps.requests.scene import FRAME_NUMBER, Names, Size
+from gscompleter.config import SourceDepthName
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Device, Seed, Settings
 from gscompleter.data.sfm import NUM_VIDEO_FRAMES
@@ -266,8 +267,7 @@ class EngineOptions(Options):
 def list_inputs(options: Settings) -> list[Path]:
     """List the paths that a command reads: those of its options but the outputs.
 
-    A number is a photograph, and what is no file is the name of a protocol, whatever the working
-    folder holds.
+    Of words, those are left out that no command reads as a path, whatever the working folder holds.
     """
     inputs: list[Path] = []
     for name, value in vars(options).items():
@@ -283,9 +283,14 @@ def list_inputs(options: Settings) -> list[Path]:
 
 
 def may_be_path(name: str, word: str) -> bool:
-    """Return True if a word of one of `WORDS_OR_PATHS` may be a path."""
+    """Return True if a word of one of `WORDS_OR_PATHS` may be a path.
+
+    A number is a photograph, and what is no file is the name of a protocol.
+    """
     if name == "protocol":
         return os.path.isfile(word)
+    if name == "generator_depth":
+        return word not in get_args(SourceDepthName)
     return FRAME_NUMBER.fullmatch(word) is None
 
 
