@@ -614,16 +614,24 @@ def test_slurm_gives_no_part_of_a_gpu(tmp_path):
 
 @pytest.mark.parametrize("error", [ConnectionError, Exception])
 @pytest.mark.parametrize(
-    ("address", "sentence"), [(None, "Ray cannot start on this machine"), ("far:1", "Ray at far:1")]
+    ("address", "sentence", "option"),
+    [
+        (None, "Ray cannot start on this machine", "engine"),
+        ("far:1", "Ray at far:1", "address"),
+    ],
 )
-def test_ray_that_does_not_answer_is_a_sentence(address, sentence, error):
+def test_ray_that_does_not_answer_is_a_sentence(address, sentence, option, error):
     class Ray:
         @staticmethod
         def init(**options):
+            signal.signal(signal.SIGTERM, signal.SIG_IGN)
             raise error("no answer")
 
-    with pytest.raises(InputError, match=f"{sentence}: no answer"):
+    before = signal.getsignal(signal.SIGTERM)
+    with pytest.raises(InputError, match=f"{sentence}: no answer") as raised:
         connect_to_ray(Ray, address, 1)
+    assert raised.value.argument == option
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 def test_submitit_does_the_shares_and_a_lost_one_is_done_again(tmp_path, monkeypatch):

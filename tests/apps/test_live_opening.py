@@ -609,5 +609,6 @@ def test_weights_and_depths_of_ones_own_are_kept_by_their_whole_paths(tmp_path, 
     assert (
         described["generator_weights"] == described["generator_depth"] == str(tmp_path / "network")
     )
+    (tmp_path / "monocular").mkdir()
     named = GeneratorOptions(generator_depth="monocular")
     assert describe_value("synthesis", named)["generator_depth"] == "monocular"

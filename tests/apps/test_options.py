@@ -107,3 +107,15 @@ def test_the_number_of_a_photograph_is_no_path(tmp_path, monkeypatch):
     inputs = list_inputs(parse_command(words))
     assert Path("8") not in inputs
     assert Path("cameras.json") in inputs
+
+
+def test_results_may_be_called_as_their_protocol(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "n-10").mkdir()
+    (tmp_path / "index.json").touch()
+    words = ["evaluate", "scenes", "--protocol", "n-10", "index.json", "--out", "n-10"]
+    options = parse_command(words)
+    inputs = list_inputs(options)
+    assert Path("n-10") not in inputs
+    assert Path("index.json") in inputs
+    options.check_overlap()

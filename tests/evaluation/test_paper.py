@@ -175,10 +175,22 @@ def test_a_table_takes_the_given_protocols_of_its_kind():
     assert choose_protocols(decide().cases, PAPER.tables["models"]) == ("",)
 
 
+def test_an_index_of_the_user_has_no_kind_whatever_it_is_called():
+    given = decide(preset="re10k", protocol=("stress-rooms.json", "n-rooms.json")).run.cases
+    assert choose_protocols(given, PAPER.tables["stress"]) == ("stress",)
+    assert choose_protocols(given, PAPER.tables["spans"]) == ("n-10", "n-20", "n-30")
+    assert choose_protocols(given, PAPER.tables["models"]) == ("stress-rooms.json",)
+
+
 def test_a_figure_shows_one_protocol():
     given = decide(preset="re10k", protocol=("sequence-4", "sequence-2-steps-2")).run.cases
     assert choose_protocols(given, PAPER.tables["sequence"]) == given.protocol
     assert choose_protocols(given, PAPER.figures["sequence"]) == ("sequence-4",)
+
+
+def test_a_protocol_that_does_not_exist_is_refused_where_no_table_takes_it(written):
+    with pytest.raises(InputError, match="no protocol 'sequence-x'"):
+        written({}, table=("spans",), protocol=("n-2", "sequence-x"))
 
 
 def test_protocols_that_nothing_takes_are_told():

@@ -20,17 +20,17 @@ def view(x: float, yaw: float) -> View:
 
 def test_the_widest_baseline_wins():
     choice = select_anchor(TARGET, [view(x=1, yaw=10), view(x=3, yaw=30)])
-    assert (choice.index, choice.fallback) == (1, False)
+    assert (choice.index, choice.is_fallback) == (1, False)
 
 
 def test_a_view_turned_too_far_loses_however_wide_its_baseline():
     choice = select_anchor(TARGET, [view(x=1, yaw=10), view(x=9, yaw=46)])
-    assert (choice.index, choice.fallback) == (0, False)
+    assert (choice.index, choice.is_fallback) == (0, False)
 
 
 def test_when_every_view_is_turned_too_far_the_least_turned_wins_and_says_so():
     choice = select_anchor(TARGET, [view(x=9, yaw=80), view(x=1, yaw=-50)])
-    assert (choice.index, choice.fallback) == (1, True)
+    assert (choice.index, choice.is_fallback) == (1, True)
 
 
 def test_a_view_from_where_the_target_stands_tells_no_depth():

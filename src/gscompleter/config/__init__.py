@@ -23,6 +23,8 @@ from gscompleter.system.plugins import is_in_file
 
 PixelCount = Annotated[int, Interval(ge=0, le=4096)]
 StepSize = Annotated[float, Interval(gt=0, le=10)]
+SourceDepthName = Literal["context", "monocular", "moge-2-large"]
+"""Names of depths of a photograph, which come before folders that are called so."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +33,7 @@ class SynthesisConfig(Settings):
 
     correct_color: bool = True
     """Match the colours of the synthesized image to those of the photographs (not in the paper)."""
-    source_depth: Literal["context", "monocular", "moge-2-large"] = "context"
+    source_depth: SourceDepthName = "context"
     """Default of `complete --generator-depth`: rendered, or by a network; `moge-2-large` is
     that of PE-Field's authors (paper)."""
 

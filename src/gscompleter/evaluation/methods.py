@@ -180,7 +180,7 @@ def complete_by_similarity(state: Completion, target: Camera, models: Models) ->
                 pair.gaussians, state.scene, reference, models.renderer, models.seed, config
             )
     scene = merge([state.scene, added])
-    return Prediction(scene, added, seconds, anchor.index, anchor.fallback, added)
+    return Prediction(scene, added, seconds, anchor.index, anchor.is_fallback, added)
 
 
 def mark_target(prediction: Prediction, number: int, before: Gaussians) -> Prediction:

@@ -29,13 +29,17 @@ class OnnxNetwork:
 
     @property
     def fixed_size(self) -> tuple[int, int] | None:
-        """Height and width that the network accepts, or None for any."""
+        """Height and width that the network accepts; None if either is free."""
         # Images have the shape [1, c, h, w]; a side is text or None if it is free.
         height, width = (*self.session.get_inputs()[0].shape, None, None)[2:4]
         return (height, width) if isinstance(height, int) and isinstance(width, int) else None
 
     def __call__(self, **inputs: ndarray) -> list[ndarray]:
-        """Run the network on images of shape [1, c, h, w]; raise InputError if it fails."""
+        """Run the network on `inputs` by name; return its outputs in the order of the file.
+
+        Images have the shape [1, c, h, w] and the type and range that the caller's model asks for.
+        Raise InputError if it fails.
+        """
         try:
             return list(self.session.run(None, inputs))
         except Exception as error:  # onnxruntime has an error class per status code
@@ -51,6 +55,10 @@ def load_network(
     num_outputs: int = 1,
 ) -> OnnxNetwork:
     """Load the published network, or a file of the same signature that the user named by `option`.
+
+    The file has exactly the inputs of `signature` and `num_outputs` outputs, and if it fixes the
+    size of its images, that is `weights.image_size`. On `cuda` it runs on the GPU if onnxruntime
+    can, and on the CPU else.
 
     Raises:
         InputError: onnxruntime or the file is missing, or the file is not such a network.

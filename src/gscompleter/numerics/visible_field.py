@@ -18,11 +18,13 @@ from gscompleter.numerics.geometry import is_inside, project, unproject
 from gscompleter.types import Camera
 
 FIELD_SIDE = 128
-"""Voxels along the longest side of the grid."""
+"""Voxels along the longest side of the box of what is seen; the grid has a margin around it."""
 TRUNCATION = 4
-"""Largest distance that is told, in voxels; nothing is known farther behind a surface."""
+"""Largest distance that is told, and margin of the grid, in voxels; nothing is known farther behind
+a surface."""
 BOX_SHARE = 0.01
-"""Share of the seen points that the grid may leave out at each end of an axis."""
+"""Share of the seen points that the box leaves out at each end of an axis: a few far ones would
+make the voxels large."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +37,7 @@ class VisibleField:
     is_seen: Bool[np.ndarray, "x y z"]
     """True where a camera tells: before a surface, or just behind it."""
     origin: Float[np.ndarray, "3"]
-    """Centre of the first voxel."""
+    """Centre of the first voxel, in the frame of the cameras."""
     voxel_size: float
     """Side of a voxel in scene units."""
 
@@ -45,7 +47,8 @@ def compute_visible_field(
 ) -> VisibleField | None:
     """Compute the field of what cameras see; `depths` are z-depths, 0 where they see nothing.
 
-    The cameras are in float64, and in one frame. None if they see nothing.
+    The cameras are in float64, in one frame, and on the CPU as the depths are. None if they see
+    nothing.
     """
     points = [
         unproject(depth, camera)[depth > 0] for depth, camera in zip(depths, cameras, strict=True)

@@ -66,34 +66,20 @@ class SceneRenderer:
     ) -> FrozenScene:
         """Extend what was `frozen` of the parts `known` to `parts`, or freeze these anew.
 
-        Parts are immutable, so that an identical object is an equal part. A first one that was only
-        recoloured is repainted, and one of which some were hidden is drawn again where it showed.
-        In `known` it is replaced then.
+        Parts are immutable, so that an identical object is an equal part. Only the first one may be
+        another than before.
         """
-        if frozen is not None and known[0] is not parts[0] and differ_in_color(known[0], parts[0]):
-            rows = find_changed_rows(known[0].sh, parts[0].sh).nonzero()[:, 0]
-            frozen = frozen.repaint(rows, parts[0][rows])
-            known = (parts[0], *known[1:])
-        if (
-            isinstance(frozen, HidingScene)
-            and known[0] is not parts[0]
-            # Else all is frozen anew below, and hiding would be in vain.
-            and has_first_parts(parts[1:], known[1:])
-            and (hidden := find_hidden(known[0], parts[0])) is not None
-        ):
-            known = (parts[0], *known[1:])
-            # Of the later parts nothing is hidden.
-            hidden = pad(hidden, (0, sum(map(len, known[1:]))))
-            frozen = frozen.hide(hidden, known)
-        shared = 0
-        while shared < min(len(known), len(parts)) and known[shared] is parts[shared]:
-            shared += 1
-        if frozen is None or shared < len(known):
-            frozen = self.renderer.freeze(parts[0], camera)
-            shared = 1
-        for part in parts[shared:]:
-            frozen = frozen.extend(part)
-        return frozen
+        # Nothing can be taken out of a frozen scene but by freezing it anew.
+        is_grown = has_first_parts(parts[1:], known[1:])
+        updated = (
+            replace_first(frozen, known, parts[0]) if frozen is not None and is_grown else None
+        )
+        if updated is None:
+            updated = self.renderer.freeze(parts[0], camera)
+            known = parts[:1]
+        for part in parts[len(known) :]:
+            updated = updated.extend(part)
+        return updated
 
     def _thin(self, part: Gaussians) -> tuple[Gaussians, Gaussians]:
         """Simplify a part, or find it among those simplified before."""
@@ -101,6 +87,27 @@ class SceneRenderer:
             if pair[0] is part:
                 return pair
         return part, thin_gaussians(part, MAX_PREVIEW_GAUSSIANS)
+
+
+def replace_first(frozen: FrozenScene, known: Parts, first: Gaussians) -> FrozenScene | None:
+    """Replace the first of the parts `known` that were frozen; None if all has to be frozen anew.
+
+    One that was only recoloured is repainted, and one of which some were hidden is drawn again
+    where it showed them.
+    """
+    before, *later = known
+    if before is first:
+        return frozen
+    if differ_in_color(before, first):
+        rows = find_changed_rows(before.sh, first.sh).nonzero()[:, 0]
+        return frozen.repaint(rows, first[rows])
+    if not isinstance(frozen, HidingScene):
+        return None
+    hidden = find_hidden(before, first)
+    if hidden is None:
+        return None
+    # Of the later parts nothing is hidden.
+    return frozen.hide(pad(hidden, (0, sum(map(len, later)))), (first, *later))
 
 
 def differ_in_color(one: Gaussians, other: Gaussians) -> bool:

@@ -28,7 +28,7 @@ class AnchorChoice:
     """The number of the context view that forms the stereo pair with the target."""
 
     index: int
-    fallback: bool
+    is_fallback: bool
     """True if every view exceeded the rotation limit, so that the smallest rotation won."""
 
 
@@ -72,13 +72,14 @@ def select_anchor(
 
     Among views rotated by less than `max_rotation`, the widest baseline wins, since it triangulates
     best; if none qualifies, the smallest rotation wins. Beyond the paper, a view needs
-    `min_baseline` and `min_overlap` (fraction of the target's visible surfaces) unless no view has
-    them.
+    `min_baseline`, relative to the widest one, and `min_overlap` unless no view has that.
+    `overlaps` has the share of the target's visible surfaces that each view sees, too; without it
+    all views are taken to see all of them. Raises ValueError without views.
     """
     if not views:
         raise ValueError("select_anchor needs at least one observed view, got none")
     if config.selection == "nearest":
-        return AnchorChoice(find_nearest_view(target, views), fallback=False)
+        return AnchorChoice(find_nearest_view(target, views), is_fallback=False)
 
     rotations = [measure_rotation(target, view.camera) for view in views]
     baselines = [measure_baseline(target, view.camera) for view in views]
@@ -88,16 +89,16 @@ def select_anchor(
     facing = [i for i in possible if rotations[i] < config.max_rotation]
     if not facing:
         least_turned = min(possible, key=lambda i: rotations[i])
-        return AnchorChoice(least_turned, fallback=True)
+        return AnchorChoice(least_turned, is_fallback=True)
 
     # On a path of 40 m the widest baseline shows something else (decision 015).
     overlap_of = overlaps or [1.0] * len(views)
     overlapping = [i for i in facing if overlap_of[i] >= config.min_overlap]
     if not overlapping:
         most_overlapping = max(facing, key=lambda i: overlap_of[i])
-        return AnchorChoice(most_overlapping, fallback=False)
+        return AnchorChoice(most_overlapping, is_fallback=False)
     widest = max(overlapping, key=lambda i: baselines[i])
-    return AnchorChoice(widest, fallback=False)
+    return AnchorChoice(widest, is_fallback=False)
 
 
 def compute_overlap(camera: Camera, render: Render, anchor: Camera, at_anchor: Render) -> float:
@@ -123,14 +124,16 @@ def choose_anchor(view: TargetView) -> Anchor:
     state = view.state
     target = view.camera.target
     config = state.config.anchor
-    overlaps = None if config.min_overlap == 0 else measure_overlaps(view)
+    needs_overlaps = config.selection == "widest" and config.min_overlap > 0
+    overlaps = measure_overlaps(view) if needs_overlaps else None
     choice = select_anchor(target, state.views, config, overlaps)
-    return Anchor(choice.index, choice.fallback, view)
+    return Anchor(choice.index, choice.is_fallback, view)
 
 
 def measure_overlaps(view: TargetView) -> list[float]:
     """Measure in small images how much of what a target sees each context view sees, too."""
     state = view.state
+    # The size at which candidates for the next target get their anchors by the same measure.
     side = state.config.next_best_view.image_size
     small_target = shrink_camera(view.camera.target, side)
     small_views = [shrink_camera(known.camera, side) for known in state.views]

@@ -25,6 +25,7 @@ from gscompleter.apps.commands.shared_options import (
     WORDS_OR_PATHS,
     CompletingOptions,
     list_inputs,
+    may_be_path,
 )
 from gscompleter.apps.live.opening import SessionRequest
 from gscompleter.apps.live.strokes import (
@@ -170,7 +171,8 @@ def describe_value(name: str, value: Any) -> Any:
         file, _, attribute = value.rpartition(":")
         return f"{os.path.abspath(file)}:{attribute}"
     is_path = isinstance(value, Path)
-    is_path |= name in WORDS_OR_PATHS and isinstance(value, str) and os.path.exists(value)
+    if name in WORDS_OR_PATHS and isinstance(value, str):
+        is_path = may_be_path(name, value) and os.path.exists(value)
     return os.path.abspath(value) if is_path else value
 
 

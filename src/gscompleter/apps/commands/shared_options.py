@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, get_args
 
 import tyro
 from annotated_types import Interval
@@ -14,6 +15,7 @@ from annotated_types import Interval
 from gscompleter.apps.command_line.chosen_config import ChosenConfig
 from gscompleter.apps.requests.answer import AnswerRequest
 from gscompleter.apps.requests.scene import FRAME_NUMBER, Names, Size
+from gscompleter.config import SourceDepthName
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.config.settings import Device, Seed, Settings
 from gscompleter.data.sfm import NUM_VIDEO_FRAMES
@@ -29,7 +31,8 @@ NumFrames = Annotated[int, Interval(ge=3, le=1000)]
 OUTPUTS = ("out", "save", "export_holes")
 """Options that name what a command writes."""
 WORDS_OR_PATHS = ("target", "protocol", "generator_weights", "generator_depth")
-"""Options whose words may be paths of files or folders that are read."""
+"""Options whose words may be paths of files or folders that are read. Other words are counted as
+paths, too, which do not exist. Functions (file.py:function) are not: nothing writes over code."""
 ADDRESS = re.compile(r"\w\w+:/")
 """Beginning of an address such as s3://bucket; a path makes one of its two slashes. It has two
 letters at least, since `C:/results` is a path of Windows."""
@@ -264,19 +267,31 @@ class EngineOptions(Options):
 def list_inputs(options: Settings) -> list[Path]:
     """List the paths that a command reads: those of its options but the outputs.
 
-    A number is a photograph, whatever the working folder holds.
+    Of words, those are left out that no command reads as a path, whatever the working folder holds.
     """
     inputs: list[Path] = []
     for name, value in vars(options).items():
         values = value if isinstance(value, tuple) else (value,)
         if name in WORDS_OR_PATHS:
             words = [word for word in values if isinstance(word, str)]
-            inputs += [Path(word) for word in words if not FRAME_NUMBER.fullmatch(word)]
+            inputs += [Path(word) for word in words if may_be_path(name, word)]
         elif isinstance(value, Settings):
             inputs += list_inputs(value)
         elif name not in OUTPUTS:
             inputs += [path for path in values if isinstance(path, Path)]
     return inputs
+
+
+def may_be_path(name: str, word: str) -> bool:
+    """Return True if a word of one of `WORDS_OR_PATHS` may be a path.
+
+    A number is a photograph, and what is no file is the name of a protocol.
+    """
+    if name == "protocol":
+        return os.path.isfile(word)
+    if name == "generator_depth":
+        return word not in get_args(SourceDepthName)
+    return FRAME_NUMBER.fullmatch(word) is None
 
 
 def refuse_size_alone(resolution: tuple[int, int] | None, cameras: Path | None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -35,7 +36,7 @@ from gscompleter.evaluation.paper_tables import (
     format_paper_markdown,
     write_paper_table,
 )
-from gscompleter.evaluation.protocols import list_indices
+from gscompleter.evaluation.protocols import FRAME_RULES, list_indices, parse_protocol
 from gscompleter.evaluation.store import make_file_name, read_run_file
 from gscompleter.evaluation.tables import format_markdown, write_tables
 from gscompleter.system.console import make_console
@@ -111,6 +112,9 @@ def reproduce(request: ReproductionRequest) -> int:
 
     Return the exit code, which counts the cases of all tables and figures.
     """
+    # A protocol that does not exist is of no kind: no table would take it, and so refuse it.
+    for protocol in request.run.cases.protocol:
+        parse_protocol(protocol)
     paper = load_paper()
     answer = request.run.answer
     console = make_console(stderr=True, quiet=answer.quiet)
@@ -217,7 +221,8 @@ def run_all(
 ) -> dict[tuple[str, str], Path]:
     """Run what a table or figure needs; return the folder of each model and protocol.
 
-    The outcome of each run is appended to `scored`.
+    A protocol is named by its stem there, so that the path of an index is shown as its name. The
+    outcome of each run is appended to `scored`.
     """
     runs = {}
     for model in request.weights:
@@ -256,11 +261,13 @@ def find_unused_protocols(cases: CasesRequest, specs: Iterable[Requirements]) ->
 def get_kind(protocol: str) -> str:
     """Return the kind of a protocol: what its name begins with, such as `n`, `stress`, `sequence`.
 
-    In the names of our indices it comes second: `n` in dl3dv-n-10. An index of the user is given by
-    its path, which has no kind that a table asks for.
+    In the names of our indices it comes second: `n` in dl3dv-n-10. An index of the user, which is
+    given by its path, has the empty kind, whatever its file is called.
     """
-    parts = protocol.split("-")
-    return parts[1] if protocol in list_indices() else parts[0]
+    if protocol in list_indices():
+        return protocol.split("-")[1]
+    is_rule = any(re.fullmatch(pattern, protocol) for pattern in FRAME_RULES)
+    return protocol.split("-")[0] if is_rule else ""
 
 
 def make_run(

@@ -28,7 +28,10 @@ NUM_SAMPLED = 100_000
 
 
 def check_scene(task: CompletionTask, scene: Gaussians) -> None:
-    """Refuse a splat that does not fit into memory together with its photographs."""
+    """Raise InputError if a splat does not fit into memory together with its photographs.
+
+    `scene` is the splat as it was read, before it becomes `task.scene`.
+    """
     photographs = len(task.views) + len(task.check_views or ())
     what = f"The {len(scene):,} Gaussians of the scene and {photographs} photographs"
     remedy = "crop the scene, or give a folder with fewer photographs"
@@ -36,7 +39,7 @@ def check_scene(task: CompletionTask, scene: Gaussians) -> None:
 
 
 def check_gpu(task: CompletionTask, models: ModelRequest) -> None:
-    """Refuse a placed splat that does not fit on the GPU together with its photographs."""
+    """Raise InputError if `task.scene` does not fit on the GPU together with its photographs."""
     assert task.scene is not None
     views = [*task.views, *(task.check_views or ())]
     cameras = [view.camera for view in views]
@@ -51,7 +54,7 @@ def check_gpu(task: CompletionTask, models: ModelRequest) -> None:
 def estimate_matching_bytes(cameras: Sequence[Camera]) -> int:
     """Estimate the bytes that plane-sweep takes on a GPU for photographs that show what is lacking.
 
-    All of them may do so, as far as they are reconstructed together.
+    All of them may do so, as far as they are reconstructed together. There is at least one camera.
     """
     sizes = sorted([(camera.height, camera.width) for camera in cameras], key=math.prod)
     number = limit_part_photos(math.prod(sizes[-1]))
@@ -61,7 +64,8 @@ def estimate_matching_bytes(cameras: Sequence[Camera]) -> int:
 def estimate_gpu_memory(scene: Gaussians, cameras: Sequence[Camera], matching: int = 0) -> int:
     """Estimate the bytes that a completion of a placed splat needs on a GPU.
 
-    `cameras` are those of its photographs, and `matching` bytes are those of plane-sweep there.
+    `cameras` are those of its photographs, at least one, and `matching` bytes are those of
+    plane-sweep there. The splat has Gaussians, as every file that is read does.
     """
     # Views on a GPU hold the Gaussians in their image, whatever hides them.
     means = scene.means[:: max(1, len(scene) // NUM_SAMPLED)]
@@ -72,7 +76,7 @@ def estimate_gpu_memory(scene: Gaussians, cameras: Sequence[Camera], matching: i
 
 
 def estimate_memory(task: CompletionTask, scene: Gaussians | None) -> int:
-    """Estimate the bytes that a completion needs, with an input splat or without."""
+    """Estimate the bytes of main memory that a completion needs, with an input splat or without."""
     pixels = max(camera.width * camera.height for camera in task.cameras)
     needed = estimate_bytes(pixels, len(task.cameras))
     if scene is None:

@@ -68,7 +68,10 @@ def check_processes() -> None:
 
 @contextlib.contextmanager
 def open_local(workers: int) -> Iterator[Pool]:
-    """Open a pool of local processes, which end with this one."""
+    """Open a pool of local processes, which end with this one.
+
+    They compute with as many threads as this one, whose limit is in the environment.
+    """
     # One executor for each process: a killed process breaks its whole executor. A broken one, whose
     # future has an exception, is not used again.
     futures: dict[ProcessPoolExecutor, Future[Exception | None]] = {}
@@ -169,7 +172,10 @@ def open_ray(
 
 
 def connect_to_ray(ray: Any, address: str | None, cores: int | None) -> None:
-    """Connect to a cluster, or start one of `cores` cores on this machine."""
+    """Connect to a cluster, or start one of `cores` cores on this machine, all if None.
+
+    Raise InputError if that fails. Ctrl-C and SIGTERM do afterwards what they did before.
+    """
     for name, value in RAY_VARIABLES.items():
         os.environ.setdefault(name, value)
     # A cluster elsewhere has its own settings.
@@ -181,15 +187,15 @@ def connect_to_ray(ray: Any, address: str | None, cores: int | None) -> None:
             ray.init(log_to_driver=False, logging_level="ERROR", **options)
     # A machine that is too busy to start Ray in time makes it raise a plain Exception.
     except Exception as error:
+        reason = quote_value(str(error))
         if address is None:
-            reason = f"Ray cannot start on this machine: {quote_value(str(error))}."
-        else:
-            reason = (
-                f"There is no cluster of Ray at {quote_value(address)}: {quote_value(str(error))}."
-            )
-        raise InputError(reason, "address") from error
-    for number, handler in handlers.items():  # Ray has replaced them by its own
-        signal.signal(number, handler)
+            raise InputError(f"Ray cannot start on this machine: {reason}.", "engine") from error
+        raise InputError(
+            f"There is no cluster of Ray at {quote_value(address)}: {reason}.", "address"
+        ) from error
+    finally:
+        for number, handler in handlers.items():  # Ray has replaced them by its own
+            signal.signal(number, handler)
 
 
 def run_task(share: WorkerShare, threads: int, folder: str) -> Exception | None:
