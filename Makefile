@@ -35,8 +35,9 @@ endif
 # All that the tests and the checks need, in one go.
 set-up: $(VENV)/installed-dev $(GPU_WHEELS)
 
-# Compiled once, instead of in each process of the tests.
-kernels: $(VENV)/installed-test
+# Compiled once, instead of in each process of the tests. They need nothing but the package itself, so
+# that `make --jobs=2 set-up kernels` compiles them while pip, which works on one core, goes on.
+kernels: $(VENV)/installed
 	$(BIN)/gscompleter warmup --quiet
 
 # A process for each core, up to four: most tests wait for one core, and files share what they set up.
@@ -172,7 +173,7 @@ $(VENV)/installed-evaluation: pyproject.toml | $(VENV)/torch
 	$(PIP) -e '.[evaluation]'
 	touch $@ $(VENV)/installed
 
-$(VENV)/installed-test: pyproject.toml | $(VENV)/torch
+$(VENV)/installed-test: pyproject.toml | $(VENV)/installed
 	$(PIP) -e '.[test]'
 	touch $@ $(VENV)/installed
 
@@ -184,7 +185,7 @@ $(GPU_WHEELS): | $(VENV)/bin/python
 	-$(BIN)/python -m pip download --quiet --disable-pip-version-check --no-deps -d $(@D) \
 		gsplat==1.5.3 metal-gauss==0.2.1 && touch $@
 
-$(VENV)/installed-dev: pyproject.toml | $(VENV)/torch
+$(VENV)/installed-dev: pyproject.toml | $(VENV)/installed
 	$(PIP) -e '.[test,dev]'
 	touch $@ $(VENV)/installed $(VENV)/installed-test
 
