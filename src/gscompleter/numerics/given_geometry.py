@@ -30,7 +30,7 @@ MAX_DEVIATION = 0.05
 MIN_COMPARED = 0.001
 """Smallest share of the photographs' pixels that has to be compared."""
 FRAME_ADVICE = "give it in the frame and unit of the scene"
-"""What to do about geometry that is not what the scene shows, as a clause of a sentence."""
+"""Advice on geometry that is not what the scene shows, as a clause of a sentence."""
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ are the dual variables of each direction: they are differentiated, and moved, to
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -49,40 +48,26 @@ def fit_on_device(
     The host waits once, for the result. Roundings differ: the result is equal to about 1e-5 of the
     largest height. One map is fitted at a time, from whatever threads.
     """
-    # Tensors of a fit are let go before the next one begins: they belong to the call inside.
-    with _FITTING:
-        found = fit_tensors(
-            device, (heights, *gradients), data, weight, across, down, bend, tolerance, iterations
-        )
-    heights[:] = found[0]
-    gradients[:] = found[1:]
-
-
-def fit_tensors(
-    device: str,
-    start: Sequence[HeightMap],
-    data: HeightMap,
-    weight: HeightMap,
-    across: HeightMap,
-    down: HeightMap,
-    bend: np.float32,
-    tolerance: np.float32,
-    iterations: int,
-) -> Float32[np.ndarray, "3 h w"]:
-    """Fit heights and their two gradients, which begin at `start`, on a device; return them."""
 
     def upload(*arrays: np.ndarray) -> Tensor:
         return torch.from_numpy(np.stack(arrays)).to(device, non_blocking=True)
 
-    state = upload(*start)
-    # Beyond the last column and the last row there is nothing to step to.
-    bounds = upload(across, down)
-    bounds[0, :, -1] = 0
-    bounds[1, -1] = 0
-    (target,) = upload(data)
-    (pull,) = upload(PRIMAL_STEP * weight)
-    state = iterate(state, bounds, target, pull, float(bend), float(tolerance), iterations)
-    return state.cpu().numpy()
+    def fit() -> Float32[np.ndarray, "3 h w"]:
+        state = upload(heights, *gradients)
+        # Beyond the last column and the last row there is nothing to step to.
+        bounds = upload(across, down)
+        bounds[0, :, -1] = 0
+        bounds[1, -1] = 0
+        (target,) = upload(data)
+        (pull,) = upload(PRIMAL_STEP * weight)
+        state = iterate(state, bounds, target, pull, float(bend), float(tolerance), iterations)
+        return state.cpu().numpy()
+
+    # The tensors belong to the call inside, so that they are let go before the next fit begins.
+    with _FITTING:
+        found = fit()
+    heights[:] = found[0]
+    gradients[:] = found[1:]
 
 
 def iterate(

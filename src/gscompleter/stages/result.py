@@ -14,13 +14,13 @@ from gscompleter.target_result import TargetResult
 
 @dataclass(frozen=True)
 class TargetOutcome:
-    """What came of a target."""
+    """Hold the scene after a target, the result, and what was added."""
 
     state: Completion
     """The scene in its new colours, without what was added for the target."""
     result: TargetResult
     parts: tuple[Part, ...] = ()
-    """What was added for it, in the order of addition."""
+    """Parts that were added for the target, in the order of addition."""
 
 
 def make_unchanged_result(view: TargetView, anchor: Anchor) -> TargetResult:

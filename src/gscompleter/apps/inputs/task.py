@@ -140,7 +140,7 @@ class CompletionTask:
     method: str = "given"
     """How the frame of the input splat was found (`AlignmentMethod`)."""
     frame_description: str = "the frame of the photographs"
-    """What was found about that frame, in words for people."""
+    """Words for people about the frame that was found."""
     check_views: Sequence[View] | None = None
     """Photographs that check the input splat, at low resolution; without one, those to which the
     reconstructed scene is fitted besides the context."""

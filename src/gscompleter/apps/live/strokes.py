@@ -82,7 +82,7 @@ class StrokeRow:
 
 @dataclass(frozen=True)
 class StrokesFile:
-    """What a session reads of `strokes.json`; other entries of it are for other readers."""
+    """Hold the entries of `strokes.json` that a session reads; others are for other readers."""
 
     version: str
     frames: tuple[StrokeRow, ...]

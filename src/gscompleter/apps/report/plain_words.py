@@ -239,9 +239,11 @@ def describe_displaced(rows: Sequence[ContextRow]) -> str:
     named = ", ".join(str(row.photograph) for row in rows)
     worst = max(row.pose_error or 0 for row in rows)
     if len(rows) == 1:
-        subject, whom = f"The pose of photograph {named} contradicts", "it"
+        subject = f"The pose of photograph {named} contradicts"
+        whom = "it"
     else:
-        subject, whom = f"The poses of photographs {named} contradict", "them"
+        subject = f"The poses of photographs {named} contradict"
+        whom = "them"
     return (
         f"{subject} the other photographs by up to {format_number(worst, 1)} pixels, which blurs "
         f"what they show together; leave {whom} out (--context names the others), or find all "
