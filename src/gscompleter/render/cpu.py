@@ -57,7 +57,7 @@ class CpuRenderer:
         return self._freeze_nothing(camera).extend(context)
 
     def _freeze_nothing(self, camera: Camera) -> CpuFrozenScene:
-        threads = self.threads or numba.config.NUMBA_NUM_THREADS  # type: ignore[attr-defined]
+        threads = self.threads or numba.config.NUMBA_NUM_THREADS
         return freeze_nothing(Viewpoint(make_pinhole(camera), threads))
 
 
