@@ -570,6 +570,14 @@ class Gaussians(Displayed, TensorDataclass):
         """
         return replace(self, opacities=self.opacities.masked_fill(hidden, 0.0), encoded=None)
 
+    def drop_colors(self) -> Gaussians:
+        """Make all Gaussians grey, for steps that read no colours.
+
+        Harmonics are most of the memory of a scene, and may have to be read from a file.
+        """
+        gray = self.sh.new_zeros((1, 1, 3)).expand(len(self), 1, 3)
+        return replace(self, sh=gray, encoded=None)
+
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics, 0 to 3."""

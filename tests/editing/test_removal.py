@@ -155,14 +155,14 @@ def test_what_photographs_need_elsewhere_returns(begun):
         added_parts=(),
         trust_elsewhere=trust,
     )
-    restored = restore_surroundings(state, COMPLETER.renderer)
+    restored = restore_surroundings(state, COMPLETER.scenes)
     assert restored.source.stand_ins[-1] == len(restored.rendered_context) - 1
     assert torch.equal(restored.scene.means[-1], glow.means[0])
     assert not restored.source.gone_mask[-1]
     assert torch.equal(restored.source.chosen_mask, chosen)
-    assert restore_surroundings(begun, COMPLETER.renderer) is begun
+    assert restore_surroundings(begun, COMPLETER.scenes) is begun
     # Once more, colours would change again; after a further target or removal, they have to.
-    assert restore_surroundings(restored, COMPLETER.renderer) is restored
+    assert restore_surroundings(restored, COMPLETER.scenes) is restored
     further = COMPLETER.advance(restored, CAMERAS[1])
     again = remove_gaussians(restored, chosen, is_crate, COMPLETER.scenes)
     assert restored.is_restored
@@ -294,7 +294,7 @@ def test_what_reaches_out_of_the_place_stays_and_additions_match_photographs(beg
     assert [part.origin.kind for part in cut.added_parts] == ["piece"]
     dyed = replace(cut.added, sh=cut.added.sh - 0.5)
     dyed = replace(cut, added_parts=(replace(cut.added_parts[0], gaussians=dyed),))
-    restored = restore_surroundings(dyed, COMPLETER.renderer)
+    restored = restore_surroundings(dyed, COMPLETER.scenes)
     before, after = measure_errors(state, dyed.scene), measure_errors(state, restored.scene)
     assert max(after) < 0.7 * max(before)
 

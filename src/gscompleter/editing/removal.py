@@ -120,7 +120,7 @@ def remove_gaussians(
     return prepare_guards(changed, scenes)
 
 
-def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
+def restore_surroundings(state: Completion, scenes: SceneRenderer) -> Completion:
     """Let photographs be as good as before where they do not show what was removed.
 
     What was generated is faded until none is worse than with all revealed Gaussians behind it. Of
@@ -141,11 +141,13 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
     known = merge([first[:0], *(part.gaussians for part in rest)])
     is_revealed = source.revealed_mask
     revealed = source.gaussians[is_revealed]
-    invented = fade_harmful(invented, (first, known, revealed), state, renderer)
+    invented = fade_harmful(invented, (first, known, revealed), state, scenes)
 
     # The context is frozen once. What is compared with it is added, since it is much smaller; at
     # one photograph at a time, to save memory.
-    context = [renderer.freeze(first, view.camera) for view in views]
+    cameras = [view.camera for view in views]
+    scenes.clear()
+    context = scenes.freeze_at((first,), cameras)
     added = merge([first[:0], *(part.gaussians for part in invented)])
     is_needed = find_needed_revealed(revealed, context, known, added, views)
 
@@ -162,8 +164,10 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
             proxy_index=source.stand_ins.masked_scatter(is_returned, rows),
             revealed_mask=is_revealed & ~is_returned,
         )
+        # Names of what was frozen would hold it in memory beside what replaces it.
+        del context
+        context = scenes.freeze_at((first, returned), cameras)
         first = remaining.rendered if first is source.rendered else merge([first, returned])
-        context = [scene.extend(returned) for scene in context]
 
     # Additions reach beyond the hole, where photographs tell their colours. Ignored pixels show the
     # scene itself, so that colours stay as they are in the hole.
@@ -174,6 +178,7 @@ def restore_surroundings(state: Completion, renderer: Renderer) -> Completion:
         for view, scene in zip(views, context, strict=True)
     ]
     fitted = fit_colors(added, context, images, [RELAXATION] * HOLE_COLOR_ROUNDS)
+    scenes.clear()
     return replace(
         state,
         source=remaining,
@@ -240,7 +245,7 @@ def sum_in_mask(frozen: FrozenScene, inside: Float[Tensor, "h w"]) -> Float[Tens
 
 
 def fade_harmful(
-    parts: Sequence[Part], scene: Parts, state: Completion, renderer: Renderer
+    parts: Sequence[Part], scene: Parts, state: Completion, scenes: SceneRenderer
 ) -> list[Part]:
     """Fade what was invented until no photograph is clearly worse than with `scene` alone.
 
@@ -253,7 +258,7 @@ def fade_harmful(
     config = state.config.psnr_guard
     config = replace(config, max_drop=max(config.max_drop, REVEALED_TOLERANCE))
     views = [photo.view for photo in state.photos]
-    frozen = SceneRenderer(renderer).freeze_at(scene, [view.camera for view in views])
+    frozen = scenes.freeze_at(scene, [view.camera for view in views])
     budgets = [
         set_error_budgets(view, shown.render.image, ~view.valid_mask, config)
         for view, shown in zip(views, frozen, strict=True)
@@ -279,7 +284,8 @@ def find_revealed(
     first = state.rendered_context
     others = first.hide(unused)
     gone = torch.cat([unused, unused.new_ones(len(inner)), unused.new_zeros(len(outer))])
-    # Areas do not depend on colours, which take the most memory.
+    # Areas do not depend on colours by direction. Those that are left lie in a file as they did, so
+    # that frozen views do, too.
     uncolored = merge([replace(part, sh=part.sh[:, :1]) for part in (others, inner, outer)])
 
     added = state.parts[1:]
@@ -289,11 +295,14 @@ def find_revealed(
     # Each photograph may hold a million sorted Gaussians; the rounds below make others.
     del frozen
     confirmed_area = (before.areas * before.agreement).amax(dim=0)
+    areas_before = before.areas
+    del before
     # A round reveals the next layer: what is behind it was hidden until then.
     for _ in range(MAX_LAYERS):
         areas = measure_areas((uncolored.hide(gone), *added), views, scenes)
         largest = areas.amax(dim=0)
-        revealed = (areas - before.areas).amax(dim=0) > MIN_REVEALED * largest
+        # In place, since there is a number for each Gaussian in each photograph.
+        revealed = areas.sub_(areas_before).amax(dim=0) > MIN_REVEALED * largest
         # What a photograph showed before, in the right colours, was trained on and stays.
         revealed &= confirmed_area < MIN_SHOWN_BEFORE * largest
         if not revealed.any():

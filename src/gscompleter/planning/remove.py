@@ -82,7 +82,7 @@ def remove(
         planner = PhotographPlanner(completer)
         completion, _choices = planner.explore(begun, cameras, MAX_REMOVAL_TARGETS)
     # What was removed behind the object returns where photographs need it.
-    return restore_surroundings(completion, completer.renderer)
+    return restore_surroundings(completion, completer.scenes)
 
 
 def contain_nothing(points: Float[Tensor, "n 3"]) -> Bool[Tensor, "n"]:

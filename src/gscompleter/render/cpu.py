@@ -177,18 +177,30 @@ class CpuFrozenScene:
         starts = np.where(is_drawn, len(old.entries) + new.tile_start[:-1], old.tile_start[:-1])
         counts = np.where(is_drawn, np.diff(new.tile_start), np.diff(old.tile_start))
         tile_start = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
-        places = np.arange(tile_start[-1]) + np.repeat(starts - tile_start[:-1], counts)
+        places = np.repeat(starts - tile_start[:-1], counts)
+        places += np.arange(len(places))
         splats = np.concatenate([old.entries, new.entries + np.int32(len(old.splats))])[places]
+        del places
         rows_of_entries = np.concatenate([self.rows, drawn.rows])[splats]
         splat_of_row = np.full(self.count, -1, np.int32)
         splat_of_row[rows_of_entries] = splats
         rows = np.flatnonzero(splat_of_row >= 0).astype(np.int32)
         kept = splat_of_row[rows]
         splat_of_row[rows] = np.arange(len(rows), dtype=np.int32)
+
+        # Joined to one array, those of both layers would be copied twice.
+        is_new = kept >= len(old.splats)
+        new_kept = kept[is_new] - len(old.splats)
+
+        def take(mine: ndarray, other: ndarray) -> ndarray:
+            taken = mine[np.where(is_new, 0, kept)]
+            taken[is_new] = other[new_kept]
+            return taken
+
         layer = Layer(
-            np.concatenate([old.splats, new.splats])[kept],
-            np.concatenate([old.opacities, new.opacities])[kept],
-            np.concatenate([old.boxes, new.boxes])[kept],
+            take(old.splats, new.splats),
+            take(old.opacities, new.opacities),
+            take(old.boxes, new.boxes),
             tile_start,
             splat_of_row[rows_of_entries],
         )

@@ -51,5 +51,6 @@ def mark_shown(
     """Mark the pixels that show Gaussians among others."""
     # With a value of 1 for these and 0 for the others, the image is their weight.
     values = torch.cat([torch.zeros_like(others.opacities), torch.ones_like(gaussians.opacities)])
-    hiding = renderer.freeze(gaussians, camera).freeze_occluders(others)
-    return hiding.extend(gaussians).splat(values) > MIN_REMOVED_WEIGHT
+    drawn = gaussians.drop_colors()
+    hiding = renderer.freeze(drawn, camera).freeze_occluders(others.drop_colors())
+    return hiding.extend(drawn).splat(values) > MIN_REMOVED_WEIGHT

@@ -24,7 +24,7 @@ from gscompleter.render.spherical_harmonics import evaluate_sh_basis
 from gscompleter.stages.synthesize import GeneratedView
 from gscompleter.stages.target_view import TargetView
 from gscompleter.state import Completion
-from gscompleter.system.files.mapping import change_rows, select_rows
+from gscompleter.system.files.mapping import change_rows, release_pages, select_rows
 from gscompleter.system.threads import use_one_torch_thread
 from gscompleter.system.timing import timed_stage
 from gscompleter.trust import HeldViews
@@ -128,8 +128,7 @@ def fit_image_colors(
     )
 
     # Colours are given in each step, so that harmonics, most of the memory, are not copied.
-    black = context.means.new_zeros((1, 1, 3)).expand(len(context), 1, 3)
-    opened = replace(context, sh=black, encoded=None)[rows]
+    opened = context.drop_colors()[rows]
     wanted = torch.lerp(frozen.render.image, reference.image, weight[..., None])
     others = scenes.freeze((context.hide(is_open), *added), reference.camera)
     errors = others.vary_colors(opened)
@@ -195,6 +194,7 @@ def solve_directions(
     with use_one_torch_thread():
         for _ in map_chunks(solve, range(0, len(rows), CHUNK)):
             pass
+    release_pages(held.sums)
     return change, colors, gains
 
 

@@ -13,6 +13,7 @@ from jaxtyping import Float, Int, Int64
 from torch import Tensor
 
 from gscompleter.render.protocols import FrozenScene
+from gscompleter.system.files.mapping import join_rows
 from gscompleter.types import Camera
 
 
@@ -30,7 +31,7 @@ class HeldViews:
         """Hold one more view, with weight 1."""
         return HeldViews(
             torch.cat([self.centers, camera.center.to(self.centers)[None]]),
-            torch.cat([self.sums, sums[None]]),
+            join_rows([self.sums, sums[None]]),
             torch.cat([self.weights, self.weights.new_ones(1)]),
         )
 

@@ -29,6 +29,7 @@ from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.protocols import FrozenScene
 from gscompleter.render.view_map import get_view_map
 from gscompleter.render.viewpoint import to_float32
+from gscompleter.system.files.mapping import file_beside, release_pages
 from gscompleter.system.threads import use_one_torch_thread
 from gscompleter.trust import HeldViews, Trust
 from gscompleter.types import Camera, Gaussians, Render, View
@@ -108,13 +109,18 @@ class PhotometricTrust(Trust):
         rows = rows[is_observed]
         growth = growth[is_observed]
         measured = rows.cpu()
+        # Growth is of the lengths.
+        areas = seen.areas[:, measured] * growth.cpu() ** 2
         thinned = PhotoObservations(
             means=seen.means[rows],
             centers=seen.centers,
-            areas=seen.areas[:, measured] * growth.cpu() ** 2,  # growth is of the lengths
-            agreement=seen.agreement[:, measured],
+            areas=file_beside(areas, seen.areas),
+            agreement=file_beside(seen.agreement[:, measured], seen.agreement),
         )
-        held = replace(self.held, sums=self.held.sums[:, rows])
+        held_sums = self.held.sums
+        held = replace(self.held, sums=file_beside(held_sums[:, rows], held_sums))
+        for values in (seen.areas, seen.agreement, held_sums):
+            release_pages(values)
         return PhotometricTrust(thinned, self.is_recolored[rows], self.config, held)
 
 
@@ -142,6 +148,9 @@ def load_trust(
         ]
     )
     weights = sums.new_full((len(cameras),), config.recolor.hold_weight)
+    # For each photograph a number for each Gaussian: with a large scene that is much memory.
+    sums = file_beside(sums, parts[0].sh)
+    release_pages(observations.areas)
     held = HeldViews(observations.centers, sums, weights)
     is_recolored = torch.zeros(len(parts[0]), dtype=torch.bool, device=sums.device)
     return PhotometricTrust(observations, is_recolored, settings, held)
@@ -173,6 +182,9 @@ def gather_observations(
     for _ in get_view_map(rendered.means)(gather, range(len(views))):
         pass
     centers = torch.stack([view.camera.center for view in views])
+    # They are as large as the scene, and are read only when trust is computed.
+    areas = file_beside(areas, rendered.sh)
+    agreement = file_beside(agreement, rendered.sh)
     return PhotoObservations(rendered.means, centers, areas, agreement)
 
 
@@ -259,6 +271,8 @@ def compute_trust(
         np.float32(FULL_TRUST_FRACTION),
         values,
     )
+    release_pages(observations.areas)
+    release_pages(observations.agreement)
     return torch.from_numpy(values).to(sums)
 
 

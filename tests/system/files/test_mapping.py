@@ -129,7 +129,8 @@ def test_rows_are_selected_in_any_order_with_few_pages(tmp_path, count):
     rows = torch.randint(ROWS, (count,), generator=torch.Generator().manual_seed(0))
     selected = select_rows(mapped, rows)
     assert torch.equal(selected, values[rows])
-    assert not is_mapped(selected)
+    # A large selection would take as much memory as the file saves.
+    assert is_mapped(selected) == (2 * count >= ROWS)
     # The system reads some pages around each one.
     assert read_resident(mapped) < 0.2 * values.nbytes
 

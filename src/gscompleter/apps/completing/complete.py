@@ -279,7 +279,7 @@ def write_done(
 
     # After a removal, photographs must look as before where they do not show what was removed.
     # Without one this returns the completion as it is.
-    completion = restore_surroundings(completion, renderer)
+    completion = restore_surroundings(completion, ready.completer.scenes)
     completion = replace(completion, seconds=add_seconds(completion.seconds, ready.seconds))
 
     # Coverage is measured from cameras beside the photographs, not from the targets themselves.

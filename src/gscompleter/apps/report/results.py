@@ -36,6 +36,7 @@ from gscompleter.evaluation.metrics.coverage import (
 from gscompleter.evaluation.verdict.held_out import HeldOut, render_before_after
 from gscompleter.evaluation.verdict.judge import prepare_held_out
 from gscompleter.numerics.geometry import is_same_camera
+from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
 from gscompleter.splats.edits import EDITS, EditDraft
@@ -109,7 +110,7 @@ def prepare_judged(completion: Completion, unused_views: Sequence[View]) -> Judg
     renderer = load_renderer(completion.context.means.device.type)
     # After a removal, photographs must look as before where they do not show what was removed. What
     # `gsc.remove` returns is restored already, and is written as it is.
-    completion = restore_surroundings(completion, renderer)
+    completion = restore_surroundings(completion, SceneRenderer(renderer))
 
     targets = []
     others = list(held_out)

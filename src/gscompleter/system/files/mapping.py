@@ -48,6 +48,14 @@ def move_to_file(values: Tensor, beside: Path) -> Tensor:
     return _map_blocks([values], tuple(values.shape), values.dtype, beside)
 
 
+def file_beside(values: Tensor, mapped: Tensor) -> Tensor:
+    """Copy values to a temporary file beside that of others, if these are mapped.
+
+    Otherwise values are returned as they are. Raises OutputError as `move_to_file`.
+    """
+    return move_to_file(values, _find_folder(mapped)) if is_mapped(mapped) else values
+
+
 def file_array_beside(values: np.ndarray, mapped: Tensor) -> np.ndarray:
     """Copy values to a temporary file beside that of others, and return them mapped from there.
 
@@ -136,17 +144,30 @@ def _map_blocks(
 
 
 def select_rows(values: Tensor, rows: Int64[Tensor, "m"]) -> Tensor:
-    """Select rows; of a mapped file, pages are read in their order and released behind."""
+    """Select rows; of a mapped file, pages are read in their order and released behind.
+
+    At least half as many rows as a mapped file has go to another one beside the same folder. Raises
+    OutputError as `move_to_file`.
+    """
     if not is_mapped(values) or len(rows) == 0:
         # It copies rows as they are, in a quarter of the time of `values[rows]`.
         return values.index_select(0, rows)
+    if 2 * len(rows) >= len(values):
+        shape = (len(rows), *values.shape[1:])
+        return _map_blocks(_read_rows(values, rows), shape, values.dtype, _find_folder(values))
     selected = values.new_empty((len(rows), *values.shape[1:]))
     in_order, order = rows.sort()
-    blocks = zip(in_order.split(MAPPED_BLOCK), order.split(MAPPED_BLOCK), strict=True)
-    for part, places in blocks:
-        selected.index_copy_(0, places, values.index_select(0, part))
-        release_pages(values[part[0] : part[-1] + 1])
+    blocks = zip(_read_rows(values, in_order), order.split(MAPPED_BLOCK), strict=True)
+    for block, places in blocks:
+        selected.index_copy_(0, places, block)
     return selected
+
+
+def _read_rows(values: Tensor, rows: Int64[Tensor, "m"]) -> Iterator[Tensor]:
+    """Read rows of a mapped file block by block, and release their pages."""
+    for part in rows.split(MAPPED_BLOCK):
+        yield values.index_select(0, part)
+        release_pages(values[part.amin() : part.amax() + 1])
 
 
 def find_changed_rows(before: Tensor, after: Tensor) -> Bool[Tensor, "n"]:
