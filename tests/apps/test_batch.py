@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -28,8 +29,9 @@ from gscompleter.apps.commands.batch_rows import parse_batch_row
 from gscompleter.apps.report.page import render_batch_page
 from gscompleter.system.errors import FullDiskError, OutputError, WorkerError
 from gscompleter.system.files.writing import replace_file
+from gscompleter.system.jobs import engines
 from gscompleter.system.jobs import jobs as batch
-from gscompleter.system.jobs.engines import connect_to_ray, open_submitit
+from gscompleter.system.jobs.engines import connect_to_ray, open_ray, open_submitit
 from gscompleter.system.jobs.jobs import (
     Job,
     Pool,
@@ -632,6 +634,65 @@ def test_ray_that_does_not_answer_is_a_sentence(address, sentence, option, error
         connect_to_ray(Ray, address, 1)
     assert raised.value.argument == option
     assert signal.getsignal(signal.SIGTERM) == before
+
+
+@pytest.mark.parametrize(
+    ("threads", "gpus", "sentence"),
+    [(64, 0.0, "CPU cores .*: 2, too few .* 64"), (1, 0.5, "GPUs .*: 0, too few .* 0.5")],
+)
+def test_ray_refuses_workers_that_this_machine_cannot_hold(threads, gpus, sentence, monkeypatch):
+    """Its tasks would wait without end, and without a word."""
+    ended = []
+    task = SimpleNamespace(options=lambda **_: None)
+    ray = SimpleNamespace(
+        init=lambda **_: None,
+        remote=lambda _: task,
+        cluster_resources=lambda: {"CPU": 2.0},
+        shutdown=lambda: ended.append(True),
+    )
+    monkeypatch.setattr(engines, "import_engine", lambda *_: ray)
+    with pytest.raises(InputError, match=sentence) as raised, open_ray(None, threads, gpus):
+        pass
+    assert raised.value.argument == ("threads" if threads > 1 else "gpus")
+    assert ended == [True]
+    with open_ray(None, threads, gpus, "far:1") as pool:  # it may get further machines
+        assert pool.size == (1 if threads > 1 else 2)
+
+
+class RefusedError(RuntimeError):
+    """A job that SLURM did not take."""
+
+
+def stand_in_submitit(cluster: str) -> SimpleNamespace:
+    """Make a submitit whose SLURM takes no job."""
+
+    def submit(task):
+        raise RefusedError("sbatch: error: invalid partition specified: gpux")
+
+    executor = SimpleNamespace(
+        cluster=cluster, submit=submit, update_parameters=lambda **parameters: None
+    )
+    errors = SimpleNamespace(utils=SimpleNamespace(FailedJobError=RefusedError))
+    return SimpleNamespace(AutoExecutor=lambda folder: executor, core=errors)
+
+
+def test_a_job_that_slurm_refuses_is_a_sentence(tmp_path, monkeypatch):
+    monkeypatch.setattr(engines, "import_engine", lambda *_: stand_in_submitit("slurm"))
+    with (
+        open_submitit(1, 1, 0.0, tmp_path, {"partition": "gpux"}) as pool,
+        pytest.raises(InputError, match="SLURM took no job: .* invalid partition"),
+    ):
+        pool.start(lambda: None)
+
+
+def test_parameters_of_slurm_are_not_dropped_where_there_is_none(tmp_path, monkeypatch):
+    monkeypatch.setattr(engines, "import_engine", lambda *_: stand_in_submitit("local"))
+    with (
+        pytest.raises(InputError, match="SLURM, which this machine does not have") as raised,
+        open_submitit(1, 1, 0.0, tmp_path, {"partition": "gpu"}),
+    ):
+        pass
+    assert raised.value.argument == "slurm"
 
 
 def test_submitit_does_the_shares_and_a_lost_one_is_done_again(tmp_path, monkeypatch):

@@ -4,16 +4,19 @@ import json
 
 from command import run
 from gscompleter.apps.completing import demo
-from gscompleter.apps.completing.complete import complete_folder
+from gscompleter.apps.completing.complete import write_completion
 from gscompleter.system.files.image import read_image
 from gscompleter.system.files.unfinished import UNFINISHED_PREFIX
 
 
-def test_both_targets_are_completed_and_shown_before_and_after(tmp_path, monkeypatch):
+def test_both_targets_are_completed_and_shown_before_and_after(tmp_path, monkeypatch, capsys):
     height, width = 32, 48
     monkeypatch.setattr(demo, "DEMO_SIZE", (height, width))
     out = tmp_path / "demo"
-    assert run(monkeypatch, "demo", "--out", out, "--quiet") == 0
+    assert run(monkeypatch, "demo", "--out", out) == 0
+    printed = capsys.readouterr()
+    assert f"written to {out / 'completion'}" in " ".join(printed.err.split())
+    assert UNFINISHED_PREFIX not in printed.out + printed.err
     summary = json.loads((out / "completion" / "summary.json").read_text())
     assert len(summary["targets"]) == 2
     assert summary["gaussians"]["added"] > 0
@@ -27,13 +30,13 @@ def test_both_targets_are_completed_and_shown_before_and_after(tmp_path, monkeyp
 
 
 def test_a_demo_that_fails_says_so(tmp_path, monkeypatch, capsys):
-    def fail(request):
-        summary = complete_folder(request)
+    def fail(folder, ready):
+        summary = write_completion(folder, ready)
         summary["outcome"] |= {"status": "not-reconstructed", "headline": "There is no scene."}
-        (request.results.out / "summary.json").write_text(json.dumps(summary))
+        (folder / "summary.json").write_text(json.dumps(summary))
         return summary
 
     monkeypatch.setattr(demo, "DEMO_SIZE", (32, 48))
-    monkeypatch.setattr(demo, "complete_folder", fail)
+    monkeypatch.setattr(demo, "write_completion", fail)
     assert run(monkeypatch, "demo", "--out", tmp_path / "demo", "--quiet") == 1
     assert "There is no scene." in capsys.readouterr().err

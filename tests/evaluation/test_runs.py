@@ -35,6 +35,7 @@ from gscompleter.evaluation.methods import (
 )
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.evaluation.protocols import Task, make_case_task, read_evaluation_index
+from gscompleter.evaluation.run_facts import RunFacts
 from gscompleter.evaluation.runner import RowCounts, RunConfig, evaluate
 from gscompleter.evaluation.store import (
     get_step_path,
@@ -43,7 +44,12 @@ from gscompleter.evaluation.store import (
     load_values,
     read_run_file,
 )
-from gscompleter.evaluation.tables import summarize_run, write_tables
+from gscompleter.evaluation.tables import (
+    format_score_latex,
+    format_score_markdown,
+    summarize_run,
+    write_tables,
+)
 from gscompleter.system import memory
 from gscompleter.system.files.image import read_image
 from gscompleter.system.timing import STAGES
@@ -174,6 +180,22 @@ def test_geometry_of_few_pixels_is_left_out(finished):
     assert hole == (pytest.approx(0.3), 3)
     assert median == (0.2, 3)
     assert "at least 500 pixels" in " ".join(summary.notes)
+
+
+def test_tables_are_plain_latex_and_blame_no_package_for_what_was_not_to_measure():
+    facts = RunFacts("plane-sweep", "warp-inpaint", 0, 0, ())
+    scores = {"target_before": {"psnr": 20.0}, "target_after": {"psnr": 21.0}}
+    row = {"task": {"name": "a", "targets": [1]}, "method": "full", "error": None}
+    summary = summarize_run([{**row, "steps": [{"scores": scores}]}])
+    latex = format_score_latex(summary, facts)
+    assert latex.isascii()
+    assert r"min $\Delta$PSNR" in latex
+
+    # FLIP is installed here, and there is no hole.
+    markdown = format_score_markdown(summary, "not requested.", facts)
+    assert "FLIP: not available. It needs a hole" in markdown
+    failed = summarize_run([{**row, "error": "broken", "steps": []}])
+    assert "not available" not in format_score_markdown(failed, "not requested.", facts)
 
 
 # `test_steps.py` makes the rows of a sequence again.

@@ -2,7 +2,10 @@
 
 import ast
 import os
+import signal
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -94,6 +97,19 @@ def test_workers_import_nothing_of_the_working_folder_and_work_in_it(
         assert pool.start(check_is_here).result(timeout=120) is None
         assert pool.start(check_is_here).result(timeout=120) is None  # by the same process
     assert not strange.exists()
+
+
+def test_a_worker_that_was_killed_while_it_waited_is_replaced():
+    num_threads = threading.active_count()
+    with open_local(1) as pool:
+        first = pool.start(os.getpid).result(timeout=120)
+        os.kill(first, signal.SIGTERM)
+        # The threads of its executor end once it is found dead.
+        end = time.monotonic() + 60
+        while threading.active_count() > num_threads:
+            assert time.monotonic() < end
+            time.sleep(0.01)
+        assert pool.start(os.getpid).result(timeout=120) != first
 
 
 def check_is_here() -> None:

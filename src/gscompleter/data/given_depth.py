@@ -29,6 +29,7 @@ GAP_RATIO = 1.2
 
 def give_depth(view: View, frame: Frame, origin: Float[np.ndarray, "3"]) -> View:
     """Give a photograph its depth map or laser points, and the triangulated points beside them."""
+    # Tracks of this photograph alone: of the scene's points, surfaces may hide some from it.
     sparse = project_tracks(frame, view, origin)
     if view.depth is not None:
         sure = drop_unsure(view.depth, frame)

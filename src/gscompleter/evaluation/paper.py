@@ -128,6 +128,7 @@ def select_names(
     given: Iterable[str], known: Mapping[str, Requirements], generator: str
 ) -> dict[str, Requirements]:
     """Select tables or figures by name; `all` leaves out those that need another generator."""
+    # The oracle needs no model: it returns the photograph of the target.
     usable = (generator, "oracle", None)
     every = {name: spec for name, spec in known.items() if spec.generator in usable}
     chosen: dict[str, Requirements] = {}

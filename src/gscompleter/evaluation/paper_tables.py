@@ -309,7 +309,9 @@ def describe_missing(table: PaperTable) -> list[str]:
     """Name the columns without a value, with the reason if it is known."""
     absent = [key for key in table.spec.columns if not table.has_value(key)]
     names = ", ".join(BY_KEY[key].title for key in absent)
-    notes = [f"{ABSENT_NOTES[key]}\n" for key in absent if key in ABSENT_NOTES]
+    # Without any value no case was finished by all methods, which no package mends.
+    has_values = len(absent) < len(table.spec.columns)
+    notes = [f"{ABSENT_NOTES[key]}\n" for key in absent if has_values and key in ABSENT_NOTES]
     return [f"Without a value: {names}.\n", *notes] if absent else []
 
 
@@ -317,9 +319,5 @@ def format_paper_latex(table: PaperTable) -> str:
     """Format a table with booktabs."""
     cell = partial(format_paper_number, error=r"{{\tiny$\pm${}}}", difference=r"~{{\tiny({})}}")
     text = format_latex(*format_rows(table, cell))
-    # pdfLaTeX knows none of these characters.
-    signs = {"≈": r"$\approx$", "Ψ": r"$\Psi$", "Φ": r"$\Phi$", "Δ": r"$\Delta$"}
-    for sign, command in signs.items():
-        text = text.replace(sign, command)
     about = [table.spec.title, *describe_facts(table.facts)]
     return "\n".join([*(f"% {spell_greek(line)}" for line in about), text]) + "\n"

@@ -63,11 +63,22 @@ ABSENT_NOTES = {
         "again to add the column."
     ),
     "hole_flip": (
-        "FLIP: not installed. Run `pip install 'gscompleter[evaluation]'`; then score the run "
-        "again to add the columns."
+        "FLIP: not available. It needs a hole at some target, and "
+        "`pip install 'gscompleter[evaluation]'`; then score the run again to add the columns."
     ),
 }
-"""Reasons why the group of a column is absent."""
+"""Reasons why the group of a column is absent, where other columns have values."""
+LATEX_SIGNS = str.maketrans(
+    {
+        **{sign: f"\\{sign}" for sign in "_%&#"},
+        "–": "--",
+        "≈": r"$\approx$",
+        "Ψ": r"$\Psi$",
+        "Φ": r"$\Phi$",
+        "Δ": r"$\Delta$",
+    }
+)
+"""Replacements for signs that are commands of LaTeX, or that pdfLaTeX does not know."""
 
 
 @dataclass(frozen=True)
@@ -260,10 +271,12 @@ def format_markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def format_latex(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """Format a LaTeX table with booktabs."""
-    body = [" & ".join(row).replace("_", r"\_").replace("–", "--") + r" \\" for row in rows]
+    """Format a LaTeX table with booktabs; cells may hold commands."""
+    title, *body = (
+        " & ".join(cell.translate(LATEX_SIGNS) for cell in row) + r" \\" for row in (head, *rows)
+    )
     begin = rf"\begin{{tabular}}{{l{'r' * (len(head) - 1)}}}"
-    lines = [begin, r"\toprule", " & ".join(head) + r" \\", r"\midrule", *body]
+    lines = [begin, r"\toprule", title, r"\midrule", *body]
     return "\n".join([*lines, r"\bottomrule", r"\end{tabular}"])
 
 
@@ -293,7 +306,8 @@ def format_score_markdown(summary: RunSummary, fids: Fids, facts: RunFacts) -> s
         *(f"### {title}\n\n{table}" for title, table in tables.items()),
     ]
     parts += [f"{note}\n" for note in summary.notes]
-    parts += [f"{note}\n" for key, note in ABSENT_NOTES.items() if key not in present]
+    if present:  # else no case was finished by all methods, which no package mends
+        parts += [f"{note}\n" for key, note in ABSENT_NOTES.items() if key not in present]
     parts.append(format_fid_markdown(summary, fids))
     if summary.failures:
         # A bar in a message would end the cell.

@@ -14,7 +14,11 @@ from gscompleter.system.files import unfinished
 from gscompleter.system.files.output_file import reserve_file
 from gscompleter.system.files.output_folder import open_output_folder
 from gscompleter.system.files.unfinished import digest_target
-from gscompleter.system.files.writing import defer_interrupts, replace_file
+from gscompleter.system.files.writing import (
+    defer_interrupts,
+    get_download_folder,
+    replace_file,
+)
 
 
 def test_events_that_windows_lists_among_the_signals_are_not_asked_for(monkeypatch):
@@ -25,6 +29,22 @@ def test_events_that_windows_lists_among_the_signals_are_not_asked_for(monkeypat
             signal.raise_signal(signal.SIGINT)
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_is_not_lost_where_the_results_cannot_be_renamed():
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        with pytest.raises(KeyboardInterrupt, match="^$"), defer_interrupts("is complete"):
+            signal.raise_signal(signal.SIGINT)
+            raise OSError("no space")
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_a_user_without_a_home_folder_is_told_where_to_name_one(monkeypatch):
+    monkeypatch.setenv("GSCOMPLETER_HOME", "~nobody of this name/downloads")
+    with pytest.raises(InputError, match="no home folder .* GSCOMPLETER_HOME"):
+        get_download_folder()
 
 
 def test_a_file_written_in_place_of_another_keeps_it_until_the_end(tmp_path):

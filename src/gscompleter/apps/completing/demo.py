@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
-import json
+from dataclasses import replace
 from pathlib import Path
 
-from gscompleter.apps.completing.complete import answer_outcome, complete_folder
+from gscompleter.apps.completing.complete import (
+    answer_outcome,
+    describe_completion_plan,
+    prepare,
+    write_completion,
+)
 from gscompleter.apps.inputs.describing import print_lines
-from gscompleter.apps.report.page import write_completion_page
 from gscompleter.apps.report.pictures import IMAGES_FOLDER, join_images
+from gscompleter.apps.report.results import COMPLETE_COMMAND
 from gscompleter.apps.requests.completion import (
     CompletionRequest,
     ResultsRequest,
@@ -20,8 +25,9 @@ from gscompleter.apps.requests.scene import PhotographsRequest, PosesRequest, Sc
 from gscompleter.data.demo_scene import write_motorcycle_scene
 from gscompleter.system.console import make_console
 from gscompleter.system.files.image import read_image, write_image
-from gscompleter.system.files.output_folder import reserve_output
+from gscompleter.system.files.output_folder import open_output_folder, reserve_output
 from gscompleter.system.files.writing import SUMMARY_FILE, TARGETS_FILE
+from gscompleter.system.progress import show_progress
 
 BEFORE_AFTER_FILE = "before_after.png"
 DEMO_SIZE = (250, 370)
@@ -31,17 +37,20 @@ DEMO_FILES = ("scene/**/*", "completion/**/*", BEFORE_AFTER_FILE, SUMMARY_FILE)
 """Globs of the files that the command may write."""
 
 
-def name_scene(completion: Path, scene: Path) -> None:
-    """Name the scene in the summary and the report of its completion by where it will lie.
-
-    It was completed in the temporary folder that becomes OUT at the end.
-    """
-    summary = completion / SUMMARY_FILE
-    content = json.loads(summary.read_bytes())
-    content["settings"] |= {"folder": str(scene), "target": [str(scene / TARGETS_FILE)]}
-    summary.write_bytes(json.dumps(content, indent=2).encode() + b"\n")
-    # The page is made of the summary.
-    write_completion_page(completion)
+def make_request(folder: Path, models: ModelRequest, results: ResultsRequest) -> CompletionRequest:
+    """Make the request for the completion in `folder` of the scene in it."""
+    # The scene has cameras, so that none are searched for.
+    source = PhotographsRequest(
+        scene=SceneRequest(folder / "scene", resolution=DEMO_SIZE),
+        poses=PosesRequest(folder / "completion"),
+        context=(0, 1),
+    )
+    return CompletionRequest(
+        source=source,
+        work=WorkRequest(models=models),
+        targets=TargetRequest((str(folder / "scene" / TARGETS_FILE),)),
+        results=ResultsRequest(out=folder / "completion", answer=results.answer),
+    )
 
 
 def complete_demo(models: ModelRequest, results: ResultsRequest) -> int:
@@ -51,39 +60,39 @@ def complete_demo(models: ModelRequest, results: ResultsRequest) -> int:
     """
     answer = results.answer
     out = results.out
+    console = make_console(stderr=True, quiet=answer.quiet)
     with (
+        show_progress(console),
         reserve_output(out, results.overwrite, DEMO_COMMAND, DEMO_FILES) as output,
         output.write() as folder,
     ):
-        print_lines(make_console(stderr=True, quiet=answer.quiet), *output.describe_others())
-        scene = folder / "scene"
-        write_motorcycle_scene(scene)
-        completion = folder / "completion"
-        # The scene has cameras, so that none are searched for.
-        source = PhotographsRequest(
-            scene=SceneRequest(scene, resolution=DEMO_SIZE),
-            poses=PosesRequest(completion),
-            context=(0, 1),
+        print_lines(console, *output.describe_others())
+        write_motorcycle_scene(folder / "scene")
+        ready = prepare(make_request(folder, models, results), console)
+        # `folder` is temporary and becomes OUT at the end: what is printed and written names OUT.
+        # Photographs that are still to be read keep their present paths.
+        lasting = make_request(out, models, results)
+        ready = replace(
+            ready,
+            source=lasting.source,
+            targets=lasting.targets,
+            results=lasting.results,
+            opened=replace(
+                ready.opened, request=replace(ready.opened.request, folder=out / "scene")
+            ),
         )
-        complete_folder(
-            CompletionRequest(
-                source=source,
-                work=WorkRequest(models=models),
-                targets=TargetRequest((str(scene / TARGETS_FILE),)),
-                results=ResultsRequest(out=completion, answer=answer),
-            )
-        )
-        name_scene(completion, out / "scene")
+        print_lines(console, *describe_completion_plan(ready))
+        with open_output_folder(folder / "completion", command=COMPLETE_COMMAND) as completion:
+            write_completion(completion, ready)
 
         # One row of four images: before and after at the first target, then at the second.
-        images = completion / IMAGES_FOLDER
+        images = folder / "completion" / IMAGES_FOLDER
         names = [f"target{number}_{when}" for number in (1, 2) for when in ("before", "after")]
         picture = join_images([read_image(images / f"{name}.png") for name in names])
         write_image(folder / BEFORE_AFTER_FILE, picture)
 
     # `output.write` has moved the results from its temporary folder to OUT by now.
-    moved = ResultsRequest(out=out / "completion", answer=answer)
-    code = answer_outcome(moved, {"before_after": str(out / BEFORE_AFTER_FILE)})
+    code = answer_outcome(lasting.results, {"before_after": str(out / BEFORE_AFTER_FILE)})
     if not answer.quiet and not answer.json:
         print(f"Before and after, beyond either camera: {out / BEFORE_AFTER_FILE}")
     return code

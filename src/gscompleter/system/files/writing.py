@@ -15,7 +15,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from gscompleter.system.errors import FullDiskError, OutputError, quote_value
+from gscompleter.system.errors import FullDiskError, InputError, OutputError, quote_value
 from gscompleter.system.files.renaming import replace
 from gscompleter.system.files.unfinished import give_signs, make_unfinished_name
 
@@ -160,7 +160,10 @@ def handle_stop_signals() -> None:
 
 @contextmanager
 def defer_interrupts(state: str) -> Iterator[None]:
-    """Defer KeyboardInterrupt, with the message `state`, to the end of a block."""
+    """Defer KeyboardInterrupt to the end of a block.
+
+    It has the message `state`; none if the block failed, whose error it then replaces.
+    """
     came: list[int] = []
     handled = []
     if threading.current_thread() is threading.main_thread():
@@ -168,15 +171,28 @@ def defer_interrupts(state: str) -> Iterator[None]:
         handled = [n for n in numbers if signal.getsignal(n) is signal.default_int_handler]
     for number in handled:
         signal.signal(number, lambda number, _: came.append(number))
+    is_done = False
     try:
         yield
+        is_done = True
     finally:
         for number in handled:
             signal.signal(number, signal.default_int_handler)
-    if came:
-        raise KeyboardInterrupt(state)
+        # After a failure, too: who handles that would go on, though the process was told to end.
+        if came:
+            raise KeyboardInterrupt(*([state] if is_done else []))
 
 
 def get_download_folder() -> Path:
-    """Return $GSCOMPLETER_HOME, or else ~/.cache/gscompleter."""
-    return Path(os.environ.get("GSCOMPLETER_HOME") or "~/.cache/gscompleter").expanduser()
+    """Return $GSCOMPLETER_HOME, or else ~/.cache/gscompleter.
+
+    Raise InputError if a `~` leads nowhere, as for a user without a home folder in a container.
+    """
+    named = os.environ.get("GSCOMPLETER_HOME") or "~/.cache/gscompleter"
+    try:
+        return Path(named).expanduser()
+    except RuntimeError as error:
+        raise InputError(
+            f"There is no home folder for {quote_value(named)}; name a folder for downloads by "
+            "the environment variable GSCOMPLETER_HOME."
+        ) from error

@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from concurrent.futures import Future, ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -83,9 +84,11 @@ def open_local(workers: int) -> Iterator[Pool]:
             for executor, future in futures.items()
             if future.done() and future.exception() is None
         ]
-        if idle:
-            futures[idle[0]] = idle[0].submit(share)
-            return futures[idle[0]]
+        for executor in idle:
+            # Its process may have been killed since it ended its share.
+            with contextlib.suppress(BrokenProcessPool):
+                futures[executor] = executor.submit(share)
+                return futures[executor]
         begin = partial(begin_worker, os.getcwd())
         with hide_working_folder():
             executor = ProcessPoolExecutor(1, spawn, begin)
@@ -159,7 +162,11 @@ def open_ray(
         return started[-1].future()
 
     try:
-        cores = int(ray.cluster_resources().get("CPU", 1) // threads)
+        resources = ray.cluster_resources()
+        # A cluster elsewhere may get further machines when a task waits for them.
+        if address is None:
+            check_resources(resources, threads, gpus)
+        cores = int(resources.get("CPU", 1) // threads)
         yield Pool(workers or max(1, cores), start)
         # All is done, and nothing is left to cancel. Only an exception skips this line.
         started.clear()
@@ -198,6 +205,24 @@ def connect_to_ray(ray: Any, address: str | None, cores: int | None) -> None:
             signal.signal(number, handler)
 
 
+def check_resources(resources: Mapping[str, float], threads: int, gpus: float) -> None:
+    """Raise InputError if this machine cannot run one task of Ray, which would wait without end.
+
+    `resources` are those of a cluster that was started here.
+    """
+    for name, title, needed, option in (
+        ("CPU", "CPU cores", threads, "threads"),
+        ("GPU", "GPUs", gpus, "gpus"),
+    ):
+        available = resources.get(name, 0)
+        if needed > available:
+            raise InputError(
+                f"{title} that Ray finds on this machine: {available:g}, too few for a worker with "
+                f"{needed:g}; ask for fewer.",
+                option,
+            )
+
+
 def run_task(share: WorkerShare, threads: int, folder: str) -> Exception | None:
     """Run a share in a Ray task or a SLURM job, on `threads` threads, in a working folder."""
     with contextlib.suppress(OSError):  # a machine elsewhere may not have it
@@ -212,9 +237,13 @@ def open_submitit(
 ) -> Iterator[Pool]:
     """Open a pool of SLURM jobs, or of local processes without SLURM.
 
+    Each worker gets one share of all that is to be run, since a job of SLURM waits in a queue.
     `threads` and `gpus` are those of one job. `folder` is for files and output of the jobs;
-    `parameters` are further ones of SLURM, such as `partition` and `time`. Raise InputError for a
-    fraction of a GPU, which SLURM cannot give.
+    `parameters` are further ones of SLURM, such as `partition` and `time`.
+
+    Raises:
+        InputError: SLURM cannot give a fraction of a GPU, there is no SLURM to follow the
+            parameters, or it refuses them or a job.
     """
     if gpus != int(gpus):
         raise InputError(
@@ -225,7 +254,13 @@ def open_submitit(
     executor = submitit.AutoExecutor(folder=str(folder))
     further: dict[str, Any] = {f"slurm_{name}": value for name, value in parameters.items()}
     if executor.cluster == "local":
-        # Local processes take none of the parameters of SLURM. Their limit of time is one day.
+        if parameters:
+            raise InputError(
+                "These are parameters of SLURM, which this machine does not have (no srun); run "
+                "the command where it is, or leave them out to use processes of this machine.",
+                "slurm",
+            )
+        # The limit of time of local processes is one day.
         further = {"timeout_min": 24 * 60}
     resources = {"cpus_per_task": threads, "gpus_per_node": int(gpus), "name": "gscompleter"}
     try:
@@ -238,8 +273,13 @@ def open_submitit(
 
     def start(share: WorkerShare) -> Any:
         task = partial(run_task, share, threads, os.getcwd())
-        with hide_working_folder():
-            started.append(executor.submit(task))
+        try:
+            with hide_working_folder():
+                started.append(executor.submit(task))
+        except (submitit.core.utils.FailedJobError, FileNotFoundError) as error:
+            raise InputError(
+                f"SLURM took no job: {quote_value(str(error))}; mend what it names, or try again."
+            ) from error
         return started[-1]
 
     try:
