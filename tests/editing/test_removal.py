@@ -10,6 +10,7 @@ import torch
 from copies import watch_copies
 from gscompleter import GSCompleter
 from gscompleter.config import CompleterConfig
+from gscompleter.editing import removal
 from gscompleter.editing.cutting import cut
 from gscompleter.editing.removal import (
     MAX_LAYERS,
@@ -26,10 +27,12 @@ from gscompleter.guards.free_space import Observed, ignore_removed, is_before_su
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.parts import NOT_INVENTED
 from gscompleter.planning.remove import contain_nothing
+from gscompleter.render.fit_colors import fit_colors
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.removed import find_removed
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError
+from gscompleter.system.files.mapping import is_mapped, move_to_file
 from gscompleter.trust.photometric import PhotoObservations, gather_observations, load_trust
 from gscompleter.types import Gaussians, make_observed, merge, sh_from_rgb
 from scenes import Room, camera_at, gaussians_of, view_of
@@ -169,6 +172,32 @@ def test_what_photographs_need_elsewhere_returns(begun):
     assert not further.is_restored
     assert not again.is_restored
     assert len(again.trust_elsewhere.observations.means) == len(trust.observations.means)
+
+
+@pytest.mark.linux
+def test_what_is_as_large_as_a_scene_in_a_file_lies_in_files(begun, tmp_path, monkeypatch):
+    """Frozen views, and what is left: three gigabytes of four million Gaussians."""
+    seen = []
+
+    def watch(added, context, images, gains):
+        seen.extend(context)
+        return fit_colors(added, context, images, gains)
+
+    monkeypatch.setattr(removal, "fit_colors", watch)
+    plain = begun.context
+    results = []
+    for scene in (plain, replace(plain, sh=move_to_file(plain.sh, tmp_path))):
+        completer = GSCompleter(config=CompleterConfig.splat().for_removal())
+        state = completer.begin([photo.view for photo in begun.photos], scene, [])
+        state = remove_gaussians(state, choose_surface(begun), is_crate, completer.scenes)
+        results.append((state, restore_surroundings(state, completer.scenes)))
+    (kept, expected), (state, restored) = results
+    assert all(is_mapped(view.layer.splats.base) for view in seen[len(seen) // 2 :])
+    assert not any(isinstance(view.layer.splats.base, torch.Tensor) for view in seen[:1])
+    for each, other in ((state, kept), (restored, expected)):
+        assert is_mapped(each.rendered_context.sh)
+        assert torch.equal(each.scene.sh, other.scene.sh)
+        assert torch.equal(each.scene.opacities, other.scene.opacities)
 
 
 def test_what_shows_in_the_hole_alone_does_not_return(removed):

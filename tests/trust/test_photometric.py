@@ -20,6 +20,7 @@ from gscompleter.config import (
 )
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.numerics.geometry import is_inside, project
+from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.lod import MIN_PROXY_GAUSSIANS
 from gscompleter.splats.morton import argsort_nearby
@@ -31,6 +32,7 @@ from gscompleter.trust import Trust
 from gscompleter.trust.photometric import (
     compute_trust,
     gather_observations,
+    load_trust,
     sum_weights,
 )
 from gscompleter.types import merge, sh_from_rgb
@@ -94,6 +96,32 @@ def test_surfaces_are_supported_and_shreds_are_not():
     assert found[drawn & ~ARE_SHREDS].median() > 0.8
     # A few overlap the border of a photograph.
     assert found[drawn & ARE_SHREDS].quantile(0.9) < 0.1
+
+
+@pytest.mark.linux
+def test_trust_in_a_scene_in_a_file_lies_in_files(tmp_path):
+    """It has three numbers for each Gaussian in each photograph."""
+    mapped = replace(SCENE, sh=move_to_file(SCENE.sh, tmp_path))
+    scenes = SceneRenderer(RENDERER)
+    config = CompleterConfig.splat()
+    plain, filed = (load_trust(config, (scene,), VIEWS, scenes) for scene in (SCENE, mapped))
+    rows = torch.arange(0, len(SCENE), 2)
+    growth = torch.full((len(rows),), 1.5)
+    further = [trust.accept(AT_TARGET, TARGET, rows) for trust in (plain, filed)]
+    for ours, truth in (
+        (filed, plain),
+        (filed.thin(rows, growth), plain.thin(rows, growth)),
+        (further[1], further[0]),
+    ):
+        assert is_mapped(ours.held.sums)
+        assert torch.equal(ours.held.sums, truth.held.sums)
+        for name in ("areas", "agreement"):
+            values = getattr(ours.observations, name)
+            assert is_mapped(values), name
+            assert torch.equal(values, getattr(truth.observations, name)), name
+    assert torch.equal(
+        filed.compute_alpha(AT_TARGET, TARGET), plain.compute_alpha(AT_TARGET, TARGET)
+    )
 
 
 @pytest.mark.parametrize("exposure", [0.8, 1.25])
