@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from dataclasses import replace
 
 import pytest
@@ -136,6 +137,8 @@ def test_a_scene_is_completed_with_its_help(tmp_path, monkeypatch, capsys):
     words += ("--depth", "moge-2", "--depth-weights", save(tmp_path / "model.onnx"))
     assert run(monkeypatch, *words) == 0
     assert len(load_ply(tmp_path / "out" / "completed.ply")) > 0
+    settings = json.loads((tmp_path / "out" / "summary.json").read_text())["settings"]
+    assert settings["depth_weights"] == str(tmp_path / "model.onnx")
     words += ("--overwrite", "--reconstructor", "mapanything")
     assert run(monkeypatch, *words) == 2
 

@@ -504,6 +504,7 @@ def describe_settings(ready: Prepared) -> dict[str, Any]:
         "reconstructor": models.reconstructor,
         "weights": None if models.weights is None else str(models.weights),
         "depth": models.depth,
+        "depth_weights": None if models.depth_weights is None else str(models.depth_weights),
         "network_device": models.network_device,
         **models.describe_generator(),
         "geometry": None if ready.work.geometry is None else str(ready.work.geometry),
