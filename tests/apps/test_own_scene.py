@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import torch
 
 from command import run
 from gscompleter import load_ply, save_ply
