@@ -13,7 +13,7 @@ from gscompleter.system.files.display import Displayed
 from gscompleter.types import Camera, DepthAffine, Gaussians, Render, View
 
 MANY_TIMES = 4
-"""Gaussians outside of the image of a target, against those in it, from which on they are many."""
+"""Gaussians outside of the image of a target, against those in it, beyond which they are many."""
 AFFINE_NOTES = {
     "ransac": "",
     "median": "RANSAC finds no reliable depth correction; the median depth ratio replaces it.",
@@ -75,8 +75,8 @@ class GeometryUse:
     share: float = 0.0
     """Share of the pixels of the hole, at the padded target, whose depth it gives."""
     contradicted: float = 0.0
-    """Share of these pixels at which it has a depth that is not used, because it disagrees with
-    what the scene shows around."""
+    """Share of the pixels of the hole at which it has a depth that is not used, because it
+    disagrees with what the scene shows around."""
     added: int = 0
     """Number of added Gaussians that stand where it says."""
 
@@ -188,7 +188,8 @@ class TargetResult(Displayed):
         found = []
         if self.rejection.guard:
             # A guard without a reason of its own rejected the image for what Φ says of it.
-            found += [self.rejection.reason or " ".join(self.synthesis_notes), NOTHING_ADDED]
+            reasons = (self.rejection.reason,) if self.rejection.reason else self.synthesis_notes
+            found += [*reasons, NOTHING_ADDED]
         if self.unfilled.share >= self.unfilled.LARGE_SHARE:
             found.append(self.unfilled.describe())
         return tuple(filter(None, found))

@@ -5,6 +5,7 @@ import json
 import multiprocessing
 import os
 import re
+import shlex
 import signal
 import subprocess
 import sys
@@ -376,6 +377,71 @@ def test_options_have_one_name_in_both_spellings(tmp_path):
         read_manifest(manifest, {})
 
 
+def test_nested_settings_add_to_those_of_all_rows(tmp_path):
+    manifest = tmp_path / "m.jsonl"
+    manifest.write_text('{"folder": "room", "config": {"holes": {"dilation": 5}}}')
+    (job,) = read_manifest(manifest, {"config": "paper", "config.holes.dilation": "3"})
+    options = parse_batch_row(job.options, tmp_path / "out")
+    assert options.config.name == "paper"
+    assert options.config.changes == {"holes": {"dilation": 5}}
+    row = {"folder": "room", "config": {"margin": 0.1}, "config.margin": 0.2}
+    manifest.write_text(json.dumps(row))
+    with pytest.raises(InputError, match=r"config\.margin in two spellings"):
+        read_manifest(manifest, {})
+    manifest.write_text('{"folder": "room", "config": {"holes": {"candidate_radius": null}}}')
+    with pytest.raises(InputError, match=r"null at config\.holes\.candidate_radius"):
+        read_manifest(manifest, {})
+
+
+@pytest.mark.parametrize("ending", ["jsonl", "csv"])
+@pytest.mark.parametrize(
+    ("column", "words", "paths"),
+    [
+        ("target", ["one.json", "4"], [0]),
+        ("target", ["two cameras.json"], [0]),
+        ("target", ["photo.jpg", "5"], []),
+        ("config.guards", ["psnr", "own.py:Guard"], [1]),
+    ],
+)
+def test_each_of_several_words_that_is_a_file_lies_beside_the_manifest(
+    column, words, paths, ending, tmp_path
+):
+    for name in ("one.json", "two cameras.json", "photo.jpg", "own.py"):
+        (tmp_path / name).touch()
+    manifest = tmp_path / f"m.{ending}"
+    if ending == "csv":
+        manifest.write_text(f"folder,{column}\nroom,{shlex.join(words)}\n")
+    else:
+        manifest.write_text(json.dumps({"folder": "room", column: words}))
+    (job,) = read_manifest(manifest, {})
+    expected = [str(tmp_path / w) if n in paths else w for n, w in enumerate(words)]
+    assert job.options[column] == expected
+
+
+def test_nothing_of_a_manifest_is_lost(tmp_path):
+    """Spaces after commas, empty cells beyond the header, and line breaks of Unicode in JSON."""
+    (tmp_path / "m.CSV").write_text("folder, target ,\nroom, 4 ,,,\n")
+    (job,) = read_manifest(tmp_path / "m.CSV", {})
+    assert job.options == {"folder": str(tmp_path / "room"), "target": ["4"]}
+    row = {"folder": "a\u2028room", "name": None}
+    (tmp_path / "m.jsonl").write_text(json.dumps(row, ensure_ascii=False), encoding="utf-8")
+    (job,) = read_manifest(tmp_path / "m.jsonl", {})
+    assert job == Job("a-room", {"folder": str(tmp_path / "a\u2028room")})
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "sentence"),
+    [
+        ("m.csv", "folder,seed,seed\nroom,1,2\n", "it has the column seed twice"),
+        ("m.jsonl", '\n{"folder": "room", "seed": 1, "seed": 2}', "line 2 has seed twice"),
+    ],
+)
+def test_an_option_that_is_there_twice_is_refused(name, text, sentence, tmp_path):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=sentence):
+        read_manifest(tmp_path / name, {})
+
+
 def test_a_cell_names_a_mask_for_each_target(tmp_path):
     (tmp_path / "one mask.png").touch()
     manifest = tmp_path / "m.csv"
@@ -444,7 +510,7 @@ def test_rows_of_one_scene_need_names(tmp_path):
         ({"folder": None}, "no folder"),
         ({"help": True}, "all rows of a batch are alike"),
         ({"target": "it's.jpg"}, "target is 'it's.jpg', which has an unmatched"),
-        ({"config": {"ego_mask": "perhaps"}}, "config.ego-mask is perhaps"),
+        ({"config.ego_mask": "perhaps"}, "config.ego-mask is perhaps"),
     ],
 )
 def test_a_wrong_row_is_a_sentence(row, sentence, tmp_path):

@@ -125,6 +125,24 @@ def test_lama_gets_colours_and_a_mask_of_the_hole(lama_file):
     assert (filled - expected)[inner, inner].abs().max() < 1e-5 * expected.abs().max()
 
 
+@pytest.mark.parametrize("side", ["left", "right", "top", "bottom"])
+def test_each_window_continues_what_is_known_whatever_side_that_is_on(side):
+    hole = torch.ones(512, 1600, dtype=torch.bool)
+    hole[:, :100] = False
+    hole = {"left": hole, "right": hole.flip(1), "top": hole.T, "bottom": hole.T.flip(0)}[side]
+    shares = []
+
+    def fill(image, unfilled):
+        shares.append(unfilled.float().mean().item())
+        return torch.ones_like(image)
+
+    filled = fill_windows(torch.zeros(*hole.shape, 3), hole, fill)
+    assert max(shares) < 1
+    assert torch.equal(filled[..., 0] > 0, hole)
+    # Where nothing is known at all, windows are filled all the same.
+    assert fill_windows(torch.zeros(*hole.shape, 3), torch.ones_like(hole), fill).all()
+
+
 def test_windows_cover_the_image_and_overlap_by_half():
     for height, width in ((100, 300), (512, 513), (1200, 700)):
         count = torch.zeros(height, width)

@@ -68,6 +68,16 @@ def test_files_near_zero_and_of_floats_stay_as_they_are(tmp_path):
     assert load_splat(tmp_path / "large.ply").origin is None
 
 
+def test_tiny_gaussians_near_zero_have_no_origin(tmp_path):
+    """Their positions are rounded, and nothing that could be taken off helps."""
+    gaussians = small_gaussians()
+    tiny = replace(gaussians, means=0.05 * gaussians.means, scales=1e-6 * gaussians.scales)
+    write_map_ply(tmp_path / "tiny.ply", tiny, np.zeros(3))
+    assert load_splat(tmp_path / "tiny.ply").origin is None
+    assert describe_oddities(tmp_path / "tiny.ply") == []
+    assert convert_splat(tmp_path / "tiny.ply", tmp_path / "tiny.spz").notes == ()
+
+
 def test_of_a_large_file_a_sample_tells(tmp_path, monkeypatch):
     means = write_map_ply(tmp_path / "map.ply", small_gaussians())
     whole = load_splat(tmp_path / "map.ply")

@@ -16,7 +16,7 @@ from gscompleter.numerics.image_ops import find_largest_regions
 from gscompleter.stages.additions import Step
 from gscompleter.stages.find_unfilled import find_unfilled
 from gscompleter.state import Completion
-from gscompleter.target_result import Unfilled
+from gscompleter.target_result import NOTHING_ADDED, Rejection, Unfilled
 from scenes import Room, camera_at, view_of
 
 SIZE = 48
@@ -116,6 +116,18 @@ def test_what_stays_empty_is_a_sentence_for_people_and_a_warning_only_if_it_is_m
     assert replace(done, unfilled=few).warnings == ()
     many = replace(few, share=0.3)
     assert replace(done, unfilled=many).warnings == (many.describe(),)
+
+
+def test_warnings_are_some_of_the_notes():
+    """The page lists the others beside them, so that each is there once."""
+    (done,) = complete().targets
+    said = ("Photographs contradict the image.", "Their exposures differ.")
+    agreement = Rejection("image-agreement")
+    rejected = replace(done, synthesis_notes=said, rejection=agreement, unfilled=Unfilled())
+    assert rejected.warnings == (*said, NOTHING_ADDED)
+    assert set(rejected.warnings) <= set(rejected.notes)
+    why = replace(rejected, rejection=Rejection("mine", "It is upside down."))
+    assert why.warnings == ("It is upside down.", NOTHING_ADDED)
 
 
 def test_regions_are_the_largest_first_and_count_from_the_corner_of_the_target():

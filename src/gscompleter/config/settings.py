@@ -57,7 +57,8 @@ def validate(settings: S, prefix: str = "") -> S:
 def apply_changes(settings: S, changes: Mapping[str, Any], where: str = "", prefix: str = "") -> S:
     """Apply nested changes, and validate the result as `validate` does.
 
-    The sentence of an InputError begins with `where`, the place that the changes are from.
+    The sentence of an InputError begins with `where`, the place that the changes are from; that of
+    a group of settings that contradict each other is its own.
     """
     from pydantic import TypeAdapter
 

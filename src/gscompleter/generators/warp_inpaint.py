@@ -83,6 +83,8 @@ class WarpInpaint:
         """
         render = context.target_render
         trusted_alpha = context.trusted_alpha
+        # Under full trust it is the alpha of the render itself. Where only some of the holes are
+        # filled it never is: what is covered is smooth there, too (0.03 dB or less in a room).
         if trusted_alpha is None or trusted_alpha is render.alpha:
             return self.fill_holes(nearest, target, context)
         smooth = average_trusted(render, trusted_alpha / render.alpha.clamp_min(1e-6))
@@ -132,7 +134,7 @@ class WarpInpaint:
         )
 
         # Patches add what is finer than the tone, and keep the tone itself (decision 033). Deep in
-        # a hole they fade.
+        # a hole they fade, and beyond `reach` and in cracks the tone counts as known to them.
         patched = fill_by_patches(tone, ~undecided, warped.depth.log(), sources, self.seed)
         detail = patched - tone
         detail = detail - smooth_masked(detail, undecided, TONE_RADIUS)
@@ -230,6 +232,7 @@ def fill_by_patches(
     filled = image
     field = None
     for number, level in reversed(list(enumerate(levels))):
+        # From 0 on the finest level to 1 on the coarsest; a single level counts as the finest.
         coarseness = number / max(len(levels) - 1, 1)
         rounds = MIN_VOTE_ROUNDS + round((MAX_VOTE_ROUNDS - MIN_VOTE_ROUNDS) * coarseness)
         # All patches that overlap the hole. The finest level, which has the most, takes every

@@ -19,6 +19,7 @@ from numpy import ndarray
 from gscompleter.types import Gaussians, Origin
 
 LEAST_DIGITS = 4
+"""Fewest digits of a coordinate in a sentence."""
 MOST_DIGITS = 15
 """Digits that float64 holds."""
 MAX_POSITION_STEP = 0.01
@@ -57,11 +58,15 @@ def is_too_far(middle: Float[ndarray, "3"], size: float) -> bool:
 
 
 def choose_origin(middle: Float[ndarray, "3"], size: float) -> Origin | None:
-    """Choose the origin for positions near `middle`, in whole units; None for zero."""
+    """Choose the origin for positions near `middle`, in whole scene units; None for zero.
+
+    `size` is that of the median Gaussian. None where float32 serves as well: positions are exact
+    enough, or so near zero that no whole unit can be taken off.
+    """
     if not is_too_far(middle, size):
         return None
     x, y, z = middle.round().tolist()
-    return (x, y, z)
+    return (x, y, z) if any((x, y, z)) else None
 
 
 def measure_size(gaussians: Gaussians) -> float:
@@ -72,7 +77,10 @@ def measure_size(gaussians: Gaussians) -> float:
 
 
 def measure_distance(gaussians: Gaussians, others: Gaussians) -> float:
-    """Measure the largest distance of Gaussians from others in their order, in scene units."""
+    """Measure the largest distance of Gaussians from others in their order, in scene units.
+
+    Either may have an origin; they are compared in the coordinates of their files.
+    """
     places = [
         scene.means.double().cpu() + torch.tensor(scene.origin or (0, 0, 0), dtype=torch.float64)
         for scene in (gaussians, others)

@@ -1,7 +1,8 @@
 """Manifests of a batch: a CSV file, JSON lines, or a folder of scenes.
 
 A row has the options of `complete` and, optionally, a `name`; the default is the name of the scene
-folder. Empty CSV cells are ignored. Paths are relative to the manifest.
+folder. Empty CSV cells are ignored. Paths are relative to the manifest. JSON may nest options, as
+in {"config": {"holes": {"dilation": 3}}}, where CSV has a column `config.holes.dilation`.
 """
 
 from __future__ import annotations
@@ -13,11 +14,12 @@ import os
 import re
 import shlex
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from gscompleter.data.file_names import PHOTOGRAPH_ENDINGS
 from gscompleter.system.damage import DamagedError, describe_damage
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.names import fold_name, make_valid_name
@@ -43,6 +45,8 @@ PATH_COLUMNS = (
 """Options that are always a path."""
 PROGRAM_COLUMNS = ("reconstructor", "depth", "generator")
 """Options that may name a function in a file of Python, as in `my_models.py:predict_depth`."""
+GUARDS_COLUMN = "config.guards"
+"""Option with several words, each of which may name a class in a file of Python."""
 MARKERS = ("batch.json", "run.json")
 """Files that mark the output folders of `batch` and `evaluate`."""
 COMPLETING = ("complete", "clean", "demo")
@@ -85,17 +89,39 @@ def read_manifest(manifest: Path, common: Mapping[str, Any], out: Path | None = 
 
 
 def unify_names(row: Mapping[str, Any]) -> OptionValues:
-    """Name options as in `depth_weights`, which may also be written as in `depth-weights`.
+    """Name options as in `config.holes.max_alpha`, so that each of them is told by its name.
 
-    Raise InputError if a row has both, of which only one would count.
+    They may also be nested, or written as in `max-alpha`. Raise InputError if a row has two
+    spellings of one, of which only one would count.
     """
-    counts = Counter(key.replace("-", "_") for key in row)
-    for name, count in counts.items():
-        if count > 1:
+    pairs = [(key.replace("-", "_"), value) for key, value in flatten_row(row)]
+    if (name := find_repeated_name(name for name, _ in pairs)) is not None:
+        raise InputError(
+            f"A row has {quote_value(name)} in two spellings, such as with - and with _, or nested "
+            "and with dots; give it once."
+        )
+    return dict(pairs)
+
+
+def flatten_row(row: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Flatten nested options, as `{"holes": {"dilation": 3}}` to `holes.dilation`."""
+    for key, value in row.items():
+        name = f"{prefix}{key}"
+        if isinstance(value, Mapping):
+            yield from flatten_row(value, f"{name}.")
+        # Null leaves a column out. Nested it is the value None, which a command line cannot give.
+        elif prefix and value is None:
             raise InputError(
-                f"A row has {quote_value(name)} in two spellings, with - and with _; give it once."
+                f"A row has null at {quote_value(name)}, which only a YAML file can set; leave it "
+                f"out, or name such a file at {quote_value(prefix.partition('.')[0])}."
             )
-    return {key.replace("-", "_"): value for key, value in row.items()}
+        else:
+            yield name, value
+
+
+def find_repeated_name(names: Iterable[str]) -> str | None:
+    """Find the first name that is there twice; None if there is none."""
+    return next((name for name, count in Counter(names).items() if count > 1), None)
 
 
 def resolve_paths(row: Mapping[str, Any], base: Path) -> OptionValues:
@@ -107,6 +133,21 @@ def resolve_paths(row: Mapping[str, Any], base: Path) -> OptionValues:
     def exists(value: Any) -> bool:
         return isinstance(value, str) and bool(value) and os.path.exists(join(value))
 
+    def is_file(word: Any) -> bool:
+        # Numbers are those of photographs.
+        return exists(word) and not re.fullmatch(r"[\d\s]*", word)
+
+    def is_camera_file(word: Any) -> bool:
+        return is_file(word) and not word.lower().endswith(PHOTOGRAPH_ENDINGS)
+
+    def resolve_words(name: str, is_path: Callable[[Any], bool]) -> None:
+        words = result.get(name)
+        if isinstance(words, str):
+            # The path of a file may have spaces; a list keeps it in one piece.
+            words = [words] if is_file(words) else split_words(words)
+        if isinstance(words, list):
+            result[name] = [join(word) if is_path(word) else word for word in words]
+
     result = {key: join(value) if key in PATH_COLUMNS else value for key, value in row.items()}
     for key in PROGRAM_COLUMNS:
         if is_in_file(result.get(key)):
@@ -115,24 +156,18 @@ def resolve_paths(row: Mapping[str, Any], base: Path) -> OptionValues:
     for key in ("generator_weights", "generator_depth"):
         if exists(result.get(key)):
             result[key] = join(result[key])
-    target = result.get("target")
+    # Photographs are those of the scene, wherever the manifest lies.
+    resolve_words("target", is_camera_file)
+    resolve_words("mask", lambda word: True)
+    resolve_words(GUARDS_COLUMN, is_in_file)
     config = result.get("config")
-    # A text is the path of a file of cameras, or else numbers and names of photographs. A list
-    # keeps a path with spaces in one piece.
-    if exists(target) and not re.fullmatch(r"[\d\s]*", str(target)):
-        result["target"] = [join(target)]
-    masks = result.get("mask")
-    if isinstance(masks, str):
-        masks = [masks] if exists(masks) else split_masks(masks)
-    if isinstance(masks, list):
-        result["mask"] = [join(mask) for mask in masks]
     if isinstance(config, str) and config.endswith((".yaml", ".yml")):
         result["config"] = join(config)
     return result
 
 
-def split_masks(text: str) -> list[str]:
-    """Split the paths of masks as a shell does; what it cannot split is one path."""
+def split_words(text: str) -> list[str]:
+    """Split a text as a shell does; what it cannot split is one word."""
     with suppress(ValueError):
         return shlex.split(text) or [text]
     return [text]
@@ -145,14 +180,15 @@ def read_manifest_rows(manifest: Path, out: Path | None = None) -> list[OptionVa
         folders = list_folders(manifest.resolve())
         return [{FOLDER: str(path)} for path in folders if path not in results]
     parsers = {".csv": parse_csv, ".jsonl": parse_json_lines, ".ndjson": parse_json_lines}
-    if manifest.suffix not in parsers:
+    parse = parsers.get(manifest.suffix.lower())
+    if parse is None:
         raise InputError(
             f"The manifest {quote_value(manifest)} is neither a .csv or .jsonl file nor a folder "
             "of scenes; correct the path."
         )
     content = read_bytes(manifest, LONGEST_FILE)
     try:
-        return list(parsers[manifest.suffix](content.decode("utf-8-sig")))
+        return list(parse(content.decode("utf-8-sig")))
     except csv.Error as error:  # its words are about lines, quotation marks and the like
         raise InputError(
             f"The manifest {quote_value(manifest)} cannot be read: {quote_value(str(error))}; "
@@ -182,22 +218,31 @@ def is_result(folder: Path, out: Path | None) -> bool:
 
 
 def parse_csv(text: str) -> Iterator[OptionValues]:
-    """Parse the rows of a CSV file with a header."""
-    for row in csv.DictReader(io.StringIO(text, newline=""), strict=True):
+    """Parse the rows of a CSV file with a header; white space around names and cells is ignored."""
+    table = csv.DictReader(io.StringIO(text, newline=""), strict=True)
+    header = [name.strip() for name in table.fieldnames or ()]
+    # `DictReader` keeps the last of two columns. Spreadsheets add empty columns without a name.
+    if (name := find_repeated_name(filter(None, header))) is not None:
+        raise DamagedError(f"it has the column {quote_value(name)} twice")
+    table.fieldnames = header
+    for row in table:
         options = {k: v.strip() for k, v in row.items() if isinstance(v, str) and v.strip()}
         # `DictReader` collects cells beyond the header under None; as an option of this name they
         # are refused like any unknown one.
-        if row.get(None) is not None:
-            options["too many cells"] = " ".join(row[None])
+        if surplus := " ".join(row.get(None) or ()).strip():
+            options["too many cells"] = surplus
         yield options
 
 
 def parse_json_lines(text: str) -> Iterator[OptionValues]:
     """Parse JSON lines."""
-    for number, line in enumerate(text.splitlines(), start=1):
+    # Not `splitlines`, which also splits at characters that a text in JSON may have, as U+2028.
+    for number, line in enumerate(text.split("\n"), start=1):
         if line.strip():
             try:
-                row = json.loads(line)
+                row = json.loads(line, object_pairs_hook=make_object)
+            except DamagedError as error:
+                raise DamagedError(f"line {number} {error}") from error
             except ValueError as error:
                 raise DamagedError(f"line {number} is no JSON") from error
             if not isinstance(row, dict):
@@ -205,7 +250,15 @@ def parse_json_lines(text: str) -> Iterator[OptionValues]:
             yield row
 
 
+def make_object(pairs: list[tuple[str, Any]]) -> OptionValues:
+    """Make an object of JSON, or raise DamagedError for a name that is there twice."""
+    if (name := find_repeated_name(name for name, _ in pairs)) is not None:
+        raise DamagedError(f"has {quote_value(name)} twice")
+    return dict(pairs)
+
+
 def make_job_name(row: OptionValues) -> str:
     """Turn the name of a row, or that of its scene folder, into a valid file name."""
-    name = str(row[NAME_COLUMN]) if NAME_COLUMN in row else Path(str(row.get(FOLDER, ""))).name
+    given = row.get(NAME_COLUMN)
+    name = Path(str(row.get(FOLDER, ""))).name if given in (None, "") else str(given)
     return make_valid_name(name.strip(".")[:LONGEST_NAME]) or "job"

@@ -1,4 +1,7 @@
-"""Rows of a manifest: words of a command line of `complete`, and the request that they make."""
+"""Rows of a manifest: words of a command line of `complete`, and the request that they make.
+
+Rows are those that `read_manifest` returns: flat, with absolute paths.
+"""
 
 from __future__ import annotations
 
@@ -57,17 +60,15 @@ def parse_batch_row(row: Mapping[str, Any], out: Path) -> CompleteOptions:
     return options
 
 
-def row_to_words(row: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """Convert a row to words of a command line; nested mappings give `--config.holes.dilation`."""
+def row_to_words(row: Mapping[str, Any]) -> Iterator[str]:
+    """Convert a row to words of a command line; null leaves an option out."""
     for key, value in row.items():
-        name = f"{prefix}{key}".replace("_", "-")
+        name = key.replace("_", "-")
         if name in RESERVED:
             raise InputError(
                 f"A row cannot set '{quote_value(name)}', in which all rows of a batch are alike."
             )
-        if isinstance(value, Mapping):
-            yield from row_to_words(value, f"{name}.")
-        elif name != FOLDER and value is not None:
+        if name != FOLDER and value is not None:
             yield from option_to_words(name, value)
 
 

@@ -21,7 +21,8 @@ WINDOW = 512
 """Side in pixels of the windows in which larger images are filled; networks are trained at it."""
 
 Fill = Callable[[Float[Tensor, "h w 3"], Bool[Tensor, "h w"]], Float[Tensor, "h w 3"]]
-"""Network: image and hole -> image, of the same size; pixels outside the hole may change."""
+"""Network: image in [0, 1] and hole, True where it is filled -> image, of the same size; pixels
+outside the hole may change, and colours may leave [0, 1]."""
 
 
 @dataclass(frozen=True)
@@ -59,8 +60,11 @@ def fill_windows(
     image = image.clone()
     unfilled = hole.clone()
     # Windows that know most of their surroundings first: they continue it inwards.
-    windows = sorted(place_windows(*hole.shape), key=lambda at: hole[at].float().mean().item())
-    for at in windows:
+    waiting = sorted(place_windows(*hole.shape), key=lambda at: hole[at].float().mean().item())
+    while waiting:
+        # One in which nothing is known waits for its neighbours, whatever side they are on.
+        at = next((at for at in waiting if not unfilled[at].all()), waiting[0])
+        waiting.remove(at)
         if unfilled[at].any():
             filled = fill(image[at], unfilled[at])
             image[at] = torch.where(unfilled[at][..., None], filled, image[at])
