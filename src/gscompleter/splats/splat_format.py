@@ -8,6 +8,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from gscompleter.system.files.reading import ZIP_ERRORS
 from gscompleter.types import Gaussians
 
 PLY_MAGIC = b"ply"
@@ -76,7 +77,6 @@ class SplatFormat:
 
 def list_zip(path: Path) -> list[str]:
     """List the names in a .zip; none if it is damaged."""
-    errors = (OSError, ValueError, RuntimeError, zipfile.BadZipFile, NotImplementedError)
-    with suppress(*errors), zipfile.ZipFile(path) as archive:
+    with suppress(*ZIP_ERRORS), zipfile.ZipFile(path) as archive:
         return archive.namelist()
     return []
