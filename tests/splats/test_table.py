@@ -14,10 +14,10 @@ import torch
 from damage import require_plain
 from fuzz import damage, replaced
 from gscompleter import InputError, load_splat, save_splat
-from gscompleter.splats.formats import HEAD_BYTES, get_labels_path, read_provenance
+from gscompleter.splats.formats import get_labels_path, read_provenance
 from gscompleter.splats.packing import ZIP_MAGIC
 from gscompleter.splats.provenance import Provenance, RunRecord
-from gscompleter.splats.splat_format import SplatFormat
+from gscompleter.splats.splat_format import HEAD_BYTES, SplatFormat
 from gscompleter.splats.table import SPLAT_FORMATS, match_ending
 from paths import ROOT
 from splat_files import BY_HAND, made, plausible, read_parts, write_parts

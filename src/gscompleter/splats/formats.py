@@ -52,7 +52,7 @@ from gscompleter.splats.provenance import (
     parse_provenance,
 )
 from gscompleter.splats.sog import SOG_FOLDER
-from gscompleter.splats.splat_format import SplatFormat
+from gscompleter.splats.splat_format import HEAD_BYTES, SplatFormat
 from gscompleter.splats.table import SPLAT_FORMATS as SPLAT_FORMATS
 from gscompleter.splats.table import get_written_format, match_ending
 from gscompleter.system.damage import describe_damage
@@ -75,8 +75,6 @@ JSON_ERRORS = (AttributeError, TypeError)
 """Errors by JSON whose values are of another type."""
 MAX_DEFECT = 120
 """Most characters of the description of a defect."""
-HEAD_BYTES = 8192
-"""Bytes read to detect a format; the header of a compressed .ply fits."""
 
 
 @run_in_plain_torch

@@ -12,6 +12,8 @@ from gscompleter.system.files.reading import ZIP_ERRORS
 from gscompleter.types import Gaussians
 
 PLY_MAGIC = b"ply"
+HEAD_BYTES = 8192
+"""Bytes read to detect a format; the header of a compressed .ply fits."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,9 @@ class SplatFormat:
 
     name: str
     endings: tuple[str, ...]
-    """Ends of names of its files. It is written to such a name; the first is said in sentences."""
+    """Ends of names of its files. It is written to such a name; the first is said in sentences.
+    A file that is named in the place of photographs counts as a splat by its ending alone, and so
+    do names in a .zip that is no splat; of files in a folder, the content decides as well."""
     read: Callable[..., Gaussians]
     """Takes a path. Damage may be raised as any error of a decoder, best as `DamagedError`."""
     starts: tuple[bytes, ...] = ()
