@@ -7,9 +7,10 @@
 that are not kept apart, with the settings `default` and `paper`, a trained splat at seven targets,
 and eight targets in sequence. `room` is the same for a synthetic room, which needs no data: the
 tests check it everywhere. `texts` holds the help of every command, and exit code and sentence of
-wrong input. Bytes are compared on the machine that recorded them; other machines round otherwise
-and compare scores. A method that gave the recorded bytes of all scenes is listed by its digest
-(`methods`), so that figures measured with another one of the list still hold (write_results.py).
+wrong input. Bytes are compared on the machine that recorded them (`machines`, which has one for
+each of `scenes` and `room`); other machines round otherwise and compare scores. A method that gave
+the recorded bytes of all scenes is listed by its digest (`methods`), so that figures measured with
+another one of the list still hold (write_results.py).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import hashlib
 import json
 import os
 import platform
+import re
 import subprocess
 import sys
 import tempfile
@@ -40,6 +42,8 @@ PROGRAM = (sys.executable, "-c", "from gscompleter.cli import run; run()")
 MEAN_TOLERANCE, CASE_TOLERANCE = 0.02, 0.1
 """dB by which the mean PSNR, and the PSNR of one view, may fall on another machine."""
 SECTIONS = ("scenes", "room", "texts")
+PROCESSOR_NUMBERS = ("cpu family", "model", "stepping")
+"""Numbers of a processor in /proc/cpuinfo that tell it from others of the same name."""
 RUN_COMMENT = b"comment gscompleter-provenance/"
 
 
@@ -65,23 +69,27 @@ def main() -> None:
             "room": lambda: run_scenes(dict(list_room_runs(place)), place / "rooms"),
             "texts": run_texts,
         }
-        found = {"machine": describe_machine()} | {name: present[name]() for name in sections}
+        found = {name: present[name]() for name in sections}
+    # Texts are the same everywhere.
+    found["machines"] = {name: describe_machine() for name in sections if name != "texts"}
     if options.action == "record":
         if "scenes" in found:
             found["methods"] = [compute_method_digest()]
-        # Texts are the same everywhere: the machine stays that of the recorded bytes.
-        if sections == ("texts",):
-            found["machine"] = known.get("machine", found["machine"])
+        # What is not recorded now stays that of the machine that recorded it.
+        found["machines"] = known.get("machines", {}) | found["machines"]
         write(options.file, known | found)
     elif differences := compare(known, found):
         sys.exit("\n".join([*differences, f"{len(differences)} differences"]))
     else:
-        counts = ", ".join(f"{len(found[name])} {name}" for name in sections)
-        exact = "bytes" if known["machine"] == found["machine"] else "scores (another machine)"
-        if exact == "bytes" and "scenes" in found:
+        if "scenes" in found and is_same_machine(known, found, "scenes"):
             methods = dict.fromkeys([*known.get("methods", []), compute_method_digest()])
             write(options.file, known | {"methods": [*methods]})
-        print(f"equal: {counts}; compared: {exact}")
+        counts = [
+            f"{len(found[name])} {name}"
+            + ("" if is_same_machine(known, found, name) else " (by scores: another machine)")
+            for name in sections
+        ]
+        print(f"equal: {', '.join(counts)}")
 
 
 def write(path: Path, content: Mapping[str, Any]) -> None:
@@ -92,13 +100,25 @@ def write(path: Path, content: Mapping[str, Any]) -> None:
 def describe_machine() -> dict[str, str]:
     """Describe what decides how numbers round: processor, vector instructions, libraries."""
     info = Path("/proc/cpuinfo")
-    lines = info.read_text().splitlines() if info.is_file() else []
-    model = next((line.split(": ")[1] for line in lines if line.startswith("model name")), "")
     return {
-        "processor": model or platform.processor(),
+        "processor": describe_processor(info.read_text() if info.is_file() else ""),
         "capability": torch.backends.cpu.get_cpu_capability(),
         "torch": torch.__version__,
     }
+
+
+def describe_processor(info: str) -> str:
+    """Describe the first processor of the text of /proc/cpuinfo; empty text for what Python says.
+
+    The name alone does not tell one: virtual machines shorten it, so that several generations are
+    an "AMD EPYC". Family, model and stepping are what libraries choose their kernels by.
+    """
+    first = info.partition("\n\n")[0]
+    fields = dict(re.findall(r"^(.+?)\s*: (.+)$", first, re.M))
+    if "model name" not in fields:
+        return platform.processor()
+    numbers = [f"{key} {fields[key]}" for key in PROCESSOR_NUMBERS if key in fields]
+    return ", ".join([fields["model name"], *numbers])
 
 
 def list_runs(data: Path, uses_apart: bool = False) -> Iterator[tuple[str, list[str]]]:
@@ -212,14 +232,13 @@ def compare(known: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
     """Describe every difference, in a line each."""
     if not known:
         return ["nothing was recorded; run `make golden` on the state to compare with"]
-    same_machine = known["machine"] == found["machine"]
-    match = match_bytes if same_machine else match_scores
     differences = []
     for section in ("scenes", "room"):
+        match = match_bytes if is_same_machine(known, found, section) else match_scores
         for name, row in found.get(section, {}).items():
             recorded = known.get(section, {}).get(name)
             differences += [f"{name}: {text}" for text in match(recorded, row)]
-    if not same_machine and "scenes" in found:
+    if "scenes" in found and not is_same_machine(known, found, "scenes"):
         same = {name: row for name, row in known["scenes"].items() if name in found["scenes"]}
         fall = mean_psnr(same) - mean_psnr(found["scenes"])
         differences += [f"mean PSNR fell by {fall:.3f} dB"] * (fall > MEAN_TOLERANCE)
@@ -227,6 +246,12 @@ def compare(known: Mapping[str, Any], found: Mapping[str, Any]) -> list[str]:
         before = known["texts"].get(name, {})
         differences += [f"{name}: {key} differs" for key in row if row[key] != before.get(key)]
     return differences
+
+
+def is_same_machine(known: Mapping[str, Any], found: Mapping[str, Any], section: str) -> bool:
+    """Check that the machine that recorded a section is this one; texts are the same everywhere."""
+    before, now = (table.get("machines", {}).get(section) for table in (known, found))
+    return section == "texts" or before == now
 
 
 def match_bytes(known: Mapping[str, Any] | None, found: Mapping[str, Any]) -> list[str]:

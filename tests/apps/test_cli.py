@@ -312,15 +312,15 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
         (("--scene", "nowhere.ply"), "nowhere.ply"),
         (("--seed", -1), "seed must be greater than or equal to 0, got -1 (--seed)."),
         (("--seed", 2**64), "seed must be less than 4611686018427387904"),
-        (("--seed", 1.5), "'1.5'; give --seed INT (see gscompleter complete --help)."),
+        (("--seed", 1.5), "--seed takes a whole number, and was given '1.5' (see gscompleter "),
         (("--sed", 1), "nearest is --seed INT (see gscompleter complete --help)."),
         (("--drop_nonfinit",), "options: --drop_nonfinit; the nearest is --drop-nonfinite (see"),
         (("--qwertz", 1), "Unrecognized options: --qwertz, 1 (see gscompleter complete --help)."),
         (("--depth", "none", "moge-2"), "moge-2 belongs to no option of complete, and"),
         (("--config.registration.hole-deptth", 1), "nearest is --config.registration.hole-depth"),
-        (("--device", "tpu"), "invalid choice 'tpu' for argument '--device'."),
+        (("--device", "tpu"), "--device takes auto, cpu, cuda or mps, and was given 'tpu' ("),
         (("--near", "a" * 5000), "aaa…aaa"),
-        (("--config",), "Missing value for argument '--config'."),
+        (("--config",), "--config takes a text, and none was given (see gscompleter "),
         (("--config", "c" * 5000), "no config 'ccc"),
         (("--config", "nowhere.yaml"), "nowhere.yaml"),
         (("--config.margin", 1e9), "got 1000000000.0 (--config.margin)."),
@@ -398,13 +398,38 @@ def test_an_option_of_another_command_is_told_as_such(monkeypatch, capsys, words
     ("number", "sentence"),
     [
         ("-3", "auto must be greater than or equal to 1, got -3 (--auto)."),
-        ("2.5", "could be instantiated from ['2.5']; give --auto INT"),
+        ("2.5", "--auto takes a whole number, and was given '2.5' (see gscompleter"),
     ],
 )
 def test_a_wrong_number_of_targets_is_told_as_that_of_its_option(
     monkeypatch, capsys, number, sentence
 ):
     assert run(monkeypatch, "complete", "a", "--auto", number, "--out", "b") == 2
+    assert sentence in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (
+            "view a --up 0 1",
+            "--up takes 3 numbers, and 2 were given (see gscompleter view --help).",
+        ),
+        ("inspect a --resolution 48 64 32", "--resolution takes 2 whole numbers, and 3 were given"),
+        (
+            "complete a --out b --resolution 48 64 32",
+            "--resolution takes 2 whole numbers, a whole number or full, and 3 were given (see",
+        ),
+        ("complete a --out b --resolution", "or full, and none was given (see"),
+        ("complete a --out b --resolution 4 x", "or full, and was given '4 x' (see"),
+        ("convert a b --rotate=0 90", "--rotate takes 3 numbers (X Y Z), and 2 were given (see"),
+        ("convert a b --rotate 0 -90 x", "3 numbers (X Y Z), and was given '0 -90 x' (see"),
+        ("convert a b --crop_sphere 1 --plain", "numbers (X Y Z RADIUS), and 1 was given (see"),
+        ("convert a b --bands 7", "--bands takes 0, 1, 2 or 3, and was given '7' (see"),
+    ],
+)
+def test_wrong_values_of_an_option_are_told_without_types(monkeypatch, capsys, words, sentence):
+    assert run(monkeypatch, *words.split()) == 2
     assert sentence in capsys.readouterr().err
 
 

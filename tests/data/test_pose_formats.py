@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import struct
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -195,6 +196,19 @@ def test_a_project_that_cannot_be_read_is_a_sentence(tmp_path):
     with zipfile.ZipFile(path, "w") as project:
         project.writestr("splat_0.ply", b"ply\n")
     with pytest.raises(InputError, match=r"scene\.ssproj is no project of SuperSplat"):
+        load_cameras(path, (SIZE, SIZE))
+
+
+def test_a_project_that_ends_within_its_cameras_is_a_sentence(tmp_path):
+    """Python raises `EOFError` where the directory states more bytes than the file has."""
+    path = tmp_path / "scene.ssproj"
+    with zipfile.ZipFile(path, "w") as project:
+        project.writestr("document.json", "{}")
+    content = bytearray(path.read_bytes())
+    place = content.rindex(b"PK\x01\x02") + 20
+    struct.pack_into("<II", content, place, 9999, 9999)
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"no project of SuperSplat \(it ends too early"):
         load_cameras(path, (SIZE, SIZE))
 
 

@@ -13,15 +13,19 @@ from gscompleter import InputError, load_generator
 from gscompleter.cli import parse_command
 from gscompleter.config import generators
 from gscompleter.config.generators import (
+    GENERATOR_PLUGINS,
     GENERATORS,
+    PREFIX,
     GeneratorEntry,
     GeneratorOptions,
     GeneratorSettings,
     add_options,
+    get_settings_class,
 )
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.generators import GeneratorRequest
 from gscompleter.numerics.smooth import compute_distance_to_known
+from gscompleter.system.plugins import load_plugins
 from known_room import TARGET, known_room
 from paths import ROOT
 from scenes import Room, view_of
@@ -29,6 +33,7 @@ from scenes import Room, view_of
 TRUTH = view_of(Room(), TARGET)
 CONTEXT = known_room()
 HOLES = CONTEXT.holes
+OPTION_START = "generator-"
 
 
 def continues_the_border(image: torch.Tensor) -> bool:
@@ -78,6 +83,27 @@ def test_a_generator_has_a_line_in_the_reference_page(name):
     page = (ROOT / "docs" / "generators.md").read_text("utf-8")
     is_there = re.search(rf"^\| [^|]*`{name}`[^|]*\|", page, re.M) is not None
     assert is_there, f"add a line for `{name}` to the first table of docs/generators.md"
+
+
+def test_the_reference_page_says_which_generators_have_an_option():
+    page = (ROOT / "docs" / "generators.md").read_text("utf-8")
+    rows = re.findall(rf"^\| `--{OPTION_START}([a-z-]+)` \| ([^|]*) \|", page, re.M)
+    said = {f"--{OPTION_START}{name}": set(re.findall("`(.+?)`", names)) for name, names in rows}
+    assert said == list_options(), "correct the table of options of docs/generators.md"
+
+
+def list_options() -> dict[str, set[str]]:
+    """List the options of generators, with the names of the generators that have each."""
+    names = [*GENERATORS, *load_plugins(GENERATOR_PLUGINS)]
+    settings = [f.name for f in fields(GeneratorOptions) if f.name.startswith(PREFIX)]
+    return {
+        f"--{setting.replace('_', '-')}": {
+            name
+            for name in names
+            if hasattr(get_settings_class(name), setting.removeprefix(PREFIX))
+        }
+        for setting in settings
+    }
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
 """Splats of other trainers in the layout of a .ply: fused filters, surfels, model folders."""
 
 import math
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -149,6 +150,18 @@ def test_a_folder_without_a_splat_names_what_is_in_it(tmp_path):
         load_splat(tmp_path)
     save_ply(tmp_path / "chair.ply", random_gaussians(3))
     with pytest.raises(InputError, match=r"name one of the splats in it, such as chair\.ply"):
+        load_splat(tmp_path)
+
+
+def test_a_folder_names_no_file_of_another_kind_for_its_ending(tmp_path):
+    """As matrices in a .npz would be, if a format of splats had that ending."""
+    with zipfile.ZipFile(tmp_path / "cameras.sog", "w") as archive:
+        archive.writestr("world_mat_0.npy", b"")
+    with pytest.raises(InputError, match="is a folder without a splat; name the file of a splat"):
+        load_splat(tmp_path)
+    # A damaged one is worth naming: what is wrong with it is said then.
+    (tmp_path / "cut.sog").write_bytes(b"PK\x03\x04")
+    with pytest.raises(InputError, match=r"such as cut\.sog"):
         load_splat(tmp_path)
 
 

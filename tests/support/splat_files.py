@@ -365,6 +365,25 @@ def made(folder: Path, name: str, gaussians: Gaussians) -> Path:
     return path
 
 
+def read_parts(path: Path) -> dict[str, bytes]:
+    """Read all files of a .zip, by name."""
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def write_parts(path: Path, parts: dict[str, bytes]) -> Path:
+    """Write a .zip with right checksums; each file begins at 64 bytes, as OpenUSD asks for."""
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, data in parts.items():
+            entry = zipfile.ZipInfo(name)
+            assert archive.fp is not None
+            # The header has 30 bytes, then come the name and this field, whose own head has 4.
+            free = -(archive.fp.tell() + 30 + len(name.encode()) + 4) % 64
+            entry.extra = struct.pack("<HH", 0x1986, free) + bytes(free)
+            archive.writestr(entry, data)
+    return path
+
+
 def psnr(a: Gaussians, b: Gaussians) -> float:
     """Compute the PSNR between two scenes in dB, the worst of three cameras."""
     cameras = [

@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 import os
 import zipfile
-import zlib
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import product
@@ -50,6 +49,7 @@ from gscompleter.system.damage import describe_damage
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import (
     MAX_JSON,
+    ZIP_ERRORS,
     is_json_list,
     list_entries,
     parse_json,
@@ -107,7 +107,7 @@ def read_document(path: Path) -> Any:
     try:
         with zipfile.ZipFile(path) as project:
             data = read_zip_entry(project, PROJECT_CAMERAS, MAX_JSON)
-    except (OSError, KeyError, ValueError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+    except ZIP_ERRORS as error:
         raise InputError(
             f"{quote_value(path)} is no project of SuperSplat "
             f"({quote_value(describe_damage(error))}); save it again."

@@ -19,7 +19,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from zipfile import is_zipfile
 
 import torch
 from jaxtyping import Float
@@ -189,7 +188,7 @@ def load_values(path: Path, device: torch.device | str) -> dict[str, Any]:
 def is_complete(path: Path) -> bool:
     """Return True if a file of `save_values` exists and has its end."""
     # A zip archive has its directory at its end.
-    return is_zipfile(path)
+    return reading.is_zip_file(path)
 
 
 def read_run_file(path: Path, advice: str = "delete it and run again") -> Any:

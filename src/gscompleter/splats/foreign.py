@@ -19,11 +19,11 @@ from gscompleter.data.frame import FOLDERS
 from gscompleter.data.sfm.poses import holds_packed_splat
 from gscompleter.splats.packing import ZIP_MAGIC
 from gscompleter.splats.sog import LOD_KEY, LOD_META, META, is_meta_of_others
-from gscompleter.splats.splat_format import list_zip
+from gscompleter.splats.splat_format import HEAD_BYTES, list_zip
 from gscompleter.splats.spz import GZIP, GZIP_BITS
-from gscompleter.splats.table import FILE_ENDINGS
+from gscompleter.splats.table import FILE_ENDINGS, SPLAT_FORMATS, match_ending
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.reading import list_entries, make_read_error, read_bytes
+from gscompleter.system.files.reading import list_entries, make_read_error, read_bytes, read_head
 
 OF_STREAMED = (
     "in several levels of detail; write one of them to a .ply with `gscompleter convert`, and name "
@@ -143,12 +143,26 @@ def refuse_folder(path: Path) -> None:
         raise InputError(
             f"{name} holds {quote_value(indices[0])}, which {KINDS_BY_ENDING['.lcc']}."
         )
-    inside = [child for child in names if child.lower().endswith(FILE_ENDINGS)]
-    if inside:
+    ending_so = (child for child in names if child.lower().endswith(FILE_ENDINGS))
+    inside = next((child for child in ending_so if not is_other_kind(path / child)), None)
+    if inside is not None:
         raise InputError(
-            f"{name} is a folder; name one of the splats in it, such as {quote_value(inside[0])}."
+            f"{name} is a folder; name one of the splats in it, such as {quote_value(inside)}."
         )
     raise InputError(f"{name} is a folder without a splat; name the file of a splat.")
+
+
+def is_other_kind(path: Path) -> bool:
+    """Check that a file shares ending and first bytes with a format of splats, and is none.
+
+    A .zip or JSON of any program may be named so. Damaged files stay those of their ending: their
+    reader says what is wrong.
+    """
+    named = match_ending(path)
+    head = read_head(path, HEAD_BYTES)
+    if named is None or not head.lstrip().startswith(named.starts):
+        return False
+    return not any(row.begins(path, head) for row in SPLAT_FORMATS.values())
 
 
 def refuse_foreign(path: Path, head: bytes) -> None:

@@ -10,8 +10,6 @@ import contextlib
 import json
 import lzma
 import struct
-import zipfile
-import zlib
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -54,13 +52,13 @@ from gscompleter.splats.provenance import (
     parse_provenance,
 )
 from gscompleter.splats.sog import SOG_FOLDER
-from gscompleter.splats.splat_format import SplatFormat
+from gscompleter.splats.splat_format import HEAD_BYTES, SplatFormat
 from gscompleter.splats.table import SPLAT_FORMATS as SPLAT_FORMATS
 from gscompleter.splats.table import get_written_format, match_ending
 from gscompleter.system.damage import describe_damage
 from gscompleter.system.errors import InputError, quote_value, refuse_pointer, require_path
 from gscompleter.system.files.output_file import check_free, reserve_file
-from gscompleter.system.files.reading import hash_file, open_file, read_json
+from gscompleter.system.files.reading import ZIP_ERRORS, hash_file, open_file, read_json
 from gscompleter.system.files.writing import replace_file
 from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import Gaussians, Origin
@@ -68,8 +66,8 @@ from gscompleter.types import Gaussians, Origin
 OPACITY_TOLERANCE = 1e-3
 """Distance from [0, 1] up to which an opacity is clamped instead of refused."""
 DECODING_ERRORS = (
-    *(ArithmeticError, EOFError, LookupError, MemoryError, OSError, RecursionError, ValueError),
-    *(NotImplementedError, struct.error, zipfile.BadZipFile, zlib.error, lzma.LZMAError),
+    *ZIP_ERRORS,
+    *(ArithmeticError, MemoryError, RecursionError, struct.error, lzma.LZMAError),
     Image.DecompressionBombError,
 )
 """Errors that decoders raise on damaged bytes."""
@@ -77,8 +75,6 @@ JSON_ERRORS = (AttributeError, TypeError)
 """Errors by JSON whose values are of another type."""
 MAX_DEFECT = 120
 """Most characters of the description of a defect."""
-HEAD_BYTES = 8192
-"""Bytes read to detect a format; the header of a compressed .ply fits."""
 
 
 @run_in_plain_torch

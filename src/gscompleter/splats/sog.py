@@ -125,8 +125,6 @@ def _read_meta(path: Path) -> dict[str, Any]:
 def _read_bundle_entry(bundle: zipfile.ZipFile, name: str, most: int) -> bytes:
     if name not in bundle.NameToInfo:
         raise DamagedError(f"it lacks its file {quote_value(name)}")
-    if bundle.getinfo(name).flag_bits & 1:
-        raise UnsupportedError(f"is encrypted ({quote_value(name)})")
     return read_zip_entry(bundle, name, most)
 
 

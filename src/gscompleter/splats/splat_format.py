@@ -8,9 +8,12 @@ from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from gscompleter.system.files.reading import ZIP_ERRORS
 from gscompleter.types import Gaussians
 
 PLY_MAGIC = b"ply"
+HEAD_BYTES = 8192
+"""Bytes read to detect a format; the header of a compressed .ply fits."""
 
 
 @dataclass(frozen=True)
@@ -23,7 +26,9 @@ class SplatFormat:
 
     name: str
     endings: tuple[str, ...]
-    """Ends of names of its files. It is written to such a name; the first is said in sentences."""
+    """Ends of names of its files. It is written to such a name; the first is said in sentences.
+    A file that is named in the place of photographs counts as a splat by its ending alone, and so
+    do names in a .zip that is no splat; of files in a folder, the content decides as well."""
     read: Callable[..., Gaussians]
     """Takes a path. Damage may be raised as any error of a decoder, best as `DamagedError`."""
     starts: tuple[bytes, ...] = ()
@@ -76,7 +81,6 @@ class SplatFormat:
 
 def list_zip(path: Path) -> list[str]:
     """List the names in a .zip; none if it is damaged."""
-    errors = (OSError, ValueError, RuntimeError, zipfile.BadZipFile, NotImplementedError)
-    with suppress(*errors), zipfile.ZipFile(path) as archive:
+    with suppress(*ZIP_ERRORS), zipfile.ZipFile(path) as archive:
         return archive.namelist()
     return []

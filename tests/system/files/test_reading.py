@@ -1,18 +1,23 @@
 """Only regular files are opened, and none is read beyond its limit."""
 
 import os
+import random
 import socket
 import struct
 import tracemalloc
 import zipfile
+import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from gscompleter import InputError, load_splat
+from gscompleter.system.damage import DamagedError
 from gscompleter.system.files.reading import (
+    ZIP_ERRORS,
     check_plain,
+    is_zip_file,
     read_bytes,
     read_head,
     read_lines,
@@ -131,6 +136,52 @@ def test_a_file_in_an_archive_is_unpacked_to_no_more_than_it_may_have(
         most = tracemalloc.get_traced_memory()[1]
         tracemalloc.stop()
     assert most < 2**20
+
+
+def test_an_encrypted_file_in_an_archive_is_refused_in_a_clause(tmp_path):
+    with zipfile.ZipFile(tmp_path / "a.zip", "w") as archive:
+        archive.writestr("a", b"abc")
+    content = bytearray((tmp_path / "a.zip").read_bytes())
+    # The first flag, in the header of the file and in the directory.
+    content[6] |= 1
+    content[content.rindex(b"PK\x01\x02") + 8] |= 1
+    (tmp_path / "a.zip").write_bytes(content)
+    with (
+        zipfile.ZipFile(tmp_path / "a.zip") as archive,
+        pytest.raises(DamagedError, match="its a is encrypted"),
+    ):
+        read_zip_entry(archive, "a", 100)
+
+
+def test_a_damaged_archive_raises_errors_of_archives_alone(tmp_path):
+    """Sizes that are too large end in `EOFError`, headers of newer programs in others."""
+    path = tmp_path / "a.zip"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("a", b"abc" * 50)
+    whole = path.read_bytes()
+    chance = random.Random(0)
+    kinds = set()
+    for _ in range(400):
+        content = bytearray(whole)
+        for place in chance.choices(range(len(content)), k=chance.choice((1, 2))):
+            content[place] = chance.randrange(256)
+        path.write_bytes(content)
+        try:
+            with zipfile.ZipFile(path) as archive:
+                read_zip_entry(archive, "a", 10_000)
+        except ZIP_ERRORS as error:
+            kinds.add(type(error))
+        is_zip_file(path)
+    assert kinds >= {EOFError, KeyError, DamagedError, zipfile.BadZipFile, zlib.error}
+
+
+def test_an_archive_of_several_disks_is_no_complete_one(tmp_path):
+    """Python raises an error of its own for the end of an archive that names other disks."""
+    locator = b"PK\x06\x07" + struct.pack("<IQI", 1, 0, 2)
+    (tmp_path / "a.pt").write_bytes(locator + b"PK\x05\x06" + bytes(18))
+    with pytest.raises(zipfile.BadZipFile):
+        zipfile.is_zipfile(tmp_path / "a.pt")
+    assert not is_zip_file(tmp_path / "a.pt")
 
 
 def test_files_in_archives_are_read_whole(tmp_path):

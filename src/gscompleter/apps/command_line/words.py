@@ -22,6 +22,7 @@ from gscompleter.apps.command_line.chosen_config import (
 from gscompleter.apps.command_line.command_list import HELP, HELP_ALL
 from gscompleter.apps.command_line.help_pages import Rule, describe_command, make_help_rule
 from gscompleter.apps.command_line.old_spellings import refuse_old_spellings
+from gscompleter.apps.command_line.wrong_values import explain_values
 from gscompleter.apps.requests.completion import DEFAULT_NUM_TARGETS
 from gscompleter.config import CompleterConfig, load_config
 from gscompleter.system.errors import InputError, join_names, quote_value
@@ -142,7 +143,11 @@ def explain_words(words: Sequence[str], kinds: Mapping[str, type], box: str) -> 
     """Explain wrong words by tyro's message; `kinds` has the option class of each command."""
     # tyro only says that an option is unknown; that it belongs to another command says more.
     own = list_options(kinds[words[0]])
-    sentence = describe_foreign_option(words, own, kinds) or extract_sentence(box, own)
+    sentence = (
+        describe_foreign_option(words, own, kinds)
+        or explain_values(words, own, "\n".join(list_box_lines(box)))
+        or extract_sentence(box, own)
+    )
     # Of words that are no options, tyro says so as well.
     surplus = sentence.removeprefix(SURPLUS)
     if surplus != sentence and not surplus.startswith("-"):
@@ -259,13 +264,18 @@ def show_config(words: Sequence[str]) -> tuple[CompleterConfig, list[str]]:
     return config if adapt is None else adapt(config), others
 
 
+def list_box_lines(box: str) -> list[str]:
+    """List the lines of tyro's boxed error message, without the border."""
+    # The first line is its top, and each other one begins with `│ `.
+    return [line[2:].rstrip("│ ") for line in box.splitlines()[1:]]
+
+
 def extract_sentence(box: str, own: Collection[str]) -> str:
     """Extract the sentence from tyro's boxed error message, with the option that is meant.
 
     tyro also suggests options of other commands; only those of this one (`own`) are named.
     """
-    # Without the border: the first line is its top, and each other one begins with `│ `.
-    lines = [line[2:].rstrip("│ ") for line in box.splitlines()[1:]]
+    lines = list_box_lines(box)
 
     # The message is the first paragraph, up to an empty line or a rule. Its deeply indented lines
     # are lists of arguments, no part of a sentence.

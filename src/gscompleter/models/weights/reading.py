@@ -17,7 +17,7 @@ from gscompleter.models.weights.fetching import fetch
 from gscompleter.models.weights.published import PUBLISHED, PublishedWeights
 from gscompleter.system.damage import describe_damage
 from gscompleter.system.errors import InputError, join_names, quote_value, refuse_pointer
-from gscompleter.system.files.reading import hash_file, open_file
+from gscompleter.system.files.reading import hash_file, is_zip_file, open_file
 
 IGNORED_PREFIXES = ("decoder.", "losses.")
 """Prefixes of tensors of other parts that training checkpoints contain."""
@@ -64,7 +64,7 @@ def check_kind(path: Path, name: str) -> None:
         wrong = "is empty"
     elif head.lstrip().lower().startswith((b"<!doctype", b"<html")):
         wrong = "is a web page that was saved under this name"
-    elif head.startswith(b"PK\x03\x04") and not is_archive(path):
+    elif head.startswith(b"PK\x03\x04") and not is_zip_file(path):
         wrong = "ends too early, as after an interrupted download"
     if wrong:
         raise _create_file_error(path, wrong, name)
@@ -84,17 +84,9 @@ def check_sha256(path: Path, expected: str, name: str) -> None:
     raise _create_file_error(path, f"is not the published file (SHA-256 {digest[:8]})", name)
 
 
-def is_archive(path: Path) -> bool:
-    """Return True for a complete zip archive, the format of torch."""
-    try:
-        return zipfile.is_zipfile(path)
-    except zipfile.BadZipFile:
-        return False
-
-
 def check_archive(path: Path, name: str) -> None:
     """Raise InputError if a part of a zip archive does not match its checksum."""
-    if not is_archive(path):
+    if not is_zip_file(path):
         return
     try:
         with zipfile.ZipFile(path) as archive:
@@ -109,7 +101,7 @@ def read_tensors(path: Path, name: str) -> Any:
     """Read a torch file that contains only tensors in plain containers."""
     try:
         # Old files of torch are not zip archives and cannot be mapped.
-        mapped = is_archive(path)
+        mapped = is_zip_file(path)
         return torch.load(path, map_location="cpu", weights_only=True, mmap=mapped)
     except pickle.UnpicklingError as error:
         # A pickle may name any function; torch refuses it and names what it refused.

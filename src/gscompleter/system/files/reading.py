@@ -6,6 +6,7 @@ import json
 import os
 import stat
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from io import TextIOWrapper
@@ -31,6 +32,12 @@ MAX_DEPTH = 32
 error of its own beyond 32 dimensions, numpy 2 beyond 64."""
 BLOCK_BYTES = 1 << 20
 """Bytes that are read at a time from a file of unknown size."""
+
+ZIP_ERRORS = (
+    *(EOFError, LookupError, NotImplementedError, OSError, ValueError),
+    *(zipfile.BadZipFile, zlib.error),
+)
+"""Errors that opening an archive and `read_zip_entry` raise of a damaged one."""
 
 _HOLDERS = (list, tuple, dict, set, frozenset)
 
@@ -88,11 +95,16 @@ def read_bytes(path: Path, max_bytes: int = MAX_BYTES) -> bytes:
 
 
 def read_zip_entry(archive: zipfile.ZipFile, name: str, max_bytes: int) -> bytes:
-    """Read a file in an archive; raise DamagedError if it has more than `max_bytes` bytes.
+    """Read a file in an archive of at most `max_bytes` bytes, once it is unpacked.
 
-    However little an archive takes, it may hold any number of bytes, and state any other.
+    However little an archive takes, it may hold any number of bytes, and state any other. Raises
+    DamagedError for a larger file, one that is encrypted, and one that is not packed by deflate;
+    `ZIP_ERRORS` for a damaged archive.
     """
     entry = archive.getinfo(name)
+    # Its first flag says so. Python asks for a password by a RuntimeError, as for defects.
+    if entry.flag_bits & 1:
+        raise DamagedError(f"its {quote_value(name)} is encrypted")
     if entry.file_size > max_bytes:
         claim = f"{entry.compress_size:,} bytes claim to hold {entry.file_size:,}"
         raise DamagedError(f"its {quote_value(name)} is too large: {claim}")
@@ -101,6 +113,14 @@ def read_zip_entry(archive: zipfile.ZipFile, name: str, max_bytes: int) -> bytes
         raise DamagedError(f"its {quote_value(name)} is packed by another method than deflate")
     with archive.open(entry) as file:
         return file.read(entry.file_size)
+
+
+def is_zip_file(path: Path) -> bool:
+    """Check whether a file is an archive with its end; a damaged end is none."""
+    try:
+        return zipfile.is_zipfile(path)
+    except zipfile.BadZipFile:
+        return False
 
 
 def read_lines(
