@@ -35,6 +35,9 @@ GAP_REACH = 16
 """Radius in pixels around a known pixel within which the farthest surface is looked for."""
 DEPTH_SHARPNESS = 16
 """Power of the depth of a pixel, relative to the largest one there, by which it weighs in a gap."""
+SIDE_MOVES = (0.75, 1.25)
+"""Moves to a side, relative to the one away from the photograph. A crack that is wide from afar is
+thin from nearby, and what is closed from there opens again further on."""
 MIN_SHARE = 1e-4
 """Share of an image from which on its gaps are closed, seven pixels of 256 x 256: fewer are hardly
 seen, and guards would take as long for them as for many."""
@@ -43,20 +46,21 @@ seen, and guards would take as long for them as for many."""
 def displace_camera(
     target: Camera, views: Sequence[View], displacement: float
 ) -> tuple[Camera, ...]:
-    """Return three cameras beside a target, none of which is turned.
+    """Return five cameras beside a target, none of which is turned.
 
-    Each is moved by `displacement`, relative to the baseline of the target and its nearest
-    photograph. The first moves on, away from that photograph, where the gaps of parallax between
-    the known and the completed part open widest. The others move to the right and to the left: a
+    The first is moved by `displacement`, relative to the baseline of the target and its nearest
+    photograph, away from that photograph, where the gaps of parallax between the known and the
+    completed part open widest. The others stand to the right and to the left, near ones first: a
     gap that one side opens is hidden from the other.
     """
     nearest = views[find_nearest_view(target, views)].camera
     baseline = target.center - nearest.center
     right = baseline.norm() * target.c2w[:3, 0]
+    moves = [baseline, *(side * move for move in SIDE_MOVES for side in (right, -right))]
     cameras = []
-    for direction in (baseline, right, -right):
+    for move in moves:
         c2w = target.c2w.clone()
-        c2w[:3, 3] = target.center + displacement * direction
+        c2w[:3, 3] = target.center + displacement * move
         cameras.append(replace(target, c2w=c2w))
     return tuple(cameras)
 

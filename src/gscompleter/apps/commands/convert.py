@@ -27,10 +27,11 @@ Factor = Annotated[float, Interval(ge=1e-9, le=1e9)]
 class ConvertOptions(WritingOptions):
     """Convert a file of Gaussians to another format, by the name of B.
 
-    A table of docs/formats.md has the formats, such as .ply, .spz and .sog; a B that ends otherwise
-    is refused with all endings that are written. On the way a splat can be joined with others, cut,
-    scaled, turned, moved and reduced, in the order of the options below, whatever their order is
-    when they are given. Numbers are in the axes of a .ply: x right, y down, z forward.
+    A table of docs/formats.md has all formats, such as .ply, .compressed.ply, .spz, .splat, .sog,
+    .glb (KHR_gaussian_splatting) and .usdz (OpenUSD, with usd-core). On the way a splat can be
+    joined with others, cut, scaled, turned, moved and reduced, in the order of the options below,
+    whatever their order is when they are given. Numbers are in the axes of a .ply: x right, y down,
+    z forward.
 
     Example: gscompleter convert splat.ply splat.spz
     """
