@@ -1,5 +1,6 @@
 """Options of all commands: one name has one meaning, and an old one is refused with the new one."""
 
+import re
 import sys
 from collections import defaultdict
 from dataclasses import dataclass
@@ -15,6 +16,7 @@ from gscompleter.apps.command_line.words import list_options
 from gscompleter.apps.commands.shared_options import list_inputs
 from gscompleter.cli import OptionClasses, parse_command
 from gscompleter.config.settings import Settings
+from gscompleter.data.formats import SCENE_FORMATS
 from gscompleter.system.errors import InputError
 from paths import TESTS
 
@@ -50,6 +52,11 @@ def test_one_name_has_one_kind_of_value_and_one_sentence_in_every_command(table)
 def test_the_page_of_options_is_that_of_the_commands(table):
     said = (DOCS / "options.md").read_text(encoding="utf-8")
     assert said == table.make_page(), "run `python docs/make_option_table.py`"
+
+
+def test_the_help_of_a_format_names_all(table):
+    (sentence,) = {one.sentence for one in table.list_all_options() if one.name == "--format"}
+    assert set(re.findall(r"[\w-]+", sentence.partition(": ")[2])) == {*SCENE_FORMATS, "or"}
 
 
 def test_another_meaning_under_the_same_name_is_found(table, monkeypatch):

@@ -1,7 +1,7 @@
 """What commands decide on: requests, and refusals of options that exclude each other."""
 
 import pickle
-from dataclasses import fields, is_dataclass
+from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -120,6 +120,17 @@ def test_a_setting_that_is_typed_wins_over_any_preset(decide):
     with pytest.raises(InputError, match=r"config\.holes\.dilation must be less than") as error:
         decide("complete SPLAT --config.holes.dilation 5000 --out out")
     assert error.value.argument == "config.holes.dilation"
+
+
+def test_a_setting_of_a_file_wins_over_what_the_command_does(decide, tmp_path):
+    (tmp_path / "mine.yaml").write_text("holes: {max_alpha: 0.61}")
+    line = "remove SPLAT --sphere 0 0 0 1 --config mine.yaml --out out"
+    config = decide(line).completion.work.config
+    preset = CompleterConfig.bare().for_removal()
+    assert config == replace(preset, holes=replace(preset.holes, max_alpha=0.61))
+    line = "repair SPLAT --target c.json --mask m.png --config mine.yaml --out out"
+    config = decide(line).completion.work.config
+    assert (config.holes.max_alpha, config.holes.forces_removed) == (0.61, True)
 
 
 def test_each_command_makes_a_request_of_its_own(decide):

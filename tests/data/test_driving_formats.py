@@ -239,6 +239,40 @@ def test_kitti_raw_shows_its_sweeps(shared, tmp_path):
     assert (view.depth > 0).sum() == 2
 
 
+def test_kitti_raw_shrinks_its_cameras_with_its_photographs(shared, tmp_path):
+    drive = raw_drive(shared, tmp_path)
+    calibration = tmp_path / "calib_cam_to_cam.txt"
+    content = calibration.read_text()
+    calibration.write_text(f"{content}S_rect_02: 1.242000e+03 3.750000e+02\n")
+    for number in range(3):
+        write_grey(drive / "image_02" / "data" / f"{number:010d}.png", 828, 250)
+    K = open_photographs(drive).camera(0).K
+    assert K[0].tolist() == pytest.approx([721.5377 / 1.5, 0, 609.5593 / 1.5], abs=1e-3)
+    assert K[1].tolist() == pytest.approx([0, 721.5377 / 1.5, 172.854 / 1.5], abs=1e-3)
+    write_grey(drive / "image_02" / "data" / f"{0:010d}.png", 640, 160)
+    with pytest.raises(InputError, match="another aspect ratio"):
+        open_photographs(drive).camera(0)
+    for size in ("0 375", "1242"):
+        calibration.write_text(f"{content}S_rect_02: {size}\n")
+        with pytest.raises(InputError, match="line S_rect_02"):
+            open_photographs(drive)
+
+
+def test_kitti_raw_takes_what_is_no_photograph_for_none(shared, tmp_path):
+    drive = raw_drive(shared, tmp_path)
+    (drive / "image_02" / "data" / "Thumbs.db").write_bytes(b"small pictures")
+    assert len(open_photographs(drive)) == 3
+
+
+def test_a_projection_of_kitti_with_skew_is_refused(shared, tmp_path):
+    drive = raw_drive(shared, tmp_path)
+    calibration = tmp_path / "calib_cam_to_cam.txt"
+    before, _, after = calibration.read_text().partition(" 0.000000e+00 ")
+    calibration.write_text(f"{before} 5.000000e+01 {after}")
+    with pytest.raises(InputError, match="is not that of a rectified camera"):
+        open_photographs(drive)
+
+
 def test_kitti_raw_says_what_is_missing(shared, tmp_path):
     drive = raw_drive(shared, tmp_path)
     content = (tmp_path / "calib_cam_to_cam.txt").read_text()

@@ -64,6 +64,14 @@ def test_psnr_is_that_of_scikit_image():
     assert psnr(image, truth) == pytest.approx(expected, rel=1e-6)
 
 
+def test_psnr_of_an_image_that_is_not_finite_is_no_number():
+    image, truth = images()
+    broken = image.clone()
+    broken[3, 4, 1] = torch.nan
+    assert np.isnan(psnr(broken, truth))
+    assert psnr(truth, truth) == MAX_PSNR
+
+
 def test_ssim_of_an_image_with_itself_is_one_and_noise_lowers_it():
     image, truth = images()
     assert ssim(truth, truth) == pytest.approx(1.0)

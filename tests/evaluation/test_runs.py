@@ -9,7 +9,7 @@ import shutil
 import signal
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from random import Random
 
@@ -426,6 +426,11 @@ def test_wrong_runs_are_refused(finished, tasks, tmp_path):
     assert not (tmp_path / "out").exists()
     with pytest.raises(InputError, match="seed 0, and this run has 1"):
         evaluate(tasks, ["context"], finished, RunConfig(seed=1, baseline_iterations=6))
+    # A file of cases whose resolution or depth was changed: names of cases do not tell it.
+    for name, value in (("resolution", (48, 48)), ("near", 0.6), ("neighbours", ())):
+        changed = replace(tasks[0], **{name: value})
+        with pytest.raises(InputError, match=rf"the case box .* with {name} .*; name another"):
+            evaluate([changed], ["no-rc"], finished, CONFIG)
     (tmp_path / "mine.txt").write_text("precious")
     with pytest.raises(InputError, match="something other than a run"):
         evaluate(tasks, ["context"], tmp_path, CONFIG)

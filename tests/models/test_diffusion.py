@@ -299,6 +299,7 @@ def test_flux2_klein_edits_what_is_painted_over_and_gets_no_mask(tmp_path):
     answer(replace(generator, painter=painter), nearest, TARGET, context)
     assert {"mask_image", "strength"}.isdisjoint(seen)
     assert seen["num_inference_steps"] == 4
+    assert seen["guidance_scale"] == 1.0
     assert seen["prompt"].endswith("Change nothing else: a red room.")
 
     # The hole is green in the first image; the second is the nearest photograph.
@@ -309,6 +310,17 @@ def test_flux2_klein_edits_what_is_painted_over_and_gets_no_mask(tmp_path):
     assert shown.any()
     assert (over[shown] == (0, 255, 0)).all()
     assert not (over == (0, 255, 0)).all(axis=-1).all()
+
+
+def test_a_base_model_of_flux2_klein_is_guided_as_its_pipeline_does(tmp_path):
+    pipeline = tiny_diffusion.flux2_klein()
+    pipeline.register_to_config(is_distilled=False)
+    folder = tiny_diffusion.saved(pipeline, tmp_path)
+    painter = replace(load_painter(str(folder)), side=64)
+    context = known_room()
+    answer(DiffusersInpaint(painter, steps=1), context.views[1], TARGET, context)
+    assert painter.pipeline.guidance_scale == 4.0
+    assert painter.pipeline.do_classifier_free_guidance
 
 
 def test_the_size_follows_the_pipeline_and_the_aspect(inpaint_folder):

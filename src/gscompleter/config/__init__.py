@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -622,18 +623,24 @@ def get_named_config(
 
 
 def load_config(
-    source: Path | str, is_splat: bool = False, has_photographs: bool = True
+    source: Path | str,
+    is_splat: bool = False,
+    has_photographs: bool = True,
+    adapt: Callable[[CompleterConfig], CompleterConfig] = lambda config: config,
 ) -> CompleterConfig:
-    """Return a config by name, or read the changes to its `base` from a YAML file."""
+    """Return a config by name, or read the changes to its `base` from a YAML file.
+
+    `adapt` changes the named config, as `CompleterConfig.for_removal` does; a file's changes win.
+    """
     # A name is no path, and may be longer than one.
     is_given = isinstance(source, (str, os.PathLike)) and bool(os.fspath(source))
     if is_given and Path(source).suffix not in {".yaml", ".yml"}:
-        return get_named_config(os.fspath(source), is_splat, has_photographs)
+        return adapt(get_named_config(os.fspath(source), is_splat, has_photographs))
     path = require_path(source)
     # Imported here, so that only a file waits for PyYAML.
     from gscompleter.config.yaml_file import read_yaml
 
     changes = read_yaml(path)
     base_name = str(changes.pop("base", "default"))
-    base = get_named_config(base_name, is_splat, has_photographs)
+    base = adapt(get_named_config(base_name, is_splat, has_photographs))
     return apply_changes(base, changes, f"{quote_value(source)}: ")

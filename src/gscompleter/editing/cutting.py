@@ -36,12 +36,13 @@ MIN_PIECE_OPACITY = 1 / 255
 
 
 def cut(gaussians: Gaussians, contains: Region) -> tuple[Gaussians, Gaussians]:
-    """Cut Gaussians at the border of the region that their centres lie in.
+    """Cut Gaussians that were chosen, at the border of the region that their centres lie in.
 
-    Returns the Gaussians, of those at the border only what lies in the region, and the rest.
+    Returns what is chosen, and the rest of what was cut: pieces in the region, and those outside.
+    Gaussians whose centre lies outside were chosen by something else than the region, and belong
+    to the first as a whole.
     """
-    # A Gaussian lies in the region as a whole if the six ends of its axes do. One whose centre lies
-    # outside is not cut either.
+    # A Gaussian lies in the region as a whole if the six ends of its axes do.
     ends = GAUSSIAN_REACH * torch.cat([torch.eye(3), -torch.eye(3)]).to(gaussians.means)
     is_inside = torch.stack([contains(move(gaussians, end)) for end in ends]).all(dim=0)
     is_whole = is_inside | ~contains(gaussians.means)

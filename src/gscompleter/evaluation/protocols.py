@@ -18,6 +18,7 @@ from typing import Annotated, Literal
 from annotated_types import Ge, MinLen
 from pydantic import Field, TypeAdapter, ValidationError
 
+from gscompleter.data.ignored_regions import IgnoredRegions
 from gscompleter.data.photographs import Photographs, Resolution
 from gscompleter.data.sfm.refining import PoseRefinement
 from gscompleter.evaluation.cases import Case
@@ -224,6 +225,11 @@ class Task:
     """What was done to the poses of `open`; None for nothing."""
     apart_by: Path | None = None
     """File that keeps the task apart, or None."""
+    near: float | None = None
+    """Smallest z-depth that its case gives, which `open` has set; None for none. So are `far` and
+    `ignore`."""
+    far: float | None = None
+    ignore: IgnoredRegions | None = None
 
     def load(self, frames: tuple[int, ...]) -> list[View]:
         """Load the photographs of `frames`."""
@@ -249,6 +255,9 @@ def make_case_task(case: Case) -> Task:
         case.resolution,
         case.neighbours,
         apart_by=case.apart_by,
+        near=case.near,
+        far=case.far,
+        ignore=case.ignore,
     )
 
 

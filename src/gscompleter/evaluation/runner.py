@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -21,7 +22,7 @@ from gscompleter.reconstructors import load_reconstructor
 from gscompleter.reconstructors.features.depth_range import set_depth_range
 from gscompleter.render.loading import load_renderer
 from gscompleter.stages.context import normalize_exposures, reconstruct_context, sort_by_frame
-from gscompleter.system.errors import InputError
+from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.jobs.jobs import (
     Engine,
     Job,
@@ -117,10 +118,10 @@ def evaluate(
 ) -> RowCounts:
     """Run methods on tasks and write a row of scores, or of an error, for each pair.
 
-    Existing rows and completed steps in `out` are kept; simultaneous calls share the tasks.
-    `shard` (i, n) selects the tasks i, i + n, i + 2n, …. Without an `engine` the tasks run in this
-    process. Raises InputError for tasks, methods or settings with which nothing can be run; an
-    error of a task is in its rows.
+    Existing rows, reconstructed scenes and completed steps in `out` are kept, also for rows that
+    are done again; simultaneous calls share the tasks. `shard` (i, n) selects the tasks i, i + n,
+    i + 2n, …. Without an `engine` the tasks run in this process. Raises InputError for tasks,
+    methods or settings with which nothing can be run; an error of a task is in its rows.
     """
     check_methods(methods, max((len(task.targets) for task in tasks), default=0))
     check_shard(*shard)
@@ -130,6 +131,7 @@ def evaluate(
     store.claim(out, collect_settings(config))
     share = tasks[shard[0] :: shard[1]]
     runner = TaskRunner(out, tuple(dict.fromkeys(methods)), config)
+    refuse_changed_tasks(out, share)
     for task in share:
         for row in runner.find_rows(task):
             if rerun == "scores" or (rerun == "failures" and has_failed(row)):
@@ -248,7 +250,10 @@ def load_task_views(task: Task, frames: tuple[int, ...], config: RunConfig) -> l
 
 
 def load_or_reconstruct(path: Path, views: Sequence[View], models: Models) -> store.SavedContext:
-    """Load the scene saved at `path`, or reconstruct and save it."""
+    """Load the scene saved at `path`, or reconstruct and save it.
+
+    What is saved is of these photographs, since `evaluate` refuses a folder with rows of others.
+    """
     if not store.is_complete(path):
         with record_seconds() as seconds:
             context = reconstruct_context(models.reconstructor, views)
@@ -293,11 +298,48 @@ def build_row(
         poses = prepared.poses
         if poses is not None and poses.is_accepted:
             outcome["refined_poses"] = asdict(poses)
-    keys = ("name", "scene", "context", "targets", "neighbours")
-    named = {key: getattr(task, key) for key in keys}
-    row = {"version": store.RUN_VERSION, "task": named, "method": method, **outcome}
+    described = describe_evaluated_task(task)
+    row = {"version": store.RUN_VERSION, "task": described, "method": method, **outcome}
     commit = find_commit()
     return row if commit is None else {**row, "commit": commit}
+
+
+def describe_evaluated_task(task: Task) -> dict[str, Any]:
+    """Describe a task for its rows: what decides its scores, apart from the settings of the run."""
+    keys = (
+        *("name", "scene", "context", "targets", "neighbours"),
+        *("resolution", "near", "far", "ignore"),
+    )
+    # As JSON has it, to be compared with rows. Of a mask the name, since it may lie elsewhere in a
+    # later run.
+    text = json.dumps(
+        {key: getattr(task, key) for key in keys},
+        default=lambda value: value.name if isinstance(value, Path) else asdict(value),
+    )
+    described: dict[str, Any] = json.loads(text)
+    return described
+
+
+def refuse_changed_tasks(out: Path, tasks: Sequence[Task]) -> None:
+    """Raise InputError if a row, of any method, was made from other data than its task has now.
+
+    The name of a task tells its scene and frames. If its file of cases has another resolution now,
+    for instance, the scene and predictions that are saved do not fit it.
+    """
+    for task in tasks:
+        wanted = describe_evaluated_task(task)
+        for row in sorted(store.get_task_folder(out, task.name).glob("*.json")):
+            saved = store.read_run_file(row).get("task", {})
+            # Rows of earlier versions tell less.
+            known = {key: value for key, value in wanted.items() if key in saved}
+            difference = store.find_difference({key: saved[key] for key in known}, known)
+            if difference is not None:
+                name, old, new = difference
+                raise InputError(
+                    f"{quote_value(out)} holds the case {quote_value(task.name)} with {name} "
+                    f"{quote_value(repr(old))}, and it has {quote_value(repr(new))} now; name "
+                    "another folder."
+                )
 
 
 def check_tasks(tasks: Sequence[Task]) -> None:

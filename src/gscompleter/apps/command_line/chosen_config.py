@@ -41,8 +41,12 @@ class ChosenConfig(Settings):
         has_photographs: bool,
         adapt: Callable[[CompleterConfig], CompleterConfig] = lambda config: config,
     ) -> CompleterConfig:
-        """Load the config for an input, adapt it to what is done, and apply the changes."""
-        config = adapt(load_config(self.name, is_splat, has_photographs))
+        """Load the config for an input, and apply the changes.
+
+        `adapt` changes the preset to what the command does, such as a removal. What the user gives,
+        in a YAML file or as `changes`, wins over it.
+        """
+        config = load_config(self.name, is_splat, has_photographs, adapt)
         where = f"{CONFIG_OPTION}."
         return apply_changes(config, self.changes, where, where) if self.changes else config
 
@@ -74,7 +78,10 @@ def make_parsing_rule(
 
 @cache
 def make_changes_type(config: type) -> Any:
-    """Make the type of a mapping with some settings of a group; none of them has a default."""
+    """Make the type of a mapping with some settings of a group, by which tyro parses them.
+
+    None has a default, so that tyro hands over those that were typed and no others.
+    """
     hints = get_type_hints(config, include_extras=True)
     kinds = {
         one.name: make_changes_type(hints[one.name]) if has_group(one.default) else hints[one.name]
@@ -84,7 +91,7 @@ def make_changes_type(config: type) -> Any:
 
 
 def has_group(default: object) -> bool:
-    """Return True if the default of a setting is a group of further ones."""
+    """Return True if the default of a setting is a group of further ones; no group lacks one."""
     return default is not MISSING and is_dataclass(default)
 
 

@@ -259,9 +259,8 @@ def show_config(words: Sequence[str]) -> tuple[CompleterConfig, list[str]]:
     if not words or words[0] not in CONFIGURED:
         return CompleterConfig(), others
     has_scene = any(word.partition("=")[0] == "--scene" for word in others)
-    config = load_config(name, has_scene or words[0] in OF_SPLATS)
-    adapt = ADAPTED.get(words[0])
-    return config if adapt is None else adapt(config), others
+    adapt = ADAPTED.get(words[0], lambda config: config)
+    return load_config(name, has_scene or words[0] in OF_SPLATS, adapt=adapt), others
 
 
 def list_box_lines(box: str) -> list[str]:

@@ -32,7 +32,8 @@ OUTPUTS = ("out", "save", "export_holes")
 """Options that name what a command writes."""
 WORDS_OR_PATHS = ("target", "protocol", "generator_weights", "generator_depth")
 """Options whose words may be paths of files or folders that are read. Other words are counted as
-paths, too, which do not exist. Functions (file.py:function) are not: nothing writes over code."""
+paths, too, which do not exist. Functions (file.py:function) and configs (YAML) are not: no command
+writes over these."""
 ADDRESS = re.compile(r"\w\w+:/")
 """Beginning of an address such as s3://bucket; a path makes one of its two slashes. It has two
 letters at least, since `C:/results` is a path of Windows."""
@@ -179,8 +180,8 @@ class SceneOptions(ComputeOptions, WritingOptions, MaskOptions):
     summary.json."""
     format: str | None = None
     """Format of SCENE: colmap, nerfstudio, cameras-json, llff, kitti, kitti-raw, dgp, waymo,
-    mmdet3d, pandaset, chunks, real-estate-10k, polycam, record3d, 3d-scanner-app or photograph.
-    Detected if not given."""
+    mmdet3d, pandaset, chunks, real-estate-10k, polycam, record3d, 3d-scanner-app, scannet, replica,
+    mvsnet, idr or photograph. Detected if not given."""
     scene: Path | None  # each command has its own help and default
     resolution: Size | None = None
     """Size of images in pixels. The working size: longest side (photographs are never enlarged),
@@ -217,10 +218,10 @@ class CompletingOptions(SceneOptions, ModelOptions, GeometryOptions):
     # May be left out, unlike that of `SceneOptions`.
     folder: Annotated[Path | None, tyro.conf.Positional, tyro.conf.arg(metavar="SCENE")] = None  # type: ignore[assignment]
     """Folder of the photographs: COLMAP, nerfstudio, cameras.json, LLFF, KITTI, DGP, Waymo,
-    PandaSet, a pixelSplat chunk, a RealEstate10K camera file, or what Polycam, Record3D or 3d
-    Scanner App exports. If it has no cameras, COLMAP finds them and they are kept in OUT/colmap;
-    also of 360° panoramas (2:1) and of a video (.mp4, .mov, .mkv). One image needs none. A splat
-    without photographs may be SCENE itself."""
+    PandaSet, ScanNet, Replica, MVSNet, IDR, a pixelSplat chunk, a RealEstate10K camera file, or
+    what Polycam, Record3D or 3d Scanner App exports. If it has no cameras, COLMAP finds them and
+    they are kept in OUT/colmap; also of 360° panoramas (2:1) and of a video (.mp4, .mov, .mkv). One
+    image needs none. A splat without photographs may be SCENE itself."""
     scene: Path | None = None
     """File of Gaussians (a splat) to work on. It is of these photographs, and completed instead of
     reconstructing the scene; all are kept, but what earlier commands added gives way where

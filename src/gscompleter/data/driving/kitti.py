@@ -20,6 +20,7 @@ from jaxtyping import Float
 
 from gscompleter.data.cameras import Intrinsics, find_pose_defect
 from gscompleter.data.driving.vehicle import build_poses, read_sweep
+from gscompleter.data.file_names import is_photograph_name
 from gscompleter.data.frame import Frame
 from gscompleter.data.limits import MAX_NUMBER, require
 from gscompleter.data.photographs import Photographs, build_drive, build_photographs
@@ -106,12 +107,13 @@ def open_kitti_raw(path: Path) -> Iterator[Photographs]:
     camera = _list_raw_cameras(path)[0]
     date = path.resolve().parent
     # The chain of frames: map <- inertial sensor <- laser <- camera 0 <- camera of the photographs.
-    # Calibration files hold the transforms in the other direction.
+    # Calibration files hold the transforms in the other direction. `pinv` also takes what is not
+    # rigid, which is refused with the poses.
     imu_from_laser = np.linalg.pinv(_read_rigid(date / "calib_imu_to_velo.txt"))
     intrinsics, first_from_camera, first_from_laser = _read_raw_camera(date, camera)
     laser_from_first = np.linalg.pinv(first_from_laser)
 
-    images = list_entries(path / f"image_{camera}" / "data")
+    images = _list_raw_photographs(path, camera)
     readings = [_read_oxts(path / "oxts" / "data" / f"{image.stem}.txt") for image in images]
     # One scale of the map for all frames, that at the first latitude, so that it stays rigid.
     scale = float(np.cos(np.radians(readings[0][0])))
@@ -142,17 +144,30 @@ def _read_raw_camera(
     rectify[:3, :3] = _get_entry(entries, "R_rect_00", 9, path).reshape(3, 3)
     projection = _get_matrix(entries, f"P_rect_{camera}", path)
     first_from_laser = rectify @ _read_rigid(date / "calib_velo_to_cam.txt")
-    return *_split_projection(projection, path), first_from_laser
+    # The size that the projection belongs to: copies of a drive may have smaller photographs.
+    label = f"S_rect_{camera}"
+    size = None
+    if label in entries:
+        width, height = _get_entry(entries, label, 2, path).round().astype(int).tolist()
+        require(
+            min(width, height) > 0,
+            f"{quote_value(path)} has a size without pixels in line {label}; copy it again.",
+        )
+        size = width, height
+    return *_split_projection(projection, path, size), first_from_laser
 
 
 def _split_projection(
-    projection: HomogeneousMatrix, path: Path
+    projection: HomogeneousMatrix, path: Path, size: tuple[int, int] | None = None
 ) -> tuple[Intrinsics, HomogeneousMatrix]:
-    """Split the projection of a rectified camera into intrinsics and the transform to camera 0."""
+    """Split the projection of a rectified camera into intrinsics and the transform to camera 0.
+
+    `size` is the width and height of its images; None for those of the photographs.
+    """
     K = projection[:3, :3]
-    # Rectified cameras are all turned alike, so the left part is K alone.
+    # Rectified cameras are all turned alike, so the left part is K alone, which has no skew.
     require(
-        not np.tril(K, -1).any() and (np.diag(K) > 0).all() and K[2, 2] == 1,
+        not np.tril(K, -1).any() and K[0, 1] == 0 and (np.diag(K) > 0).all() and K[2, 2] == 1,
         f"The projection in {quote_value(path)} is not that of a rectified camera; name the "
         "calib.txt of KITTI odometry.",
     )
@@ -160,7 +175,7 @@ def _split_projection(
     transform = np.eye(4)
     transform[:3, 3] = -np.linalg.solve(K, projection[:3, 3])
     (fx, _, cx), (_, fy, cy), _ = K.tolist()
-    return Intrinsics(None, (fx, fy), (cx, cy)), transform
+    return Intrinsics(size, (fx, fy), (cx, cy)), transform
 
 
 def _compute_imu_pose(reading: LineNumbers, scale: float) -> HomogeneousMatrix:
@@ -242,4 +257,9 @@ def _list_poses(path: Path) -> list[Path]:
 
 
 def _list_raw_cameras(path: Path) -> list[str]:
-    return [c for c in RAW_CAMERAS if list_entries(path / f"image_{c}" / "data", "*.*")]
+    return [camera for camera in RAW_CAMERAS if _list_raw_photographs(path, camera)]
+
+
+def _list_raw_photographs(path: Path, camera: str) -> list[Path]:
+    files = list_entries(path / f"image_{camera}" / "data")
+    return [file for file in files if is_photograph_name(file.name)]

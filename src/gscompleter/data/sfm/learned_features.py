@@ -73,6 +73,7 @@ class LearnedMatcher:
         if mask is not None:
             with Image.open(mask) as image:
                 is_shown = np.array(image.convert("L").resize(size, Image.Resampling.NEAREST)) > 0
+            # Keypoints are middles of pixels of the network's input, so that each is inside.
             x, y = keypoints.round().long().unbind(dim=1)
             shown = torch.from_numpy(is_shown)[y, x]
             keypoints, descriptors = keypoints[shown], descriptors[shown]
@@ -80,7 +81,7 @@ class LearnedMatcher:
         return LearnedFeatures(keypoints, descriptors, size, scale)
 
     def match(self, one: LearnedFeatures, other: LearnedFeatures) -> Int[np.ndarray, "m 2"]:
-        """Match the features of two photographs; return their numbers in both."""
+        """Match the features of two photographs; return the rows of each match in both."""
         if len(one.keypoints) == 0 or len(other.keypoints) == 0:
             return np.zeros((0, 2), np.int64)
         given = {}
@@ -134,6 +135,7 @@ def match_learned(
         database.clear_two_view_geometries()
         database.clear_matches()
         numbers = [read_image_number(database, name) for name in names]
+        # SIFT's descriptors stay: from here on COLMAP reads places and matches only.
         for number, found in zip(numbers, features, strict=True):
             database.update_keypoints(number, found.pixels)
         for i, j in sorted(pairs):

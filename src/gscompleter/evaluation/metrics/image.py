@@ -20,9 +20,10 @@ LUMINANCE = (0.299, 0.587, 0.114)
 
 
 def psnr(image: Float[Tensor, "h w 3"], truth: Float[Tensor, "h w 3"]) -> float:
-    """Compute PSNR in dB: -10 log10(mean((clip(image) - truth)²)) with peak 1."""
+    """Compute PSNR in dB: -10 log10(mean((clip(image) - truth)²)) with peak 1; NaN if one is."""
     error = (image.clamp(0, 1) - truth).double().square().mean().item()
-    return min(-10 * math.log10(error), MAX_PSNR) if error > 0 else MAX_PSNR
+    # NaN stays: `min` returns its first argument unless the second one is smaller.
+    return MAX_PSNR if error == 0 else min(-10 * math.log10(error), MAX_PSNR)
 
 
 def compute_masked_psnr(

@@ -81,17 +81,15 @@ class Painter:
             "prompt": prompt,
             "image": resize_antialiased(image, size).permute(2, 0, 1)[None].cpu(),
             "mask_image": mask.permute(2, 0, 1)[None].cpu(),
+            # Of its own size, to which the pipeline fits its tokens.
             "image_reference": reference.permute(2, 0, 1)[None].cpu(),
             "height": size[0],
             "width": size[1],
             "strength": 1.0,  # start from pure noise in the hole
             "generator": torch.Generator().manual_seed(seed),
             "output_type": "pt",
+            **choose_denoising(self.pipeline, steps),
         }
-        if getattr(self.pipeline.config, "is_distilled", False):
-            wanted["guidance_scale"] = 1.0  # which distilled models do not use
-        if steps is not None:
-            wanted["num_inference_steps"] = steps
 
         # Pipelines differ in their parameters; each gets those of its own.
         known = inspect.signature(self.pipeline.__call__).parameters
@@ -121,18 +119,26 @@ class Editor(Painter):
         color = image.new_tensor(PAINTED_OVER)
         over = resize_antialiased(torch.where(hole[..., None], color, image), size)
         shown = [Image.fromarray(convert_to_pixels(picture)) for picture in (over, reference)]
-        arguments: dict[str, Any] = {} if steps is None else {"num_inference_steps": steps}
         edited = self.pipeline(
             image=shown,
             prompt=INSTRUCTION.format(prompt=prompt),
             height=size[0],
             width=size[1],
-            guidance_scale=1.0,  # which distilled models do not use
             generator=torch.Generator().manual_seed(seed),
             output_type="pt",
-            **arguments,
+            **choose_denoising(self.pipeline, steps),
         ).images[0]
         return restore_size(edited, image)
+
+
+def choose_denoising(pipeline: Any, steps: int | None) -> dict[str, Any]:
+    """Choose the arguments of denoising that differ from the defaults of the pipeline."""
+    chosen: dict[str, Any] = {} if steps is None else {"num_inference_steps": steps}
+    # Distilled models use no guidance, and warn of a scale above 1. For others, such as the base
+    # models of FLUX.2 [klein], a scale of 1 would turn the guidance off.
+    if getattr(pipeline.config, "is_distilled", False):
+        chosen["guidance_scale"] = 1.0
+    return chosen
 
 
 def restore_size(
