@@ -333,6 +333,21 @@ def test_a_setting_that_is_given_again_is_that_of_the_session(
     assert told.value.argument == "config"
 
 
+@pytest.mark.parametrize(
+    ("words", "kind"),
+    [
+        ((), "auto"),
+        (("--config.holes.kind", "all"), "all"),
+        (("--config.holes.kind", "enclosed"), "enclosed"),
+        (("--holes", "all"), "all"),
+    ],
+)
+def test_holes_of_a_splat_alone_are_those_that_the_session_began_with(splat, tmp_path, words, kind):
+    out = begin(tmp_path / "out", splat, *words)
+    for given in ((), words):
+        assert find_opening(out, *given).completion.source.holes == kind
+
+
 def test_an_option_that_an_early_session_did_not_know_is_refused_and_not_ignored(
     room, splat, tmp_path
 ):

@@ -38,6 +38,7 @@ from gscompleter.apps.live.strokes import (
 )
 from gscompleter.apps.report.schema import find_completed
 from gscompleter.apps.requests.completion import CompletionRequest, TargetRequest
+from gscompleter.apps.requests.scene import AloneRequest
 from gscompleter.config import CompleterConfig
 from gscompleter.config.generators import GeneratorOptions
 from gscompleter.splats.edits import read_edits
@@ -149,7 +150,11 @@ def describe_session(options: CompletingOptions, completion: CompletionRequest) 
     scene = None if splat is None else os.path.abspath(splat.path)
     folder = None if has_splat_alone(options) else describe_value("folder", options.folder)
     config = describe_value("config", asdict(completion.work.config))
-    return {**describe_options(options), "folder": folder, "scene": scene, "config": config}
+    described = {**describe_options(options), "folder": folder, "scene": scene, "config": config}
+    if isinstance(completion.source, AloneRequest):
+        # A setting may have said so in place of the option.
+        described["holes"] = completion.source.holes
+    return described
 
 
 def describe_options(options: CompletingOptions) -> dict[str, Any]:
@@ -243,13 +248,18 @@ def restore_options(options: AnyOptions, saved: StrokesFile, path: Path) -> AnyO
     known = {**saved.session, **{name: getattr(saved, name) for name in SEPARATE_OPTIONS}}
     config = validate_typed(CompleterConfig, known.get("config", {}), shown, STROKES_ADVICE)
 
+    settings = asdict(config)
+    if config.holes.kind == "all":
+        # It was not given, or the option of the session says so, too.
+        del settings["holes"]["kind"]
+
     # Of this run are its own options, and those of the command that no completion has.
     own = {field.name for field in fields(kind)}
     own -= {field.name for field in fields(CompletingOptions)} - set(OPTIONS_OF_A_RUN)
     values = {
         **known,
         **{name: getattr(options, name) for name in own},
-        "config": ChosenConfig(changes=asdict(config)),
+        "config": ChosenConfig(changes=settings),
     }
     restored = validate_typed(kind, values, shown, STROKES_ADVICE)
     for name in SCENE_PATHS:

@@ -9,6 +9,7 @@ import os
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 from gscompleter.apps.commands.shared_options import (
     CompletingOptions,
@@ -96,7 +97,8 @@ def decide_filling(
     if lacks_photographs:
         assert splat is not None
         scene = decide_scene(options, splat.path, masks, has_splat=True)
-        source = AloneRequest(scene, context, options.cameras, options.up, options.holes)
+        kind = choose_hole_kind(options, config)
+        source = AloneRequest(scene, context, options.cameras, options.up, kind)
     else:
         assert options.folder is not None
         scene = decide_scene(options, options.folder, masks, splat is not None)
@@ -116,10 +118,32 @@ def decide_config(
     config = options.config.decide(is_splat, not lacks_photographs, adapt)
     if options.no_recolor:
         config = stop_recoloring(config)
-    # With photographs, a scene is what they show, unless the user says otherwise.
-    if not lacks_photographs and options.holes != "auto":
-        config = config.for_holes(options.holes)
+    # With photographs, a scene is what they show, unless the user says otherwise. Of a splat alone
+    # the kind is decided when it was read.
+    kind = choose_hole_kind(options, config)
+    if not lacks_photographs and kind != "auto":
+        config = config.for_holes(kind)
     return config
+
+
+def choose_hole_kind(
+    options: CompletingOptions, config: CompleterConfig
+) -> Literal["auto", "all", "enclosed"]:
+    """Choose which holes are filled: those of the option, or else of the setting if it was given.
+
+    `config` is that of the options. Raises InputError if both are given and differ.
+    """
+    # No preset has another kind than the default, so that the user chose what differs from it.
+    is_given = "kind" in options.config.changes.get("holes", {}) or config.holes.kind != "all"
+    if not is_given:
+        return options.holes
+    if options.holes not in ("auto", config.holes.kind):
+        raise InputError(
+            f"--holes is {options.holes}, and the setting holes.kind is {config.holes.kind}; give "
+            "one of them.",
+            "holes",
+        )
+    return config.holes.kind
 
 
 def decide_results(options: SceneOptions) -> ResultsRequest:
