@@ -54,7 +54,7 @@ SIZE = 24
 MOST_WAITS = {
     # A plan waits twice: for the number of intersections, and for what its tiles show.
     "default": {"context": 139, "generate": 40, "lift": 37, "register": 14, "integrate": 37},
-    # Closing thin gaps asks all guards once more for each of three cameras, and here `psnr` in
+    # Closing thin gaps asks all guards once more for each of five cameras, and here `psnr` in
     # several rounds.
     "with gaps": {"context": 139, "generate": 40, "lift": 37, "register": 14, "integrate": 226},
     "paper": {"context": 78, "generate": 44, "lift": 53, "register": 55, "integrate": 10},

@@ -227,8 +227,9 @@ class GapConfig(Settings):
     """Closing of thin gaps, which open where the camera moves from a target."""
 
     displacement: Annotated[float, Interval(ge=0, le=2)] = 0.6
-    """Moves of the cameras that look for gaps, away from the photograph nearest to the target and
-    to both sides, relative to their baseline; 0 closes none (paper)."""
+    """Move of the first camera that looks for gaps, away from the photograph nearest to the target,
+    relative to their baseline; others stand 0.75 and 1.25 times as far to both sides. 0 closes none
+    (paper)."""
     max_alpha: Annotated[float, Interval(gt=0, le=1)] = 0.85
     """Accumulated opacity below which a thin structure is a gap."""
 
