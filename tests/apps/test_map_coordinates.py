@@ -12,10 +12,14 @@ import torch
 import gscompleter as gsc
 from command import run
 from gscompleter import load_splat, merge, save_ply
+from gscompleter.apps.report.schema import ResultFrame
 from gscompleter.apps.viewer.exhibit import (
+    ViewerContent,
     add_file_cameras,
+    load_scene_cameras,
     load_viewer_completion,
     load_viewer_files,
+    place_content,
 )
 from gscompleter.data.formats import open_photographs
 from map_scene import PLACE, write_map_ply
@@ -115,6 +119,46 @@ def test_cameras_of_a_file_are_those_of_the_splat_beside_it(folders):
     for camera, shot in zip(CAMERAS, content.cameras, strict=True):
         centre = shot.camera.center.double().numpy() + np.array(content.after.origin) - MAP
         assert np.abs(centre - camera.center.numpy()).max() < 1e-5
+
+
+@pytest.mark.parametrize("is_splat_in_map", [False, True])
+def test_cameras_of_a_splat_in_another_frame_are_not_rounded(tmp_path, is_splat_in_map):
+    """Either the splat or its photographs are in a map."""
+    cameras = [camera_at(0.37, 0.13, size=SIZE), *CAMERAS]
+    photographed(tmp_path, cameras)
+    splat = gaussians_of(view_of(Room(), CAMERAS[0]))
+    origin = tuple(MAP.tolist()) if is_splat_in_map else None
+    by = MAP if is_splat_in_map else -MAP
+    if not is_splat_in_map:
+        shift_cameras(tmp_path / "transforms.json", MAP)
+    transform = np.eye(4)
+    transform[:3, 3] = by
+    rows = tuple(map(tuple, transform.tolist()))
+    # As versions wrote it whose origin was that of the splat, in its frame.
+    frame = ResultFrame("cameras", rows, origin or (0.0, 0.0, 0.0))
+    content = place_content(ViewerContent("a", replace(splat, origin=origin), None), frame)
+    loaded = load_scene_cameras(tmp_path, content.transform, content.origin)
+    for camera, expected in zip(loaded, cameras, strict=True):
+        assert torch.allclose(camera.center, expected.center, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_the_origin_of_a_result_is_that_of_its_photographs(folders, tmp_path, monkeypatch):
+    """Its splat is in a map, and its photographs are not, as cameras.json beside it tells."""
+    splat = shutil.copy(folders[1] / "splat.ply", tmp_path / "splat.ply")
+    entries = []
+    for number, frame in enumerate(open_photographs(folders[0] / "room").frames):
+        position, rotation = (frame.c2w[:3, 3] + MAP).tolist(), frame.c2w[:3, :3].tolist()
+        name = {"id": number, "img_name": Path(frame.name).stem}
+        shape = {"width": SIZE, "height": SIZE, "fx": 0.9 * SIZE, "fy": 0.9 * SIZE}
+        entries.append({**name, **shape, "position": position, "rotation": rotation})
+    (tmp_path / "cameras.json").write_text(json.dumps(entries))
+    words = (folders[0] / "room", "--scene", splat, "--out", tmp_path / "OUT")
+    assert run(monkeypatch, "complete", *words, *WORDS) == 0
+    frame = summary_of(tmp_path / "OUT")["frame"]
+    assert frame["method"] == "cameras"
+    assert np.allclose(np.array(frame["transform"])[:3, 3], MAP)
+    assert frame["origin"] == [0, 0, 0]
 
 
 def test_a_page_counts_in_the_coordinates_of_the_file(folders, tmp_path, monkeypatch):

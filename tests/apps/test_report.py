@@ -16,7 +16,11 @@ from PIL import Image
 
 from command import run
 from gscompleter.apps.report.page import open_gallery, render_completion_page
-from gscompleter.apps.report.plain_words import describe_wanted_photographs, list_photograph_notes
+from gscompleter.apps.report.plain_words import (
+    describe_exposures,
+    describe_wanted_photographs,
+    list_photograph_notes,
+)
 from gscompleter.apps.report.record import fit_frame
 from gscompleter.apps.report.schema import AlignmentRow, ContextRow, TargetRow, read_summary
 from gscompleter.evaluation.verdict.numbers import format_change, format_number, format_percent
@@ -393,6 +397,14 @@ def test_depth_maps_beside_a_colmap_model_are_no_points(completed_room):
     scene = replace(summary.scene, format="colmap", notes=notes)
     (note,) = list_photograph_notes(replace(summary, scene=scene, context=(row,)))
     assert "have a measured or predicted depth, which" in note.text
+
+
+def test_exposures_are_compared_by_channel():
+    said = describe_exposures([(1.2, 1.0, 0.5), (0.8, 1.0, 0.5)])
+    assert "differ by a factor of up to 1.50; the scene has one exposure" in said
+    # A remade scene keeps the exposure of an earlier one, which all photographs differ from alike.
+    said = describe_exposures([(0.8, 1.0, 1.25)] * 2)
+    assert said.startswith("The scene has another exposure than the context photographs, at which")
 
 
 def test_what_is_ignored_is_told_with_its_cause(completed_room):

@@ -20,6 +20,7 @@ import numpy as np
 import plyfile
 import pytest
 import torch
+from PIL import Image
 
 from command import run
 from gscompleter.apps.report.schema import (
@@ -37,6 +38,7 @@ from gscompleter.apps.viewer.exhibit import (
     ViewerContent,
     load_viewer_completion,
     load_viewer_files,
+    make_frame_thumbnail,
 )
 from gscompleter.apps.viewer.packages import (
     MODULES,
@@ -59,7 +61,7 @@ from gscompleter.evaluation.verdict.rows import OutcomeRow
 from gscompleter.splats.formats import load_splat
 from gscompleter.splats.ply import save_ply
 from gscompleter.system.errors import InputError
-from gscompleter.system.files.image import write_image
+from gscompleter.system.files.image import ORIENTATION, write_image
 from gscompleter.types import Gaussians, merge
 from pose_files import CAMERAS, NAMES, write_colmap_binary, write_photographs
 from scenes import camera_at
@@ -699,3 +701,19 @@ def test_a_browser_that_leaves_leaves_no_traceback(monkeypatch, capfd):
 def test_a_port_that_is_taken_gets_a_sentence(port):
     with pytest.raises(InputError, match=f"Port {port}"):
         make_page_server(b"", port)
+
+
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+def test_the_thumbnail_of_a_single_photograph_is_upright(tmp_path, orientation):
+    pixels = np.zeros((32, 48, 3), np.uint8)
+    pixels[:16, :24] = 255
+    image = Image.fromarray(pixels)
+    exif = image.getexif()
+    exif[ORIENTATION] = orientation
+    image.save(tmp_path / "a.png", exif=exif)
+    photographs = open_photographs(tmp_path / "a.png")
+    shown = make_frame_thumbnail(photographs.frame(0))
+    assert shown is not None
+    thumbnail = np.asarray(Image.open(io.BytesIO(shown))).astype(int)
+    (view,) = photographs.views([0])
+    assert np.abs(thumbnail - 255 * view.image.numpy()).mean() < 8

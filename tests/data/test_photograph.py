@@ -95,6 +95,29 @@ def test_a_single_photograph_is_upright(tmp_path, orientation):
     assert photographs.frame(0).size() == upright.shape[1::-1]
 
 
+@pytest.mark.parametrize("orientation", [1, 3, 6])
+@pytest.mark.parametrize("is_beside", [False, True])
+def test_masks_and_alpha_of_a_single_photograph_hide_however_it_is_turned(
+    tmp_path, orientation, is_beside
+):
+    save_turned(tmp_path / "a.png", orientation, "RGB" if is_beside else "RGBA")
+    if is_beside:
+        width, height = StoredPhotograph(tmp_path / "a.png").upright_size
+        mask = np.full((height, width), 255, np.uint8)
+        mask[:4] = 0
+        (tmp_path / "masks").mkdir()
+        Image.fromarray(mask).save(tmp_path / "masks" / "a.png")
+    photographs = open_photographs(tmp_path / "a.png")
+    described = photographs.describe_masks([0])
+    assert described is not None
+    assert described.startswith("masks of 1" if is_beside else "the alpha channel of 1")
+    if is_beside:
+        (view,) = photographs.views([0])
+        assert view.ignore_mask is not None
+        assert view.ignore_mask[:4].all()
+        assert not view.ignore_mask[4:].any()
+
+
 @pytest.mark.parametrize("is_packed", [False, True])
 def test_an_alpha_that_is_the_same_everywhere_hides_nothing(tmp_path, is_packed):
     pixels = np.full((SIZE, SIZE, 4), 100, np.uint8)

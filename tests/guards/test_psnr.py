@@ -78,6 +78,35 @@ def test_no_photograph_is_matched_worse_than_allowed(halvings, removals, monkeyp
     assert len(mended) == len(harmful)
 
 
+def test_what_goes_at_last_harms_no_other_photograph(monkeypatch):
+    """Of two Gaussians the first is wrong in one photograph, and hides the second in another."""
+    view = view_of(ROOM, CAMERA)
+    context = gaussians_of(view)
+    added = replace(context[:2], opacities=torch.ones(2), encoded=None)
+    frozen = load_renderer("cpu").freeze(context, CAMERA)
+    before = frozen.render
+
+    def show_first(opacities):
+        return replace(before, image=view.image * (1 - 0.5 * opacities[0]))
+
+    def show_second(opacities):
+        return replace(before, image=view.image * (1 - 0.5 * opacities[1] * (1 - opacities[0])))
+
+    def show_neither(opacities):
+        return replace(before, image=0 * view.image + 0 * opacities.sum())
+
+    monkeypatch.setattr(guard, "NUM_HALVINGS", 0)
+    monkeypatch.setattr(guard, "NUM_REMOVALS", 0)
+    plans = show_first, show_second
+    budget = [mse(view, 1e-6)]
+    mended = meet_error_budgets(added, [frozen] * 2, [budget] * 2, plans, MENDED)
+    for plan in plans:
+        assert torch.allclose(plan(mended.opacities).image, view.image)
+    # A photograph that is over budget without any of them ends it as well.
+    kept = meet_error_budgets(added, [frozen], [budget], [show_neither], MENDED)
+    assert torch.equal(kept.opacities, added.opacities)
+
+
 def test_what_has_to_go_for_the_most_part_goes_altogether_and_soon(monkeypatch):
     view = view_of(ROOM, CAMERA)
     context = gaussians_of(view)

@@ -10,13 +10,14 @@ from gscompleter import InputError
 from gscompleter.models.diffusion import source_depth
 from gscompleter.models.diffusion.source_depth import (
     MonocularDepth,
+    PredictedDepth,
     compute_context_depth,
     convert_disparity,
     load_monocular,
     load_source_depth,
     rescale_depth,
 )
-from gscompleter.types import Render
+from gscompleter.types import DepthMap, Render
 from known_room import known_room
 from tiny_depth_model import tiny_model
 
@@ -50,6 +51,19 @@ def test_the_unit_of_length_does_not_matter(unit):
 def test_a_guess_in_another_unit_is_brought_to_the_scenes():
     true = RENDER.depth.clamp_min(0.1)
     assert torch.allclose(rescale_depth(7.0 * true, holed()), true, rtol=1e-3)
+
+
+def test_where_a_predictor_sees_no_surface_it_measures_no_scale():
+    """It takes the larger part of what the scene shows for the sky."""
+    true = RENDER.depth.clamp_min(1.0)
+    valid = torch.zeros(96, 96, dtype=torch.bool)
+    valid[:, :30] = True
+    shown = replace(RENDER, depth=torch.where(valid, true, 50 * true.max()))
+    predict = PredictedDepth(lambda _: DepthMap(torch.where(valid, true / 7, 1.0), valid))
+    assert torch.allclose(predict(VIEW, shown)[valid], true[valid], rtol=1e-3)
+    nothing = PredictedDepth(lambda _: DepthMap(true, torch.zeros_like(valid)))
+    with pytest.raises(InputError, match="no surface where the scene has one"):
+        nothing(VIEW, shown)
 
 
 def test_a_disparity_of_unknown_scale_and_shift_is_brought_to_the_scenes_depth():

@@ -214,8 +214,12 @@ def list_runs(labels: UInt8[Tensor, "n"], runs: Sequence[RunRecord]) -> Iterator
 def list_cameras(
     request: InspectionRequest, folder: Path | None, gaussians: Gaussians
 ) -> tuple[list[tuple[str, Camera]], tuple[str, ...]]:
-    """List the cameras of pictures with their names, and notes on those that are missing."""
-    # Cameras are read into the frame of the file: that of the photographs, then its transform.
+    """List the cameras of pictures with their names, and notes on those that are missing.
+
+    They are in the frame of `gaussians`: the coordinates of the file less its local origin.
+    """
+    # Files of cameras are in the frame of the photographs of a completion, which its transform
+    # leads from, or else in that of the file.
     summary = None if folder is None else read_summary(folder)
     content = place_content(
         ViewerContent("", gaussians, None), None if summary is None else summary.frame

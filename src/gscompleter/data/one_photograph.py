@@ -5,12 +5,11 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import UInt8
 
 from gscompleter.data.cameras import Intrinsics
 from gscompleter.data.file_names import PHOTOGRAPH_ENDINGS
@@ -19,11 +18,8 @@ from gscompleter.data.limits import require
 from gscompleter.data.panorama import has_panoramas
 from gscompleter.data.photograph import FULL_FRAME_DIAGONAL, StoredPhotograph
 from gscompleter.data.photographs import Photographs, build_photographs
-from gscompleter.data.sfm.poses import (
-    iterate_photographs,
-)
+from gscompleter.data.sfm.poses import iterate_photographs
 from gscompleter.system.errors import quote_value
-from gscompleter.system.files.image import turn_upright
 
 PHONE_FOCAL = 26 / FULL_FRAME_DIAGONAL
 """Focal length if EXIF has none, in image diagonals: 26 mm in 35 mm film, a phone's camera."""
@@ -52,34 +48,11 @@ def open_photograph(path: Path) -> Iterator[Photographs]:
     exif_focal = photograph.optics.focal
     title = quote_value(file)
     focal = (exif_focal or PHONE_FOCAL) * math.hypot(*size)
-    # The camera is that of the upright photograph, so the pixels are turned once and for all.
-    is_upright = photograph.orientation == 1
-    shown = photograph if is_upright else UprightPhotograph(photograph)
-    frame = Frame(file.name, title, np.eye(4), Intrinsics(size, (focal, focal)), shown)
+    frame = Frame(file.name, title, np.eye(4), Intrinsics(size, (focal, focal)), photograph)
+    # The camera is that of the upright photograph. Its width and height tell the frame of most
+    # quarter turns; of half a turn, a mirror or a square they do not.
+    if frame.find_turn() != photograph.orientation:
+        frame = replace(frame, image=replace(photograph, is_turned=True))
     origin = "of EXIF" if exif_focal else "of a phone, since EXIF has none"
     note = f"The photograph has no camera; a focal length of {focal:.0f} px is used, {origin}."
     yield replace(build_photographs(file.stem, title, [frame]), notes=(note,))
-
-
-@dataclass(frozen=True)
-class UprightPhotograph:
-    """A photograph that is turned as EXIF asks, whatever its camera says."""
-
-    turned: StoredPhotograph
-
-    def measure(self) -> tuple[int, int]:
-        """Return the size of the upright photograph."""
-        return self.turned.upright_size
-
-    def read_orientation(self) -> int:
-        """Return 1: it is upright."""
-        return 1
-
-    def read_pixels(
-        self,
-    ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None]:
-        """Read the pixels, and turn them."""
-        colors, alpha = self.turned.read_pixels()
-        orientation = self.turned.orientation
-        upright = turn_upright(colors, orientation)
-        return upright, None if alpha is None else turn_upright(alpha, orientation)

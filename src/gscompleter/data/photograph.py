@@ -24,6 +24,7 @@ from gscompleter.system.files.image import (
     read_colors_and_alpha,
     read_image_size,
     read_orientation,
+    turn_upright,
 )
 
 FULL_FRAME_DIAGONAL = 43.2666
@@ -74,6 +75,9 @@ class StoredPhotograph:
     """An existing file, or a function that reads the bytes of one from its container."""
     title: str = ""
     """Name of bytes, for errors."""
+    is_turned: bool = False
+    """True to turn the pixels as EXIF asks when they are read, whatever their camera says: they
+    then count as stored upright."""
 
     @property
     def path(self) -> Path | None:
@@ -114,19 +118,23 @@ class StoredPhotograph:
         return (height, width) if self.orientation in QUARTER_TURNS else (width, height)
 
     def measure(self) -> tuple[int, int]:
-        """Return `size`."""
-        return self.size
+        """Return `size`, or `upright_size` if it is turned."""
+        return self.upright_size if self.is_turned else self.size
 
     def read_orientation(self) -> int:
-        """Return `orientation`."""
-        return self.orientation
+        """Return `orientation`, or 1 if it is turned."""
+        return 1 if self.is_turned else self.orientation
 
     def read_pixels(
         self,
     ) -> tuple[UInt8[np.ndarray, "h w 3"], UInt8[np.ndarray, "h w"] | None]:
         """Read colours and alpha; one that is the same everywhere tells nothing, and is None."""
         colors, alpha = read_colors_and_alpha(self.stored, self.title)
-        return colors, None if alpha is None else leave_out_constant(alpha)
+        alpha = None if alpha is None else leave_out_constant(alpha)
+        if not self.is_turned:
+            return colors, alpha
+        upright = turn_upright(colors, self.orientation)
+        return upright, None if alpha is None else turn_upright(alpha, self.orientation)
 
 
 def read_lens(exif: Image.Exif) -> str:

@@ -264,7 +264,7 @@ def describe_transforms(photographs: Photographs, home: Path) -> dict[str, Any]:
 
 def describe_frame(frame: Frame, home: Path) -> dict[str, Any]:
     """Describe a photograph and its camera, as `describe_transforms` does."""
-    if frame.file is None or frame.file.path is None:
+    if frame.file is None or frame.file.path is None or frame.file.is_turned:
         raise InputError(
             f"The photograph of {frame.title} is no file of its own, which transforms.json cannot "
             "name; export the images first."

@@ -55,8 +55,8 @@ def continue_lines(
 
     layers = (image, known, directions, limits)
     traced = trace_lines(*(layer.contiguous().numpy() for layer in layers))
-    colours, lengths = (torch.from_numpy(array) for array in traced)
-    return colours, coherence * torch.exp(-lengths / reach)
+    colors, lengths = (torch.from_numpy(array) for array in traced)
+    return colors, coherence * torch.exp(-lengths / reach)
 
 
 def continue_structure_tensor(

@@ -28,11 +28,11 @@ class UnsupportedError(ValueError):
 
 
 class BandError(UnsupportedError):
-    """Intact bytes with harmonics of degree 4."""
+    """Intact bytes with harmonics of degree 4; who knows the file makes a `DegreeError` of it."""
 
 
 class DegreeError(InputError):
-    """An intact file with harmonics of degree 4, which can be read without its fourth band."""
+    """A named file with harmonics of degree 4, which can be read without its fourth band."""
 
 
 def unpack_fractions(packed: UInt32[ndarray, "n"], widths: Sequence[int]) -> Float[ndarray, "n k"]:
@@ -60,7 +60,10 @@ def pack_fractions(fractions: Float[ndarray, "n k"], widths: Sequence[int]) -> U
 def restore_largest(
     largest: Integer[ndarray, "n"], smaller: Float[ndarray, "n 3"]
 ) -> Float[ndarray, "n 4"]:
-    """Restore unit quaternions whose positive component `largest` was dropped."""
+    """Restore unit quaternions whose positive component was dropped, that of number `largest`.
+
+    Components keep the order of the file, as in `drop_largest`.
+    """
     quats = np.empty((len(smaller), 4), np.float32)
     # Places of the other three: those from the dropped one on move up by one.
     places = np.arange(3) + (np.arange(3) >= largest[:, None])
@@ -85,7 +88,7 @@ def drop_largest(
 def check_count(count: int, stored: int, what: str = "Gaussians") -> None:
     """Raise DamagedError if `stored` bytes claim more Gaussians than any file would hold in them.
 
-    Anything else that is counted is named by `what`.
+    `what` names them in the sentence, where other things than Gaussians are counted.
 
     What is equal for all Gaussians, such as their size, takes hardly a byte in a packed format, so
     that no ratio of sizes tells a bomb. Only where a count would fill the memory has each further

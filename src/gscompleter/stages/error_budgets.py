@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import count
 from typing import Literal
 
 import torch
@@ -150,7 +151,8 @@ def meet_error_budgets(
 
     In a photograph over budget, opacities with a harmful gradient are halved, the most harmful
     first and no more than needed. If that fails, Gaussians at the worst pixels are removed, finally
-    all that the photograph sees. `regions` are numbers from 0 of parts that stand or fall alone, by
+    all that the photograph sees. Only a photograph that is over budget with none stays so.
+    `regions` are numbers from 0 of parts that stand or fall alone, by
     default one for all: a region that loses more than `max_opacity_loss` of its opacity is dropped.
     """
     if len(added) == 0:
@@ -163,7 +165,7 @@ def meet_error_budgets(
     checks = make_checks(budgets, frozen_views, plans)
     opacities = added.opacities
     active = checks
-    for trial in range(NUM_HALVINGS + NUM_REMOVALS + 1):
+    for trial in count():
         worse = find_over_budget(active, opacities)
         # While opacities are halved, only photographs that were over budget are rendered. A
         # Gaussian that faded may have occluded another one in the rest, so that all of them have
@@ -176,6 +178,10 @@ def meet_error_budgets(
         # A Gaussian that one photograph objects to gives way, whatever it improves in others.
         objections = [render.choose_fading(trial, added) for render in worse]
         is_lowered = torch.stack(objections).any(dim=0)
+        # Whatever one photograph loses may have hidden something in another, so this goes on as
+        # long as there is something to lose.
+        if trial >= NUM_HALVINGS + NUM_REMOVALS and not (is_lowered & (opacities > 0)).any():
+            break
         factor = 0.5 if trial < NUM_HALVINGS else 0.0
         opacities = torch.where(is_lowered, factor * opacities, opacities)
         # What is left of a region that faded for the most part would be fog.

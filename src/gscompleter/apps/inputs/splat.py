@@ -131,14 +131,15 @@ def move_to_splat(
         transform = from_splat if target.is_in_splat_frame else from_photographs
         targets.append(replace(target, camera=transform_camera(target.camera, transform)))
 
-    # Where the splat fits as it is, its zero is that of the photographs as they were read.
-    is_given = alignment.method == "given"
+    # Where the splat fits as it is, its zero is that of the photographs as they were read. The
+    # origin of a splat that states its own is in another frame than theirs unless it fits so.
+    has_their_origin = alignment.method == "given" or scene.origin is not None
     return replace(
         task,
         views=[transform_view(view, from_photographs) for view in task.views],
         targets=targets,
         frame=from_photographs @ task.frame,
-        origin=photographs.origin if is_given else origin,
+        origin=photographs.origin if has_their_origin else origin,
         scene=scene,
         splat_file=splat_file,
         method=alignment.method,

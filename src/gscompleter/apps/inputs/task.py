@@ -131,7 +131,8 @@ class CompletionTask:
     frame: Float[np.ndarray, "4 4"]
     """Similarity from the frame of the photographs to that of the result."""
     origin: Float[np.ndarray, "3"]
-    """Origin of the result in the coordinates of the input; zero unless those are large."""
+    """Local origin of the photographs in their own coordinates; zero unless those are large, and
+    where an input splat is in a frame of its own near zero."""
     depths: Mapping[str, str]
     """Source of `near` and `far`: given, scene, points, splat, model or features."""
     scene: Gaussians | None = None

@@ -27,6 +27,7 @@ FRAME_NOTES = {
     "normalised": "in a frame that its trainer normalised",
     "similarity": "in a frame of its own, aligned by matching features",
 }
+"""Words about the frame of a splat, by the method that found it (`ResultFrame`)."""
 ALIGNMENTS = {
     "ransac": "RANSAC fits scene depth = {scale:.3f} × lifted depth {shift:+.3f} {unit}; "
     "{inliers} of the pixels agree.",
@@ -34,6 +35,7 @@ ALIGNMENTS = {
     "{inliers} of the pixels agree.",
     "identity": "The lifted depths are used unchanged.",
 }
+"""Sentences about the depth alignment of a target, by its method (`AlignmentRow`)."""
 ORIGIN_NOTE = (
     "The coordinates are much larger than the distances between the cameras, so the result is "
     "relative to a local origin, which summary.json lists."
@@ -123,7 +125,8 @@ def list_notes(summary: CompletionSummary) -> Iterator[Note]:
     if frame.method in FRAME_NOTES:
         text = f"The splat is {FRAME_NOTES[frame.method]}; summary.json lists the transform."
         yield Note("frame", text)
-    # A splat with positions of double is written where it was.
+    # The local origin of the photographs in the coordinates of the written files: near zero if
+    # these are relative to it. A splat with positions of double is written where it was.
     place = np.array(frame.transform) @ [*frame.origin, 1.0]
     if any(frame.origin) and np.abs(place[:3]).max() < 0.5 * np.abs(frame.origin).max():
         # Whoever joins the result with other data has to shift it.
@@ -224,14 +227,23 @@ def list_photograph_notes(summary: CompletionSummary) -> Iterator[Note]:
     if displaced:
         yield Note("poses", describe_displaced(displaced), is_warning=True)
 
-    factors = [factor for row in context for factor in row.exposure_gain or ()]
-    if factors:
-        yield Note(
-            "exposure",
-            "The exposures of the context photographs differ by a factor of up to "
-            f"{max(factors) / min(factors):.2f}; the scene has the mean exposure, at which these "
-            "photographs are scored. Target photographs are scored as they are.",
-        )
+    gains = [row.exposure_gain for row in context if row.exposure_gain is not None]
+    if gains:
+        yield Note("exposure", describe_exposures(gains))
+
+
+def describe_exposures(gains: Sequence[tuple[float, float, float]]) -> str:
+    """Describe the exposure gains (R, G, B) of photographs relative to the scene."""
+    # By channel: a scene that was made anew in the exposure of what stays of an earlier one has
+    # gains that all photographs share, and which differ between channels.
+    factor = max(max(channel) / min(channel) for channel in zip(*gains, strict=True))
+    scored = "these photographs are scored. Target photographs are scored as they are."
+    if f"{factor:.2f}" == "1.00":
+        return f"The scene has another exposure than the context photographs, at which {scored}"
+    return (
+        "The exposures of the context photographs differ by a factor of up to "
+        f"{factor:.2f}; the scene has one exposure, at which {scored}"
+    )
 
 
 def describe_displaced(rows: Sequence[ContextRow]) -> str:

@@ -214,7 +214,8 @@ class ResultFrame:
     transform: tuple[MatrixRow, MatrixRow, MatrixRow, MatrixRow]
     """Similarity from the frame of the photographs to that of the .ply."""
     origin: Vector
-    """Origin of the result in the coordinates of the input; zero unless those are large."""
+    """Local origin of the photographs in their own coordinates; zero unless those are large. Files
+    are relative to it, except those of a splat with positions of double."""
 
 
 @dataclass(frozen=True)

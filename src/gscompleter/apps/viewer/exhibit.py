@@ -119,11 +119,12 @@ def place_content(content: ViewerContent, frame: ResultFrame | None = None) -> V
     They are in that of the file, or in that of the photographs of a completion with its `frame`.
     """
     origin = np.array(content.after.origin or (0.0, 0.0, 0.0))
-    to_scene = compute_frame_from_photographs(origin)
-    if frame is None:
-        return replace(content, transform=to_scene, origin=origin)
-    transform = to_scene @ np.array(frame.transform)
-    return replace(content, transform=transform, origin=np.array(frame.origin))
+    transform = compute_frame_from_photographs(origin)
+    if frame is not None:
+        transform = transform @ np.array(frame.transform)
+    # What lies at the zero of the scene: cameras beside it are near that, in whatever map they are.
+    zero = np.linalg.solve(transform[:3, :3], -transform[:3, 3])
+    return replace(content, transform=transform, origin=zero)
 
 
 def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:
@@ -250,8 +251,10 @@ def add_file_cameras(content: ViewerContent, path: Path, resolution: Resolution)
 
 def make_frame_thumbnail(frame: Frame) -> bytes | None:
     """Make a small JPEG of the upright photograph of a frame; None if it is no file."""
-    path = None if frame.file is None else frame.file.path
-    return None if path is None else make_thumbnail(path, frame.find_turn())
+    file = frame.file
+    if file is None or file.path is None:
+        return None
+    return make_thumbnail(file.path, file.orientation if file.is_turned else frame.find_turn())
 
 
 def make_thumbnail(stored: Path, orientation: int = 1) -> bytes | None:

@@ -105,12 +105,26 @@ class PredictedDepth:
         """Predict depth and fit it to the scene; raises the errors of `compute_context_depth`."""
         predicted = self.predict(photograph)
         farthest = predicted.depth.where(predicted.valid, 0.0).max()
-        return rescale_depth(predicted.depth.where(predicted.valid, farthest), render)
+        filled = predicted.depth.where(predicted.valid, farthest)
+        # What was filled in measures nothing, so that it does not take part in the fit.
+        return rescale_depth(filled, render, predicted.valid)
 
 
-def rescale_depth(guess: Float[Tensor, "h w"], render: Render) -> Float[Tensor, "h w"]:
-    """Scale depth by the median ratio to the depth of the scene."""
+def rescale_depth(
+    guess: Float[Tensor, "h w"], render: Render, measured: Bool[Tensor, "h w"] | None = None
+) -> Float[Tensor, "h w"]:
+    """Scale depth by the median ratio to the depth of the scene where it was `measured`.
+
+    None is everywhere. Raises InputError if the scene shows nothing there.
+    """
     valid = find_valid_depth(render)
+    if measured is not None:
+        valid = valid & measured
+        if not valid.any():
+            raise InputError(
+                "The predicted depth of the photograph nearest to the target has no surface where "
+                "the scene has one, and so no scale; choose the depth 'context'."
+            )
     guess = guess.clamp_min(1e-6 * float(guess.abs().max().clamp_min(1e-12)))
     return guess * (render.depth[valid] / guess[valid]).median()
 
@@ -137,7 +151,10 @@ def compute_deviation(values: Float[Tensor, "n"]) -> Float[Tensor, ""]:
 
 
 def load_source_depth(name: str, device: str = "cpu") -> SourceDepth:
-    """Return `context`, `monocular` (the published model), MoGe-2 or the model of a path."""
+    """Load a depth by its name: `context`, `monocular` (the published model) or a predictor.
+
+    Any other name is a model of transformers, as in `load_monocular`.
+    """
     if name == "context":
         return compute_context_depth
     if name in DEPTH_PREDICTORS:
@@ -147,7 +164,7 @@ def load_source_depth(name: str, device: str = "cpu") -> SourceDepth:
 
 @lru_cache(maxsize=1)
 def load_predicted(name: str, device: str = "cpu") -> PredictedDepth:
-    """Load MoGe-2 by its name; it stays loaded, since each target asks for it."""
+    """Load one of `DEPTH_PREDICTORS`; it stays loaded, since each target asks for it."""
     return PredictedDepth(DEPTH_PREDICTORS[name](None, device))
 
 

@@ -12,26 +12,29 @@ LENGTH_FLOOR = np.float32(0.1)
 
 
 def trace_lines(image, known, directions, limits):
-    """Trace the line through each pixel both ways, to the known pixels where it ends.
+    """Trace the line through each pixel both ways, to the first known pixels that it meets.
+
+    A length counts the unknown pixels on the way, that of the beginning included.
 
     Args:
         image: float32 [h, w, 3].
         known: bool [h, w].
         directions: float32 [h, w, 2], unit vectors (x, y) along the lines, of either sign.
-        limits: float32 [h, w], length in pixels after which a way is given up; 0 for none.
+        limits: float32 [h, w], finite length in pixels after which a way is given up; where it is
+            0, no line is traced.
 
     Returns:
-        The mean colours at both ends [h, w, 3], weighted by the inverse squared lengths, and the
-        length of the shorter way [h, w] in pixels, infinite if neither ends.
+        The mean colours at both ends [h, w, 3], weighted by the inverse squared lengths and 0
+        without an end, and the length of the shorter way [h, w] in pixels, infinite without one.
     """
-    colours = np.zeros_like(image)
+    colors = np.zeros_like(image)
     lengths = np.full(known.shape, np.inf, np.float32)
-    share(_trace_rows, len(known), image, known, directions, limits, colours, lengths)
-    return colours, lengths
+    share(_trace_rows, len(known), image, known, directions, limits, colors, lengths)
+    return colors, lengths
 
 
 @njit(nogil=True, fastmath={"contract"})
-def _trace_rows(begin, end, image, known, directions, limits, colours, lengths):
+def _trace_rows(begin, end, image, known, directions, limits, colors, lengths):
     for y in range(begin, end):
         for x in range(known.shape[1]):
             total = np.float32(0)
@@ -41,13 +44,13 @@ def _trace_rows(begin, end, image, known, directions, limits, colours, lengths):
                 if length < limit:
                     weight = np.float32(1) / (length * length + LENGTH_FLOOR)
                     total += weight
-                    colours[y, x, 0] += weight * r
-                    colours[y, x, 1] += weight * g
-                    colours[y, x, 2] += weight * b
+                    colors[y, x, 0] += weight * r
+                    colors[y, x, 1] += weight * g
+                    colors[y, x, 2] += weight * b
                     lengths[y, x] = min(lengths[y, x], length)
             # Without an end the total is 0, and so are the colours.
             for c in range(3):
-                colours[y, x, c] /= max(total, np.float32(1e-12))
+                colors[y, x, c] /= max(total, np.float32(1e-12))
 
 
 @njit(fastmath={"contract"})

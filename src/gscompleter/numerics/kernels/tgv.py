@@ -30,7 +30,8 @@ def fit(heights, gradients, data, weight, across, down, bend, tolerance, iterati
     heights [h, w], gradients [2, h, w] (x, y): initial values, which the result replaces.
     data, weight [h, w]: measured heights and their weights; 0 without measurement.
     across, down [h, w]: cost of a step to the right and to the pixel below.
-    bend: cost of a change of gradient. tolerance: deviation from `data` of quadratic loss.
+    bend: cost of a change of gradient, above 0. tolerance: deviation from `data` up to which the
+    loss is quadratic, in the unit of heights, above 0.
     """
     h, w = heights.shape
     forces = np.zeros((2, h, w), np.float32), np.zeros((4, h, w), np.float32)
@@ -64,6 +65,9 @@ def advance(top, top_step, end, end_step, iterations, state, given):
                 y = front - number
                 first = top + number * top_step
                 last = end + number * end_step
+                # Primals of a row need the duals of that row and of the one above. A band whose top
+                # moves down raises those above its first row as well. The seam, which comes later,
+                # finds these, and those above its own first row, which the upper band raised.
                 if first - (top_step > 0) <= y < last - (end_step > 0):
                     _raise_duals(y, state, given)
                 if first <= y < last:
