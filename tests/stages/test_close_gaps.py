@@ -68,6 +68,17 @@ def test_cameras_move_on_from_the_nearest_photograph_and_to_both_sides_without_t
         assert torch.equal(camera.K, target.K)
 
 
+def test_a_photograph_at_the_target_does_not_tell_how_far_cameras_move():
+    """Something is removed, or marked, as photographs see it."""
+    target = camera_at(0.4, size=SIZE)
+    at_target = view_of(Room(), target)
+    beside = view_of(Room(), camera_at(0.0, size=SIZE))
+    moved = displace_camera(target, [at_target, beside], 0.5)
+    expected = displace_camera(target, [beside], 0.5)
+    assert [one.center.tolist() for one in moved] == [one.center.tolist() for one in expected]
+    assert displace_camera(target, [at_target], 0.5) == ()
+
+
 def test_a_gap_takes_depth_and_colour_of_the_farther_surface():
     view = look_at_gap()
     gaps = find_gaps(view)

@@ -17,7 +17,7 @@ from torch import Tensor
 from torch.nn.functional import max_pool2d
 
 from gscompleter.config import GapConfig
-from gscompleter.numerics.geometry import adapt_to_mode, pad_camera
+from gscompleter.numerics.geometry import adapt_to_mode, measure_baseline, pad_camera
 from gscompleter.numerics.image_ops import dilate, keep_thin
 from gscompleter.numerics.smooth import continue_smoothly
 from gscompleter.reconstructors.plane_sweep.gaussians import DISC_SIGMA, compute_normals, make_discs
@@ -38,6 +38,9 @@ DEPTH_SHARPNESS = 16
 SIDE_MOVES = (0.75, 1.25)
 """Moves to a side, relative to the one away from the photograph. A crack that is wide from afar is
 thin from nearby, and what is closed from there opens again further on."""
+SAME_PLACE = 0.01
+"""Distance of a photograph from a target, relative to the mean one of all, below which it was taken
+at the target, as those are at which something was removed."""
 MIN_SHARE = 1e-4
 """Share of an image from which on its gaps are closed, seven pixels of 256 x 256: fewer are hardly
 seen, and guards would take as long for them as for many."""
@@ -51,9 +54,15 @@ def displace_camera(
     The first is moved by `displacement`, relative to the baseline of the target and its nearest
     photograph, away from that photograph, where the gaps of parallax between the known and the
     completed part open widest. The others stand to the right and to the left, near ones first: a
-    gap that one side opens is hidden from the other.
+    gap that one side opens is hidden from the other. Photographs at the target itself do not count,
+    and if there are no others, nothing tells how far a camera may move: there is none then.
     """
-    nearest = views[find_nearest_view(target, views)].camera
+    distances = [measure_baseline(target, view.camera) for view in views]
+    least = SAME_PLACE * sum(distances) / len(distances)
+    beside = [view for view, distance in zip(views, distances, strict=True) if distance > least]
+    if not beside:
+        return ()
+    nearest = beside[find_nearest_view(target, beside)].camera
     baseline = target.center - nearest.center
     right = baseline.norm() * target.c2w[:3, 0]
     moves = [baseline, *(side * move for move in SIDE_MOVES for side in (right, -right))]
