@@ -15,7 +15,7 @@ from gscompleter.apps.inputs.own_scene import find_own_photographs, join_photogr
 from gscompleter.apps.requests.completion import WorkRequest
 from gscompleter.apps.requests.models import ModelRequest
 from gscompleter.apps.requests.splat import SplatRequest
-from gscompleter.splats.edits import EditDraft, Edits, read_edits, record_edit
+from gscompleter.splats.edits import AppendedRows, EditDraft, Edits, read_edits, record_edit
 from gscompleter.splats.row_kinds import count_row_kinds
 from gscompleter.stages.add_observed import MAX_RECONSTRUCTED, MAX_STEREO_PHOTOS, MAX_STEREO_PIXELS
 from scenes import camera_at, photographed, random_gaussians
@@ -50,13 +50,34 @@ def test_the_record_tells_the_photographs_of_a_scene(tmp_path):
 @pytest.mark.parametrize(
     ("command", "settings"),
     [
-        ("remove", {}),  # photographs still show what went
+        ("clean", {}),  # what it took out is not known
         ("complete", {"photographs": ["a.jpg", "z.jpg"]}),  # not in this folder
         ("complete", {"reconstructor": "mvsplat-re10k"}),
     ],
 )
 def test_other_scenes_are_not_made_anew(tmp_path, command, settings):
     assert find(SplatRequest(write_own(tmp_path, command, **settings))) == ()
+
+
+@pytest.mark.parametrize(
+    ("command", "appended", "frames"),
+    [
+        ("remove", [], (0, 2)),
+        # Photographs that show what is behind became Gaussians, and others only checked.
+        ("repair", [AppendedRows("photographs", 3)], (0, 1, 2)),
+        ("clean", [], ()),
+        ("live", [], ()),
+    ],
+)
+def test_what_was_taken_out_since_is_told(tmp_path, command, appended, frames):
+    path = write_own(tmp_path)
+    out = tmp_path / "out"
+    out.mkdir()
+    save_ply(out / "completed.ply", load_ply(path))
+    draft = EditDraft(command, {**SETTINGS, "photographs": ["b.jpg"]})
+    taken_out = random_gaussians(2)
+    record_edit(out, draft, 20, appended, path, read_edits(path), None, taken_out)
+    assert find(SplatRequest(out / "completed.ply")) == frames
 
 
 def test_neither_are_a_splat_of_a_user_and_one_that_another_program_changed(tmp_path):

@@ -107,6 +107,24 @@ def test_the_new_scene_keeps_the_exposure_of_what_stays():
         assert after > true
 
 
+def test_what_shows_where_photographs_are_ignored_stays():
+    """Ψ makes nothing there: around what a person took out, the given scene is all that is left."""
+    middle = torch.zeros(48, 48, dtype=torch.bool)
+    middle[16:32, 16:32] = True
+    masked = [replace(view, ignore_mask=middle) for view in PHOTOS]
+    made = begin(merge([SHARDS, ASIDE]), masked)
+    stays = ~made.source.replaced_mask[: len(SHARDS)]
+    # A Gaussian of each pixel of the photographs that the given scene was made of.
+    for own in stays.reshape(NUM_OWN, 48, 48):
+        assert own[middle].float().mean() > 0.5
+        assert own[:12].float().mean() < 0.1
+        assert own[36:].float().mean() < 0.1
+    for view in PHOTOS[:NUM_OWN]:
+        assert RENDERER.render(made.scene, view.camera).alpha[middle].min() > 0.9
+    # Without masks all of it is made anew.
+    assert begin(merge([SHARDS, ASIDE]), PHOTOS).source.replaced_mask[: len(SHARDS)].all()
+
+
 def test_a_scene_stays_if_its_photographs_are_nearer_to_it():
     """Ψ fails here: it makes everything grey."""
 

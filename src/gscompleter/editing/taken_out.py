@@ -25,6 +25,8 @@ class TakenOut:
     """These, without colours by direction."""
     scene: Gaussians
     """The splat as it is now."""
+    occluders: Gaussians
+    """What may hide it in a photograph."""
     renderer: Renderer
 
     def hide(self, view: View) -> View:
@@ -41,6 +43,4 @@ class TakenOut:
 
     def find(self, camera: Camera) -> Bool[Tensor, "h w"]:
         """Find the pixels that show it, with their border."""
-        # What was invented since fills its place, and would hide it.
-        others = self.scene[self.scene.generated == 0]
-        return add_border(mark_shown(self.gaussians, others, camera, self.renderer))
+        return add_border(mark_shown(self.gaussians, self.occluders, camera, self.renderer))

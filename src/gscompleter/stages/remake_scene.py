@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config.settings import COVERED
@@ -44,7 +44,8 @@ def remake_scene(
     """Make anew what Ψ made of the scene of a begun completion, from its photographs.
 
     `views` are those of the context as they were given, and `has_scene_range` is that of
-    `reconstruct_context`. The `contested` Gaussians, which Φ invented, go as well. Returns None if
+    `reconstruct_context`. What shows where photographs are ignored, as around what a person took
+    out, stays. The `contested` Gaussians, which Φ invented, go as well. Returns None if
     nothing is to be made anew, or if the photographs are not nearer to the new scene than to the
     given one, in the mean of their PSNR apart from their exposures.
     """
@@ -54,6 +55,7 @@ def remake_scene(
     given = list(render_at_views(merge(state.parts), views, renderer))
     made = reconstruct_context(reconstructor, views, has_scene_range=has_scene_range)
     gone = mark_rendered(state.source, earlier.remade)
+    gone = gone & ~find_ignored(state, views, given, renderer)
     if contested is not None:
         gone = gone | contested.rows
     if not gone.all():
@@ -77,6 +79,36 @@ def remake_scene(
     return begun if is_nearer else None
 
 
+def find_ignored(
+    state: Completion, views: Sequence[View], given: Sequence[Render], renderer: Renderer
+) -> Bool[Tensor, "m"]:
+    """Find the Gaussians of the given scene that show mostly where photographs are ignored.
+
+    There Ψ makes nothing anew. Only photographs that the given scene is right from are asked, whose
+    renders are `given`: in others shards may stand before the place.
+    """
+    context = state.rendered_context
+    ignored, valid = torch.zeros((2, len(context))).to(context.means)
+    for index in choose_right_views(given, views):
+        view = views[index]
+        if view.ignore_mask is None:
+            continue
+        frozen = renderer.freeze(merge(state.parts), view.camera)
+        # A backprojection takes three channels.
+        is_valid = view.valid_mask.to(ignored)
+        layers = torch.stack([1 - is_valid, is_valid, torch.zeros_like(is_valid)], dim=-1)
+        sums = frozen.backproject(layers)[: len(context)]
+        ignored += sums[:, 0]
+        valid += sums[:, 1]
+    return ignored > valid
+
+
+def choose_right_views(given: Sequence[Render], views: Sequence[View]) -> list[int]:
+    """Choose the half of the photographs that the given scene was made of, as its errors tell."""
+    order = compute_psnrs(given, views).argsort(descending=True)
+    return order[: (len(views) + 1) // 2].tolist()
+
+
 def compute_psnrs(renders: Sequence[Render], views: Sequence[View]) -> Float[Tensor, "v"]:
     """Compute the PSNR of each photograph apart from its exposure, in dB."""
     errors = [
@@ -90,13 +122,11 @@ def measure_exposure(
 ) -> Float[Tensor, "3"]:
     """Measure the exposure of the given scene relative to a new one, per channel.
 
-    They are compared where both show the half of the photographs that the given scene was made of,
-    as far as its errors tell.
+    They are compared where both show the photographs that the given scene is right from.
     """
-    best = compute_psnrs(given, views).argsort(descending=True)[: (len(views) + 1) // 2]
     old_colors = []
     new_colors = []
-    for index in best.tolist():
+    for index in choose_right_views(given, views):
         old = given[index]
         new = shown[index]
         both = (old.alpha >= COVERED) & (new.alpha >= COVERED)

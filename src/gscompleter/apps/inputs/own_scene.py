@@ -16,8 +16,11 @@ from gscompleter.splats.formats import detect_splat_format
 from gscompleter.splats.row_kinds import tells_kinds
 from gscompleter.stages.add_observed import limit_part_photos
 
-ADDING_COMMANDS = ("complete", "update")
-"""Commands that only add. What others took out, photographs still show: Ψ would bring it back."""
+LIFTING_COMMANDS = ("complete", "update")
+"""Commands that use photographs for the scene itself; in others they may only check it."""
+TRACED_COMMANDS = (*LIFTING_COMMANDS, "remove", "repair")
+"""Commands whose record tells what they took out. Photographs still show that, and it is hidden in
+them; what the others took out Ψ would bring back."""
 OWN_PSI = "plane-sweep"
 """Ψ that fits a scene to many photographs together; networks were trained with few."""
 
@@ -25,9 +28,8 @@ OWN_PSI = "plane-sweep"
 def find_own_photographs(work: WorkRequest, files: Mapping[int | None, str]) -> tuple[int, ...]:
     """Find the frames from which earlier commands reconstructed the input splat.
 
-    `files` are those of the photographs of the folder, by frame. Returns none of them if a person
-    edited the splat since, if another program changed it, or if one of its photographs is not in
-    the folder.
+    `files` are those of the photographs of the folder, by frame. Returns none of them if another
+    command or program changed the splat since, or if one of its photographs is not in the folder.
     """
     assert work.splat is not None
     if work.splat.forget_edits or work.models.reconstructor != OWN_PSI:
@@ -35,23 +37,29 @@ def find_own_photographs(work: WorkRequest, files: Mapping[int | None, str]) -> 
     edits = read_edits(work.splat.path)
     if not (edits.is_unchanged and tells_kinds(edits) and is_ply(work.splat.path)):
         return ()
-    if edits.edits[0].given is not None or not all(map(has_only_added, edits.edits)):
+    if edits.edits[0].given is not None or not all(map(is_traced, edits.edits)):
         return ()
     number_by_name = {name: frame for frame, name in files.items() if frame is not None}
-    names = {name for edit in edits.edits for name in edit.settings.get("photographs", [None])}
+    sources = filter(has_lifted, edits.edits)
+    names = {name for edit in sources for name in edit.settings.get("photographs", [None])}
     if not names <= number_by_name.keys():
         return ()
     return tuple(sorted(number_by_name[name] for name in names))
 
 
-def has_only_added(edit: Edit) -> bool:
-    """Return True if a command of ours took nothing out, and its photographs are known."""
+def is_traced(edit: Edit) -> bool:
+    """Return True if the record tells all that a command of ours did, which used our Ψ."""
     return (
-        edit.command in ADDING_COMMANDS
-        and edit.taken_out is None
+        edit.command in TRACED_COMMANDS
         and edit.can_be_undone
         and edit.settings.get("reconstructor") == OWN_PSI
     )
+
+
+def has_lifted(edit: Edit) -> bool:
+    """Return True if photographs of a command became Gaussians."""
+    shows_behind = any(rows.kind == "photographs" for rows in edit.appended)
+    return edit.command in LIFTING_COMMANDS or shows_behind
 
 
 def is_ply(path: Path) -> bool:

@@ -50,7 +50,9 @@ def take_over_edits(
     gaussians = None if forgets else load_taken_out(task.splat_file)
     if gaussians is None:
         return task, notes
-    taken_out = TakenOut(gaussians.to(task.device), task.scene, renderer)
+    # What was invented since fills its place, and would hide it.
+    occluders = task.scene.hide(task.scene.generated != 0)
+    taken_out = TakenOut(gaussians.to(task.device), task.scene, occluders, renderer)
     return hide_taken_out(replace(task, taken_out=taken_out)), notes
 
 
@@ -88,8 +90,13 @@ def hide_taken_out(task: CompletionTask) -> CompletionTask:
     taken_out = task.taken_out
     if taken_out is None:
         return task
+    if task.is_remade:
+        # The scene was right from its own photographs alone. From others, what it has before the
+        # place may not be there, and what went would come back through it.
+        taken_out = replace(taken_out, occluders=taken_out.scene[:0])
     return replace(
         task,
+        taken_out=taken_out,
         views=[taken_out.hide(view) for view in task.views],
         check_views=[taken_out.hide(view) for view in task.check_views or ()],
         targets=[hide_in_target(target, taken_out) for target in task.targets],
