@@ -532,7 +532,9 @@ def test_a_step_without_a_mask_leaves_none_of_the_step_in_its_place(begun, tmp_p
 def served(*words: object) -> Iterator[tuple[subprocess.Popen, Callable[[str, bytes], dict]]]:
     """Serve a page in a process, and ask it as the page does, until the block kills it."""
     # The page itself is not looked at, so that it needs no libraries.
+    # A background job ignores SIGINT.
     program = (
+        "import signal; signal.signal(signal.SIGINT, signal.default_int_handler);"
         "from gscompleter.apps.viewer import packages as p; from gscompleter.cli import main;"
         "p.load_libraries = lambda: p.Libraries({}, {}); main()"
     )
