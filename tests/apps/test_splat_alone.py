@@ -244,7 +244,7 @@ def test_an_export_does_not_number_renders_that_the_next_command_does_not_have(
     assert run(monkeypatch, *words, "--export-holes", tmp_path / "holes") == 0
     (row,) = json.loads((tmp_path / "holes" / "holes.json").read_text())["frames"]
     assert (row["derived_from"], row["offset"]) == (None, None)
-    assert row["title"].startswith("near photograph")
+    assert row["title"].startswith("near render ")
 
 
 @pytest.mark.slow
