@@ -12,6 +12,7 @@ import torch
 from command import run
 from gscompleter import load_cameras, load_ply, save_ply
 from gscompleter.apps.inputs.captures import choose_side
+from gscompleter.completer import MAX_TARGET_ID
 from gscompleter.data.scene import write_cameras
 from gscompleter.system.files.image import read_image, write_image
 from gscompleter.trust.lifted import find_pixel_center
@@ -170,6 +171,8 @@ def test_cameras_alone_let_targets_be_found(folder, tmp_path, monkeypatch):
         (("splat.ply", "--target", "target.json", "--no-masks"), r"apply this to.*\(--no-masks\)"),
         (("photographs", "--cameras", "around.json"), "photographs of SCENE have cameras"),
         (("splat.ply", "--cameras", "nothing.json"), "nothing.json"),
+        (("full.ply", "--target", "target.json", "--dry-run"), "can tell 254 apart"),
+        (("full.ply", "--target", "target.json", "--export-holes", "holes"), "can tell 254 apart"),
     ],
 )
 def test_what_cannot_be_done_is_refused_with_what_to_give_instead(
@@ -193,6 +196,11 @@ def write_refused(folder: Path) -> None:
     dots = gaussians_of(view_of(Room(), camera_at(size=SIZE)))[:3000]
     save_ply(folder / "object.ply", replace(dots, means=ball, scales=torch.full_like(ball, 0.06)))
     write_cameras(folder / "object.json", [make_camera()])
+    # No label is left for a target.
+    full = gaussians_of(view_of(Room(), camera_at(size=SIZE)))
+    labels = full.generated.clone()
+    labels[-1] = MAX_TARGET_ID
+    save_ply(folder / "full.ply", replace(full, generated=labels))
     mask = torch.zeros((SIZE, SIZE), dtype=torch.bool)
     write_image(folder / "black.png", mask)
     mask[20:30, 20:34] = True
