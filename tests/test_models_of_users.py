@@ -134,6 +134,13 @@ class Batch:
         return self.answer
 
 
+class PaddingByMethod(Batch):
+    """A generator whose answer to `supports_padding` is a method."""
+
+    def supports_padding(self) -> bool:
+        return False
+
+
 def write_into_render(nearest, target, context):
     context.target_render.image[:] = math.nan
     return paint(nearest, target, context)
@@ -163,6 +170,7 @@ def write_by_numpy(nearest, target, context):
         (lambda *_: "image", "and returned 'image'"),
         (Batch(0, []), "max_batch_size of the generator .* is 0"),
         (Batch("a", []), "max_batch_size of the generator .* is 'a'"),
+        (PaddingByMethod(1, []), "supports_padding of the generator .* of type method"),
         (Batch(1, []), "a list of as many outputs, and returned 0"),
         (Batch(1, None), "a list of as many outputs, and returned None"),
         (Batch(1, [torch.rand(SIZE, SIZE, 3)]), "has to return a GeneratorOutput"),

@@ -1,6 +1,7 @@
 """Target cameras that the command finds."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,7 +13,8 @@ from gscompleter.apps.command_line.words import insert_auto_count
 from gscompleter.cli import parse_command
 from gscompleter.data.formats import open_photographs
 from gscompleter.numerics.geometry import measure_baseline
-from scenes import camera_at, photographed
+from gscompleter.system.files.image import read_image
+from scenes import Room, camera_at, photographed, view_of
 
 PLACES = ((-0.4, -4), (-0.2, 0), (0.0, 0), (0.3, 4), (0.5, 8))
 QUICK = (
@@ -157,6 +159,18 @@ def test_a_dry_run_shows_what_named_targets_would_cost(scene, tmp_path, monkeypa
     assert run(monkeypatch, *words) == 0
     (camera,) = load_cameras(out / "targets.json", 32)
     assert torch.allclose(camera.c2w, open_photographs(scene).camera(4, 32).c2w, atol=1e-6)
+
+
+def test_a_dry_run_shows_targets_nearer_than_a_hundredth_of_a_unit(tmp_path, monkeypatch):
+    """A room in kilometres, whose planes nobody gave."""
+    places = (-0.3, 0.0, 0.3, 0.15)
+    cameras = [replace(camera_at(x, size=64, unit=1e-3), near=None, far=None) for x in places]
+    scene = photographed(tmp_path / "scene", cameras, Room(unit=1e-3))
+    out = tmp_path / "out"
+    words = ("complete", scene, "--context", 0, 1, 2, "--target", 3, "--dry-run", "--quiet")
+    assert run(monkeypatch, *words, "--resolution", 64, "--out", out) == 0
+    shown = read_image(out / "images" / "target1_before.png")
+    assert (shown - view_of(Room(unit=1e-3), cameras[3]).image).abs().mean() < 0.05
 
 
 def test_a_number_may_follow_auto_or_not():

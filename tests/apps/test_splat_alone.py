@@ -11,8 +11,14 @@ import torch
 
 from command import run
 from gscompleter import load_cameras, load_ply, save_ply
-from gscompleter.apps.inputs.captures import choose_side
+from gscompleter.apps.inputs.captures import RenderRequest, choose_side
+from gscompleter.apps.inputs.renders import open_renders
+from gscompleter.apps.inputs.splat import read_splat, sort_splat
+from gscompleter.apps.requests.scene import SceneRequest
+from gscompleter.apps.requests.splat import Selection, SplatRequest
+from gscompleter.completer import MAX_TARGET_ID
 from gscompleter.data.scene import write_cameras
+from gscompleter.render.loading import load_renderer
 from gscompleter.system.files.image import read_image, write_image
 from gscompleter.trust.lifted import find_pixel_center
 from gscompleter.types import Camera, Gaussians
@@ -170,6 +176,8 @@ def test_cameras_alone_let_targets_be_found(folder, tmp_path, monkeypatch):
         (("splat.ply", "--target", "target.json", "--no-masks"), r"apply this to.*\(--no-masks\)"),
         (("photographs", "--cameras", "around.json"), "photographs of SCENE have cameras"),
         (("splat.ply", "--cameras", "nothing.json"), "nothing.json"),
+        (("full.ply", "--target", "target.json", "--dry-run"), "can tell 254 apart"),
+        (("full.ply", "--target", "target.json", "--export-holes", "holes"), "can tell 254 apart"),
     ],
 )
 def test_what_cannot_be_done_is_refused_with_what_to_give_instead(
@@ -193,6 +201,11 @@ def write_refused(folder: Path) -> None:
     dots = gaussians_of(view_of(Room(), camera_at(size=SIZE)))[:3000]
     save_ply(folder / "object.ply", replace(dots, means=ball, scales=torch.full_like(ball, 0.06)))
     write_cameras(folder / "object.json", [make_camera()])
+    # No label is left for a target.
+    full = gaussians_of(view_of(Room(), camera_at(size=SIZE)))
+    labels = full.generated.clone()
+    labels[-1] = MAX_TARGET_ID
+    save_ply(folder / "full.ply", replace(full, generated=labels))
     mask = torch.zeros((SIZE, SIZE), dtype=torch.bool)
     write_image(folder / "black.png", mask)
     mask[20:30, 20:34] = True
@@ -295,6 +308,29 @@ def test_around_an_object_no_target_is_found(folder, tmp_path, monkeypatch, caps
     assert said.out.startswith("Nothing was gained")
     assert read_summary(out)["gaussians"]["added"] == 0
     assert read_summary(out)["targets"] == []
+
+
+@pytest.mark.parametrize(
+    ("source", "further"),
+    [
+        ("place", {"place": Selection(sphere=(0.0, 0.3, 2.2, 0.3))}),
+        ("pixels", {}),
+        ("standpoints", {}),
+    ],
+)
+def test_cameras_that_are_found_have_the_depth_range_that_was_given(
+    folder, monkeypatch, source, further
+):
+    if source == "standpoints":
+        monkeypatch.setattr("gscompleter.apps.inputs.renders.find_pixel_center", lambda _: None)
+        monkeypatch.setattr("gscompleter.virtual_capture.standpoints.NUM_RANDOM", 20)
+    splat = SplatRequest(folder / "splat.ply")
+    scene, file = sort_splat(read_splat(splat), splat, "cpu")
+    reading = SceneRequest(splat.path, resolution=SIZE, near=0.01, far=300.0)
+    request = RenderRequest(reading=reading, up=(0.0, -1.0, 0.0), **further)
+    task = open_renders(request, file, scene, load_renderer("cpu"), "cpu").task
+    assert task.depths == {"near": "given", "far": "given"}
+    assert {(view.camera.near, view.camera.far) for view in task.views} == {(0.01, 300.0)}
 
 
 def test_a_camera_that_covers_little_is_refused(folder, tmp_path, monkeypatch, capsys):

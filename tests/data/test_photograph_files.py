@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import json
 import shutil
+import struct
 import sys
+import zlib
 from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -18,7 +21,13 @@ from gscompleter import InputError, load_camera, load_cameras, load_views
 from gscompleter.data.file_names import list_endings
 from gscompleter.data.formats import open_photographs
 from gscompleter.system.files import image as image_io
-from gscompleter.system.files.image import ORIENTATION, read_pixels, turn_upright
+from gscompleter.system.files.image import (
+    ORIENTATION,
+    read_colors_and_alpha,
+    read_mask,
+    read_pixels,
+    turn_upright,
+)
 
 WIDTH, HEIGHT = 64, 48
 CAMERAS = make_cameras(4, width=WIDTH, height=HEIGHT, focal=52.0)
@@ -286,6 +295,49 @@ def test_a_damaged_container_is_refused(tmp_path):
     for name, brand in (("a.avif", b"avif"), ("a.heic", b"heic"), ("a.png", b"mp42")):
         with pytest.raises(InputError):
             read_pixels(write_brand(tmp_path / name, brand))
+
+
+def make_wide_png(pixels: np.ndarray, transparent: bytes) -> bytes:
+    """Write pixels of 16 bits, channels in the order of OpenCV, with a transparent colour."""
+    png = cv2.imencode(".png", pixels)[1].tobytes()
+    checksum = zlib.crc32(b"tRNS" + transparent)
+    chunk = struct.pack(">I4s", len(transparent), b"tRNS") + transparent
+    # Behind the signature of 8 bytes and the header of 25.
+    return png[:33] + chunk + struct.pack(">I", checksum) + png[33:]
+
+
+def test_a_transparent_colour_of_16_bits_hides_that_colour_alone():
+    grey = np.full((4, 4), 30000, np.uint16)
+    grey[0] = 65535
+    rgb = np.full((4, 4, 3), 30000, np.uint16)
+    rgb[0] = (3, 2, 65535)
+    for pixels, transparent in (
+        (grey, struct.pack(">H", 65535)),
+        (rgb, struct.pack(">HHH", 65535, 2, 3)),
+    ):
+        png = make_wide_png(pixels, transparent)
+        colors, alpha = read_colors_and_alpha(png, "wide")
+        assert alpha is not None
+        assert (alpha[0] == 0).all()
+        assert (alpha[1:] == 255).all()
+        assert (np.abs(colors[1:].astype(int) - 117) <= 1).all()
+        shown = read_pixels(png, "wide")
+        assert (shown[0] == 0).all()
+        assert (shown[1:] == colors[1:]).all()
+
+
+def test_floats_are_no_colours_and_no_mask_with_nan(tmp_path):
+    pixels = np.zeros((8, 8), np.float32)
+    pixels[:4] = 1
+    Image.fromarray(pixels).save(tmp_path / "mask.tiff")
+    assert np.array_equal(read_mask(tmp_path / "mask.tiff"), pixels == 0)
+    with pytest.raises(InputError, match="floating-point values, not colours"):
+        read_pixels(tmp_path / "mask.tiff")
+    for value in (np.nan, np.inf):
+        pixels[0, 0] = value
+        Image.fromarray(pixels).save(tmp_path / "mask.tiff")
+        with pytest.raises(InputError, match="holds NaN or infinity"):
+            read_mask(tmp_path / "mask.tiff")
 
 
 @pytest.mark.skipif(not features.check("avif"), reason="Pillow without AVIF")

@@ -1,5 +1,7 @@
 """Lens distortion: OpenCV's models, our pixel centres, and no empty pixel afterwards."""
 
+from dataclasses import replace
+
 import cv2
 import numpy as np
 import pytest
@@ -9,6 +11,7 @@ from gscompleter.data.cameras import (
     Pinhole,
     compute_undistortion_map,
     distort,
+    find_distortion_defect,
     undistort_pinhole,
 )
 from gscompleter.data.colmap import CAMERA_MODELS, build_intrinsics
@@ -204,3 +207,12 @@ def test_every_lens_of_colmap_is_removed(name):
 )
 def test_a_lens_that_shows_nothing_has_no_pinhole_camera(lens):
     assert undistort_pinhole(PINHOLE, lens) is None
+    assert "fold the image" in find_distortion_defect(PINHOLE, lens)
+
+
+@pytest.mark.parametrize("center", [{"cx": -20.0}, {"cy": 140.0}])
+def test_a_crop_beside_the_principal_point_is_not_said_to_be_folded(center):
+    """As a tile of a large photograph is."""
+    crop = replace(PINHOLE, **center)
+    assert "principal point lies outside" in find_distortion_defect(crop, LENSES["pincushion"])
+    assert find_distortion_defect(crop, Distortion()) is None

@@ -147,7 +147,7 @@ def undistort_pinhole(pinhole: Pinhole, distortion: Distortion) -> Pinhole | Non
 
     It keeps the principal point and zooms until every pixel lies in the photograph and the borders
     lose as little as possible. Fisheye lenses lose more, since the zoom stops at `MAX_ZOOM_OUT`.
-    Returns None if the coefficients fold the image, so that no zoom works.
+    Returns None if no zoom works, for the reasons of `find_distortion_defect`.
     """
     if not distortion:
         return pinhole
@@ -177,8 +177,8 @@ def compute_undistortion_map(
     """Compute the photograph position of each undistorted pixel, for `remap`."""
     plane = _compute_plane(new, np.arange(new.width), np.arange(new.height))
     pixels = _to_pixels(pinhole, distort(plane, distortion))
-    # The nearest border fills pixels outside the field of the lens.
-    # OpenCV's `remap` counts from the centre of the first pixel.
+    # OpenCV's `remap` counts from the centre of the first pixel. Of `undistort_pinhole` all pixels
+    # of `new` lie in the photograph; a position that is not finite would take the first pixel.
     finite = np.nan_to_num(pixels - 0.5, nan=-1.0, posinf=-1.0, neginf=-1.0)
     with np.errstate(over="ignore"):
         return finite.astype(np.float32)
@@ -283,6 +283,17 @@ def find_pinhole_defect(pinhole: Pinhole) -> str | None:
             defect = f"its principal point lies {center:g} image sizes from the corner"
             return f"{defect}, which is beyond {MAX_CENTER:g}"
     return None
+
+
+def find_distortion_defect(pinhole: Pinhole, distortion: Distortion) -> str | None:
+    """Describe why distortion cannot be removed from a photograph; None if it can."""
+    if undistort_pinhole(pinhole, distortion) is not None:
+        return None
+    # Zooms are about the principal point, so it has to be shown.
+    x, y = pinhole.cx, pinhole.cy
+    if not (0.5 <= x <= pinhole.width - 0.5 and 0.5 <= y <= pinhole.height - 0.5):
+        return "its principal point lies outside of it, and its distortion is removed around that"
+    return "its distortion coefficients fold the image over itself"
 
 
 def compute_fov(pinhole: Pinhole) -> float:

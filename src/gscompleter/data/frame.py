@@ -15,6 +15,7 @@ from gscompleter.data.cameras import (
     FRACTIONS,
     Intrinsics,
     Pinhole,
+    find_distortion_defect,
     find_pinhole_defect,
     find_pose_defect,
     make_rigid,
@@ -179,10 +180,11 @@ class Frame:
                 "another aspect ratio"
             )
         pinhole = self.intrinsics.compute_pinhole(width, height)
-        defect = find_pose_defect(self.c2w) or find_pinhole_defect(pinhole)
-        if defect is None and undistort_pinhole(pinhole, self.intrinsics.distortion) is None:
-            return "its distortion coefficients fold the image over itself"
-        return defect
+        return (
+            find_pose_defect(self.c2w)
+            or find_pinhole_defect(pinhole)
+            or find_distortion_defect(pinhole, self.intrinsics.distortion)
+        )
 
     def compute_pinholes(self, width: int, height: int) -> tuple[Pinhole, Pinhole]:
         """Return the intrinsics at this photograph size, before and after undistortion."""

@@ -105,6 +105,12 @@ def as_generator(phi: Any) -> Generator:
             "The max_batch_size of the generator has to be a whole number from 1, and is "
             f"{describe(generator.max_batch_size)}."
         )
+    # A method would always count as True.
+    if not isinstance(generator.supports_padding, bool):
+        raise InputError(
+            "The supports_padding of the generator has to be True or False, and is "
+            f"{describe(generator.supports_padding)}."
+        )
     if not callable(generator.synthesize):
         raise InputError("The synthesize of the generator has to be a function of requests.")
     return generator

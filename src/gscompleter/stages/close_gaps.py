@@ -38,7 +38,7 @@ DEPTH_SHARPNESS = 16
 SIDE_MOVES = (0.75, 1.25)
 """Moves to a side, relative to the one away from the photograph. A crack that is wide from afar is
 thin from nearby, and what is closed from there opens again further on."""
-SAME_PLACE = 0.01
+MIN_MOVED = 0.01
 """Distance of a photograph from a target, relative to the mean one of all, below which it was taken
 at the target, as those are at which something was removed."""
 MIN_SHARE = 1e-4
@@ -58,7 +58,7 @@ def displace_camera(
     and if there are no others, nothing tells how far a camera may move: there is none then.
     """
     distances = [measure_baseline(target, view.camera) for view in views]
-    least = SAME_PLACE * sum(distances) / len(distances)
+    least = MIN_MOVED * sum(distances) / len(distances)
     beside = [view for view, distance in zip(views, distances, strict=True) if distance > least]
     if not beside:
         return ()

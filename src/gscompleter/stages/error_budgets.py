@@ -152,8 +152,8 @@ def meet_error_budgets(
     In a photograph over budget, opacities with a harmful gradient are halved, the most harmful
     first and no more than needed. If that fails, Gaussians at the worst pixels are removed, finally
     all that the photograph sees. Only a photograph that is over budget with none stays so.
-    `regions` are numbers from 0 of parts that stand or fall alone, by
-    default one for all: a region that loses more than `max_opacity_loss` of its opacity is dropped.
+    `regions` are numbers from 0 of parts that stand or fall alone, by default one for all: a region
+    that loses more than `max_opacity_loss` of its opacity is dropped.
     """
     if len(added) == 0:
         return added

@@ -89,11 +89,12 @@ def find_ignored(
     """
     context = state.rendered_context
     ignored, valid = torch.zeros((2, len(context))).to(context.means)
-    for index in choose_right_views(given, views):
-        view = views[index]
-        if view.ignore_mask is None:
-            continue
-        frozen = renderer.freeze(merge(state.parts), view.camera)
+    right_views = [views[index] for index in choose_right_views(given, views)]
+    if all(view.ignore_mask is None for view in right_views):
+        return ignored > valid
+    scene = merge(state.parts)
+    for view in right_views:
+        frozen = renderer.freeze(scene, view.camera)
         # A backprojection takes three channels.
         is_valid = view.valid_mask.to(ignored)
         layers = torch.stack([1 - is_valid, is_valid, torch.zeros_like(is_valid)], dim=-1)
@@ -104,7 +105,7 @@ def find_ignored(
 
 
 def choose_right_views(given: Sequence[Render], views: Sequence[View]) -> list[int]:
-    """Choose the half of the photographs that the given scene was made of, as its errors tell."""
+    """Choose photographs that the given scene is right from: the half with the smallest errors."""
     order = compute_psnrs(given, views).argsort(descending=True)
     return order[: (len(views) + 1) // 2].tolist()
 

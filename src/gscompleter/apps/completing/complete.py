@@ -182,6 +182,7 @@ def plan_targets(request: PlanRequest) -> int:
         refuse_completed(results.out)
         print_lines(console, *output.describe_others())
         ready = prepare(request.filling, console)
+        check_target_count(ready)
         print_lines(console, *describe_completion_plan(ready))
         with output.write() as folder:
             begun = ready.begin()
@@ -214,6 +215,7 @@ def export_holes(request: ExportRequest) -> int:
     ):
         print_lines(console, *output.describe_others())
         ready = prepare(request.filling, console)
+        check_target_count(ready)
         print_lines(console, *describe_export(ready, request.folder))
         with output.write() as folder:
             begun = ready.begin()
@@ -234,7 +236,9 @@ def write_plan_pictures(folder: Path, ready: Prepared, begun: Completion) -> Non
     folder.mkdir()
     renderer = ready.completer.renderer
     for number, target in enumerate(ready.task.targets, start=1):
-        render = renderer.render(begun.scene, target.camera.to(ready.task.device))
+        # Without the range of the scene, a camera of a file sees nothing nearer than 0.01 units.
+        camera = begun.with_depth_range(target.camera.to(ready.task.device))
+        render = renderer.render(begun.scene, camera)
         write_images(folder, f"target{number}", {"before": render.image})
         if target.derived_from is not None:
             resolution = ready.opened.request.resolution
@@ -320,11 +324,11 @@ def write_done(
 def describe_edit(ready: Prepared) -> dict[str, Any]:
     """Describe what was done for the record of edits: places, cameras, masks, photographs, models.
 
+    Places are in the coordinates of the splat's file, and cameras in the frame of the photographs.
     Paths are without their folders, which tell about the machine.
     """
     files = ready.opened.files
     settings = describe_settings(ready)
-    # Those of a place are numbers, in the coordinates of the splat's file.
     place = {name: settings[name] for name in REGIONS if settings.get(name)}
     named = {name: settings[name] for name in NAMED_FILES if settings.get(name)}
     back = np.linalg.inv(ready.task.frame)
@@ -352,37 +356,40 @@ def strip_folders(value: str | Sequence[str]) -> str | list[str]:
 def complete_targets(ready: Prepared) -> tuple[Completion, Prepared]:
     """Complete the scene for the named targets, or for targets that it finds."""
     task = ready.task
-    count = ready.max_targets
 
     # What photographs show is added when the completion begins, before any target.
     if ready.targets is None:
         return ready.begin(), ready
 
-    # Too many targets for the labels of a .ply are refused before the first one is completed.
+    check_target_count(ready)
     if task.targets:
-        check_target_ids(task.scene, len(task.targets))
         return ready.completer.complete(ready.begin(), task.target_cameras), ready
-    check_target_ids(task.scene, count)
     cameras = list(ready.cameras.values())
-    completion, choices = ready.explorer.explore(ready.begin(), cameras, count)
+    completion, choices = ready.explorer.explore(ready.begin(), cameras, ready.max_targets)
     return completion, ready.with_choices(choices)
+
+
+def check_target_count(ready: Prepared) -> None:
+    """Raise InputError, before any is completed, if a .ply cannot tell all targets apart."""
+    if ready.targets is not None:
+        check_target_ids(ready.task.scene, len(ready.task.targets) or ready.max_targets)
 
 
 def write_targets(folder: Path, task: CompletionTask) -> None:
     """Write the target cameras in the frame of the photographs, as `--target` reads them."""
     if task.targets:
-        write_in_first_frame(folder / TARGETS_FILE, task, [t.camera for t in task.targets])
+        write_in_given_frame(folder / TARGETS_FILE, task, [t.camera for t in task.targets])
 
 
 def write_chosen_cameras(folder: Path, opened: Opened, task: CompletionTask) -> None:
     """Write cameras that were not given: those of renders, and refined ones of photographs."""
     if opened.renders_from is not None:
         cameras = [view.camera for view in task.views]
-        write_in_first_frame(folder / RENDERS_FILE, task, cameras)
+        write_in_given_frame(folder / RENDERS_FILE, task, cameras)
     write_refined_poses(folder, opened)
 
 
-def write_in_first_frame(path: Path, task: CompletionTask, cameras: Sequence[Camera]) -> None:
+def write_in_given_frame(path: Path, task: CompletionTask, cameras: Sequence[Camera]) -> None:
     """Write cameras of the result in the frame of the photographs, or of a splat alone."""
     # In float64, because coordinates of maps are large.
     back = np.linalg.inv(task.frame)

@@ -51,8 +51,8 @@ def describe_run_values(
         task: What was read of it. Its views share one depth range.
         config: Settings of the method.
         settings: Those of the command alone, such as its models.
-        inverts_masks: True if masks were read the other way round: those of what goes, or else
-            those of photographs.
+        inverts_masks: True if masks were read with black and white exchanged: those that mark what
+            a command takes out, or, without any, those of photographs.
     """
     camera = task.views[0].camera
     # The request before it was opened: opening may change the resolution, and nothing else here.
@@ -148,6 +148,7 @@ def read_held_out(
     held_out = []
     # A loop of its own, since an InputError from here on is a fault of ours and not suppressed.
     for frame, view in read.items():
+        # All that are kept back have a usable camera, and are not used (`update.hold_out`).
         # The camera of the view is in the frame of the photographs. That in `cameras` is in the
         # frame of the result, and on the device of the task, to which the image follows.
         moved = view.to(task.device)

@@ -167,13 +167,9 @@ def find_cameras_alone(
             f"{MIN_FOUND_COVERED:.0%} are needed to trust it; name a camera with --target, or the "
             "cameras it was made from with --cameras."
         )
-    depth = seen.depth[seen.valid].median().item()
-    cameras = [
-        replace(moved, near=request.reading.near, far=request.reading.far)
-        for moved in move_beside(camera, depth)
-    ]
+    cameras = move_beside(camera, seen.depth[seen.valid].median().item())
     where = "cameras that follow from the sizes of its Gaussians"
-    return name_capture(cameras, "pixels", where, upward)
+    return name_capture(cameras, "pixels", where, request, upward)
 
 
 def find_standing_cameras(
@@ -189,7 +185,7 @@ def find_standing_cameras(
         )
     best = cameras[:NUM_STANDPOINTS]
     where = "cameras from which it looks like a photograph"
-    found = name_capture(best, "standpoints", where, upward)
+    found = name_capture(best, "standpoints", where, request, upward)
     return replace(found, others=cameras[NUM_STANDPOINTS:])
 
 
@@ -214,7 +210,7 @@ def search_around_place(
             "No camera around what is to be removed sees it unhidden; name cameras with --cameras, "
             "or which way is up with --up."
         )
-    return name_capture(cameras, "place", "cameras around what is removed", upward)
+    return name_capture(cameras, "place", "cameras around what is removed", request, upward)
 
 
 def choose_side(resolution: tuple[int, int] | int | None) -> int:
@@ -233,6 +229,7 @@ def search_around(
     holes: Sequence[Bool[Tensor, "h w"]],
     scene: Gaussians,
     renderer: Renderer,
+    request: RenderRequest,
 ) -> Capture:
     """Search for cameras around the holes of all targets; InputError for none."""
     # Fewer around each of many targets, and one at least.
@@ -241,22 +238,29 @@ def search_around(
     for target, hole in zip(targets, holes, strict=True):
         for camera in choose_cameras_around(scene, target, renderer, hole, count):
             if not any(is_same_camera(camera, other) for other in cameras):
-                cameras.append(replace(camera, near=target.near, far=target.far))
+                cameras.append(camera)
     if not cameras:
         raise InputError(
             "No camera around the targets sees what surrounds their holes; move them closer to the "
             "scene, or name cameras with --cameras.",
             "target",
         )
-    return name_capture(cameras, "targets", "cameras that were found around the targets")
+    where = "cameras that were found around the targets"
+    return name_capture(cameras, "targets", where, request)
 
 
 def name_capture(
-    cameras: Sequence[Camera], source: CaptureSource, where: str, upward: Upward | None = None
+    cameras: Sequence[Camera],
+    source: CaptureSource,
+    where: str,
+    request: RenderRequest,
+    upward: Upward | None = None,
 ) -> Capture:
-    """Name cameras that were found."""
+    """Name cameras that were found, and give them the depth range that was asked for."""
+    reading = request.reading
+    ranged = [replace(camera, near=reading.near, far=reading.far) for camera in cameras]
     names = [name_render(number) for number in range(1, len(cameras) + 1)]
-    return Capture(cameras, names, source, where, "; --cameras names others", upward)
+    return Capture(ranged, names, source, where, "; --cameras names others", upward)
 
 
 def describe_capture(capture: Capture, num_chosen: int) -> str:

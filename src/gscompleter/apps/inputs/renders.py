@@ -216,7 +216,7 @@ def choose_capture(
     elif not targets:
         capture = find_cameras_alone(scene, pixel_center, renderer, request)
     else:
-        capture = search_around(targets, holes, scene, renderer)
+        capture = search_around(targets, holes, scene, renderer, request)
     return ChosenCapture(capture, kind)
 
 

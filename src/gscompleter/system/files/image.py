@@ -136,7 +136,7 @@ def read_colors_and_alpha(
     with open_image(stored, name) as image:
         if not _has_alpha(image):
             return _read_over_black(image), None
-        rgba = np.array(image.convert("RGBA"))
+        rgba = _read_rgba(image)
     return np.ascontiguousarray(rgba[..., :3]), rgba[..., 3]
 
 
@@ -150,11 +150,13 @@ def read_mask(stored: Path | bytes, name: str = "") -> Bool[np.ndarray, "h w"]:
     """
     with open_image(stored, name) as image:
         # 16 bits are not reduced to 8, where 1 would become 0.
-        if image.mode == "F" or image.mode == "I" or image.mode.startswith("I;16"):
+        if image.mode == "F" or _has_wide_grey(image):
             values = np.array(image)[..., None]
+            if not np.isfinite(values).all():
+                raise DamagedError("it holds NaN or infinity")
             alpha = None
         elif _has_alpha(image):
-            rgba = np.array(image.convert("RGBA"))
+            rgba = _read_rgba(image)
             values = rgba[..., :3]
             alpha = leave_out_constant(rgba[..., 3])
         else:
@@ -240,7 +242,8 @@ def open_image(stored: Path | str | bytes, name: str = "") -> Iterator[Image.Ima
         refuse_pointer(file)
     head = stored[:64] if isinstance(stored, bytes) else read_head(Path(stored), 64)
     formats = _choose_formats(head, shown)
-    Image.preinit()  # usual formats only; Pillow would load all of them
+    # The usual formats; Pillow loads those of all plugins as soon as it misses one of them.
+    Image.preinit()
     try:
         with Image.open(file, formats=formats) as image:
             yield image
@@ -286,11 +289,29 @@ def _has_alpha(image: Image.Image) -> bool:
     return image.mode in ALPHA_MODES or "transparency" in image.info
 
 
+def _has_wide_grey(image: Image.Image) -> bool:
+    """Return True for grey of whole numbers of 16 bits, which old versions of Pillow widen."""
+    return image.mode == "I" or image.mode.startswith("I;16")
+
+
 def _read_over_black(image: Image.Image) -> UInt8[np.ndarray, "h w 3"]:
     if _has_alpha(image):
-        rgba = np.array(image.convert("RGBA"))
+        rgba = _read_rgba(image)
         return composite_over_black(rgba[..., :3], rgba[..., 3])
     return np.array(reduce_to_rgb(image))
+
+
+def _read_rgba(image: Image.Image) -> UInt8[np.ndarray, "h w 4"]:
+    """Read colours of 8 bits and the alpha of an image that has one, or a transparent colour."""
+    transparent = image.info.get("transparency", ())
+    if _has_wide_grey(image):
+        # Pillow would clip the grey, and compare it with the transparent one after that.
+        alpha = np.where(np.array(image) == transparent, 0, 255).astype(np.uint8)
+        return np.dstack([np.array(reduce_to_rgb(image)), alpha])
+    if image.mode == "RGB" and any(tile[3] == "RGB;16B" for tile in getattr(image, "tile", ())):
+        # Pillow reads the upper 8 of 16 bits, and leaves the transparent colour as it is.
+        image.info["transparency"] = tuple(value >> 8 for value in transparent)
+    return np.array(image.convert("RGBA"))
 
 
 def reduce_to_rgb(image: Image.Image) -> Image.Image:
@@ -299,9 +320,9 @@ def reduce_to_rgb(image: Image.Image) -> Image.Image:
     Pillow would clip grey of 16 bits to 255 instead of scaling it.
     """
     if image.mode == "F":
-        # As any error inside of `open_image`, it becomes the reason in an InputError.
-        raise ValueError("it holds floating-point values, not colours")
-    if image.mode == "I" or image.mode.startswith("I;16"):
+        # Inside of `open_image` it becomes the reason in an InputError.
+        raise DamagedError("it holds floating-point values, not colours")
+    if _has_wide_grey(image):
         # 65535 / 257 is 255.
         grey = np.array(image).astype(np.float64) / 257
         image = Image.fromarray((grey + 0.5).clip(0, 255).astype(np.uint8))
