@@ -5,7 +5,6 @@ import os
 import signal
 import sys
 import threading
-import time
 from pathlib import Path
 
 import pytest
@@ -100,15 +99,19 @@ def test_workers_import_nothing_of_the_working_folder_and_work_in_it(
 
 
 def test_a_worker_that_was_killed_while_it_waited_is_replaced():
-    num_threads = threading.active_count()
+    others = set(threading.enumerate())
     with open_local(1) as pool:
         first = pool.start(os.getpid).result(timeout=120)
+        managers = [
+            thread
+            for thread in threading.enumerate()
+            if thread not in others and "ExecutorManager" in type(thread).__name__
+        ]
+        assert len(managers) == 1
         os.kill(first, signal.SIGTERM)
-        # The threads of its executor end once it is found dead.
-        end = time.monotonic() + 60
-        while threading.active_count() > num_threads:
-            assert time.monotonic() < end
-            time.sleep(0.01)
+        # The thread of its executor ends once it is found dead.
+        managers[0].join(60)
+        assert not managers[0].is_alive()
         assert pool.start(os.getpid).result(timeout=120) != first
 
 

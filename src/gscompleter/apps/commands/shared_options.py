@@ -76,7 +76,7 @@ class WritingOptions(Options):
     """Options of every command that replaces earlier results on request only."""
 
     overwrite: bool = False
-    """Replace an existing file, or in the output folder the files that an earlier run wrote."""
+    """Replace an existing file, or what an earlier run wrote in the output folder."""
 
 
 @dataclass(frozen=True, kw_only=True)
