@@ -98,6 +98,7 @@ def test_workers_import_nothing_of_the_working_folder_and_work_in_it(
     assert not strange.exists()
 
 
+@pytest.mark.linux
 def test_a_worker_that_was_killed_while_it_waited_is_replaced():
     others = set(threading.enumerate())
     with open_local(1) as pool:
@@ -108,7 +109,7 @@ def test_a_worker_that_was_killed_while_it_waited_is_replaced():
             if thread not in others and "ExecutorManager" in type(thread).__name__
         ]
         assert len(managers) == 1
-        os.kill(first, signal.SIGTERM)
+        os.kill(first, signal.SIGKILL)
         # The thread of its executor ends once it is found dead.
         managers[0].join(60)
         assert not managers[0].is_alive()
