@@ -79,7 +79,7 @@ def test_no_photograph_is_matched_worse_than_allowed(halvings, removals, monkeyp
 
 
 def test_what_goes_at_last_harms_no_other_photograph(monkeypatch):
-    """Of two Gaussians the first is wrong in one photograph, and hides the second in another."""
+    """Remove a Gaussian that is wrong in one photograph and hides another one in a second."""
     view = view_of(ROOM, CAMERA)
     context = gaussians_of(view)
     added = replace(context[:2], opacities=torch.ones(2), encoded=None)

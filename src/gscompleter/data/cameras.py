@@ -290,8 +290,9 @@ def find_distortion_defect(pinhole: Pinhole, distortion: Distortion) -> str | No
     if undistort_pinhole(pinhole, distortion) is not None:
         return None
     # Zooms are about the principal point, so it has to be shown.
-    x, y = pinhole.cx, pinhole.cy
-    if not (0.5 <= x <= pinhole.width - 0.5 and 0.5 <= y <= pinhole.height - 0.5):
+    is_in_row = 0.5 <= pinhole.cx <= pinhole.width - 0.5
+    is_in_column = 0.5 <= pinhole.cy <= pinhole.height - 0.5
+    if not (is_in_row and is_in_column):
         return "its principal point lies outside of it, and its distortion is removed around that"
     return "its distortion coefficients fold the image over itself"
 

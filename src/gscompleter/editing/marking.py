@@ -8,8 +8,8 @@ import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
-from gscompleter.editing.removal import sum_in_mask
 from gscompleter.numerics.geometry import compute_z_depths, look_up
+from gscompleter.render.mask_sums import sum_in_mask
 from gscompleter.render.protocols import Renderer
 from gscompleter.types import Camera, Gaussians
 

@@ -21,6 +21,7 @@ from gscompleter.guards import prepare_guards
 from gscompleter.parts import Part, PartOrigin, make_part, split_into_parts
 from gscompleter.render.cache import Parts, SceneRenderer
 from gscompleter.render.fit_colors import RELAXATION, fit_colors
+from gscompleter.render.mask_sums import sum_in_mask
 from gscompleter.render.protocols import FrozenScene, Renderer
 from gscompleter.render.removed import mask_removed
 from gscompleter.render.view_map import get_view_map
@@ -236,12 +237,6 @@ def find_outside(
         sums += shown[len(shown) - len(revealed) :]
     # Valid pixels are those outside of the hole, since those in it are ignored.
     return sums[:, 0] > MIN_OUTSIDE * sums.sum(dim=1)
-
-
-def sum_in_mask(frozen: FrozenScene, inside: Float[Tensor, "h w"]) -> Float[Tensor, "n 3"]:
-    """Sum how much of each Gaussian is shown inside and outside of a mask; the third sum is 0."""
-    # A backprojection takes three channels.
-    return frozen.backproject(torch.stack([inside, 1 - inside, torch.zeros_like(inside)], dim=-1))
 
 
 def fade_harmful(

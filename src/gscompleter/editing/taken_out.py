@@ -26,7 +26,7 @@ class TakenOut:
     scene: Gaussians
     """The splat as it is now."""
     occluders: Gaussians
-    """What may hide it in a photograph."""
+    """Gaussians of the splat that may stand before it in a photograph."""
     renderer: Renderer
 
     def hide(self, view: View) -> View:

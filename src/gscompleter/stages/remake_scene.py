@@ -19,6 +19,7 @@ from gscompleter.config.settings import COVERED
 from gscompleter.generators.exposure import compute_median_ratio
 from gscompleter.parts import EarlierWork, PartOrigin, make_part
 from gscompleter.reconstructors import Reconstructor
+from gscompleter.render.mask_sums import sum_in_mask
 from gscompleter.render.protocols import Renderer
 from gscompleter.stages.context import InitialContext, reconstruct_context, sort_by_frame
 from gscompleter.stages.new_photos import compute_error
@@ -88,19 +89,16 @@ def find_ignored(
     renders are `given`: in others shards may stand before the place.
     """
     context = state.rendered_context
-    ignored, valid = torch.zeros((2, len(context))).to(context.means)
     right_views = [views[index] for index in choose_right_views(given, views)]
     if all(view.ignore_mask is None for view in right_views):
-        return ignored > valid
+        return torch.zeros_like(context.opacities, dtype=torch.bool)
     scene = merge(state.parts)
+    sums = torch.zeros_like(context.means)
     for view in right_views:
         frozen = renderer.freeze(scene, view.camera)
-        # A backprojection takes three channels.
-        is_valid = view.valid_mask.to(ignored)
-        layers = torch.stack([1 - is_valid, is_valid, torch.zeros_like(is_valid)], dim=-1)
-        sums = frozen.backproject(layers)[: len(context)]
-        ignored += sums[:, 0]
-        valid += sums[:, 1]
+        # The context comes first in the scene.
+        sums += sum_in_mask(frozen, view.valid_mask.to(sums))[: len(context)]
+    valid, ignored, _ = sums.unbind(dim=1)
     return ignored > valid
 
 

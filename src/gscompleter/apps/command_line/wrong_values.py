@@ -20,7 +20,7 @@ from gscompleter.system.errors import quote_value
 NAMED_OPTION = re.compile(r"(?:for argument '|Argument helptext:\s+)--([\w.-]+)")
 """Option whose values tyro refuses, in the lines of its message."""
 NOUNS = {int: "whole number", float: "number", str: "text", Path: "path"}
-"""What a value of each type is called in a sentence."""
+"""Names of the values of each type in a sentence."""
 
 
 @dataclass(frozen=True)

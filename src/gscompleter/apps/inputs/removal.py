@@ -23,8 +23,8 @@ from gscompleter.data.masks import (
     make_no_mask_error,
 )
 from gscompleter.data.photographs import Photographs, Resolution, resize_mask
-from gscompleter.editing.removal import sum_in_mask
 from gscompleter.numerics.geometry import quats_to_rotations
+from gscompleter.render.mask_sums import sum_in_mask
 from gscompleter.render.protocols import Renderer
 from gscompleter.splats.formats import load_splat, load_splat_at
 from gscompleter.splats.origin import format_corners
