@@ -11,7 +11,11 @@ import pytest
 
 from command import run
 from gscompleter import load_ply, save_ply
-from gscompleter.apps.inputs.own_scene import find_own_photographs, join_photographs
+from gscompleter.apps.inputs.own_scene import (
+    find_own_photographs,
+    find_source_frames,
+    join_photographs,
+)
 from gscompleter.apps.requests.completion import WorkRequest
 from gscompleter.apps.requests.models import ModelRequest
 from gscompleter.apps.requests.splat import SplatRequest
@@ -36,7 +40,8 @@ def write_own(folder: Path, command: str = "complete", **settings: Any) -> Path:
 
 def find(splat: SplatRequest, psi: str = "plane-sweep") -> tuple[int, ...]:
     models = ModelRequest(reconstructor=psi)
-    return find_own_photographs(WorkRequest(splat=splat, models=models), FILES)
+    work = WorkRequest(splat=splat, models=models)
+    return find_own_photographs(work, read_edits(splat.path), FILES)
 
 
 def test_the_record_tells_the_photographs_of_a_scene(tmp_path):
@@ -88,6 +93,35 @@ def test_neither_are_a_splat_of_a_user_and_one_that_another_program_changed(tmp_
     alone = tmp_path / "alone.ply"
     save_ply(alone, random_gaussians(20, seed=1))
     assert find(SplatRequest(alone)) == ()
+
+
+def find_sources(path: Path) -> tuple[int, ...]:
+    return find_source_frames(read_edits(path), FILES)
+
+
+def test_the_record_tells_where_a_scene_of_ours_is_right_whatever_came_after(tmp_path):
+    path = write_own(tmp_path, photographs=["c.jpg", "elsewhere.jpg"])
+    assert find_sources(path) == (2,)
+    out = tmp_path / "out"
+    out.mkdir()
+    save_ply(out / "completed.ply", load_ply(path))
+    draft = EditDraft("clean")
+    record_edit(out, draft, 20, [], path, read_edits(path), None, random_gaussians(2))
+    assert find_sources(out / "completed.ply") == (2,)
+    # Another program cut it, and it still lies beside its record.
+    save_ply(path, load_ply(path)[:10])
+    assert find_sources(path) == (2,)
+
+
+def test_no_record_tells_what_a_splat_of_a_user_was_trained_on(tmp_path):
+    given = tmp_path / "given.ply"
+    scene = random_gaussians(20)
+    save_ply(given, scene)
+    assert find_sources(given) == ()
+    save_ply(tmp_path / "completed.ply", scene)
+    draft = EditDraft("complete", SETTINGS)
+    record_edit(tmp_path, draft, 20, [], given, read_edits(given), None)
+    assert find_sources(tmp_path / "completed.ply") == ()
 
 
 def test_photographs_are_joined_if_they_are_not_too_many():

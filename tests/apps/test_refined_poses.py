@@ -149,11 +149,12 @@ def test_poses_that_a_given_splat_contradicts_are_kept(scene, splat, monkeypatch
     task = read_photographs(opened, CONTEXT, "cpu")
     task = move_to_splat(task, load_ply(splat), locate_splat(splat, False), opened)
     # As if matches agreed with the wrong camera, which the splat does not.
-    done = refined_poses.ask_splat(refined, photographs, task, DONE)
+    done = refined_poses.ask_splat(opened, photographs, task, DONE)
     assert done.is_contradicted_by_splat
     assert not done.is_accepted
     assert "Given poses are kept, though they miss matches by 0.40 px" in done.describe()
-    assert refined_poses.ask_splat(photographs, refined, task, DONE).is_accepted
+    wrong = replace(opened, photographs=photographs)
+    assert refined_poses.ask_splat(wrong, refined, task, DONE).is_accepted
 
 
 def test_a_splat_is_asked_with_what_was_taken_out_of_it(scene, tmp_path, monkeypatch):
@@ -170,8 +171,25 @@ def test_a_splat_is_asked_with_what_was_taken_out_of_it(scene, tmp_path, monkeyp
     task = replace(read_photographs(opened, CONTEXT, "cpu"), scene=given, splat_file=splat_file)
     asked = []
     monkeypatch.setattr(refined_poses, "compare_poses", lambda splat, *_: asked.append(len(splat)))
-    refined_poses.ask_splat(photographs, photographs, task, DONE)
+    refined_poses.ask_splat(opened, photographs, task, DONE)
     assert asked == [len(given) + len(taken_out)]
+
+
+@pytest.mark.parametrize("is_remade", [False, True])
+def test_a_splat_that_is_made_anew_is_no_witness_of_poses(scene, monkeypatch, is_remade):
+    photographs = open_photographs(scene)
+    opened = Opened(SceneRequest(scene), photographs, "nerfstudio", len(photographs))
+    task = read_photographs(opened, CONTEXT, "cpu")
+    task = replace(task, scene=random_gaussians(20), is_remade=is_remade)
+    worse = replace(DONE, splat_given=30.0, splat_refined=20.0)
+    monkeypatch.setattr(refined_poses, "refine_poses", correct)
+    monkeypatch.setattr(refined_poses, "ask_splat", lambda *_: worse)
+    quiet = Console(quiet=True)
+    taken, _ = refined_poses.read_at_refined_poses(opened, lambda _: task, quiet)
+    assert (taken.given is not None) == is_remade
+    # A command knows it before what it reads does.
+    known, _ = refined_poses.read_at_refined_poses(opened, lambda _: task, quiet, asks_splat=False)
+    assert known.given is not None
 
 
 def test_a_cleaning_compares_at_refined_poses_and_the_next_command_takes_them(

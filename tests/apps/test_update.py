@@ -11,7 +11,7 @@ from command import run
 from gscompleter import load_ply, save_ply
 from gscompleter.apps.completing import update
 from gscompleter.apps.completing.preparation import Loaded
-from gscompleter.apps.completing.update import hold_out
+from gscompleter.apps.completing.update import find_remade, hold_out, select_lacking
 from gscompleter.apps.inputs.task import Opened
 from gscompleter.apps.requests.completion import WorkRequest
 from gscompleter.apps.requests.scene import SceneRequest
@@ -19,6 +19,7 @@ from gscompleter.data.formats import open_photographs
 from gscompleter.evaluation.verdict import held_out
 from gscompleter.evaluation.verdict.held_out import render_before_after as render
 from gscompleter.parts import NOT_INVENTED
+from gscompleter.stages.add_observed import MAX_RECONSTRUCTED
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.image import write_image
 from gscompleter.types import merge
@@ -177,13 +178,46 @@ def test_new_photographs_leave_room_for_those_of_the_scene_that_show_a_lack(monk
     monkeypatch.setattr(update, "measure_lacks", lambda loaded: shares)
     monkeypatch.setattr(update, "count_pixels", lambda photographs, resolution: SIZE * SIZE)
     monkeypatch.setattr(update, "make_task", make_task)
-    opened = Mock(held_out=())
-    work = Mock(spec=WorkRequest, config=Mock(add_observed=False))
-    loaded = Mock(spec=Loaded, opened=opened, task=Mock(context_frames=context))
+    # All stand in one place, so that shares alone decide.
+    cameras = dict.fromkeys(range(50), CAMERAS[0])
+    loaded = Mock(
+        spec=Loaded, opened=Mock(held_out=()), task=Mock(context_frames=context), cameras=cameras
+    )
     with pytest.raises(InputError, match="enough is known"):
-        update.choose_evidence(work, None, loaded, new)
+        update.choose_evidence(Mock(spec=WorkRequest), None, loaded, new, ())
     joined = range(30 - update.MAX_LACKING, 30)
     assert asked == [(*context, *joined, *new)]
+
+    # A scene of ours is made anew, and takes what one reconstruction does.
+    del asked[:]
+    with pytest.raises(InputError, match="enough is known"):
+        update.choose_evidence(Mock(spec=WorkRequest), None, loaded, new, context)
+    assert asked == [(*context, 28, 29, *new)]
+    assert len(asked[0]) == MAX_RECONSTRUCTED
+
+
+def test_photographs_that_lack_as_much_are_taken_apart_from_each_other():
+    cameras = {frame: camera_at(x=0.1 * frame, size=SIZE) for frame in range(20)}
+    shares = dict.fromkeys(cameras, 1.0)
+    assert select_lacking(shares, cameras, {18, 19}, 3) == [0, 9, 4]
+    assert select_lacking({**shares, 3: 0.001}, cameras, {0}, 19) != sorted(cameras)
+    # Nothing is missing where little is.
+    assert select_lacking(dict.fromkeys(cameras, 0.001), cameras, {0}, 3) == []
+    # What lacks much is better than what stands farthest.
+    assert select_lacking({4: 0.9, 19: 0.05}, cameras, {0}, 1) == [4]
+
+
+@pytest.mark.parametrize(("count", "own"), [(1, (0, 1)), (30, ())])
+def test_a_scene_of_ours_is_made_anew_unless_photographs_are_too_many(monkeypatch, count, own):
+    monkeypatch.setattr(update, "read_edits", lambda path: None)
+    monkeypatch.setattr(update, "find_own_photographs", lambda *asked: (0, 1))
+    monkeypatch.setattr(update, "count_pixels", lambda photographs, resolution: SIZE * SIZE)
+    work = Mock(spec=WorkRequest)
+    opened = Mock(spec=Opened, photographs=None, request=Mock())
+    new = range(10, 10 + count)
+    assert find_remade(work, opened, new) == own
+    work.config.add_observed = False
+    assert find_remade(work, opened, new) == ()
 
 
 def test_a_photograph_that_cannot_be_read_is_not_kept_back_in_silence(tmp_path):

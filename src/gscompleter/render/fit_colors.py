@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import torch
 
-from gscompleter.numerics.value_checks import LARGEST_SH
 from gscompleter.render.protocols import ColorSums, FrozenScene
 from gscompleter.render.spherical_harmonics import evaluate_colors
 from gscompleter.render.view_map import get_view_map
@@ -30,9 +29,16 @@ def fit_colors(
     """Fit the colours of `new` Gaussians by SIRT (Gilbert 1972), with a step size per round.
 
     `frozen` is the scene in front of and behind them, at the camera of each image. The change is
-    the same in all directions.
+    the same in all directions, and makes none brighter than what the images show.
     """
     change = torch.zeros_like(new.means)
+
+    # What shows through half transparent surfaces would be fitted as far too bright, and be a white
+    # spot from elsewhere.
+    brightest = torch.stack([view.image.amax() for view in images]).amax().clamp_min(1.0)
+    constant = 0.5 + SH_C0 * new.sh[:, 0]
+    most = (brightest - constant).clamp_min(0.0)
+    least = (-constant).clamp_max(0.0)
 
     # A GPU keeps the bins of every view, as the host waits for each new one. A CPU makes them anew,
     # since those of many photographs take more memory than time.
@@ -51,8 +57,7 @@ def fit_colors(
         for pull, weight in get_view_map(change)(measure, range(len(frozen)), images):
             sums = sums + pull
             weights = weights + weight
-        change = change + relaxation * sums / weights.clamp_min(DAMPED_WEIGHT)[:, None]
-    # Beside a scene with absurd colours, which a Ψ of one's own may give, a fit would exceed what a
-    # file may hold.
-    constant = (new.sh[:, :1] + change[:, None] / SH_C0).clamp(-LARGEST_SH, LARGEST_SH)
+        step = relaxation * sums / weights.clamp_min(DAMPED_WEIGHT)[:, None]
+        change = (change + step).clamp(least, most)
+    constant = new.sh[:, :1] + change[:, None] / SH_C0
     return replace(new, sh=torch.cat([constant, new.sh[:, 1:]], dim=1), encoded=None)

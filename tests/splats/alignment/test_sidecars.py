@@ -24,8 +24,9 @@ from gscompleter.splats.alignment.trainer_frames import (
 from gscompleter.splats.ply import load_ply, save_ply
 from gscompleter.splats.transform import transform_gaussians
 from gscompleter.system.errors import InputError
+from gscompleter.system.files.image import write_image
 from gscompleter.types import merge
-from scenes import Room, camera_at, gaussians_of, photographed, view_of
+from scenes import Room, camera_at, gaussians_of, photographed, random_gaussians, view_of
 
 RENDERER = load_renderer("cpu")
 PLACES = ((-0.6, 0, 0, 6), (0, -0.3, 0.2, 0), (0.6, 0.1, 0, -6), (0.2, 0.3, 0.4, 0))
@@ -263,6 +264,43 @@ def test_any_similarity_of_a_real_splat_is_found(shared, seed):
     assert np.abs(np.linalg.inv(truth) @ found.transform - np.eye(4)).max() < 3e-3
     plain = score_splat(splat, sample_views(photographs, (0, 3)), RENDERER)
     assert found.fit.psnr == pytest.approx(plain.psnr, abs=0.2)
+
+
+@pytest.fixture
+def drive(tmp_path):
+    """Photographs of which the splat shows 6 and 7, named 14 and 15; others show something else."""
+    around = [camera_at(0.1 * x, 0.0, 0.0, 180, size=96) for x in range(18)]
+    cameras = [*around[:14], CAMERAS[0], CAMERAS[2], *around[14:]]
+    folder = photographed(tmp_path / "drive", cameras)
+    generator = torch.Generator().manual_seed(0)
+    for number in set(range(len(cameras))) - {14, 15}:
+        coarse = torch.rand(1, 3, 12, 12, generator=generator)
+        image = torch.nn.functional.interpolate(coarse, (96, 96), mode="bilinear")[0]
+        write_image(folder / f"{number}.png", image.permute(1, 2, 0))
+    return folder
+
+
+def test_a_splat_of_a_part_of_a_drive_is_found_in_it(splat, drive, tmp_path):
+    shown = [view.frame for view in sample_views(open_photographs(drive), (0, 1))]
+    assert not {6, 7} & set(shown)
+    found = found_for(tmp_path / "s.ply", splat, drive)
+    assert found.given_fit.is_match
+    assert np.abs(found.transform - np.eye(4)).max() < 0.05
+    # Only what no photograph agrees with is refused.
+    with pytest.raises(InputError, match="does not show what the photographs show"):
+        found_for(tmp_path / "s.ply", random_gaussians(300), drive)
+
+
+def test_the_photographs_that_a_splat_was_made_of_are_asked(splat, drive, tmp_path):
+    photographs = open_photographs(drive)
+    given = InputSplat(tmp_path / "s.ply", splat, np.zeros(3), drive)
+    views = sample_views(photographs, (0, 1), (6, 7))
+    assert [view.frame for view in views] == [6, 7]
+    assert align_splat(given, photographs, (0, 1), RENDERER, (6, 7)).fit.coverage > 0.9
+    # Without one that can be read, others are.
+    for name in ("14.png", "15.png"):
+        (drive / name).write_bytes(b"")
+    assert len(sample_views(open_photographs(drive), (0, 1), (6, 7))) == 8
 
 
 @pytest.mark.slow

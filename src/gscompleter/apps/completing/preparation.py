@@ -64,6 +64,7 @@ from gscompleter.reconstructors import DepthAware, FittingReconstructor, load_re
 from gscompleter.reconstructors.depth_predictors import StoredDepth
 from gscompleter.render.loading import load_renderer
 from gscompleter.splats.alignment.similarity import transform_camera
+from gscompleter.splats.edits import read_edits
 from gscompleter.splats.formats import find_origin
 from gscompleter.splats.geometry_files import load_geometry
 from gscompleter.stages.context import prepare_single
@@ -193,16 +194,18 @@ def read_opened(
     console: Console,
     num_known: int | None = None,
     remakes_own: bool = False,
+    asks_splat: bool = True,
 ) -> tuple[Opened, CompletionTask]:
     """Read the inputs, at refined poses unless these are to be taken as they are.
 
-    `num_known` is that of `refine_opened`, and `remakes_own` that of `read_inputs`.
+    `num_known` and `asks_splat` are those of `refine_opened`, and `remakes_own` that of
+    `read_inputs`.
     """
     read = partial(read_inputs, work, photographs, targets, remakes_own=remakes_own)
     # The paper takes poses as they are.
     if follows_paper(work) or not photographs.scene.refines_poses:
         return opened, read(opened)
-    return read_at_refined_poses(opened, read, console, num_known)
+    return read_at_refined_poses(opened, read, console, num_known, asks_splat)
 
 
 def follows_paper(work: WorkRequest) -> bool:
@@ -231,8 +234,9 @@ def read_inputs(
         with show_preparation("reading photographs"):
             has_splat = splat is not None
             is_free = splat is None and not follows_paper(work)
-            can_remake = remakes_own and splat is not None and work.config.add_observed
-            own = find_own_photographs(work, opened.files) if can_remake else ()
+            own: tuple[int, ...] = ()
+            if remakes_own and splat is not None and work.config.add_observed:
+                own = find_own_photographs(work, read_edits(splat.path), opened.files)
             # Plane-sweep fits a scene to any number of photographs (decision 140); networks were
             # trained with few.
             is_fitted = is_free and work.models.reconstructor == "plane-sweep"

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import torch
 from rich.console import Console
 
 from gscompleter.apps.completing.preparation import (
@@ -41,15 +42,18 @@ from gscompleter.apps.requests.scene import Names
 from gscompleter.config import CompleterConfig
 from gscompleter.data.formats import find_format
 from gscompleter.data.sfm.placing import place_photographs
+from gscompleter.numerics.geometry import embed_cameras
 from gscompleter.splats.alignment.similarity import transform_view
-from gscompleter.stages.add_observed import MIN_ADDED_SHARE, find_lacks
+from gscompleter.splats.edits import read_edits
+from gscompleter.stages.add_observed import MIN_ADDED_SHARE, find_lacks, limit_part_photos
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.output_folder import FOUND_POSES_FOLDER, refuse_link
 from gscompleter.system.progress import show_preparation, track
+from gscompleter.types import Camera
 
 MAX_LACKING = 16
 """Most photographs of SCENE that join the context because they show what the splat lacks; of more,
-those that show most. New ones, and those of the context, do not count."""
+those that lack most and stand apart. New ones, and those of the context, do not count."""
 MIN_LEFT = 2
 """Fewest usable photographs that `--hold-out` has to leave."""
 NO_TARGETS = TargetRequest(max_found=0)
@@ -78,9 +82,12 @@ def prepare_update(request: UpdateRequest, console: Console) -> Prepared:
     new = list(range(num_known, len(opened.photographs)))
     opened = hold_out(opened, request.hold_out, source.context, new)
 
-    opened, task = read_opened(work, source, NO_TARGETS, opened, console, num_known)
+    own = find_remade(work, opened, new)
+    opened, task = read_opened(
+        work, source, NO_TARGETS, opened, console, num_known, asks_splat=not own
+    )
     loaded = load_models(work, work.config, NO_TARGETS, opened, task, geometry, console)
-    loaded, notes = choose_evidence(work, source.context, loaded, new)
+    loaded, notes = choose_evidence(work, source.context, loaded, new, own)
     print_lines(console, *notes)
     settings = {
         "photos": None if request.photos is None else str(request.photos),
@@ -142,32 +149,43 @@ def hold_out(opened: Opened, count: int, context: Names | None, new: Sequence[in
     return replace(opened, held_out=chosen)
 
 
+def find_remade(work: WorkRequest, opened: Opened, new: Sequence[int]) -> tuple[int, ...]:
+    """Find the photographs from which an earlier command made the splat, if it is made anew.
+
+    Returns none if they and the `new` ones are too much for one reconstruction.
+    """
+    assert work.splat is not None
+    if not work.config.add_observed:
+        return ()
+    own = find_own_photographs(work, read_edits(work.splat.path), opened.files)
+    pixels = count_pixels(opened.photographs, opened.request.resolution)
+    return own if len({*own, *new}) <= limit_part_photos(pixels) else ()
+
+
 def choose_evidence(
-    work: WorkRequest, context: Names | None, loaded: Loaded, new: Sequence[int]
+    work: WorkRequest,
+    context: Names | None,
+    loaded: Loaded,
+    new: Sequence[int],
+    own: Sequence[int],
 ) -> tuple[Loaded, tuple[str, ...]]:
     """Add new photographs to the context, and photographs that show what the splat lacks.
 
     A context is chosen to overlook the scene, and what it leaves out only checks, at a low
     resolution. A context that the user named only gets the new photographs. A splat that an earlier
-    command reconstructed is made anew from its photographs and those that are added. Also returns
-    lines for the user.
+    command made of the photographs `own` is made anew from these and those that are added. Also
+    returns lines for the user.
     """
     task = loaded.task
     opened = loaded.opened
     added = [frame for frame in new if frame not in opened.held_out]
-    own = find_own_photographs(work, opened.files) if work.config.add_observed else ()
+    pixels = count_pixels(opened.photographs, opened.request.resolution)
     if context is None:
-        shares = measure_lacks(loaded)
         # A scene that is made anew has its own photographs in place of the context.
         joining = {*added, *(own or task.context_frames)}
-        lacking = [
-            frame
-            for frame, share in shares.items()
-            if share >= MIN_ADDED_SHARE and frame not in joining
-        ]
-        lacking.sort(key=lambda frame: -shares[frame])
-        added += lacking[:MAX_LACKING]
-    pixels = count_pixels(opened.photographs, opened.request.resolution)
+        room = limit_part_photos(pixels) - len(joining) if own else MAX_LACKING
+        shares = measure_lacks(loaded)
+        added += select_lacking(shares, loaded.cameras, joining, min(room, MAX_LACKING))
     joined = join_photographs(own, added, set(opened.held_out), pixels) if own else ()
     frames = joined or tuple(sorted({*task.context_frames, *added}))
     if not joined and set(frames) == set(task.context_frames):
@@ -199,6 +217,30 @@ def choose_evidence(
     completer, task = use_predicted_depth(work.models, loaded.completer, task)
     cameras = collect_cameras(opened, task)
     return replace(loaded, task=task, completer=completer, cameras=cameras), notes
+
+
+def select_lacking(
+    shares: Mapping[int, float], cameras: Mapping[int, Camera], known: Collection[int], count: int
+) -> list[int]:
+    """Select up to `count` frames that lack most, and are far from the `known` ones and each other.
+
+    Beside one that is chosen, a second one would show much the same. `shares` are those that the
+    scene lacks.
+    """
+    frames = list(cameras)
+    where = embed_cameras(list(cameras.values()))
+    is_known = torch.tensor([frame in known for frame in frames])
+    share = torch.tensor([shares.get(frame, 0.0) for frame in frames])
+    share[is_known | (share < MIN_ADDED_SHARE)] = 0.0
+    apart = torch.cdist(where, where[is_known]).amin(dim=1)
+    chosen: list[int] = []
+    while len(chosen) < count and (share > 0).any():
+        # One that stands in the place of another comes last, and before none.
+        best = int((share * apart.clamp_min(1e-6)).argmax())
+        chosen.append(frames[best])
+        share[best] = 0.0
+        apart = torch.minimum(apart, (where - where[best]).norm(dim=1))
+    return chosen
 
 
 def measure_lacks(loaded: Loaded) -> dict[int, float]:

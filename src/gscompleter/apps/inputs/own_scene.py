@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from gscompleter.apps.requests.completion import WorkRequest
-from gscompleter.splats.edits import Edit, read_edits
+from gscompleter.splats.edits import Edit, Edits
 from gscompleter.splats.formats import detect_splat_format
 from gscompleter.splats.row_kinds import tells_kinds
 from gscompleter.stages.add_observed import limit_part_photos
@@ -25,16 +25,18 @@ OWN_PSI = "plane-sweep"
 """Ψ that fits a scene to many photographs together; networks were trained with few."""
 
 
-def find_own_photographs(work: WorkRequest, files: Mapping[int | None, str]) -> tuple[int, ...]:
-    """Find the frames from which earlier commands reconstructed the input splat.
+def find_own_photographs(
+    work: WorkRequest, edits: Edits, files: Mapping[int | None, str]
+) -> tuple[int, ...]:
+    """Find the frames from which earlier commands reconstructed the input splat, to remake it.
 
-    `files` are those of the photographs of the folder, by frame. Returns none of them if another
-    command or program changed the splat since, or if one of its photographs is not in the folder.
+    `edits` are those of the splat, and `files` those of the photographs of the folder, by frame.
+    Returns none of them if another command or program changed the splat since, or if one of its
+    photographs is not in the folder.
     """
     assert work.splat is not None
     if work.splat.forget_edits or work.models.reconstructor != OWN_PSI:
         return ()
-    edits = read_edits(work.splat.path)
     if not (edits.is_unchanged and tells_kinds(edits) and is_ply(work.splat.path)):
         return ()
     if edits.edits[0].given is not None or not all(map(is_traced, edits.edits)):
@@ -45,6 +47,19 @@ def find_own_photographs(work: WorkRequest, files: Mapping[int | None, str]) -> 
     if not names <= number_by_name.keys():
         return ()
     return tuple(sorted(number_by_name[name] for name in names))
+
+
+def find_source_frames(edits: Edits, files: Mapping[int | None, str]) -> tuple[int, ...]:
+    """Find those frames of a folder from which our commands made a splat, whatever came after.
+
+    `edits` are those of the splat, and `files` those of the photographs, by frame. Returns none for
+    a splat that came from elsewhere: its record does not tell what it was trained on.
+    """
+    if not edits or edits.edits[0].given is not None:
+        return ()
+    sources = filter(has_lifted, edits.edits)
+    names = {name for edit in sources for name in edit.settings.get("photographs", ())}
+    return tuple(frame for frame, name in files.items() if frame is not None and name in names)
 
 
 def is_traced(edit: Edit) -> bool:

@@ -14,6 +14,7 @@ from pathlib import Path
 from rich.console import Console
 
 from gscompleter.apps.inputs.describing import print_lines
+from gscompleter.apps.inputs.own_scene import find_source_frames
 from gscompleter.apps.inputs.taken_out import merge_taken_out
 from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.data.local_origin import compute_frame_from_photographs
@@ -55,24 +56,31 @@ def read_at_refined_poses(
     read: Callable[[Opened], CompletionTask],
     console: Console,
     num_known: int | None = None,
+    asks_splat: bool = True,
 ) -> tuple[Opened, CompletionTask]:
     """Read a task, and once more if poses that matches contradict could be refined.
 
-    `num_known` is that of `refine_opened`.
+    `num_known` and `asks_splat` are those of `refine_opened`.
     """
     task = read(opened)
-    refined = refine_opened(opened, task, console, num_known)
+    asks_splat = asks_splat and not task.is_remade
+    refined = refine_opened(opened, task, console, num_known, asks_splat)
     return (opened, task) if refined is opened else (refined, read(refined))
 
 
 def refine_opened(
-    opened: Opened, task: CompletionTask, console: Console, num_known: int | None = None
+    opened: Opened,
+    task: CompletionTask,
+    console: Console,
+    num_known: int | None,
+    asks_splat: bool,
 ) -> Opened:
     """Refine the poses of all photographs together if matches of the context contradict them.
 
     `task` was read at the given poses. Those that an earlier command refined stay, and so does
     `opened` where nothing is taken. `num_known` is the number of photographs of the scene, if new
-    ones were placed after them.
+    ones were placed after them. `asks_splat` is False for a splat that is made anew: it fits the
+    poses that it was made at, whatever they are.
     """
     if opened.given is not None or len(opened.photographs.posed) < MIN_REFINED:
         return opened
@@ -95,9 +103,9 @@ def refine_opened(
             f"{ERROR_SIDE}): too few photographs could be refined together, or compared.",
         )
         return opened
-    if task.scene is not None and refinement.is_accepted:
+    if task.scene is not None and asks_splat and refinement.is_accepted:
         with show_preparation("comparing poses with the splat"):
-            refinement = ask_splat(opened.photographs, photographs, task, refinement)
+            refinement = ask_splat(opened, photographs, task, refinement)
     print_lines(console, refinement.describe())
     if not refinement.is_accepted:
         return opened
@@ -113,19 +121,24 @@ def write_refined_poses(folder: Path, opened: Opened) -> None:
 
 
 def ask_splat(
-    given: Photographs, refined: Photographs, task: CompletionTask, refinement: PoseRefinement
+    opened: Opened, refined: Photographs, task: CompletionTask, refinement: PoseRefinement
 ) -> PoseRefinement:
-    """Add how well the splat of a task agrees with photographs at given and at refined poses."""
+    """Add how well the splat of a task agrees with photographs at given and at refined poses.
+
+    `opened` has them at the given ones.
+    """
     assert task.scene is not None
     assert task.splat_file is not None
     # Photographs still show what earlier edits took out.
     whole = merge_taken_out(task.scene, task.splat_file)
     # Photographs are read relative to their origin, and the frame of a task begins at their own.
+    given = opened.photographs
     transform = task.frame @ compute_frame_from_photographs(-given.origin)
+    sources = find_source_frames(task.splat_file.edits, opened.files)
     given_views, refined_views = (
         [
             transform_view(view.to(task.device), transform)
-            for view in sample_views(photographs, task.context_frames)
+            for view in sample_views(photographs, task.context_frames, sources)
         ]
         for photographs in (given, refined)
     )

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from gscompleter.apps.inputs.own_scene import find_source_frames
 from gscompleter.apps.inputs.selection import (
     choose_check_size,
     collect_usable_cameras,
@@ -117,7 +118,11 @@ def move_to_splat(
     # A trainer may have moved and scaled the cameras before it trained the splat.
     splat = InputSplat(splat_file.path, whole, origin, opened.request.folder)
     alignment = align_splat(
-        splat, photographs, task.context_frames, load_renderer(task.device.type)
+        splat,
+        photographs,
+        task.context_frames,
+        load_renderer(task.device.type),
+        find_source_frames(splat_file.edits, opened.files),
     )
 
     # Cameras were read relative to the origin of the photographs, whatever frame they are in. Those

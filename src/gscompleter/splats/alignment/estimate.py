@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import chain
 from typing import Literal
 
@@ -17,7 +18,7 @@ from gscompleter.data.photographs import Photographs
 from gscompleter.reconstructors.features.depth_range import estimate_depth_range
 from gscompleter.render.lod import build_proxy, thin_gaussians
 from gscompleter.render.protocols import Renderer
-from gscompleter.splats.alignment.fit import SplatFit, score_splat
+from gscompleter.splats.alignment.fit import SplatFit, render_from, score_image, score_splat
 from gscompleter.splats.alignment.matching import (
     extract_view_features,
     refine_similarity,
@@ -35,6 +36,8 @@ from gscompleter.system.errors import InputError
 from gscompleter.types import Gaussians, View
 
 NUM_SAMPLE_VIEWS = 8
+MAX_ASKED_VIEWS = 40
+"""Most photographs that are asked before a splat is refused: it may cover few of them."""
 SAMPLE_SIDE = 320
 """Longer side of the samples in pixels: enough for features and for a blur of one pixel."""
 MIN_IMPROVEMENT = 2.0
@@ -99,29 +102,89 @@ class AlignmentData:
         views = [transform_view(view, transform) for view in self.views]
         return score_splat(self.restrict_to(transform).scene, views, self.renderer)
 
+    def find_shown(self) -> list[View]:
+        """Find the photographs that the splat shows as it is, the best `NUM_SAMPLE_VIEWS`."""
+        scene = self.restrict_to(np.eye(4)).scene
+        fits = [
+            score_image(render_from(scene, view.camera, self.renderer), view) for view in self.views
+        ]
+        matches = [(fit, view) for fit, view in zip(fits, self.views, strict=True) if fit.is_match]
+        matches.sort(key=lambda match: -match[0].margin)
+        return [view for _, view in matches[:NUM_SAMPLE_VIEWS]]
+
 
 def align_splat(
-    splat: InputSplat, photographs: Photographs, frames: Sequence[int], renderer: Renderer
+    splat: InputSplat,
+    photographs: Photographs,
+    frames: Sequence[int],
+    renderer: Renderer,
+    sources: Sequence[int] = (),
 ) -> SplatAlignment:
-    """Estimate the transform from photographs (`frames` among them) to splat, at their origins."""
-    views = [view.to(splat.scene.means.device) for view in sample_views(photographs, frames)]
+    """Estimate the transform from photographs to splat, both at their origins.
+
+    It is measured at `frames` and further ones, or at the `sources` of the splat if they are known:
+    elsewhere it may show nothing right.
+
+    Raises:
+        InputError: The splat shows none of the photographs that were asked.
+    """
+    device = splat.scene.means.device
+    views = [view.to(device) for view in sample_views(photographs, frames, sources)]
     points = photographs.points()
-    return estimate_alignment(
-        AlignmentData(splat.scene, views, renderer),
-        np.stack([pose for _, pose in collect_poses(photographs)]),
-        None if points is None else points.double().numpy(),
-        read_trainer_frames(splat, photographs),
+    align = partial(
+        estimate_alignment,
+        poses=np.stack([pose for _, pose in collect_poses(photographs)]),
+        points=None if points is None else points.double().numpy(),
+        trainer_frames=read_trainer_frames(splat, photographs),
     )
+    data = AlignmentData(splat.scene, views, renderer)
+    best = align(data)
+    if not best.fit.is_match:
+        # A part of a long drive covers few of its photographs, and the samples may miss them.
+        spread = spread_evenly(range(len(photographs)), MAX_ASKED_VIEWS)
+        others = [view.to(device) for view in read_views(photographs, spread)]
+        shown = replace(data, views=others).find_shown()
+        if len(shown) < 2:
+            raise InputError(
+                f"The splat does not show what the photographs show: at their cameras it covers "
+                f"{100 * best.given_fit.coverage:.0f} % of the pixels and matches them at "
+                f"{best.given_fit.psnr:.1f} dB; give the photographs and poses that it was trained "
+                "on."
+            )
+        best = align(replace(data, views=shown))
+    return best
 
 
-def sample_views(photographs: Photographs, frames: Sequence[int]) -> list[View]:
-    """Load the first of `frames` and, spread over all, further photographs that can be read."""
+def sample_views(
+    photographs: Photographs, frames: Sequence[int], sources: Sequence[int] = ()
+) -> list[View]:
+    """Load some of the `sources` of a splat.
+
+    If these are not known, or none can be read, load the first of `frames` and, spread over all,
+    further photographs that can be read.
+    """
+    views = read_views(photographs, spread_evenly(sources, NUM_SAMPLE_VIEWS))
+    if views:
+        return views
     # Half of the samples are the frames of the context, half are from all over.
     named = list(frames)[: NUM_SAMPLE_VIEWS // 2]
-    spread = np.linspace(0, len(photographs) - 1, NUM_SAMPLE_VIEWS).round().astype(int).tolist()
-    others = [frame for frame in dict.fromkeys(spread) if frame not in named]
-    views = photographs.views(named, SAMPLE_SIDE)
-    for frame in others[: NUM_SAMPLE_VIEWS - len(views)]:
+    spread = spread_evenly(range(len(photographs)), NUM_SAMPLE_VIEWS)
+    others = [frame for frame in spread if frame not in named][: NUM_SAMPLE_VIEWS - len(named)]
+    return photographs.views(named, SAMPLE_SIDE) + read_views(photographs, others)
+
+
+def spread_evenly(frames: Sequence[int], count: int) -> list[int]:
+    """Choose up to `count` of the frames, at even steps from the first to the last."""
+    if not frames:
+        return []
+    steps = np.linspace(0, len(frames) - 1, count).round().astype(int).tolist()
+    return [frames[step] for step in dict.fromkeys(steps)]
+
+
+def read_views(photographs: Photographs, frames: Sequence[int]) -> list[View]:
+    """Read those of the photographs that can be read, at the size of samples."""
+    views: list[View] = []
+    for frame in frames:
         with suppress(InputError):
             views += photographs.views([frame], SAMPLE_SIDE)
     return views
@@ -133,7 +196,7 @@ def estimate_alignment(
     points: Points | None = None,
     trainer_frames: Iterable[FrameProposal] = (),
 ) -> SplatAlignment:
-    """Estimate the frame of the splat by how well it fits its photographs.
+    """Estimate the frame of the splat by how well it fits its photographs, if it does.
 
     Frames are tried from the simplest on, up to the first that is exact. One that fits is replaced
     only by one that fits better by `MIN_IMPROVEMENT`. `poses` are camera-to-world of all
@@ -157,12 +220,6 @@ def estimate_alignment(
     # Features find any frame, and correct one that is slightly off.
     if not best.fit.is_exact:
         best = align_by_features(data, best, points)
-    if not best.fit.is_match:
-        raise InputError(
-            f"The splat does not show what the photographs show: at their cameras it covers "
-            f"{100 * given.coverage:.0f} % of the pixels and matches them at {given.psnr:.1f} dB; "
-            "give the photographs and poses that it was trained on."
-        )
     return best
 
 
