@@ -35,7 +35,7 @@ def fit_colors(
 
     # What shows through half transparent surfaces would be fitted as far too bright, and be a white
     # spot from elsewhere.
-    brightest = torch.stack([view.image.amax() for view in images]).amax().clamp_min(1.0)
+    brightest = torch.stack([change.new_ones(()), *(view.image.amax() for view in images)]).amax()
     constant = 0.5 + SH_C0 * new.sh[:, 0]
     most = (brightest - constant).clamp_min(0.0)
     least = (-constant).clamp_max(0.0)
@@ -59,5 +59,5 @@ def fit_colors(
             weights = weights + weight
         step = relaxation * sums / weights.clamp_min(DAMPED_WEIGHT)[:, None]
         change = (change + step).clamp(least, most)
-    constant = new.sh[:, :1] + change[:, None] / SH_C0
-    return replace(new, sh=torch.cat([constant, new.sh[:, 1:]], dim=1), encoded=None)
+    fitted = new.sh[:, :1] + change[:, None] / SH_C0
+    return replace(new, sh=torch.cat([fitted, new.sh[:, 1:]], dim=1), encoded=None)

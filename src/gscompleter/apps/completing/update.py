@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import torch
@@ -82,12 +83,18 @@ def prepare_update(request: UpdateRequest, console: Console) -> Prepared:
     new = list(range(num_known, len(opened.photographs)))
     opened = hold_out(opened, request.hold_out, source.context, new)
 
+    def load(own: Sequence[int]) -> tuple[Loaded, tuple[str, ...]]:
+        """Load the photographs, where those of `own` are to make the splat anew."""
+        read = partial(read_opened, work, source, NO_TARGETS, opened, console, num_known)
+        at_poses, task = read(asks_splat=not own)
+        loaded = load_models(work, work.config, NO_TARGETS, at_poses, task, geometry, console)
+        return choose_evidence(work, source.context, loaded, new, own)
+
     own = find_remade(work, opened, new)
-    opened, task = read_opened(
-        work, source, NO_TARGETS, opened, console, num_known, asks_splat=not own
-    )
-    loaded = load_models(work, work.config, NO_TARGETS, opened, task, geometry, console)
-    loaded, notes = choose_evidence(work, source.context, loaded, new, own)
+    loaded, notes = load(own)
+    if own and not loaded.task.is_remade and loaded.opened.given is not opened.given:
+        # The splat stays, as nothing is to be added, and has to agree with refined poses.
+        loaded, notes = load(())
     print_lines(console, *notes)
     settings = {
         "photos": None if request.photos is None else str(request.photos),

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
 from itertools import chain
 from typing import Literal
 
@@ -38,6 +37,8 @@ from gscompleter.types import Gaussians, View
 NUM_SAMPLE_VIEWS = 8
 MAX_ASKED_VIEWS = 40
 """Most photographs that are asked before a splat is refused: it may cover few of them."""
+MIN_SHOWN = 2
+"""Fewest of them that have to match: a single one may do so by chance."""
 SAMPLE_SIDE = 320
 """Longer side of the samples in pixels: enough for features and for a blur of one pixel."""
 MIN_IMPROVEMENT = 2.0
@@ -129,30 +130,32 @@ def align_splat(
         InputError: The splat shows none of the photographs that were asked.
     """
     device = splat.scene.means.device
-    views = [view.to(device) for view in sample_views(photographs, frames, sources)]
+    poses = np.stack([pose for _, pose in collect_poses(photographs)])
     points = photographs.points()
-    align = partial(
-        estimate_alignment,
-        poses=np.stack([pose for _, pose in collect_poses(photographs)]),
-        points=None if points is None else points.double().numpy(),
-        trainer_frames=read_trainer_frames(splat, photographs),
-    )
-    data = AlignmentData(splat.scene, views, renderer)
-    best = align(data)
-    if not best.fit.is_match:
-        # A part of a long drive covers few of its photographs, and the samples may miss them.
-        spread = spread_evenly(range(len(photographs)), MAX_ASKED_VIEWS)
-        others = [view.to(device) for view in read_views(photographs, spread)]
-        shown = replace(data, views=others).find_shown()
-        if len(shown) < 2:
-            raise InputError(
-                f"The splat does not show what the photographs show: at their cameras it covers "
-                f"{100 * best.given_fit.coverage:.0f} % of the pixels and matches them at "
-                f"{best.given_fit.psnr:.1f} dB; give the photographs and poses that it was trained "
-                "on."
-            )
-        best = align(replace(data, views=shown))
-    return best
+
+    def align(views: Sequence[View]) -> SplatAlignment:
+        """Estimate the alignment by some photographs."""
+        return estimate_alignment(
+            AlignmentData(splat.scene, views, renderer),
+            poses,
+            None if points is None else points.double().numpy(),
+            read_trainer_frames(splat, photographs),
+        )
+
+    best = align([view.to(device) for view in sample_views(photographs, frames, sources)])
+    if best.fit.is_match:
+        return best
+    # A part of a long drive covers few of its photographs, and the samples may miss them.
+    spread = spread_evenly(range(len(photographs)), MAX_ASKED_VIEWS)
+    others = [view.to(device) for view in read_views(photographs, spread)]
+    shown = AlignmentData(splat.scene, others, renderer).find_shown()
+    if len(shown) < MIN_SHOWN:
+        raise InputError(
+            f"The splat does not show what the photographs show: at their cameras it covers "
+            f"{100 * best.given_fit.coverage:.0f} % of the pixels and matches them at "
+            f"{best.given_fit.psnr:.1f} dB; give the photographs and poses that it was trained on."
+        )
+    return align(shown)
 
 
 def sample_views(
