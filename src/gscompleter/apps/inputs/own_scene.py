@@ -63,7 +63,10 @@ def find_source_frames(edits: Edits, files: Mapping[int | None, str]) -> tuple[i
 
 
 def is_traced(edit: Edit) -> bool:
-    """Return True if the record tells all that a command of ours did, which used our Ψ."""
+    """Return True if the record tells all that a command of ours did, which used our Ψ or none."""
+    # A cleaning takes out what no photograph shows or needs, so that Ψ brings nothing back.
+    if edit.command == "clean":
+        return edit.can_be_undone
     return (
         edit.command in TRACED_COMMANDS
         and edit.can_be_undone
