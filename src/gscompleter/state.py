@@ -56,6 +56,9 @@ class Completion(Displayed):
     added_parts: tuple[Part, ...] = ()
     """What was added, part by part, in the order of addition."""
     targets: tuple[TargetResult, ...] = ()
+    completed_cameras: tuple[Camera, ...] = ()
+    """Targets for which something was added, with their depth range; what is added for others may
+    not show in their images."""
     free_space_cameras: tuple[Camera, ...] = ()
     """Further cameras whose free space stays empty, such as the witnesses of a splat; their images
     are not read."""
@@ -254,7 +257,16 @@ class Completion(Displayed):
         """Append the result of one more target, and what it `added`, in the order of addition."""
         parts = (*self.added_parts, *(part for part in added if len(part)))
         targets = (*self.targets, result)
-        changed = replace(self, added_parts=parts, targets=targets, is_restored=False)
+        cameras = self.completed_cameras
+        if len(result.added):
+            cameras = (*cameras, result.target)
+        changed = replace(
+            self,
+            added_parts=parts,
+            targets=targets,
+            completed_cameras=cameras,
+            is_restored=False,
+        )
         return changed.plus_seconds(seconds)
 
     def plus_seconds(self, seconds: Mapping[str, float]) -> Completion:

@@ -10,6 +10,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config.settings import COVERED
+from gscompleter.numerics.geometry import measure_distances
 from gscompleter.numerics.image_ops import blur_gaussian, dilate
 from gscompleter.numerics.sky import mask_out_sky
 from gscompleter.render.cache import SceneRenderer
@@ -25,6 +26,8 @@ from gscompleter.stages.hole_masks import (
 from gscompleter.state import Completion
 from gscompleter.types import Camera, DepthMap, ErrorBudget, PaddedCamera, Render, View, merge
 
+MAX_COMPLETED_VIEWS = 4
+"""Most completed targets whose images are kept from changing: of long paths those nearest."""
 FULL_TRUST = 1.0
 """Mean trust of what a pixel shows at which it keeps its colour."""
 NO_TRUST = 0.6
@@ -121,6 +124,26 @@ class TargetView:
             share_budgets(photo.budgets, frozen.render.image, guard)
             for photo, frozen in zip(self.state.photos, self.frozen_photos, strict=True)
         )
+
+    @cached_property
+    def completed_views(self) -> tuple[tuple[View, FrozenScene], ...]:
+        """Images of the completed targets nearest to this one, with the scene frozen there.
+
+        What is added for this target may not change them, but in what is still a hole there.
+        """
+        cameras = self.state.completed_cameras
+        if not cameras:
+            return ()
+        order = measure_distances(cameras, [self.camera.target]).argsort(stable=True)
+        nearest = [cameras[index] for index in order[:MAX_COMPLETED_VIEWS].tolist()]
+        views = []
+        for camera, frozen in zip(
+            nearest, self.scenes.freeze_at(self.state.parts, nearest), strict=True
+        ):
+            holes = compute_hole_mask(frozen.render.alpha, self.state.config.holes)
+            image = frozen.render.image.clamp(0, 1)
+            views.append((View(image, camera, ignore_mask=holes), frozen))
+        return tuple(views)
 
     def freeze_views(self, views: Sequence[View]) -> tuple[FrozenScene, ...]:
         """Freeze the scene at the cameras of views."""
