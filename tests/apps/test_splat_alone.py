@@ -6,13 +6,14 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
 from command import run
 from gscompleter import load_cameras, load_ply, save_ply
-from gscompleter.apps.inputs.captures import RenderRequest, choose_side
-from gscompleter.apps.inputs.renders import open_renders
+from gscompleter.apps.inputs.captures import Capture, RenderRequest, choose_side
+from gscompleter.apps.inputs.renders import make_frames, open_renders
 from gscompleter.apps.inputs.splat import read_splat, sort_splat
 from gscompleter.apps.requests.scene import SceneRequest
 from gscompleter.apps.requests.splat import Selection, SplatRequest
@@ -331,6 +332,17 @@ def test_cameras_that_are_found_have_the_depth_range_that_was_given(
     task = open_renders(request, file, scene, load_renderer("cpu"), "cpu").task
     assert task.depths == {"near": "given", "far": "given"}
     assert {(view.camera.near, view.camera.far) for view in task.views} == {(0.01, 300.0)}
+
+
+def test_the_frames_of_cameras_in_float64_leave_these_where_they_stand(folder):
+    splat = SplatRequest(folder / "splat.ply")
+    scene, _ = sort_splat(read_splat(splat), splat, "cpu")
+    camera = make_camera(0.3)
+    exact = replace(camera, c2w=camera.c2w.double(), K=camera.K.double())
+    capture = Capture([exact], ["a"], "cameras", "cameras", "")
+    (frame,) = make_frames(capture, scene, load_renderer("cpu"), np.array([100.0, 0, 0]))
+    assert exact.center.tolist() == camera.center.tolist()
+    assert frame.c2w[0, 3] == 100 + exact.center[0].item()
 
 
 def test_a_camera_that_covers_little_is_refused(folder, tmp_path, monkeypatch, capsys):

@@ -510,6 +510,20 @@ def test_a_page_is_saved_once(packed, tmp_path, monkeypatch, capsys):
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.ply", "page.html"]
 
 
+@pytest.mark.parametrize("content", ['["door", "yard"]', '[{"id": 0, "rotation": 0}]'])
+def test_a_list_of_other_cameras_beside_a_splat_keeps_nobody_from_looking(
+    packed, tmp_path, monkeypatch, capsys, content
+):
+    save_ply(tmp_path / "a.ply", room_exhibit().after)
+    (tmp_path / "cameras.json").write_text(content)
+    page = tmp_path / "page.html"
+    assert run(monkeypatch, "view", tmp_path / "a.ply", "--save", page) == 0
+    unread, upward, _ = capsys.readouterr().out.splitlines()
+    assert unread.startswith("The cameras beside the splat do not tell what is up. ")
+    assert "cameras.json" in unread
+    assert upward.startswith("Up is -y, as in most files")
+
+
 def test_the_second_scene_is_the_one_after(packed, tmp_path, monkeypatch):
     exhibit = room_exhibit()
     assert exhibit.before is not None

@@ -17,7 +17,7 @@ from gscompleter.evaluation.metrics.fitted_camera import (
 )
 from gscompleter.evaluation.metrics.scores import compute_view_psnr
 from gscompleter.render.loading import load_renderer
-from gscompleter.types import Gaussians, View
+from gscompleter.types import Camera, Gaussians, View
 from scenes import Room, camera_at, gaussians_of, view_of
 
 SIZE = 96
@@ -65,15 +65,23 @@ def test_a_large_image_does_not_get_worse(scene):
     assert fitted.psnr > plain - 0.01
 
 
-def test_derivatives_are_how_colours_change_with_the_camera(scene, target):
-    renderer, camera = load_renderer("cpu"), target.camera
+def stretch_rows(camera: Camera, factor: int) -> Camera:
+    """Give a camera pixels that are as wide, and only a part as high."""
+    K = camera.K.clone()
+    K[1] *= factor
+    return replace(camera, K=K, height=factor * camera.height)
+
+
+@pytest.mark.parametrize("factor", [1, 2])
+def test_derivatives_are_how_colours_change_with_the_camera(scene, target, factor):
+    renderer, camera = load_renderer("cpu"), stretch_rows(target.camera, factor)
     median, focal = 3.5, float(camera.K[0, 0])
     render = renderer.render(scene, camera)
     rays = camera.z_rays() @ camera.c2w[:3, :3]
     depth = render.depth.where(render.alpha > 0.5, median)
     points = (rays * depth[..., None]).double().numpy()
     image = blur(clamp_image(render), 1.5)
-    jacobian = compute_move_jacobian(image, points, median, focal)
+    jacobian = compute_move_jacobian(image, points, median, (focal, factor * focal))
     for number in range(6):
         move = 0.1 * np.eye(6)[number]
         moved = renderer.render(scene, move_camera_by(camera, move, median / focal))
@@ -82,6 +90,18 @@ def test_derivatives_are_how_colours_change_with_the_camera(scene, target):
         ours, truth = (x[8:-8, 8:-8].ravel() for x in (jacobian[..., number], change))
         assert np.corrcoef(ours, truth)[0, 1] > 0.9
         assert (ours @ truth) / (truth @ truth) == pytest.approx(1, abs=0.25)
+
+
+def test_a_camera_whose_pixels_are_not_square_costs_nothing(scene, target):
+    renderer = load_renderer("cpu")
+    camera = stretch_rows(target.camera, 2)
+    photograph = renderer.render(scene, camera).image.clamp(0, 1)
+    move = np.array([0.8, -0.5, 0.6, 0.7, -1.0, 0.5])
+    shifted = View(photograph, move_camera_by(camera, move, 0.03))
+    holes = torch.zeros(camera.height, camera.width, dtype=torch.bool)
+    fitted = measure_fitted(scene, shifted, holes, renderer)
+    assert fitted is not None
+    assert fitted.psnr > 60
 
 
 def test_another_exposure_costs_nothing(scene, target):

@@ -132,6 +132,19 @@ def test_the_pose_that_is_off_has_the_largest_error_in_pixels(pixels):
     assert off[2] == pytest.approx(pixels, rel=0.3)
 
 
+@pytest.mark.parametrize("number", [0, 2, 4])
+def test_a_photograph_of_twice_the_size_is_off_by_twice_as_many_of_its_pixels(number):
+    """Wherever it stands among the others: each error is in pixels of its own photograph."""
+    sizes = [256 if each == number else 128 for each in range(5)]
+    places = zip((-0.4, -0.2, 0.0, 0.2, 0.4), sizes, strict=True)
+    views = [view_of(ROOM, camera_at(x, size=size)) for x, size in places]
+    pixels = 12.0
+    off = measure_pose_errors(
+        turn_camera(views, number, pixels / views[number].camera.K[1, 1].item())
+    )
+    assert off[number] == pytest.approx(pixels, rel=0.2)
+
+
 def test_a_camera_that_looks_back_is_off_by_an_image():
     views = [view_of(ROOM, camera_at(x, size=128)) for x in (-0.4, -0.2, 0.0, 0.2, 0.4)]
     assert measure_pose_errors(pitch_middle(views, math.pi))[2] == 128
@@ -139,11 +152,17 @@ def test_a_camera_that_looks_back_is_off_by_an_image():
 
 def pitch_middle(views: list[View], radians: float) -> list[View]:
     """Turn the third camera about its horizontal axis, not its photograph."""
+    return turn_camera(views, 2, radians)
+
+
+def turn_camera(views: list[View], number: int, radians: float) -> list[View]:
+    """Turn a camera about its horizontal axis, not its photograph."""
     pitch = axis_angle_to_matrix(torch.tensor([1.0, 0.0, 0.0]), radians)
-    c2w = views[2].camera.c2w.clone()
+    view = views[number]
+    c2w = view.camera.c2w.clone()
     c2w[:3, :3] @= pitch
-    turned = replace(views[2], camera=replace(views[2].camera, c2w=c2w))
-    return [*views[:2], turned, *views[3:]]
+    turned = replace(view, camera=replace(view.camera, c2w=c2w))
+    return [*views[:number], turned, *views[number + 1 :]]
 
 
 def test_pose_errors_are_unknown_without_features_or_without_a_baseline():

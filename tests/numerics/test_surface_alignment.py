@@ -7,6 +7,8 @@ from scipy.spatial.transform import Rotation
 
 from gscompleter.numerics.given_geometry import GivenGeometry, make_geometry, move_points
 from gscompleter.numerics.surface_alignment import (
+    DistanceField,
+    SeenPoints,
     align_surface,
     find_least_determined_move,
     fit_closest_points,
@@ -68,6 +70,15 @@ def test_a_small_error_is_fitted_away():
     similarity, share = fit_closest_points(np.eye(4), surface, see_room())
     assert measure_error(similarity, moved) < 0.002
     assert share > 0.95
+
+
+@pytest.mark.parametrize("growth", [0.98, 1.02])
+def test_what_is_seen_a_little_behind_the_outermost_walls_lies_on_them(growth):
+    surface = sample_surface(MESH, np.random.default_rng(0))
+    middle = MESH.vertices.mean(axis=0)
+    points = middle + growth * (surface.points[:2000] - middle)
+    seen = SeenPoints(points, surface.normals[:2000], np.full(2000, 3.0))
+    assert DistanceField.make(surface).measure_agreement(np.eye(4)[None], seen)[0] > 0.95
 
 
 def make_seen_grid(shape: str):

@@ -43,8 +43,9 @@ NUM_PAIRED_POINTS = 300
 """Points of the surface whose pairs are tried: of a room of 6 m, one every 0.7 m."""
 NUM_PAIRS = 80
 """Seen pairs that are looked up among them."""
-MAX_ANGLE_ERROR = 0.15
-"""Largest distance of the cosines of two equal pairs: normals of noisy depth err by degrees."""
+MAX_COSINE_DISTANCE = 0.15
+"""Largest distance between the three cosines of two pairs whose angles count as equal: normals of
+noisy depth err by degrees."""
 MAX_EQUAL_PAIRS = 2000
 """Most pairs of the surface that are tried for a seen one, chosen at random."""
 SEEN_SIZES = (0.1, 2.0)
@@ -191,33 +192,40 @@ def propose_similarities(
 
     field = DistanceField.make(surface)
     sizes = measure_spread_of_points(surface.points) * np.array(SEEN_SIZES)
-    corners = SurfacePoints(surface.points[:NUM_PAIRED_POINTS], surface.normals[:NUM_PAIRED_POINTS])
-    pairs = PointPairs.make(corners.with_both_signs(), *list_pairs(NUM_PAIRED_POINTS))
+    paired = SurfacePoints(surface.points[:NUM_PAIRED_POINTS], surface.normals[:NUM_PAIRED_POINTS])
+    pairs = PointPairs.make(paired.with_both_signs(), *list_pairs(NUM_PAIRED_POINTS))
     tree = cKDTree(pairs.cosines)
-    few = seen.choose(rng.choice(len(seen.points), min(NUM_SCORED, len(seen.points)), False))
-    own = choose_far_pairs(seen, rng)
+    scored = seen.choose(rng.choice(len(seen.points), min(NUM_SCORED, len(seen.points)), False))
+    seen_pairs = choose_far_pairs(seen, rng)
 
     proposals = []
-    for pair, cosines in enumerate(own.cosines):
-        equal = np.array(tree.query_ball_point(cosines, MAX_ANGLE_ERROR), int)
+    for number, cosines in enumerate(seen_pairs.cosines):
+        equal = np.array(tree.query_ball_point(cosines, MAX_COSINE_DISTANCE), int)
         if len(equal) > MAX_EQUAL_PAIRS:
             equal = rng.choice(equal, MAX_EQUAL_PAIRS, replace=False)
-        scale = own.lengths[pair] / pairs.lengths[equal]
-        sized = (seen.size / scale > sizes[0]) & (seen.size / scale < sizes[1])
-        equal = equal[sized]
-        # From the frame of the surface's pair to that of the seen one.
-        turns = own.frames[pair] @ pairs.frames[equal].transpose(0, 2, 1)
-        proposed = np.tile(np.eye(4), (len(equal), 1, 1))
-        proposed[:, :3, :3] = scale[sized, None, None] * turns
-        moved = np.einsum("nij,nj->ni", proposed[:, :3, :3], pairs.middles[equal])
-        proposed[:, :3, 3] = own.middles[pair] - moved
-        best = np.argsort(-field.measure_agreement(proposed, few), kind="stable")[
-            :NUM_BEST_PROPOSALS
-        ]
-        proposals.append(proposed[best])
+        scales = seen_pairs.lengths[number] / pairs.lengths[equal]
+        # The size of what is seen in the unit of the surface.
+        is_sized = (seen.size / scales > sizes[0]) & (seen.size / scales < sizes[1])
+        proposed = match_pairs(pairs, equal[is_sized], seen_pairs, number)
+        order = np.argsort(-field.measure_agreement(proposed, scored), kind="stable")
+        proposals.append(proposed[order[:NUM_BEST_PROPOSALS]])
     kept = np.concatenate(proposals) if proposals else np.empty((0, 4, 4))
     order = np.argsort(-field.measure_agreement(kept, seen), kind="stable")
     return keep_distinct(list(kept[order]), seen, SAME_START, NUM_REFINED_PROPOSALS)
+
+
+def match_pairs(
+    pairs: PointPairs, rows: Int[ndarray, "k"], seen_pairs: PointPairs, number: int
+) -> Float[ndarray, "k 4 4"]:
+    """Compute the similarities that bring pairs of the surface, by their rows, to one seen pair."""
+    scales = seen_pairs.lengths[number] / pairs.lengths[rows]
+    # From the frame of the surface's pair to that of the seen one.
+    turns = seen_pairs.frames[number] @ pairs.frames[rows].transpose(0, 2, 1)
+    similarities = np.tile(np.eye(4), (len(rows), 1, 1))
+    similarities[:, :3, :3] = scales[:, None, None] * turns
+    moved = np.einsum("nij,nj->ni", similarities[:, :3, :3], pairs.middles[rows])
+    similarities[:, :3, 3] = seen_pairs.middles[number] - moved
+    return similarities
 
 
 def list_pairs(count: int) -> tuple[Int[ndarray, "m"], Int[ndarray, "m"]]:
@@ -307,7 +315,10 @@ class DistanceField:
     def measure_agreement(
         self, similarities: Float[ndarray, "m 4 4"], seen: SeenPoints
     ) -> Float[ndarray, "m"]:
-        """Measure the share of seen points that lie on the surface, by each similarity."""
+        """Measure the share of seen points that lie on the surface, by each similarity.
+
+        A point beside the grid is as far as the nearest cell, and as the way from there.
+        """
         # From the scene to cells.
         linear = np.linalg.inv(similarities[:, :3, :3])
         shift = np.einsum("mij,mj->mi", linear, similarities[:, :3, 3])
@@ -387,23 +398,24 @@ class GapEquations:
     """
 
     rows: Float[ndarray, "n 7"]
+    """Change of each gap by the unknowns: a turn about x, y and z, a shift along them, a growth."""
     gaps: Float[ndarray, "n"]
     """Along the normals of the surface, relative to the depth of each seen point."""
     weights: Float[ndarray, "n"]
 
     def decompose(self) -> tuple[Float[ndarray, "7"], Float[ndarray, "7 7"]]:
-        """Find seven moves, as columns, and the sum of squares by which each changes the gaps.
+        """Find seven moves, and by which sum of squares each changes the gaps.
 
-        The move that changes them least is the first.
+        Returns the sums, the smallest first, and the moves, as columns in the same order.
         """
-        values, moves = np.linalg.eigh(self.rows.T @ (self.weights[:, None] * self.rows))
-        return values, moves
+        sums, moves = np.linalg.eigh(self.rows.T @ (self.weights[:, None] * self.rows))
+        return sums, moves
 
     def solve(self) -> Float[ndarray, "7"]:
         """Find the move that closes the gaps."""
-        values, moves = self.decompose()
-        sums = self.rows.T @ (self.weights * self.gaps)
-        return moves @ (moves.T @ sums / (values + DAMPING * values[-1]))
+        sums, moves = self.decompose()
+        wanted = self.rows.T @ (self.weights * self.gaps)
+        return moves @ (moves.T @ wanted / (sums + DAMPING * sums[-1]))
 
 
 def make_gap_equations(

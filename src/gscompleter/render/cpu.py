@@ -171,54 +171,8 @@ class CpuFrozenScene:
         for part in parts:
             drawn = drawn.extend(part)
 
-        # Entries of either layer, tile by tile, by the rows of their Gaussians; of a Gaussian that
-        # is in both layers, either splat will do.
-        new = drawn.layer
-        starts = np.where(is_drawn, len(old.entries) + new.tile_start[:-1], old.tile_start[:-1])
-        counts = np.where(is_drawn, np.diff(new.tile_start), np.diff(old.tile_start))
-        tile_start = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
-        places = np.repeat(starts - tile_start[:-1], counts)
-        places += np.arange(len(places))
-        splats = np.concatenate([old.entries, new.entries + np.int32(len(old.splats))])[places]
-        del places
-        rows_of_entries = np.concatenate([self.rows, drawn.rows])[splats]
-        splat_of_row = np.full(self.count, -1, np.int32)
-        splat_of_row[rows_of_entries] = splats
-        rows = np.flatnonzero(splat_of_row >= 0).astype(np.int32)
-        kept = splat_of_row[rows]
-        splat_of_row[rows] = np.arange(len(rows), dtype=np.int32)
-
-        # Joined to one array, those of both layers would be copied twice.
-        is_new = kept >= len(old.splats)
-        new_kept = kept[is_new] - len(old.splats)
-
-        def take(mine: ndarray, other: ndarray) -> ndarray:
-            taken = mine[np.where(is_new, 0, kept)]
-            taken[is_new] = other[new_kept]
-            return taken
-
-        layer = Layer(
-            take(old.splats, new.splats),
-            take(old.opacities, new.opacities),
-            take(old.boxes, new.boxes),
-            tile_start,
-            splat_of_row[rows_of_entries],
-        )
-
-        height, width = self.frame.alpha.shape
-        tiles = is_drawn.reshape(-1, self.viewpoint.tiles_x)
-        pixels = tiles.repeat(TILE, axis=0).repeat(TILE, axis=1)[:height, :width]
-
-        def join(name: str, where: ndarray) -> ndarray:
-            mine, other = getattr(self.frame, name), getattr(drawn.frame, name)
-            return np.where(
-                where.reshape(where.shape + (1,) * (mine.ndim - where.ndim)), other, mine
-            )
-
-        of_tiles = ("used", "full")
-        frame = RasterFrame(
-            *[join(name, is_drawn if name in of_tiles else pixels) for name in RasterFrame._fields]
-        )
+        layer, rows = choose_lists(self, drawn, is_drawn)
+        frame = choose_pixels(self, drawn, is_drawn)
         depth_limits = np.where(is_drawn, drawn.depth_limits, self.depth_limits)
         self.release()
         return CpuFrozenScene(self.viewpoint, layer, frame, depth_limits, rows, self.count)
@@ -498,6 +452,70 @@ def freeze_nothing(viewpoint: Viewpoint) -> CpuFrozenScene:
     )
     limits = np.full(viewpoint.tiles, np.inf, np.float32)
     return CpuFrozenScene(viewpoint, layer, frame, limits, np.empty(0, np.int32), 0)
+
+
+def choose_lists(
+    scene: CpuFrozenScene, drawn: CpuFrozenScene, is_drawn: Bool[ndarray, "tiles"]
+) -> tuple[Layer, Int32[ndarray, "splats"]]:
+    """Choose the lists of `drawn` in some tiles, and those of `scene` in the others.
+
+    Both are frozen from the same Gaussians at the same camera. Also returns the index of the
+    Gaussian of each splat.
+    """
+    # Entries of either layer, tile by tile, by the rows of their Gaussians; of a Gaussian that is
+    # in both layers, either splat will do.
+    old = scene.layer
+    new = drawn.layer
+    starts = np.where(is_drawn, len(old.entries) + new.tile_start[:-1], old.tile_start[:-1])
+    counts = np.where(is_drawn, np.diff(new.tile_start), np.diff(old.tile_start))
+    tile_start = np.concatenate([[0], np.cumsum(counts, dtype=np.int64)])
+    places = np.repeat(starts - tile_start[:-1], counts)
+    places += np.arange(len(places))
+    splats = np.concatenate([old.entries, new.entries + np.int32(len(old.splats))])[places]
+    del places
+    rows_of_entries = np.concatenate([scene.rows, drawn.rows])[splats]
+    splat_of_row = np.full(scene.count, -1, np.int32)
+    splat_of_row[rows_of_entries] = splats
+    rows = np.flatnonzero(splat_of_row >= 0).astype(np.int32)
+    kept = splat_of_row[rows]
+    # From here on the number of each splat among those that are kept.
+    splat_of_row[rows] = np.arange(len(rows), dtype=np.int32)
+
+    # Joined to one array, those of both layers would be copied twice.
+    is_new = kept >= len(old.splats)
+    new_kept = kept[is_new] - len(old.splats)
+
+    def take(mine: ndarray, other: ndarray) -> ndarray:
+        taken = mine[np.where(is_new, 0, kept)]
+        taken[is_new] = other[new_kept]
+        return taken
+
+    layer = Layer(
+        take(old.splats, new.splats),
+        take(old.opacities, new.opacities),
+        take(old.boxes, new.boxes),
+        tile_start,
+        splat_of_row[rows_of_entries],
+    )
+    return layer, rows
+
+
+def choose_pixels(
+    scene: CpuFrozenScene, drawn: CpuFrozenScene, is_drawn: Bool[ndarray, "tiles"]
+) -> RasterFrame:
+    """Choose the frame of `drawn` in some tiles, and that of `scene` in the others."""
+    height, width = scene.frame.alpha.shape
+    tiles = is_drawn.reshape(-1, scene.viewpoint.tiles_x)
+    pixels = tiles.repeat(TILE, axis=0).repeat(TILE, axis=1)[:height, :width]
+
+    def join(name: str, where: ndarray) -> ndarray:
+        mine, other = getattr(scene.frame, name), getattr(drawn.frame, name)
+        return np.where(where.reshape(where.shape + (1,) * (mine.ndim - where.ndim)), other, mine)
+
+    of_tiles = ("used", "full")
+    return RasterFrame(
+        *[join(name, is_drawn if name in of_tiles else pixels) for name in RasterFrame._fields]
+    )
 
 
 def make_pinhole(camera: Camera) -> CameraArrays:

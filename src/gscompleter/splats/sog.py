@@ -75,8 +75,8 @@ FileReader = Callable[[str, int], bytes]
 """Function that reads a file of the scene by name and most bytes, from a folder or a bundle."""
 Coded = tuple[dict[str, Any], dict[str, bytes]]
 """A property as numbers for `meta.json`, and images by file name."""
-READ = ("means", "scales", "quats", "sh0", "shN", LABELS_IMAGE)
-"""Properties that are read."""
+READ_PROPERTIES = ("means", "scales", "quats", "sh0", "shN", LABELS_IMAGE)
+"""Entries of `meta.json` that are read; each names the images of a property of Gaussians."""
 
 
 def read_sog(path: Path) -> Gaussians:
@@ -106,13 +106,13 @@ def list_sog_names(path: Path) -> list[str]:
     return [
         name
         for name, stored in _read_meta(path).items()
-        if name not in READ and isinstance(stored, dict) and "files" in stored
+        if name not in READ_PROPERTIES and isinstance(stored, dict) and "files" in stored
     ]
 
 
 def _read_meta(path: Path) -> dict[str, Any]:
     if path.is_dir():
-        data = read_bytes(path / META)
+        data = read_bytes(path / META, MAX_META)
     else:
         data = read_bytes(path)
         if data.startswith(ZIP_MAGIC):
@@ -148,14 +148,15 @@ def _decode_scene(read: FileReader, table: dict[str, Any], stored: int) -> Gauss
     is_coded = table.get("version", 1) == 2
     count = int(table["count"] if is_coded else table["means"]["shape"][0])
     (quats,) = table["quats"]["files"]
-    _open_image(read, quats, count)  # with fewer pixels the count is wrong, whatever it is
+    # Before the count is believed: an image with fewer pixels shows that it is wrong.
+    quats_image = _open_image(read, quats, count)
     check_count(count, stored)
     logs = _decode_values(read, table["scales"], count, 3)
     rgba = _decode_values(read, table["sh0"], count, 4)
     rest = _decode_sh_rest(read, table["shN"], count) if table.get("shN") else None
     gaussians = build_gaussians(
         _decode_means(read, table["means"], count),
-        _decode_quats(_read_pixels(read, quats, count)),
+        _decode_quats(_decode_pixels(quats_image, quats, count)),
         np.exp(logs),
         rgba[:, 3] if is_coded else 1 / (1 + np.exp(-rgba[:, 3])),
         assemble_sh(0.5 + SH_C0 * rgba[:, :3], rest),
@@ -195,7 +196,11 @@ def _open_image(read: FileReader, name: object, count: int) -> Image.Image:
 
 def _read_pixels(read: FileReader, name: object, count: int) -> UInt8[ndarray, "n 4"]:
     """Read the first `count` pixels of an image."""
-    return _decode_image(_open_image(read, name, count), name).reshape(-1, 4)[:count]
+    return _decode_pixels(_open_image(read, name, count), name, count)
+
+
+def _decode_pixels(image: Image.Image, name: object, count: int) -> UInt8[ndarray, "n 4"]:
+    return _decode_image(image, name).reshape(-1, 4)[:count]
 
 
 def _decode_image(image: Image.Image, name: object) -> UInt8[ndarray, "h w 4"]:
@@ -284,6 +289,7 @@ def write_sog(path: Path, gaussians: Gaussians, made_by: Provenance = NOTHING_KN
 
 def _encode_scene(gaussians: Gaussians) -> dict[str, Coded]:
     """Encode the properties of Gaussians by their names in `meta.json`."""
+    # Those of a .ply stay as they were read, where they still decode to the scales.
     log_scales = encode(gaussians)[:, :3].numpy().clip(-MAX_LOG_SCALE, MAX_LOG_SCALE)
     scale_book, scales = fit_codebook(log_scales)
     color_book, colors = fit_codebook(gaussians.sh[:, 0].numpy())

@@ -41,7 +41,7 @@ from gscompleter.apps.inputs.reading import check_sizes
 from gscompleter.apps.inputs.removal import select_without_masks
 from gscompleter.apps.inputs.selection import choose_context
 from gscompleter.apps.inputs.splat import place_scene
-from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened
+from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile, Opened, Target
 from gscompleter.apps.requests.scene import SceneRequest
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.data.cameras import Intrinsics
@@ -69,8 +69,8 @@ from gscompleter.virtual_capture.witnesses import choose_witnesses
 RENDERS_FORMAT = "renders"
 """Format of photographs that are renders of the splat."""
 SURFACE_POINTS = 10_000
-"""Gaussians that stand for the surfaces of the scene where cameras are compared: as many, if there
-are, and fewer than twice as many."""
+"""Gaussians that stand for the surfaces of the scene where cameras are compared. They are taken at
+even steps, so that up to twice as many may be left."""
 MIN_POINT_OPACITY = 0.5
 """Least opacity of such a Gaussian."""
 
@@ -139,10 +139,7 @@ def open_renders(
         format=RENDERS_FORMAT,
         sparse=partial(sample_surface_points, scene, origin),
     )
-    chosen = find_context(photographs, request.context)
-    if not chosen and path is not None:
-        chosen = choose_context(photographs, targets, reading.resolution, has_splat=True)
-    chosen = chosen or tuple(range(len(capture.cameras)))
+    chosen = choose_rendered(photographs, targets, request, is_from_file=path is not None)
     notes = [describe_capture(capture, len(chosen))]
     notes += [] if capture.upward is None else capture.upward.describe()
     if decided.holes == "enclosed" and not request.masks and request.marked is None:
@@ -158,7 +155,7 @@ def open_renders(
     else:
         up = capture.upward.direction
     witnesses = choose_witnesses(scene, pixel_center, list(cameras.values()), others, up, renderer)
-    check_capture_images([*cameras.values(), *(target.camera for target in targets)])
+    check_capture_images([*cameras.values(), *target_cameras])
     opened = Opened(
         reading,
         replace(photographs, notes=tuple(notes)),
@@ -178,6 +175,20 @@ def open_renders(
         witnesses=witnesses,
     )
     return OpenedAlone(opened, task, SplatAloneKind(pixel_center is not None, decided.holes))
+
+
+def choose_rendered(
+    photographs: Photographs, targets: Sequence[Target], request: RenderRequest, is_from_file: bool
+) -> tuple[int, ...]:
+    """Choose the numbers of the cameras whose renders are the context.
+
+    They are those that were named, or of a file those that suit the targets. Cameras that were
+    found are few, and all are taken.
+    """
+    chosen = find_context(photographs, request.context)
+    if not chosen and is_from_file:
+        chosen = choose_context(photographs, targets, request.reading.resolution, has_splat=True)
+    return chosen or tuple(range(len(photographs)))
 
 
 def choose_capture(
@@ -320,7 +331,8 @@ def make_frames(
     """Make the frames of the cameras, whose photographs are rendered when they are asked for."""
     frames = []
     for name, camera in zip(capture.names, capture.cameras, strict=True):
-        c2w = camera.c2w.double().cpu().numpy()
+        # A copy, or a camera in float64 would be moved itself.
+        c2w = camera.c2w.double().cpu().numpy().copy()
         c2w[:3, 3] += origin
         (fl_x, _, cx), (_, fl_y, cy), _ = camera.K.double().tolist()
         intrinsics = Intrinsics((camera.width, camera.height), (fl_x, fl_y), (cx, cy))

@@ -30,21 +30,21 @@ def make_run_record(
     A model is None where none took part. Of several painters the first is named.
     """
     labels = [part.origin.label for part in completion.added_parts if len(part)]
-    # What is recoloured has the number of its target: none of these is 0.
+    # A recoloured Gaussian of the context has the number of its target, which is never 0.
     labels += completion.recolored.generated.unique().tolist()
     # What photographs show was added as well, and nobody invented it.
     invented = [label for label in labels if label != NOT_INVENTED]
     painters = [result.painter for result in completion.targets if result.painter]
     return RunRecord(
-        TOOL,
-        __version__,
-        (min(invented), max(invented)) if invented else None,
-        reconstructor,
-        depth,
-        generator if invented else None,
-        shorten(painters[0]) if painters and invented else None,
-        completion.seed,
-        hash_given(given),
+        tool=TOOL,
+        version=__version__,
+        labels=(min(invented), max(invented)) if invented else None,
+        reconstructor=reconstructor,
+        depth=depth,
+        generator=generator if invented else None,
+        painter=shorten(painters[0]) if painters and invented else None,
+        seed=completion.seed,
+        given=hash_given(given),
     )
 
 
@@ -64,4 +64,4 @@ def record_model_by_name(name: str | None) -> ModelRecord | None:
     """Record a model by its name, without its weights; None if there is none."""
     if not name:
         return None
-    return ModelRecord(shorten(name), None, LICENCE if name in OWN_MODELS else None)
+    return ModelRecord(shorten(name), licence=LICENCE if name in OWN_MODELS else None)

@@ -31,6 +31,7 @@ from gscompleter.splats.upward import Direction
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.output_file import reserve_file
 from gscompleter.system.files.writing import SUMMARY_FILE, replace_file
+from gscompleter.types import Camera
 from gscompleter.virtual_capture.upward import find_upward, require_direction
 
 LOCAL_ADDRESS = "127.0.0.1"
@@ -111,11 +112,24 @@ def set_upward(content: ViewerContent, up: Direction | None, splat_file: Path) -
         return replace(content, up=up)
     if content.cameras:
         return content
-    beside = find_cameras_beside(splat_file)
-    cameras = [] if beside is None else load_cameras(beside)
+    cameras, notes = load_cameras_beside(splat_file)
     upward = find_upward(splat_file, content.after, load_renderer("cpu"), cameras=cameras)
     x, y, z = upward.direction.tolist()
-    return replace(content, up=(x, y, z), notes=(*content.notes, *upward.describe()))
+    return replace(content, up=(x, y, z), notes=(*content.notes, *notes, *upward.describe()))
+
+
+def load_cameras_beside(splat_file: Path) -> tuple[list[Camera], tuple[str, ...]]:
+    """Load the cameras that lie beside a splat; none if they cannot be read, with a note on that.
+
+    Nobody named that file, and it may be of another program, so it keeps no splat from being shown.
+    """
+    beside = find_cameras_beside(splat_file)
+    if beside is None:
+        return [], ()
+    try:
+        return load_cameras(beside), ()
+    except InputError as error:
+        return [], (f"The cameras beside the splat do not tell what is up. {error}",)
 
 
 def make_page_server(page: bytes, port: int = 0) -> ThreadingHTTPServer:

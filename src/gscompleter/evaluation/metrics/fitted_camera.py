@@ -60,9 +60,11 @@ PixelValues = Float[np.ndarray, "h w 3"]
 Move = Float[np.ndarray, "6"]
 """Rotation about x, y, z and shift along them, in camera axes.
 
-In pixels: a rotation by one is 1 / focal length in radians, and a shift by one is what moves a
+In pixels along x: a rotation by one is 1 / `focal_x` in radians, and a shift by one is what moves a
 point at the median depth of the scene by a pixel. Moves are small, so that their numbers add.
 """
+FocalLengths = tuple[float, float]
+"""Along x and y, in pixels. They differ where pixels are not square."""
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,8 @@ def measure_fitted(
         return None
     start = renderer.render(scene, small.camera)
     median_depth = measure_depth(start, small.valid_mask)
-    focal = float(small.camera.K[0, 0])
+    focals = (float(small.camera.K[0, 0]), float(small.camera.K[1, 1]))
+    unit = median_depth / focals[0]
     # From world axes to those of the camera, in which moves are made.
     rays = small.camera.z_rays().double().cpu().numpy()
     rays = rays @ small.camera.c2w[:3, :3].double().cpu().numpy()
@@ -122,12 +125,12 @@ def measure_fitted(
         return MovedPicture(clamp_image(render), rays * depth[..., None])
 
     def draw(move: Move) -> MovedPicture:
-        camera = move_camera_by(small.camera, move, median_depth / focal)
+        camera = move_camera_by(small.camera, move, unit)
         return read_picture(renderer.render(scene, camera))
 
     first = read_picture(start)
-    move = fit_move(draw, first, small.image.cpu().numpy(), counted, median_depth, focal)
-    pose = move_camera_by(small.camera, move, median_depth / focal).c2w
+    move = fit_move(draw, first, small.image.cpu().numpy(), counted, median_depth, focals)
+    pose = move_camera_by(small.camera, move, unit).c2w
 
     truth = target.image.cpu().numpy()
     shown = observed.cpu().numpy()
@@ -179,20 +182,18 @@ def fit_move(
     truth: PixelValues,
     counted: Bool[np.ndarray, "h w"],
     median_depth: float,
-    focal: float,
+    focals: FocalLengths,
 ) -> Move:
     """Fit the move, from wide to narrow blur; zero if the picture is no nearer to the truth.
 
-    `first` is the picture before any move. `median_depth` is in scene units, and `focal` the focal
-    length along x in pixels. It is taken for that along y, too: if pixels are not square, steps are
-    less exact, but each is tested.
+    `first` is the picture before any move. `median_depth` is in scene units.
     """
     no_move = np.zeros(6)
     move = no_move
     picture = first
     for sigma in BLURS:
         move, picture = fit_blurred(
-            draw, move, picture, truth, counted, sigma, median_depth=median_depth, focal=focal
+            draw, move, picture, truth, counted, sigma, median_depth=median_depth, focals=focals
         )
     before, after = (measure_loss(each.image, truth, counted) for each in (first, picture))
     return move if after < before else no_move
@@ -207,7 +208,7 @@ def fit_blurred(
     sigma: float,
     *,
     median_depth: float,
-    focal: float,
+    focals: FocalLengths,
 ) -> tuple[Move, MovedPicture]:
     """Fit the move to images blurred by `sigma` pixels, by Gauss-Newton steps with robust weights.
 
@@ -225,7 +226,7 @@ def fit_blurred(
         gains = fit_gains(picture.image, truth, counted)
         residuals = compute_residuals(picture.image, gains)
         jacobian = compute_move_jacobian(
-            blur(picture.image, sigma), picture.points, median_depth, focal
+            blur(picture.image, sigma), picture.points, median_depth, focals
         )
         jacobian = (jacobian * gains[:, None])[counted].reshape(-1, 6)
         # Weights of the loss of Huber: errors beyond `ROBUST` pull no harder than one of its size.
@@ -254,7 +255,10 @@ def fit_blurred(
 
 
 def compute_move_jacobian(
-    image: PixelValues, points: Float[np.ndarray, "h w 3"], median_depth: float, focal: float
+    image: PixelValues,
+    points: Float[np.ndarray, "h w 3"],
+    median_depth: float,
+    focals: FocalLengths,
 ) -> Float[np.ndarray, "h w 3 6"]:
     """Compute the derivatives of each colour by the six numbers of a move.
 
@@ -262,22 +266,23 @@ def compute_move_jacobian(
     point X goes to X - r x X - s there, and its pixel by du; the colour at a fixed pixel changes by
     -gradient · du.
     """
+    focal_x, focal_y = focals
     x, y, z = np.moveaxis(points, -1, 0)
     # r x X + s for each number: -1 times the motion of X.
     across = np.stack(
         [
-            # Rotations about x, y and z, by 1 / focal radians each.
-            np.stack([np.zeros_like(z), -z, y], axis=-1) / focal,
-            np.stack([z, np.zeros_like(z), -x], axis=-1) / focal,
-            np.stack([-y, x, np.zeros_like(z)], axis=-1) / focal,
+            # Rotations about x, y and z, by 1 / focal_x radians each.
+            np.stack([np.zeros_like(z), -z, y], axis=-1) / focal_x,
+            np.stack([z, np.zeros_like(z), -x], axis=-1) / focal_x,
+            np.stack([-y, x, np.zeros_like(z)], axis=-1) / focal_x,
             # Shifts along them, by the unit of `move_camera_by`.
-            *(np.broadcast_to(axis * median_depth / focal, points.shape) for axis in np.eye(3)),
+            *(np.broadcast_to(axis * median_depth / focal_x, points.shape) for axis in np.eye(3)),
         ],
         axis=-1,
     )
-    # The pixel is focal * (x, y) / z up to a constant: du by the quotient rule.
-    moved_x = -focal * (across[..., 0, :] - (x / z)[..., None] * across[..., 2, :]) / z[..., None]
-    moved_y = -focal * (across[..., 1, :] - (y / z)[..., None] * across[..., 2, :]) / z[..., None]
+    # The pixel is (focal_x * x, focal_y * y) / z up to a constant: du by the quotient rule.
+    moved_x = -focal_x * (across[..., 0, :] - (x / z)[..., None] * across[..., 2, :]) / z[..., None]
+    moved_y = -focal_y * (across[..., 1, :] - (y / z)[..., None] * across[..., 2, :]) / z[..., None]
     down, right = np.gradient(image, axis=(0, 1))
     return -(right[..., None] * moved_x[..., None, :] + down[..., None] * moved_y[..., None, :])
 

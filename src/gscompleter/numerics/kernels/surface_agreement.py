@@ -12,9 +12,10 @@ def measure_shares_on_surface(
     """Measure the share of points within their reach of a surface, for each similarity.
 
     `linear` [m, 3, 3] is a rotation times a scale, and with `shifts` [m, 3] takes `points` [n, 3]
-    to cells; `reaches` [n] is in the unit of the points. `distances` [x, y, z], in cells, and
-    `directions` [x, y, z, 3] are those of the closest point of the surface. `normals` [n, 3] and
-    directions count as parallel from `min_cosine` on, whatever their sign.
+    to cells; the grid begins at 0. `reaches` [n] is in the unit of the points. `distances`
+    [x, y, z], in cells, and `directions` [x, y, z, 3] are those of the closest point of the
+    surface. `normals` [n, 3] and directions count as parallel from `min_cosine` on, whatever their
+    sign.
     """
     shares = np.empty(len(linear))
     arguments = (linear, shifts, points, normals, reaches, distances, directions, min_cosine)
@@ -36,10 +37,23 @@ def _measure_rows(
             x = a[0, 0] * px + a[0, 1] * py + a[0, 2] * pz + shifts[m, 0]
             y = a[1, 0] * px + a[1, 1] * py + a[1, 2] * pz + shifts[m, 1]
             z = a[2, 0] * px + a[2, 1] * py + a[2, 2] * pz + shifts[m, 2]
-            if not (0 <= x < width and 0 <= y < height and 0 <= z < length):
+            reach = scale * reaches[n]
+            if not (
+                -reach <= x <= width + reach
+                and -reach <= y <= height + reach
+                and -reach <= z <= length + reach
+            ):
                 continue
-            i, j, k = int(x), int(y), int(z)
-            if distances[i, j, k] > scale * reaches[n]:
+            i = min(max(int(x), 0), width - 1)
+            j = min(max(int(y), 0), height - 1)
+            k = min(max(int(z), 0), length - 1)
+            # Walls lie at the border of the grid. A point beside it is at most as far from the
+            # surface as the nearest cell is, and from that cell.
+            beside_x = max(-x, x - width, 0.0)
+            beside_y = max(-y, y - height, 0.0)
+            beside_z = max(-z, z - length, 0.0)
+            beside = np.sqrt(beside_x**2 + beside_y**2 + beside_z**2)
+            if distances[i, j, k] + beside > reach:
                 continue
             nx, ny, nz = normals[n, 0], normals[n, 1], normals[n, 2]
             cosine = (
