@@ -106,8 +106,11 @@ def list_property_names(path: Path) -> Sequence[str]:
     if name == PLY.name:
         # Harmonics of a higher degree are refused, or left out, by those who read them.
         return read_scene(path, leaves_out_band_4=True).rows.dtype.names or ()
-    listed = SPLAT_FORMATS[name].list_names
-    return () if listed is None else listed(path)
+    row = SPLAT_FORMATS[name]
+    if row.list_names is None:
+        return ()
+    with translate_damage(path, row.has_json):
+        return row.list_names(path)
 
 
 def decode_splat(path: Path, leaves_out_band_4: bool = False) -> Gaussians:
@@ -118,11 +121,24 @@ def decode_splat(path: Path, leaves_out_band_4: bool = False) -> Gaussians:
     read = row.read
     if row.can_leave_out_band_4:
         read = partial(read, leaves_out_band_4=leaves_out_band_4)
-    errors = DECODING_ERRORS + JSON_ERRORS if row.has_json else DECODING_ERRORS
+    # Infinite values are refused by those who load the file (`require_finite`).
+    with translate_damage(path, row.has_json), np.errstate(over="ignore", invalid="ignore"):
+        gaussians = read(path)
+    # Labels lie in the file, or beside it as an earlier version wrote them for all formats.
+    if not gaussians.generated.any():
+        gaussians = replace(gaussians, generated=load_labels(path, len(gaussians)))
+    return validate_ranges(gaussians, path)
+
+
+@contextlib.contextmanager
+def translate_damage(path: Path, has_json: bool) -> Iterator[None]:
+    """Translate the errors of a decoder of the file at `path` into InputErrors.
+
+    With `has_json`, those by values of another type are damage, too, and else defects of ours.
+    """
+    errors = DECODING_ERRORS + JSON_ERRORS if has_json else DECODING_ERRORS
     try:
-        # Infinite values are refused by those who load the file (`require_finite`).
-        with np.errstate(over="ignore", invalid="ignore"):
-            gaussians = read(path)
+        yield
     except InputError:
         raise
     except BandError as error:
@@ -136,10 +152,6 @@ def decode_splat(path: Path, leaves_out_band_4: bool = False) -> Gaussians:
             f"{quote_value(path)} cannot be read: {quote_value(describe_damage(error), MAX_DEFECT)}"
             "; fetch the file again, or export it as .ply."
         ) from error
-    # Labels lie in the file, or beside it as an earlier version wrote them for all formats.
-    if not gaussians.generated.any():
-        gaussians = replace(gaussians, generated=load_labels(path, len(gaussians)))
-    return validate_ranges(gaussians, path)
 
 
 def find_origin(path: Path, leaves_out_band_4: bool = False) -> Origin | None:
@@ -293,15 +305,9 @@ def read_provenance(path: Path) -> Provenance:
     """
     path = resolve_splat(path)
     row = SPLAT_FORMATS[detect_splat_format(path)]
-    try:
+    # A record is JSON in every format.
+    with translate_damage(path, has_json=True):
         table = load_record(path) if row.read_record is None else row.read_record(path)
-    except InputError:
-        raise
-    except (*DECODING_ERRORS, *JSON_ERRORS) as error:
-        raise InputError(
-            f"{quote_value(path)} cannot be read: {quote_value(describe_damage(error), MAX_DEFECT)}"
-            "; fetch the file again."
-        ) from error
     return parse_provenance(table, quote_value(path))
 
 
