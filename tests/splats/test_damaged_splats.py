@@ -89,7 +89,7 @@ def test_a_conversion_of_a_download_that_was_cut_ends_in_a_sentence(
     path = made(tmp_path, name, plausible(COUNT, 0))
     path.write_bytes(path.read_bytes()[:40])
     assert run(monkeypatch, "convert", path, tmp_path / "out.ply") == 2
-    assert f"{name} cannot be read: " in require_plain(capsys.readouterr().err)
+    assert f"{name} cannot be read: " in require_plain(capsys.readouterr().err.strip())
 
 
 def test_a_packed_spz_that_was_cut_says_how_far_it_goes(tmp_path):
