@@ -89,7 +89,8 @@ def run() -> None:
 def replace_closed_outputs() -> None:
     """Open the null device in the place of a standard output or error that is closed (`>&-`).
 
-    Otherwise Python has None there, and the next file that is opened gets its number.
+    Otherwise Python has None there, and the next file that is opened gets its number. Processes
+    that are started inherit it for the same reason.
     """
     for number, name in ((1, "stdout"), (2, "stderr")):
         if getattr(sys, name) is None:
@@ -97,6 +98,7 @@ def replace_closed_outputs() -> None:
             null = os.open(os.devnull, os.O_WRONLY)
             if null != number:
                 os.dup2(null, number)
+            os.set_inheritable(number, True)
             setattr(sys, name, open(number, "w", encoding="utf-8", closefd=False))  # noqa: SIM115
 
 
@@ -110,9 +112,9 @@ def leave_output() -> None:
 
 
 def main() -> None:
-    """Run the command that `sys.argv` names, or exit with one of the codes of `exit_codes`.
+    """Run the command that `sys.argv` names; exit with one of the codes of `exit_codes` but 0.
 
-    It prints one sentence on the standard error. A defect raises its own exception.
+    What went wrong is one sentence on the standard error. A defect raises its own exception.
     """
     # Before anything imports torch, which reads this setting once.
     let_idle_threads_sleep()
@@ -125,6 +127,23 @@ def main() -> None:
         sys.stdout.write(format_command_list(COMMANDS))
         return
 
+    try:
+        code = run_words(words)
+    except KeyboardInterrupt as stop:
+        # `defer_interrupts` gives the reason where results were complete when the signal came.
+        reason = str(stop) or "no unfinished result was written"
+        print_error(f"interrupted; {reason}.")
+        code = INTERRUPTED
+    if code:
+        sys.exit(code)
+
+
+def run_words(words: Sequence[str]) -> int | None:
+    """Run the command that the words name, and return its exit code; None is 0.
+
+    What the user or the machine did wrong is printed as one sentence. A defect raises its own
+    exception.
+    """
     # Imported here, since tyro and the classes of options and settings take most of the time of a
     # help page, and the page of all commands does without them.
     from gscompleter.apps.command_line.failures import explain_failure
@@ -151,26 +170,20 @@ def main() -> None:
                 logging.getLogger("gscompleter").setLevel(logging.ERROR)
 
         run_command = getattr(import_command(words[0]), f"run_{words[0]}")
-        code = run_command(command_options)
+        code: int | None = run_command(command_options)
+        return code
     except InputError as error:
         print_error(format_error(error))
         # These three are InputErrors for their sentences alone: no other input would help.
         is_failure = isinstance(error, (FullDiskError, NoCaseError, WorkerError))
-        sys.exit(ERROR if is_failure else WRONG_INPUT)
-    except KeyboardInterrupt as stop:
-        # `defer_interrupts` gives the reason where results were complete when the signal came.
-        reason = str(stop) or "no unfinished result was written"
-        print_error(f"interrupted; {reason}.")
-        sys.exit(INTERRUPTED)
+        return ERROR if is_failure else WRONG_INPUT
     except Exception as error:
         # A lack of memory or a path of the user gets a sentence, a defect its traceback.
         failure = explain_failure(error)
         if failure is None:
             raise
         print_error(failure.sentence)
-        sys.exit(failure.code)
-    if code:
-        sys.exit(code)
+        return failure.code
 
 
 def check_working_folder() -> None:

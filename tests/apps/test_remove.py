@@ -14,6 +14,7 @@ from command import run
 from gscompleter import InputError, load_ply, save_ply
 from gscompleter.apps.inputs.removal import (
     describe_masks_in_vain,
+    describe_parts_in_vain,
     find_by_position,
     find_equal_positions,
     find_in_boxes,
@@ -274,6 +275,26 @@ def test_a_selection_of_supersplat_is_found(tmp_path):
     file = write_supersplat(tmp_path / "selection.ply", splat[chosen])
     found = find_by_position(Selection(file=file), splat, np.zeros(3))
     assert torch.nonzero(found)[:, 0].tolist() == sorted(chosen.tolist())
+
+
+def test_parts_of_a_selection_that_select_nothing_are_said(scene, tmp_path):
+    """As a box with a typing error beside one that is right."""
+    splat = load_ply(scene / "splat.ply")
+    nowhere = (50.0, 50.0, 50.0, 51.0, 51.0, 51.0)
+    given = Selection(boxes=(*CRATE, *nowhere), sphere=(60.0, 0.0, 0.0, 1.0))
+    assert describe_parts_in_vain(given, splat, np.zeros(3)) == [
+        "Box 2 of 2 contains no Gaussian.",
+        "The sphere contains no Gaussian.",
+    ]
+    # Three Gaussians of the splat, and five that somebody moved.
+    three = replace(splat[:3], generated=torch.zeros(3, dtype=torch.uint8))
+    moved = random_gaussians(5, sh_degree=three.sh_degree)
+    save_ply(tmp_path / "some.ply", merge([three, moved]))
+    (line,) = describe_parts_in_vain(Selection(file=tmp_path / "some.ply"), splat, np.zeros(3))
+    assert line.startswith("5 of 8 Gaussians of ")
+    # Where nothing is selected, the error says so.
+    assert describe_parts_in_vain(Selection(boxes=nowhere), splat, np.zeros(3)) == []
+    assert describe_parts_in_vain(Selection(boxes=CRATE), splat, np.zeros(3)) == []
 
 
 @pytest.mark.parametrize(

@@ -143,3 +143,43 @@ def test_a_reader_that_ends_early_leaves_no_traceback(words):
 def test_what_could_not_be_said_is_no_success():
     with open("/dev/full", "w") as full:
         assert ended("--version", stdout=full).returncode != 0
+
+
+STOPPED_EARLY = """
+import sys
+from gscompleter.cli import run
+
+class Stop:
+    def find_spec(self, name, *_):
+        if name == "tyro":
+            raise KeyboardInterrupt
+
+sys.meta_path.insert(0, Stop())
+sys.argv = ["gscompleter", "doctor"]
+run()
+"""
+
+
+def test_a_command_that_is_stopped_while_it_starts_says_so_in_a_sentence():
+    """As by Ctrl+C within the first tenths of a second, in which its options are imported."""
+    command = [sys.executable, "-c", STOPPED_EARLY]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.stderr == "gscompleter: interrupted; no unfinished result was written.\n"
+    assert done.returncode == 130
+
+
+CLOSED_OUTPUT = """
+import subprocess, sys
+from gscompleter.cli import replace_closed_outputs
+
+replace_closed_outputs()
+child = "import sys; print(sys.stdout is None, file=sys.stderr)"
+subprocess.run([sys.executable, "-c", child], check=True)
+"""
+
+
+@pytest.mark.skipif(os.name == "nt", reason="needs a POSIX shell")
+def test_what_a_command_starts_has_an_output_where_its_own_is_closed():
+    command = ["sh", "-c", 'exec "$0" -c "$1" >&-', sys.executable, CLOSED_OUTPUT]
+    done = subprocess.run(command, stderr=subprocess.PIPE, text=True, check=True)
+    assert done.stderr == "False\n"

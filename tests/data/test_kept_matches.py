@@ -24,14 +24,14 @@ CENTRES = np.array([[0.0, 0, 0], [1, 0.1, 0], [2, -0.2, 0.1], [3, 0.3, 0], [4, 0
 """Positions of five cameras that look along z."""
 
 
-def make_model(centres: np.ndarray) -> pycolmap.Reconstruction:
+def make_model(centres: np.ndarray, distortion: float = 0.05) -> pycolmap.Reconstruction:
     """Make a model with cameras at these places, numbered from 1."""
     model = pycolmap.Reconstruction()
     camera = pycolmap.Camera(
         model="SIMPLE_RADIAL",
         width=SIDE,
         height=SIDE,
-        params=[FOCAL, SIDE / 2, SIDE / 2, 0.05],
+        params=[FOCAL, SIDE / 2, SIDE / 2, distortion],
         camera_id=1,
     )
     model.add_camera_with_trivial_rig(camera)
@@ -42,11 +42,11 @@ def make_model(centres: np.ndarray) -> pycolmap.Reconstruction:
     return model
 
 
-def observe() -> tuple[dict[int, np.ndarray], NumberedMatches]:
+def observe(distortion: float = 0.05) -> tuple[dict[int, np.ndarray], NumberedMatches]:
     """Return the pixels of 60 points in cameras at `CENTRES`, and matches of all pairs."""
     generator = np.random.default_rng(0)
     points = generator.uniform([-1, -2, 6], [5, 2, 14], (60, 3))
-    model = make_model(CENTRES)
+    model = make_model(CENTRES, distortion)
     keypoints = {}
     for number, centre in enumerate(CENTRES, start=1):
         pixels = model.cameras[1].img_from_cam(points - centre)
@@ -74,6 +74,18 @@ def test_a_photograph_in_a_wrong_place_goes_and_the_others_stay(wrong):
     model = make_model(centres)
     assert drop_wrong_places(model, kept, keypoints).dropped == [wrong]
     assert sorted(model.reg_image_ids()) == [n for n in range(1, 6) if n != wrong]
+
+
+def test_a_feature_that_the_lens_cannot_show_costs_no_photograph():
+    """A strong barrel distortion fitted to a wide lens folds before the corner of the image."""
+    keypoints, kept = observe(distortion=-0.6)
+    keypoints[3][0] = [0, 0]
+    model = make_model(CENTRES, distortion=-0.6)
+    assert np.isnan(model.cameras[1].cam_from_img(keypoints[3][:1])).all()
+    assert np.isinf(measure_model(model, kept, keypoints)[1, 3][0])
+    checked = drop_wrong_places(model, kept, keypoints)
+    assert checked.dropped == []
+    assert checked.distance < 0.5
 
 
 def test_one_photograph_alone_does_not_confirm_a_place():

@@ -497,6 +497,18 @@ def test_maps_of_a_resized_window_are_read_where_their_pixels_lie():
     assert (found.confidence[~inside] == 0).all()
 
 
+def test_depth_of_the_sky_does_not_reach_the_surface_before_it():
+    """A network sees no surface in the sky, and its depth there is any number."""
+    camera = camera_at(0.0, size=32)
+    window = Window(top=0, left=0, height=16, width=16, scale_x=0.5, scale_y=0.5)
+    depth = torch.full((16, 16), 5.0)
+    depth[:6] = 0.01
+    found = window.resample_depth_map(depth, (depth == 5).float(), camera)
+    assert found.valid[12:].all()
+    assert not found.valid[:12].any()
+    assert torch.allclose(found.depth[12:], torch.tensor(5.0))
+
+
 def test_each_pixel_of_the_window_belongs_to_the_pixel_it_lies_in():
     views = photographs(size=40)
     (image,) = create_any_view_batch(views[:1], ResizeConfig(56), 1).windows

@@ -1,9 +1,13 @@
 """Messages if a generator's packages or weights are missing; needs no diffusers."""
 
+import errno
+
 import pytest
 
 from command import run
 from gscompleter import InputError, load_generator
+from gscompleter.apps.command_line.exit_codes import ERROR
+from gscompleter.apps.command_line.failures import explain_failure
 from gscompleter.config.generators import GeneratorOptions, get_settings_class
 from gscompleter.models.diffusion import published
 from gscompleter.models.diffusion.loading import find_sources
@@ -13,6 +17,7 @@ from gscompleter.models.diffusion.published import (
     IncompleteWeightsError,
     Source,
     announce,
+    convert_load_errors,
     create_load_error,
     parse_source,
 )
@@ -106,9 +111,49 @@ def test_a_path_is_a_folder_or_an_id_with_or_without_its_commit(tmp_path):
     pinned = parse_source(f"somebody/something@{commit}")
     assert (pinned.revision, pinned.is_pinned) == (commit, True)
     assert parse_source("somebody/flux-fill").terms != loose.terms
-    for wrong in ("nothing", "./a/b", "/a/b", "a/b/c", "a/"):
+    for wrong in ("nothing", "./a/b", "/a/b", "a/b/c", "a/", "~nobody_here/model"):
         with pytest.raises(InputError, match="no repository"):
             parse_source(wrong)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("black-forest-labs/FLUX.2-klein-4B", "Apache-2.0"),
+        ("black-forest-labs/FLUX.2-klein-base-4B", "Apache-2.0"),
+        ("black-forest-labs/FLUX.2-klein-9B", "the FLUX Non-Commercial License"),
+        ("black-forest-labs/FLUX.1-schnell", "Apache-2.0"),
+        ("black-forest-labs/FLUX.1-Fill-dev", "the FLUX.1 [dev] Non-Commercial License"),
+        ("stable-diffusion-v1-5/stable-diffusion-inpainting", "CreativeML Open RAIL-M"),
+        ("somebody/stable-diffusion-2-inpainting", "CreativeML Open RAIL++-M"),
+        ("stabilityai/stable-diffusion-3.5-medium", "the Stability AI Community License"),
+    ],
+)
+def test_members_of_a_family_with_licences_of_their_own_are_told_apart(name, words):
+    assert f"(usually {words}" in parse_source(name).terms
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to allocate 9 GB"),
+        OSError(errno.ENOSPC, "No space left on device"),
+    ],
+)
+def test_a_full_machine_is_not_told_as_a_fault_of_the_weights(error, tmp_path):
+    """Of the text encoders of PE-Field, which take 10 GB, and of a download."""
+    pytest.importorskip("diffusers", reason="needs gscompleter[diffusion]")
+    with pytest.raises(type(error)) as caught, convert_load_errors(KONTEXT):
+        try:
+            raise error
+        except (OSError, RuntimeError) as cause:
+            # As the libraries do.
+            raise type(error)("Can't load the model") from cause
+    failure = explain_failure(caught.value)
+    assert failure is not None
+    assert failure.code == ERROR
+    with pytest.raises(InputError), convert_load_errors(Source(location=str(tmp_path))):
+        raise OSError("no config.json")
 
 
 def test_gate_licence_and_missing_pin_are_named_before_a_download_and_a_folder_needs_no_word(

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+from command import run
 from damage import require_plain
 from fuzz import damage, replaced
 from gscompleter import InputError, load_splat, save_splat
@@ -78,6 +79,17 @@ def test_a_download_that_was_cut_says_how_far_it_goes(tmp_path, name, count, sen
     path = cut(made(tmp_path, name, plausible(COUNT, 2)), count)
     with pytest.raises(InputError, match=sentence):
         load_splat(path)
+
+
+@pytest.mark.parametrize("name", ["scene.spz", "scene.sog", "scene.glb"])
+def test_a_conversion_of_a_download_that_was_cut_ends_in_a_sentence(
+    tmp_path, name, monkeypatch, capsys
+):
+    """Its properties are listed before it is decoded."""
+    path = made(tmp_path, name, plausible(COUNT, 0))
+    path.write_bytes(path.read_bytes()[:40])
+    assert run(monkeypatch, "convert", path, tmp_path / "out.ply") == 2
+    assert f"{name} cannot be read: " in require_plain(capsys.readouterr().err.strip())
 
 
 def test_a_packed_spz_that_was_cut_says_how_far_it_goes(tmp_path):

@@ -10,7 +10,8 @@ from gsply import plyread
 
 from command import run
 from gscompleter import InputError, load_ply, load_splat, save_ply, save_splat
-from gscompleter.splats.formats import get_labels_path, read_provenance
+from gscompleter.splats.formats import read_provenance
+from gscompleter.splats.labels_file import get_labels_path
 from gscompleter.splats.layout import save_like, strip
 from gscompleter.splats.provenance import (
     MAX_NOTE_LENGTH,
@@ -95,6 +96,30 @@ def test_convert_carries_the_record_and_plain_drops_it(tmp_path, monkeypatch):
         assert read_provenance(path) == RECORD, name
     assert run(monkeypatch, "convert", path, tmp_path / "g.ply", "--plain", "--quiet") == 0
     assert b"comment" not in (tmp_path / "g.ply").read_bytes()[:2000]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_who_made_a_splat_is_known_where_nothing_in_it_was_invented(tmp_path, name, monkeypatch):
+    """What was invented may be cut out again, and a run may add only what photographs show."""
+    if ".usd" in name:
+        pytest.importorskip("pxr", reason="needs usd-core (the extra usd)")
+    save_splat(tmp_path / "given.ply", plausible(9, 0), RECORD)
+    out = tmp_path / name.replace("a.", "b.")
+    assert run(monkeypatch, "convert", tmp_path / "given.ply", out, "--quiet") == 0
+    assert read_provenance(out) == RECORD
+    assert not load_splat(out).generated.any()
+    assert run(monkeypatch, "convert", out, tmp_path / "again.ply", "--quiet") == 0
+    assert read_provenance(tmp_path / "again.ply") == RECORD
+    save_splat(out, plausible(9, 0))
+    assert not get_labels_path(out).exists()
+
+
+def test_a_damaged_file_beside_a_splat_is_named_and_not_the_splat(tmp_path):
+    path = tmp_path / "a.splat"
+    save_splat(path, plausible(9, 0))
+    get_labels_path(path).write_text("[1]")
+    with pytest.raises(InputError, match=r"a\.splat\.generated\.json does not hold the labels"):
+        read_provenance(path)
 
 
 @pytest.mark.parametrize("ending", [b"\n", b"\r\n"])

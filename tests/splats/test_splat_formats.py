@@ -26,7 +26,7 @@ from gscompleter import (
     save_ply,
     save_splat,
 )
-from gscompleter.splats.formats import get_labels_path
+from gscompleter.splats.labels_file import get_labels_path
 from gscompleter.splats.morton import sort_along_morton
 from gscompleter.splats.table import match_ending
 from gscompleter.splats.transform import (

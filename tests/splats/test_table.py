@@ -14,7 +14,8 @@ import torch
 from damage import require_plain
 from fuzz import damage, replaced
 from gscompleter import InputError, load_splat, save_splat
-from gscompleter.splats.formats import get_labels_path, read_provenance
+from gscompleter.splats.formats import read_provenance
+from gscompleter.splats.labels_file import get_labels_path
 from gscompleter.splats.packing import ZIP_MAGIC
 from gscompleter.splats.provenance import Provenance, RunRecord
 from gscompleter.splats.splat_format import HEAD_BYTES, SplatFormat

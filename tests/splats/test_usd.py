@@ -11,7 +11,7 @@ import torch
 
 from command import run
 from gscompleter import Gaussians, InputError, load_splat, save_splat
-from gscompleter.splats.formats import get_labels_path
+from gscompleter.splats.labels_file import get_labels_path
 from gscompleter.splats.transform import HALF_TURN_X, rotate_half_turn
 from gscompleter.splats.usd import SH_NAME
 from gscompleter.types import make_observed

@@ -23,7 +23,7 @@ PHOTOGRAPH = "context-"
 
 @dataclass(frozen=True)
 class DataSet(Settings):
-    """Options of `evaluate` for a data set of the paper; the defaults are those without one."""
+    """Options of `evaluate` for a data set of the paper; the defaults are those of no data set."""
 
     protocol: tuple[str, ...] = ()
     resolution: tuple[int, int] | None = None
@@ -38,11 +38,13 @@ class DataSet(Settings):
 
 @dataclass(frozen=True)
 class Requirements(Settings):
-    """Runs that a table or a figure needs; what is empty or None is that of the command."""
+    """Runs that a table or a figure needs."""
 
     title: str
     protocol: tuple[str, ...] = ()
+    """Protocols of the cases; empty for that of the command, or else of the data set."""
     generator: str | None = None
+    """Generator that it is about; None for that of the command, or else of the data set."""
     one_per_scene: bool = False
     """True to run only the first case of each scene, because a method is slow."""
 
@@ -59,7 +61,7 @@ class TableSpec(Requirements):
     baseline: str
     """Method to which differences are given."""
     columns: tuple[str, ...]
-    """Keys of `columns.BY_KEY`."""
+    """Scores in its columns, keys of `columns.BY_KEY`."""
 
     def list_methods(self) -> tuple[str, ...]:
         """List the methods to run."""
@@ -83,9 +85,11 @@ class Claim(Settings):
     """A claim that a method is better than another in a column of a table."""
 
     says: str
+    """The claim, as a sentence."""
     paper: str
     """The paper's numbers, of the method after those of the baseline."""
     table: str
+    """Key of a table of `Paper.tables`, which has the column and both methods."""
     column: str
     method: str
     baseline: str
@@ -127,7 +131,11 @@ def is_photograph(image: str) -> bool:
 def select_names(
     given: Iterable[str], known: Mapping[str, Requirements], generator: str
 ) -> dict[str, Requirements]:
-    """Select tables or figures by name; `all` leaves out those that need another generator."""
+    """Select tables or figures by name, each once and in the order in which they are named.
+
+    `all` stands for those that run with `generator`, that of the command; one that is named is
+    taken with the generator that it needs.
+    """
     # The oracle needs no model: it returns the photograph of the target.
     usable = (generator, "oracle", None)
     every = {name: spec for name, spec in known.items() if spec.generator in usable}

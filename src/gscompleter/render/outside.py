@@ -23,22 +23,25 @@ from gscompleter.types import Camera, Gaussians, Render
 EXTENT_QUANTILES = (0.02, 0.98)
 """Quantiles of the coordinates, weighted by opacity, between which the extent lies."""
 NUM_COMPARED_MEANS = 2000
-"""Means that are compared."""
+"""Means that stand for all in the search of the smallest box."""
 OUTSIDE_SEED = 0
+"""Seed of this search."""
 NUM_TURNS = 300
-"""Random boxes that are tried."""
+"""Boxes of its first round, which are turned at random."""
 NUM_BEST = 6
-"""Boxes that are kept from round to round."""
+"""Smallest boxes that are kept from round to round."""
 NUM_RANDOM_TURNS = 40
-"""Random turns of each of them."""
+"""Random turns of each of them in a round."""
 REACHES = (0.15, 0.05, 0.02, 0.007)
-"""Standard deviations of half of these turns in each round, in radians."""
+"""Standard deviations of these turns in the rounds after the first, about each of three axes and in
+half radians: a small turn by an angle has half of it in its quaternion."""
 DISTANCE = 4.0
 """Distance of the cameras from the middle, in radii of the extent: twice its diagonal."""
 FIELD = 2.0
 """Half of the width that an image shows at the middle, in radii of the extent."""
 OUTSIDE_NEAR = 1.0
-"""Near plane of these cameras, in radii of the extent: what stands before it is far outside."""
+"""`near` of these cameras, in radii of the extent, which begins at 3 of them. Renderers clip at a
+hundredth of it: a floater close before a camera is drawn, and hides what is behind it."""
 SLACK = 1
 """Pixels by which a silhouette is dilated, since Gaussians on its rim reach out of it."""
 
@@ -83,7 +86,8 @@ def measure_extent(scene: Gaussians) -> Extent:
     """Measure the extent of a splat, in which each Gaussian counts by its opacity.
 
     The axes of a file may have any direction in its scene. Of the boxes that are turned at random,
-    and of the best of them turned a little, the smallest lies along walls and floor.
+    and of the best of them turned a little, the smallest lies along walls and floor. Only the
+    centres of Gaussians count, not their sizes.
     """
     points = sample_by_opacity(scene)
     generator = torch.Generator().manual_seed(OUTSIDE_SEED)
@@ -92,6 +96,7 @@ def measure_extent(scene: Gaussians) -> Extent:
     for reach in REACHES:
         best = turns[measure_volumes(points, turns).topk(NUM_BEST, largest=False).indices]
         steps = reach * torch.randn((NUM_BEST, NUM_RANDOM_TURNS, 4), generator=generator)
+        # With a real part of 1 and small other parts: small turns.
         steps[..., 0] = 1.0
         turned = quats_to_rotations(steps) @ best[:, None]
         turns = torch.cat([best, turned.reshape(-1, 3, 3)])
@@ -105,7 +110,11 @@ def measure_extent(scene: Gaussians) -> Extent:
 
 
 def sample_by_opacity(scene: Gaussians) -> Float[Tensor, "n 3"]:
-    """Sample means on the CPU, each as often as its opacity says."""
+    """Sample means on the CPU, each as often as its opacity says.
+
+    `NUM_COMPARED_MEANS` steps of one length through the running sum of opacities: no random number
+    takes part.
+    """
     sums = scene.opacities.double().cpu().cumsum(0)
     steps = (torch.arange(NUM_COMPARED_MEANS) + 0.5) / NUM_COMPARED_MEANS * sums[-1]
     rows = torch.searchsorted(sums, steps).clamp_max(len(scene) - 1)
@@ -147,10 +156,10 @@ def list_directions() -> Float[Tensor, "12 3"]:
 def look_from_outside(
     scene: Gaussians, renderer: Renderer, side: int, extent: Extent | None = None
 ) -> list[OutsideView]:
-    """Render a splat from twelve directions about its box, at twice its extent.
+    """Render a splat from twelve directions about its box.
 
-    Images have `side` pixels along each side, and show twice the extent, too: around an object they
-    are empty at their borders. The extent is measured if it is not given.
+    Images have `side` pixels along each side, and show twice the diameter of the extent: around an
+    object they are empty at their borders. The extent is measured if it is not given.
     """
     small = thin_gaussians(scene, MAX_PREVIEW_GAUSSIANS)
 
@@ -181,7 +190,10 @@ def list_outside_cameras(extent: Extent, side: int) -> list[Camera]:
 def place_outside_camera(
     center: Float[Tensor, "3"], forward: Float[Tensor, "3"], half: float, side: int, near: float
 ) -> Camera:
-    """Place a camera with a square image, whose border is `half` aside at a depth of 1."""
+    """Place a camera with a square image, whose border is `half` aside at a depth of 1.
+
+    `near` is that of `Camera`, in scene units.
+    """
     focal = side / 2 / half
     K = torch.tensor([[focal, 0.0, side / 2], [0.0, focal, side / 2], [0.0, 0.0, 1.0]])
     c2w = torch.eye(4).to(center)
@@ -192,7 +204,7 @@ def place_outside_camera(
 
 
 def find_in_hull(gaussians: Gaussians, views: Sequence[OutsideView]) -> Bool[Tensor, "n"]:
-    """Find Gaussians in the visual hull: no view sees them beside the silhouette of the splat.
+    """Find Gaussians in the visual hull: every view sees them in the silhouette of the splat.
 
     Gaps that the splat encloses in an image belong to the silhouette. A hole that was cut through a
     surface is such a gap where it is looked through, and has to be filled.

@@ -1,27 +1,22 @@
 """Splat files of any format of the table: read by their first bytes, written by their extension.
 
 The labels of generated Gaussians, and who made them, are in the file, or beside it if its format
-has no place for them.
+has no place for them (`labels_file.py`).
 """
 
 from __future__ import annotations
 
 import contextlib
-import json
 import lzma
 import struct
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from itertools import groupby
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
-from jaxtyping import UInt8
 from PIL import Image
-from torch import Tensor
 
 from gscompleter.numerics.value_checks import check_gaussians
 from gscompleter.splats.foreign import (
@@ -29,6 +24,12 @@ from gscompleter.splats.foreign import (
     refuse_folder,
     refuse_foreign,
     resolve_splat,
+)
+from gscompleter.splats.labels_file import (
+    get_labels_path,
+    load_labels,
+    load_record,
+    save_labels,
 )
 from gscompleter.splats.morton import sort_along_morton
 from gscompleter.splats.origin import measure_distance
@@ -45,12 +46,7 @@ from gscompleter.splats.ply import (
     save_ply,
 )
 from gscompleter.splats.properties import describe_further_properties, refuse_other_kinds
-from gscompleter.splats.provenance import (
-    KEY,
-    NOTHING_KNOWN,
-    Provenance,
-    parse_provenance,
-)
+from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, parse_provenance
 from gscompleter.splats.sog import SOG_FOLDER
 from gscompleter.splats.splat_format import HEAD_BYTES, SplatFormat
 from gscompleter.splats.table import SPLAT_FORMATS as SPLAT_FORMATS
@@ -58,8 +54,7 @@ from gscompleter.splats.table import get_written_format, match_ending
 from gscompleter.system.damage import describe_damage
 from gscompleter.system.errors import InputError, quote_value, refuse_pointer, require_path
 from gscompleter.system.files.output_file import check_free, reserve_file
-from gscompleter.system.files.reading import ZIP_ERRORS, hash_file, open_file, read_json
-from gscompleter.system.files.writing import replace_file
+from gscompleter.system.files.reading import ZIP_ERRORS, open_file
 from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import Gaussians, Origin
 
@@ -87,13 +82,17 @@ def load_splat(
     """Load the Gaussians of a file in any format of `SPLAT_FORMATS`, in the axes of a 3DGS .ply.
 
     Of a trainer's model folder, the newest iteration is loaded. Labels of generated Gaussians are
-    in the file, or in `NAME.generated.json` beside it. `drop_nonfinite` drops
-    Gaussians with NaN, infinity or a zero quaternion instead of refusing the file, and
-    `ignore_properties` goes on with one whose further properties change what is seen.
-    `leaves_out_band_4` reads harmonics of degree 4 without the fourth band.
+    in the file, or in `NAME.generated.json` beside it. `drop_nonfinite` drops Gaussians with NaN,
+    infinity or a zero quaternion instead of refusing the file, and `ignore_properties` goes on with
+    one whose further properties change what is seen. `leaves_out_band_4` reads harmonics of degree
+    4 without the fourth band.
+
+    Raises:
+        InputError: The file is damaged, of no known format, or refused for what these options say.
     """
     path = resolve_splat(require_path(path))
-    if detect_splat_format(path) == "ply" and not leaves_out_band_4:
+    # `load_ply` refuses harmonics of degree 4, and maps the rows of the file once.
+    if detect_splat_format(path) == PLY.name and not leaves_out_band_4:
         return load_ply(path, drop_nonfinite, ignore_properties)
     gaussians = decode_splat(path, leaves_out_band_4)
     if not ignore_properties:
@@ -104,11 +103,14 @@ def load_splat(
 def list_property_names(path: Path) -> Sequence[str]:
     """List the properties of a file that `decode_splat` reads, at least those it does not use."""
     name = detect_splat_format(path)
-    if name == "ply":
+    if name == PLY.name:
         # Harmonics of a higher degree are refused, or left out, by those who read them.
         return read_scene(path, leaves_out_band_4=True).rows.dtype.names or ()
-    listed = SPLAT_FORMATS[name].list_names
-    return () if listed is None else listed(path)
+    row = SPLAT_FORMATS[name]
+    if row.list_names is None:
+        return ()
+    with translate_damage(path, row.has_json):
+        return row.list_names(path)
 
 
 def decode_splat(path: Path, leaves_out_band_4: bool = False) -> Gaussians:
@@ -119,10 +121,24 @@ def decode_splat(path: Path, leaves_out_band_4: bool = False) -> Gaussians:
     read = row.read
     if row.can_leave_out_band_4:
         read = partial(read, leaves_out_band_4=leaves_out_band_4)
-    errors = DECODING_ERRORS + JSON_ERRORS if row.has_json else DECODING_ERRORS
+    # Infinite values are refused by those who load the file (`require_finite`).
+    with translate_damage(path, row.has_json), np.errstate(over="ignore", invalid="ignore"):
+        gaussians = read(path)
+    # Labels lie in the file, or beside it as an earlier version wrote them for all formats.
+    if not gaussians.generated.any():
+        gaussians = replace(gaussians, generated=load_labels(path, len(gaussians)))
+    return validate_ranges(gaussians, path)
+
+
+@contextlib.contextmanager
+def translate_damage(path: Path, has_json: bool) -> Iterator[None]:
+    """Translate the errors of a decoder of the file at `path` into InputErrors.
+
+    With `has_json`, those by values of another type are damage, too, and else defects of ours.
+    """
+    errors = DECODING_ERRORS + JSON_ERRORS if has_json else DECODING_ERRORS
     try:
-        with np.errstate(over="ignore", invalid="ignore"):  # infinite values are refused below
-            gaussians = read(path)
+        yield
     except InputError:
         raise
     except BandError as error:
@@ -136,10 +152,6 @@ def decode_splat(path: Path, leaves_out_band_4: bool = False) -> Gaussians:
             f"{quote_value(path)} cannot be read: {quote_value(describe_damage(error), MAX_DEFECT)}"
             "; fetch the file again, or export it as .ply."
         ) from error
-    # Labels lie in the file, or beside it as an earlier version wrote them for all formats.
-    if not gaussians.generated.any():
-        gaussians = replace(gaussians, generated=load_labels(path, len(gaussians)))
-    return validate_ranges(gaussians, path)
 
 
 def find_origin(path: Path, leaves_out_band_4: bool = False) -> Origin | None:
@@ -157,9 +169,10 @@ def load_splat_at(path: Path, origin: Origin | None, drop_nonfinite: bool = Fals
     Their positions are equal to those of the same Gaussians there. Further properties do not count.
     """
     path = resolve_splat(path)
-    if origin is not None and detect_splat_format(path) == "ply":
+    if origin is not None and detect_splat_format(path) == PLY.name:
         scene = read_scene(path)
         if scene.origin is not None:
+            # Its coordinates in float64 less the other origin, without its own in between.
             gaussians = decode_gaussians(replace(scene, origin=origin))
             return require_finite(gaussians, path, drop_nonfinite)
     return load_splat(path, drop_nonfinite, ignore_properties=True).move_origin(origin)
@@ -170,7 +183,7 @@ def describe_oddities(path: Path) -> list[str]:
     path = resolve_splat(path)
     further = describe_further_properties(list_property_names(path))
     lines = [] if further is None else [further]
-    if detect_splat_format(path) == "ply":
+    if detect_splat_format(path) == PLY.name:
         # A fourth band of harmonics is refused, or left out, by those who read it.
         lines = [*describe_values(read_scene(path, leaves_out_band_4=True)), *lines]
     return lines
@@ -292,21 +305,9 @@ def read_provenance(path: Path) -> Provenance:
     """
     path = resolve_splat(path)
     row = SPLAT_FORMATS[detect_splat_format(path)]
-    beside = get_labels_path(path)
-    try:
-        if row.read_record is not None:
-            table = row.read_record(path)
-        elif beside.is_file():
-            table = read_json(beside, "remove it to go on without labels").get(KEY)
-        else:
-            table = None
-    except InputError:
-        raise
-    except (*DECODING_ERRORS, *JSON_ERRORS) as error:
-        raise InputError(
-            f"{quote_value(path)} cannot be read: {quote_value(describe_damage(error), MAX_DEFECT)}"
-            "; fetch the file again."
-        ) from error
+    # A record is JSON in every format.
+    with translate_damage(path, has_json=True):
+        table = load_record(path) if row.read_record is None else row.read_record(path)
     return parse_provenance(table, quote_value(path))
 
 
@@ -326,11 +327,6 @@ def has_splat_extension(path: Path) -> bool:
     return match_ending(path) is not None
 
 
-def get_labels_path(path: Path) -> Path:
-    """Get the path of the labels file for a splat file."""
-    return path.with_name(f"{path.name}.generated.json")
-
-
 @contextlib.contextmanager
 def reserve_splat(path: Path, overwrite: bool) -> Iterator[None]:
     """Reserve the file of a splat as `reserve_file` does, with the one of its labels.
@@ -343,47 +339,3 @@ def reserve_splat(path: Path, overwrite: bool) -> Iterator[None]:
         if row is not PLY:
             check_free(get_labels_path(path), overwrite)
         yield
-
-
-def save_labels(
-    path: Path, generated: UInt8[Tensor, "n"], made_by: Provenance = NOTHING_KNOWN
-) -> None:
-    """Write the labels of the file at `path` beside it, with who made it unless the file says so.
-
-    They are removed if nothing was generated.
-    """
-    place = get_labels_path(path)
-    has_labels = bool((generated > 0).any())
-    # What a link names lies elsewhere, and stays.
-    if not has_labels or place.is_symlink():
-        with contextlib.suppress(FileNotFoundError):
-            place.unlink()
-    if not has_labels:
-        return
-    # Run lengths, as labels come in long runs; the digest ties them to this very file.
-    runs = [[label, len(list(run))] for label, run in groupby(generated.tolist())]
-    with replace_file(place) as file:
-        table: dict[str, Any] = {"sha256": hash_file(path), "generated": runs}
-        if made_by.runs:
-            table[KEY] = made_by.to_json()
-        file.write(json.dumps(table).encode())
-
-
-def load_labels(path: Path, count: int) -> UInt8[Tensor, "n"]:
-    """Load the labels of the `count` Gaussians in the file at `path`; zeros if there are none."""
-    place = get_labels_path(path)
-    if not path.is_file() or not place.exists():
-        return torch.zeros(count, dtype=torch.uint8)
-    table = read_json(place, "remove it to go on without labels")
-    try:
-        runs = np.array(table["generated"], dtype=np.int64).reshape(-1, 2)
-        in_range = bool(((runs >= 0) & (runs <= [255, count])).all())
-        fits = in_range and runs[:, 1].sum() == count and table["sha256"] == hash_file(path)
-    except (KeyError, TypeError, ValueError, OverflowError):
-        fits = False
-    if not fits:
-        raise InputError(
-            f"{quote_value(place)} does not hold the labels of {quote_value(path.name)}; remove it "
-            "to go on without them."
-        )
-    return torch.from_numpy(np.repeat(runs[:, 0].astype(np.uint8), runs[:, 1]))

@@ -62,10 +62,10 @@ def is_object(scene: Gaussians, renderer: Renderer, given: Sequence[Camera] = ()
     that is closed on all sides, are scenes. `given` are cameras of the user, none that was found:
     if they stand between walls, it is a scene, too.
     """
-    views = look_from_outside(scene, renderer, OUTSIDE_SIDE)
+    extent = measure_extent(scene)
+    views = look_from_outside(scene, renderer, OUTSIDE_SIDE, extent)
     if max(view.border_share for view in views) > MAX_SURROUNDED:
         return False
-    extent = measure_extent(scene)
     if is_ground(scene, extent, renderer):
         return False
 

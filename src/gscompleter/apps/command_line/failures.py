@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from gscompleter.apps.command_line.exit_codes import ERROR, WRONG_INPUT
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.writing import FULL_DISK_ERRORS
+from gscompleter.system.memory_errors import is_lack_of_memory, is_of_gpu, list_causes
 
 NAME_ERRORS = {errno.ENAMETOOLONG, errno.ELOOP}
 """Numbers of errors of a path that names nothing on any disk."""
@@ -17,24 +18,6 @@ DEVICE_ERRORS = {errno.EIO, errno.ESTALE, errno.ENOTCONN, errno.EHOSTDOWN, errno
 """Numbers of errors of a disk that is broken, or on the network and not reached."""
 OPEN_FILE_ERRORS = {errno.EMFILE, errno.ENFILE}
 """Numbers of errors of more open files than the system allows."""
-MEMORY_WORDS = (
-    "can't start new thread",
-    "can't allocate memory",
-    "cannot allocate memory",
-    "out of memory",
-    "unable to allocate",
-    "failed to allocate",
-    "failed to map segment",
-    "insufficient memory",
-    "_alloc_failed",  # of CUBLAS_STATUS_ALLOC_FAILED and others
-)
-"""Words of the messages by which libraries say that memory ran out, in small letters.
-
-Threads need memory, too: of a limit of the address space (`ulimit -v`) each takes its stack.
-"""
-GPU_WORDS = ("cuda error", "cuda out of", "cublas_", "cudnn_", "hip error", "mps backend")
-"""Words by which such a message tells that the memory is that of a GPU, in small letters. A library
-called libcuda.so may lack that of the CPU."""
 GPU_MEMORY_SENTENCE = (
     "The memory of the GPU ran out; choose a smaller --resolution, fewer photographs or "
     "--generator-offload (diffusion models), or run a part on the CPU: --renderer-device cpu, "
@@ -58,36 +41,18 @@ class Failure:
 
 def explain_failure(error: BaseException) -> Failure | None:
     """Explain an error of the machine or of a path; None for any other, which is a defect."""
-    # Libraries wrap the error of the system in their own, so the causes are searched, too. A chain
-    # of causes may lead back to its beginning.
-    seen: set[int] = set()
-    cause: BaseException | None = error
-    while cause is not None and id(cause) not in seen:
+    for cause in list_causes(error):
         failure = explain_lack_of_memory(cause) or explain_system_error(cause)
         if failure is not None:
             return failure
-        seen.add(id(cause))
-        cause = cause.__cause__ or cause.__context__
     return None
 
 
 def explain_lack_of_memory(error: BaseException) -> Failure | None:
     """Explain an error, without its causes, that says that memory ran out; None for any other."""
-    # torch has its own error for the memory of a GPU; torch is not imported to name it.
-    if type(error).__name__ == "OutOfMemoryError":
-        return Failure(GPU_MEMORY_SENTENCE, ERROR)
-    number = getattr(error, "errno", None)
-    if isinstance(error, MemoryError) or number == errno.ENOMEM:
-        return Failure(MEMORY_SENTENCE, ERROR)
-
-    # torch and numba raise RuntimeError for a lack of memory, so their words are read, too. An
-    # error of the system tells by its number what it is, and its text has names of the user's
-    # files, in which any words may be.
-    text = str(error).lower()
-    if number is not None or not any(words in text for words in MEMORY_WORDS):
+    if not is_lack_of_memory(error):
         return None
-    is_of_gpu = any(words in text for words in GPU_WORDS)
-    return Failure(GPU_MEMORY_SENTENCE if is_of_gpu else MEMORY_SENTENCE, ERROR)
+    return Failure(GPU_MEMORY_SENTENCE if is_of_gpu(error) else MEMORY_SENTENCE, ERROR)
 
 
 def explain_system_error(error: BaseException) -> Failure | None:

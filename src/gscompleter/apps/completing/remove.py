@@ -16,6 +16,7 @@ from gscompleter.apps.inputs.removal import (
     check_selection,
     contain_points,
     describe_masks_in_vain,
+    describe_parts_in_vain,
     select_with_masks,
     widen_regions,
 )
@@ -40,8 +41,10 @@ def prepare_removal(request: RemovalRequest, console: Console) -> Prepared:
         print_lines(console, *unused)
 
     # The request of a removal names a splat.
-    assert ready.task.scene is not None
-    widened = widen_regions(selection, ready.task.scene, ready.task.splat_origin)
+    scene = ready.task.scene
+    assert scene is not None
+    widened = widen_regions(selection, scene, ready.task.splat_origin)
+    print_lines(console, *describe_parts_in_vain(widened, scene, ready.task.splat_origin))
     return replace(
         ready,
         command=request.command,

@@ -80,6 +80,9 @@ def select_with_masks(
     """Select the Gaussians of the input splat that are selected in any way, by masks as well.
 
     `cameras` are those of the photographs by frame, in the frame of the splat.
+
+    Raises:
+        InputError: Nothing is selected, no mask has a camera, or masks select most of the splat.
     """
     scene = task.scene
     assert scene is not None
@@ -129,16 +132,26 @@ def find_by_position(
     """
     chosen = contain_points(selection, origin, scene.means)
     if selection.file:
-        selected = load_splat_at(selection.file, scene.origin, selection.drop_nonfinite)
-        # The file of a scene may lie at the large coordinates of its photographs without an origin
-        # of its own. It was then shifted by their origin, in the arithmetic of `shift_to_origin`.
-        if scene.origin is None and origin.any():
-            moved = selected.means.double() - torch.from_numpy(origin)
-            selected = replace(selected, means=moved.float())
         # Programs that save a selection leave positions as they were, so that exactly equal ones
         # are those of the same Gaussians.
-        chosen |= find_equal_positions(scene.means, selected.means.to(scene.means.device))
+        chosen |= find_equal_positions(scene.means, load_selected_means(selection, scene, origin))
     return chosen
+
+
+def load_selected_means(
+    selection: Selection, scene: Gaussians, origin: Float[np.ndarray, "3"]
+) -> Float[Tensor, "_m 3"]:
+    """Load the means of the file of a selection, in the frame and to the bit of those of the scene.
+
+    `origin` is that of `compute_file_points`.
+    """
+    assert selection.file is not None
+    means = load_splat_at(selection.file, scene.origin, selection.drop_nonfinite).means
+    # The file of a scene may lie at the large coordinates of its photographs without an origin of
+    # its own. It was then shifted by their origin, in the arithmetic of `shift_to_origin`.
+    if scene.origin is None and origin.any():
+        means = (means.double() - torch.from_numpy(origin)).float()
+    return means.to(scene.means.device)
 
 
 def find_equal_positions(
@@ -198,7 +211,8 @@ def widen_regions(
     """Let boxes and the sphere reach farther by one Gaussian of what they enclose.
 
     The centres of the Gaussians on a face lie on both sides of it: a region drawn exactly on an
-    object would leave half of each face standing. `origin` is that of `compute_file_points`.
+    object would leave half of each face standing. The margin is one for all of them, at most
+    `MAX_MARGIN`. `origin` is that of `compute_file_points`.
     """
     inside = contain_points(selection, origin, scene.means)
     lengths = [] if selection.sphere is None else [float(selection.sphere[3])]
@@ -291,6 +305,41 @@ def find_masks_of(photographs: Photographs, folder: Path) -> dict[int, Path]:
     return find_masks(folder, [frame.name for frame in photographs.frames], photographs.files)
 
 
+def describe_parts_in_vain(
+    selection: Selection, scene: Gaussians, origin: Float[np.ndarray, "3"]
+) -> list[str]:
+    """Describe the boxes, the sphere and the rows of the file of a selection that select nothing.
+
+    None if nothing else is selected either, which is an error (`require_chosen`). `origin` is that
+    of `compute_file_points`.
+    """
+    lines = []
+    points = compute_file_points(scene.means, origin)
+    num_boxes = len(selection.boxes) // 6
+    selects = bool(selection.masks)
+    for number in range(num_boxes):
+        box = selection.boxes[6 * number : 6 * number + 6]
+        if find_in_boxes(points, box, selection.box_rotation, selection.margin).any():
+            selects = True
+        else:
+            lines.append(f"Box {number + 1} of {num_boxes} contains no Gaussian.")
+    if selection.sphere:
+        if find_in_region(points, replace(selection, boxes=())).any():
+            selects = True
+        else:
+            lines.append("The sphere contains no Gaussian.")
+    if selection.file:
+        means = load_selected_means(selection, scene, origin)
+        num_missing = int((~find_equal_positions(means, scene.means)).sum())
+        selects |= num_missing < len(means)
+        if num_missing:
+            lines.append(
+                f"{num_missing:,} of {len(means):,} Gaussians of {quote_value(selection.file)} are "
+                "at no position of the splat, and select nothing."
+            )
+    return lines if selects else []
+
+
 def describe_masks_in_vain(
     photographs: Photographs, cameras: Mapping[int, Camera], folder: Path
 ) -> list[str]:
@@ -311,8 +360,8 @@ def find_in_masks(
 ) -> Bool[Tensor, "n"]:
     """Find Gaussians of which photographs show more inside of their masks than outside.
 
-    Photographs without a camera in `cameras`, which is by frame, do not count. A mask is scaled to
-    its photograph; one of another aspect ratio raises an InputError.
+    `masks` and `cameras` are by frame; photographs without a mask or a camera do not count. A mask
+    is scaled to its photograph; one of another aspect ratio raises an InputError.
     """
     # Columns of `sum_in_mask`: how much of each Gaussian is seen inside of masks, outside, and 0.
     sums = torch.zeros_like(scene.means)
@@ -320,8 +369,8 @@ def find_in_masks(
         frame = photographs.frame(number)
         size = frame.size()
         turn = frame.find_turn()
-        # `load_mask` marks black pixels, which masks of a scene hide. Here white is what goes, or
-        # black if masks are inverted.
+        # `load_mask` marks black pixels, which masks of a scene hide, or white ones if masks are
+        # inverted. Of a removal the others are what goes.
         selected = ~load_mask(masks[number], size, frame.title, turn, reading.is_inverted)
         mask = resize_mask(frame, selected, size, resolution)
         frozen = renderer.freeze(scene, cameras[number])

@@ -25,7 +25,10 @@ from gscompleter.system.progress import show_progress, track
 
 
 def replay_session(request: SessionRequest) -> int:
-    """Do the steps of a session again, write the result, and return the exit code."""
+    """Do the steps of a session again, write the result, and return the exit code.
+
+    Steps that were undone are no part of the result, and are left out.
+    """
     results = request.completion.results
     console = make_console(stderr=True, quiet=results.answer.quiet)
     with (
@@ -46,18 +49,26 @@ def replay_session(request: SessionRequest) -> int:
 def replay_steps(
     session: Session, steps: Sequence[SessionStep], undone: Sequence[SessionStep], console: Console
 ) -> Session:
-    """Do steps again, and those that were undone, which can then be done again."""
+    """Do steps again, and those that were undone, which can then be redone at once.
+
+    Of the latter the next to be redone comes first.
+    """
+    with_steps = session
     for number, step in enumerate(track([*steps, *undone], "steps"), start=1):
-        if number == len(steps) + 1:
-            kept = len(session.steps)
         session = replay_step(session, step, number, console)
-    while undone and len(session.steps) > kept:
+        if number <= len(steps):
+            with_steps = session
+    # A redo puts back the scene after a step, which only doing that step makes.
+    while len(session.steps) > len(with_steps.steps):
         session = undo_step(session)
     return session
 
 
 def replay_step(session: Session, step: SessionStep, number: int, console: Console) -> Session:
-    """Do one step again; what is wrong with it is told with its number, from 1."""
+    """Do one step again; what is wrong with it is told with its number, from 1.
+
+    A step that changes nothing leaves the session as it is, and is told, too.
+    """
     try:
         changed, text = apply_step(session, step)
     except InputError as error:

@@ -23,7 +23,7 @@ from gscompleter.numerics.two_views import (
 )
 
 KEPT_BACK = 5
-"""One track of features in so many is kept back."""
+"""One track of features in so many is kept back, on average: each is drawn by itself."""
 MIN_PAIR_MATCHES = 5
 """Fewest matches of a pair that were kept back for it to say something."""
 MAX_DISTANCE = 1.0
@@ -56,20 +56,23 @@ def keep_back_tracks(database: pycolmap.Database, numbers: list[int]) -> Numbere
         if database.exists_two_view_geometry(i, j)
     ]
     found = {pair: database.read_two_view_geometry(*pair) for pair in pairs}
+    # In one graph the features of all photographs are the nodes, numbered one photograph after the
+    # other, and the matches are the edges.
     counts = [len(database.read_keypoints(number)) for number in numbers]
-    starts = dict(zip(numbers, np.cumsum([0, *counts[:-1]]).tolist(), strict=True))
-    ends = [
-        geometry.inlier_matches.astype(np.int64) + np.array([starts[i], starts[j]])
+    first_nodes = dict(zip(numbers, np.cumsum([0, *counts[:-1]]).tolist(), strict=True))
+    edges = [
+        geometry.inlier_matches.astype(np.int64) + np.array([first_nodes[i], first_nodes[j]])
         for (i, j), geometry in found.items()
     ]
-    joined = np.concatenate([np.zeros((0, 2), np.int64), *ends])
+    joined = np.concatenate([np.zeros((0, 2), np.int64), *edges])
     graph = coo_array((np.ones(len(joined)), joined.T), shape=(sum(counts),) * 2)
     _, track_of = connected_components(graph, directed=False)
     is_kept_back = np.random.default_rng(0).random(track_of.max(initial=0) + 1) < 1 / KEPT_BACK
 
     kept: NumberedMatches = {}
-    for (pair, geometry), rows in zip(found.items(), ends, strict=True):
-        chosen: Bool[np.ndarray, "n"] = is_kept_back[track_of[rows[:, 0]]]
+    for (pair, geometry), nodes in zip(found.items(), edges, strict=True):
+        # Both features of a match are of one track.
+        chosen: Bool[np.ndarray, "n"] = is_kept_back[track_of[nodes[:, 0]]]
         matches = geometry.inlier_matches
         if chosen.any():
             kept[pair] = matches[chosen].astype(np.int64)
@@ -135,8 +138,8 @@ def measure_model(
 ) -> dict[ImagePair, Float[np.ndarray, "_"]]:
     """Measure the distances of kept matches from epipolar lines under the cameras of a model.
 
-    In pixels of an image whose shorter side is `ERROR_SIDE`; pairs with fewer than
-    `MIN_PAIR_MATCHES` matches are left out.
+    In pixels of an image whose shorter side is `ERROR_SIDE`; infinite for features that the lens of
+    the model cannot show. Pairs with fewer than `MIN_PAIR_MATCHES` matches are left out.
     """
     numbers = set(model.reg_image_ids())
     cameras = {number: model.cameras[model.images[number].camera_id] for number in numbers}
@@ -147,17 +150,20 @@ def measure_model(
     }
     rays = {}
     for number, camera in cameras.items():
-        # Without distortion, at z = 1.
+        # Without distortion, at z = 1. Pixels that no ray reaches through the lens are NaN.
         flat = np.asarray(camera.cam_from_img(keypoints[number].astype(np.float64)))
         rays[number] = np.concatenate([flat, np.ones((len(flat), 1))], axis=1)
+    # The model has one focal length for both axes (`mapping_process.LENS_MODEL`).
     focals = {n: np.full(2, camera.mean_focal_length()) for n, camera in cameras.items()}
     poses = {number: model.images[number].cam_from_world() for number in numbers}
     distances = measure_pair_distances(among, rays, focals, poses)
     sides = {number: min(camera.width, camera.height) for number, camera in cameras.items()}
-    return {
-        pair: one * (ERROR_SIDE / min(sides[pair[0]], sides[pair[1]]))
-        for pair, one in distances.items()
+    # A distance in two images of unlike size is nearly one in the smaller, whose pixels are wider.
+    scaled = {
+        (i, j): one * (ERROR_SIDE / min(sides[i], sides[j])) for (i, j), one in distances.items()
     }
+    # A feature where the lens shows nothing contradicts it. As NaN it would be the median of all.
+    return {pair: np.where(np.isnan(one), np.inf, one) for pair, one in scaled.items()}
 
 
 def rate_places(

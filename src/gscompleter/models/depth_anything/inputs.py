@@ -39,7 +39,7 @@ class ResizeConfig:
 
 @dataclass(frozen=True)
 class Window:
-    """The part of a resized photograph that the network processes."""
+    """The part of a resized photograph that the network processes, in pixels of the latter."""
 
     top: int
     left: int
@@ -51,7 +51,7 @@ class Window:
     """Vertical scale of the resized photograph relative to the original."""
 
     def crop_center_window(self, height: int, width: int) -> Window:
-        """Crop the centre of the window."""
+        """Crop the centre of the window, in which `crop_center` crops the image."""
         top = self.top + (self.height - height) // 2
         left = self.left + (self.width - width) // 2
         return replace(self, top=top, left=left, height=height, width=width)
@@ -65,7 +65,10 @@ class Window:
         return K
 
     def locate_pixels(self, camera: Camera) -> Float[Tensor, "h w 2"]:
-        """Compute the position of each pixel of the photograph in the window; some are outside."""
+        """Compute the position (x, y) in the window of the centre of each pixel of the photograph.
+
+        In pixels of the window; some are outside.
+        """
         x = (torch.arange(camera.width) + 0.5) * self.scale_x - self.left
         y = (torch.arange(camera.height) + 0.5) * self.scale_y - self.top
         return torch.stack(torch.meshgrid(x, y, indexing="xy"), dim=-1)
@@ -85,28 +88,43 @@ class Window:
         confidence: Float[Tensor, "{self.height} {self.width}"],
         camera: Camera,
     ) -> DepthMap:
-        """Resample inverse depth of the window to the photograph; pixels outside are invalid."""
+        """Resample z-depth of the window to the photograph.
+
+        Pixels outside of the window, and those whose nearest pixel of it has no confidence, are
+        invalid.
+        """
         places = self.locate_pixels(camera).to(depth.device)
         # Inverse depth is linear in the image on a plane; confidence may be a mask, and is not
         # mixed.
-        inverse = sample(1 / depth[..., None], places)[..., 0]
+        inverse = 1 / depth[..., None]
+        mixed = sample(inverse, places)[..., 0]
         sure = sample(confidence[..., None], places, "nearest")[..., 0]
+        # Depth without confidence, as that of the sky, is any number, and is not mixed either.
+        unsure = sample((confidence[..., None] <= 0).to(depth), places)[..., 0]
+        mixed = mixed.where(unsure == 0, sample(inverse, places, "nearest")[..., 0])
         size = places.new_tensor([self.width, self.height])
         valid = ((places >= 0) & (places <= size)).all(-1) & (sure > 0)
-        return DepthMap(1 / inverse, valid, sure * valid)
+        return DepthMap(1 / mixed, valid, sure * valid)
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Network inputs for one scene: normalised images, and cameras in world coordinates."""
+    """Network inputs for one scene, on the CPU."""
 
     images: Float[Tensor, "1 v 3 h w"]
+    """Normalised as for networks trained on ImageNet."""
     poses: Poses
+    """Cameras in the world and unit of the views, with intrinsics in pixels of the windows."""
     windows: tuple[Window, ...]
+    """Place of each image in its photograph."""
 
 
 def create_any_view_batch(views: Sequence[View], sizing: ResizeConfig, min_views: int) -> Batch:
-    """Create a batch of at least `min_views` views, resized and centrally cropped to one size."""
+    """Create a batch of views, resized and centrally cropped to one size.
+
+    Raises:
+        InputError: Fewer than `min_views` views, or one that is too narrow.
+    """
     if len(views) < min_views:
         raise InputError(
             f"{len(views)} view was given, and the model matches at least {min_views}; name more "
@@ -132,7 +150,7 @@ def create_any_view_batch(views: Sequence[View], sizing: ResizeConfig, min_views
 
 
 def crop_to_patches(image: Image, sizing: ResizeConfig) -> tuple[Image, Window]:
-    """Resize and crop a photograph, and return it with its window."""
+    """Resize and crop a photograph to whole patches, and return it with its window."""
     h, w = image.shape[:2]
     scaled = scale_side(image, sizing.resolution, sizing.side)
     if min(scaled.shape[:2]) < PATCH:
@@ -142,7 +160,8 @@ def crop_to_patches(image: Image, sizing: ResizeConfig) -> tuple[Image, Window]:
         )
     height = round_to_patches(scaled.shape[0], sizing.fit)
     width = round_to_patches(scaled.shape[1], sizing.fit)
-    # The second resizing may stretch the image by up to half a patch, as the authors' does.
+    # The second resizing may stretch the image by up to half a patch, as the authors' does. After
+    # it the crop is all of the image.
     if sizing.fit == "resized":
         scaled = resize_photograph(scaled, height, width)
     rows, columns = scaled.shape[:2]

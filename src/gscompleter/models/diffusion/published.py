@@ -1,10 +1,12 @@
-"""Sources of the generators' published weights (imports neither torch nor diffusers).
+"""Sources of the generators' weights: those of PE-Field, and those that a user names.
 
-Names, sizes and licences are those of the authors' pages; no commit is known.
+Names, sizes and licences are those of the authors' pages; no commit is known. Neither torch nor
+diffusers is imported before weights are loaded.
 """
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,6 +16,8 @@ from pathlib import Path
 
 from gscompleter.models.weights.fetching import limit_retries
 from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.writing import FULL_DISK_ERRORS
+from gscompleter.system.memory_errors import is_lack_of_memory, list_causes
 
 PACKAGES = ("diffusers", "transformers", "accelerate")
 """Packages that the generators import."""
@@ -90,14 +94,20 @@ PE_FIELD_TRANSFORMER = {
 
 LICENCES = {
     "flux.2-klein-4b": "Apache-2.0",
+    "flux.2-klein-base-4b": "Apache-2.0",
+    "flux.2": "the FLUX Non-Commercial License, and a gated page",
+    "flux.1-schnell": "Apache-2.0",
     "z-image": "Apache-2.0",
     "qwen-image": "Apache-2.0",
     "flux": "the FLUX.1 [dev] Non-Commercial License for the [dev] models, and a gated page",
     "stable-diffusion-xl": "CreativeML Open RAIL++-M for Stability's own",
+    "stable-diffusion-2": "CreativeML Open RAIL++-M for Stability's own",
+    "stable-diffusion-3": "the Stability AI Community License, and a gated page",
     "stable-diffusion": "CreativeML Open RAIL-M for Stability's and Runway's own",
     "depth-anything-v2-small": "Apache-2.0",
 }
-"""Usual licences of model families, by a part of the repository id."""
+"""Usual licences of model families, by a part of the repository id in small letters. The first that
+fits counts, so that a family comes after its members with licences of their own."""
 
 
 class IncompleteWeightsError(ValueError):
@@ -110,8 +120,10 @@ class IncompleteWeightsError(ValueError):
 
 def parse_source(path: str, library: str = "diffusers") -> Source:
     """Parse a user's PATH, USER/NAME or USER/NAME@COMMIT in the format of `library`."""
-    if Path(path).expanduser().is_dir():
-        return Source(location=str(Path(path).expanduser()))
+    # Not by `Path`, which raises errors for a user that does not exist and for long names.
+    folder = os.path.expanduser(path)
+    if os.path.isdir(folder):
+        return Source(location=str(Path(folder)))
     name, _, revision = path.partition("@")
     if name.count("/") != 1 or name.startswith((".", "/", "~")) or name.endswith("/"):
         raise InputError(
@@ -126,6 +138,7 @@ def parse_source(path: str, library: str = "diffusers") -> Source:
 
 def announce(sources: list[Source]) -> None:
     """Print to stderr which weights are downloaded, and under which terms."""
+    # A pipeline and its transformer may be of one repository.
     once = {(source.location, source.revision): source for source in sources if not source.is_local}
     for source in once.values():
         page = f"https://huggingface.co/{source.location}"
@@ -152,27 +165,40 @@ def find_usual_licence(name: str) -> str | None:
 
 @contextmanager
 def convert_load_errors(source: Source, setting: str = "weights") -> Iterator[None]:
-    """Silence the libraries and convert failures to InputErrors, which name `setting`."""
+    """Silence the libraries and convert failures to InputErrors, which name `setting`.
+
+    A full disk and a lack of memory are no fault of the source, and go on as they are.
+    """
     try:
         with silence_libraries(source.is_local), limit_retries():
             yield
     except InputError:
         raise
     except (OSError, ValueError, KeyError, ImportError, AttributeError, RuntimeError) as error:
+        if any(is_lack_of_memory(cause) or is_full_disk(cause) for cause in list_causes(error)):
+            raise
         raise create_load_error(source, error, setting) from error
 
 
+def is_full_disk(error: BaseException) -> bool:
+    """Return True if an error, without its causes, says that there is no room on the disk."""
+    return isinstance(error, OSError) and error.errno in FULL_DISK_ERRORS
+
+
 @contextmanager
-def silence_libraries(local: bool) -> Iterator[None]:
-    """Limit diffusers and transformers to errors, and to progress bars of downloads."""
+def silence_libraries(is_local: bool) -> Iterator[None]:
+    """Limit diffusers and transformers to errors, and to progress bars of downloads.
+
+    Without a download (`is_local`) there is no bar.
+    """
     from diffusers.utils import logging as diffusers_logging
     from transformers.utils import logging as transformers_logging
 
-    # The libraries print progress and warnings that mean nothing to a user. What was set is set
-    # back.
+    # The libraries print progress and warnings that mean nothing to a user. What was set before is
+    # restored in the end.
     logs = (diffusers_logging, transformers_logging)
     levels = [log.get_verbosity() for log in logs]
-    bars = [log for log in logs if local and log.is_progress_bar_enabled()]
+    bars = [log for log in logs if is_local and log.is_progress_bar_enabled()]
     for log in logs:
         log.set_verbosity_error()
     for log in bars:
@@ -187,7 +213,7 @@ def silence_libraries(local: bool) -> Iterator[None]:
 
 
 def create_load_error(source: Source, error: Exception, setting: str) -> InputError:
-    """Create the error for a source that failed to load."""
+    """Create the error for a source that failed to load; `setting` named it."""
     page = f"https://huggingface.co/{source.location}"
     if source.is_local:
         way_out = "see that it is complete, as `save_pretrained` writes it"

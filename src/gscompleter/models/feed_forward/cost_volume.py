@@ -31,11 +31,13 @@ def compute_cost_volume(
     """Correlate each view with its source views at candidate depths, averaged over the sources.
 
     The n = b v views are ordered by scene; `sources` has indices within a scene. Candidates are
-    given per view or per pixel, and processed `depth_chunk` at a time to bound the memory.
+    inverse z-depths in 1 / scene units, given per view or per pixel, and processed `depth_chunk` at
+    a time to bound the memory.
     """
     n, _, h, w = features.shape
-    # Each view in the axes of its sources, and all at the resolution of the feature maps.
+    # In pixels of the feature maps.
     K = cameras.scale_intrinsics(h, w).flatten(0, 1)
+    # From the axes of each view to those of each of its sources.
     transforms = cameras.compute_sources_from_views(sources).flatten(0, 1)
     depths = (1 / inverse_depths).expand(n, -1, h, w)
     # From indices within a scene to indices in the list of all n views.
@@ -64,7 +66,10 @@ def correlate_features(
     source_from_reference: Float[Tensor, "4 4"],
     depths: Float[Tensor, "d h w"],
 ) -> Float[Tensor, "d h w"]:
-    """Correlate the reference with the source sampled at `depths`; 0 outside the source."""
+    """Correlate the reference with the source sampled at z-depths; 0 outside the source.
+
+    `K` is that of `compute_sampling_grid`.
+    """
     grid = compute_sampling_grid(K, source_from_reference, depths)
     sampled = F.grid_sample(
         source[None], grid.flatten(0, 1)[None], mode="bilinear", align_corners=True
@@ -79,9 +84,11 @@ def compute_sampling_grid(
     source_from_reference: Float[Tensor, "4 4"],
     depths: Float[Tensor, "d h w"],
 ) -> Float[Tensor, "d h w 2"]:
-    """Project the pixels of the reference at `depths` into the source, in [-1, 1].
+    """Project the pixels of the reference at z-depths into the source: x and y in [-1, 1].
 
-    As in training, pixel centres have integer coordinates and `K` serves for both views.
+    `K` is that of the reference, in pixels of the maps. As in the authors' code it serves for the
+    source, too, and pixel centres have integer coordinates: the photographs of a scene in training
+    are of one camera. Of unlike focal lengths the source is sampled beside the point.
     """
     _, h, w = depths.shape
     with disable_autocast(K):
@@ -95,5 +102,6 @@ def compute_sampling_grid(
         points = rays[:, None] * depths.flatten(1) + shift
         image = (K @ points.flatten(1)).unflatten(1, depths.shape)
         at = image[:2] / image[2:].clamp(min=MIN_DEPTH)
+        # -1 and 1 are the centres of the first and the last pixel (`align_corners`).
         last = at.new_tensor([w - 1, h - 1]).view(2, 1, 1, 1)
         return (2 * at / last - 1).permute(1, 2, 3, 0)
