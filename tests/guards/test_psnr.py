@@ -10,7 +10,6 @@ from gscompleter.evaluation.metrics.image import psnr, ssim
 from gscompleter.guards import Attempt
 from gscompleter.guards.psnr import PsnrGuard
 from gscompleter.numerics.geometry import pad_camera
-from gscompleter.parts import PartOrigin, make_part
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import FrozenScene
@@ -291,31 +290,3 @@ def test_ignored_pixels_say_nothing_about_the_colours_of_additions():
     # Beside the border of the mask, Gaussians are seen above and below it.
     change = (fitted.sh - wrong.sh)[:, 0].norm(dim=1)
     assert change[is_above].median() < 0.02 * change[~is_above].median()
-
-
-@pytest.mark.parametrize("is_filled", [True, False])
-def test_the_image_of_a_completed_target_stays_but_for_its_holes(is_filled):
-    """No photograph sees the right half, which the addition for a second target hides."""
-    view, context, right = half_a_room()
-    unseen = torch.zeros((SIZE, SIZE), dtype=torch.bool)
-    unseen[:, SIZE // 2 :] = True
-    photograph = replace(view, ignore_mask=unseen, depth=None)
-    scenes = SceneRenderer(load_renderer("cpu"))
-    begun = begin_with(context, [photograph], CompleterConfig(psnr_guard=MENDED))
-    filled = [make_part(PartOrigin("target", 1), right)] if is_filled else []
-    state = replace(
-        PsnrGuard().begin(begun, scenes), added_parts=tuple(filled), completed_cameras=(CAMERA,)
-    )
-    before = scenes.freeze(state.parts, CAMERA)
-
-    hiding = replace(right, sh=-right.sh, means=0.9 * right.means)
-    seen = render_target(state, pad_camera(camera_at(0.05, size=SIZE), 0.0), scenes)
-    reference = GeneratedView(seen.frozen.composite(hiding).image, seen.camera.target)
-    refined = Refined(hiding, tuple(f.vary_opacities(hiding) for f in seen.frozen_photos), ())
-    kept = PsnrGuard().verify(hiding, Attempt(seen, reference, DepthAffine(), refined))
-    after = before.composite(kept).image
-    if is_filled:
-        assert psnr(after, before.render.image) > MENDED.invisible_psnr - 0.1
-    else:
-        # Beside its hole, windows of SSIM show a part of the left half.
-        assert (kept.opacities == hiding.opacities).float().mean() > 0.7

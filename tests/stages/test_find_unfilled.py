@@ -57,7 +57,7 @@ def test_the_guard_that_empties_a_part_is_named_with_its_place(monkeypatch):
     assert left.lost_by["psnr"] == pytest.approx(left.share, abs=0.01)
     (note,) = [note for note in result.notes if "of the hole" in note]
     share = round(100 * left.share)
-    reason = "a filling would make photographs, or targets before, worse"
+    reason = "a filling would make given photographs worse"
     assert note == f"{share} % of the hole stays empty, because {reason}."
     assert note in result.warnings
     (details,) = describe_empty_part(UnfilledRow(left.share, left.lost_by, left.regions))
@@ -109,8 +109,7 @@ def test_what_stays_empty_is_a_sentence_for_people_and_a_warning_only_if_it_is_m
     lost = {"psnr": 0.019, "removal": 0.001}
     few = Unfilled(0.021, lost, ((67, 39, 71, 45),), PsnrGuard.loss)
     assert few.describe() == (
-        "2 % of the hole stays empty, mostly because a filling would make photographs, or targets "
-        "before, worse."
+        "2 % of the hole stays empty, mostly because a filling would make given photographs worse."
     )
     (done,) = complete().targets
     assert few.describe() in replace(done, unfilled=few).notes

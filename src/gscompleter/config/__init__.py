@@ -349,6 +349,7 @@ GUARDS = {
     "depth-agreement": "gscompleter.guards.agreement:DepthAgreement",
     "free-space": "gscompleter.guards.free_space:FreeSpace",
     "psnr": "gscompleter.guards.psnr:PsnrGuard",
+    "completed-targets": "gscompleter.guards.completed_targets:CompletedTargets",
     "contribution": "gscompleter.guards.contribution:Contribution",
     "removal": "gscompleter.editing.removal_guard:Removal",
     "hull": "gscompleter.guards.hull:Hull",
@@ -458,7 +459,7 @@ class CompleterConfig(Settings):
         # may get worse.
         return CompleterConfig(
             trust="photometric",
-            guards=("image-agreement", "free-space", "psnr", "contribution"),
+            guards=("image-agreement", "free-space", "psnr", "completed-targets", "contribution"),
             registration=SPLAT_REGISTRATION,
             holes=HoleConfig(padding="beside"),
         )
@@ -473,7 +474,7 @@ class CompleterConfig(Settings):
         is added, so no more is added than the hole asks for.
         """
         return CompleterConfig(
-            guards=("image-agreement", "free-space", "psnr", "contribution"),
+            guards=("image-agreement", "free-space", "psnr", "completed-targets", "contribution"),
             add_observed=False,
             registration=SPLAT_REGISTRATION,
             holes=HoleConfig(padding="beside"),

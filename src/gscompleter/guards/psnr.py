@@ -1,15 +1,9 @@
-"""Guard of stage 4: additions make no photograph, and no completed target, worse.
-
-Error budgets limit what each image may lose, in PSNR and SSIM.
-"""
+"""Guard of stage 4: additions make no photograph worse, by the error budgets in PSNR and SSIM."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
-import torch
-
-from gscompleter.config import PsnrGuardConfig
 from gscompleter.guards import Attempt, Guard
 from gscompleter.numerics.geometry import look_up
 from gscompleter.numerics.image_ops import label_regions
@@ -18,22 +12,21 @@ from gscompleter.render.fit_colors import RELAXATION, fit_colors
 from gscompleter.stages.error_budgets import (
     find_exceeding,
     meet_error_budgets,
-    set_error_budgets,
     set_total_budgets,
 )
 from gscompleter.stages.hole_masks import compute_hole_mask
 from gscompleter.state import Completion
-from gscompleter.types import ErrorBudget, Gaussians, View
+from gscompleter.types import Gaussians
 
 WORSE_COLOR_ROUNDS = 4
 """Rounds in which colours are fitted to photographs that additions make worse."""
 
 
 class PsnrGuard(Guard):
-    """Let no photograph and no completed target get worse than its error budgets."""
+    """Let no photograph get worse than its error budgets."""
 
     name = "psnr"
-    loss = "a filling would make photographs, or targets before, worse"
+    loss = "a filling would make given photographs worse"
 
     def begin(self, state: Completion, scenes: SceneRenderer) -> Completion:
         """Set the error budgets of all photographs for all targets, before any of them.
@@ -58,30 +51,22 @@ class PsnrGuard(Guard):
         return replace(state, photos=photos)
 
     def verify(self, added: Gaussians, attempt: Attempt) -> Gaussians:
-        """Fade added Gaussians until every photograph and target is within its budgets.
+        """Fade added Gaussians until every photograph is within its budgets.
 
         Each connected part of the hole is judged by itself: one wrong corner is no reason to drop
         what is added elsewhere.
         """
         view = attempt.view
         state = view.state
-
-        # The images of completed targets are evidence as photographs are: what is added for this
-        # one may hang before them, where no photograph sees it.
-        completed = view.completed_views
-        views = [*(photo.view for photo in state.photos), *(image for image, _ in completed)]
-        scenes = [*view.frozen_photos, *(frozen for _, frozen in completed)]
-        settings = state.config.psnr_guard
-        budgets = [*view.budgets, *(keep_image(image, settings) for image, _ in completed)]
-        plans = [*attempt.refined.plans, *(frozen.vary_opacities(added) for _, frozen in completed)]
+        budgets = view.budgets
 
         # What a photograph sees of the additions takes the colours of the photograph first, so that
         # less of it has to fade. At the target the image counts as much as each photograph.
-        worsened = find_exceeding(budgets, scenes, plans, added)
+        worsened = find_exceeding(budgets, view.frozen_photos, attempt.refined.plans, added)
         if not worsened:
             return added
-        frozen = [view.frozen, *(scenes[index] for index in worsened)]
-        images = [attempt.reference, *(views[index] for index in worsened)]
+        frozen = [view.frozen, *(view.frozen_photos[index] for index in worsened)]
+        images = [attempt.reference, *(state.photos[index].view for index in worsened)]
         # Where a photograph is ignored, the render with the additions is wanted, so that they keep
         # their colours there. A render without them would ask for the black of the holes.
         wanted = [
@@ -91,21 +76,13 @@ class PsnrGuard(Guard):
             for image, scene in zip(images, frozen, strict=True)
         ]
         added = fit_colors(added, frozen, wanted, [RELAXATION] * WORSE_COLOR_ROUNDS)
-        plans = [scene.vary_opacities(added) for scene in scenes]
+        plans = [scene.vary_opacities(added) for scene in view.frozen_photos]
 
         labels, _ = label_regions(view.addition_mask)
         regions = look_up(labels, added, view.camera.padded)
-        return meet_error_budgets(added, scenes, budgets, plans, settings, regions)
+        settings = state.config.psnr_guard
+        return meet_error_budgets(added, view.frozen_photos, budgets, plans, settings, regions)
 
     def explain_rejection(self, attempt: Attempt) -> str:
-        """Name the images as the reason."""
-        return (
-            "Most of the Gaussians that were generated for the target make photographs, or targets "
-            "before it, worse."
-        )
-
-
-def keep_image(view: View, config: PsnrGuardConfig) -> tuple[ErrorBudget, ...]:
-    """Set the error budgets of an image that the scene shows without an error."""
-    nothing = torch.zeros_like(view.valid_mask)
-    return set_error_budgets(view, view.image, nothing, config)
+        """Name the photographs as the reason."""
+        return "Most of the Gaussians that were generated for the target make photographs worse."

@@ -26,8 +26,8 @@ from gscompleter.stages.hole_masks import (
 from gscompleter.state import Completion
 from gscompleter.types import Camera, DepthMap, ErrorBudget, PaddedCamera, Render, View, merge
 
-MAX_COMPLETED_VIEWS = 4
-"""Most completed targets whose images are kept from changing: of long paths those nearest."""
+MAX_COMPLETED = 4
+"""Most completed targets that are looked at: of long paths those nearest."""
 FULL_TRUST = 1.0
 """Mean trust of what a pixel shows at which it keeps its colour."""
 NO_TRUST = 0.6
@@ -126,24 +126,18 @@ class TargetView:
         )
 
     @cached_property
-    def completed_views(self) -> tuple[tuple[View, FrozenScene], ...]:
-        """Images of the completed targets nearest to this one, with the scene frozen there.
-
-        What is added for this target may not change them, but in what is still a hole there.
-        """
+    def completed_cameras(self) -> list[Camera]:
+        """Cameras of the completed targets nearest to this one."""
         cameras = self.state.completed_cameras
         if not cameras:
-            return ()
+            return []
         order = measure_distances(cameras, [self.camera.target]).argsort(stable=True)
-        nearest = [cameras[index] for index in order[:MAX_COMPLETED_VIEWS].tolist()]
-        views = []
-        for camera, frozen in zip(
-            nearest, self.scenes.freeze_at(self.state.parts, nearest), strict=True
-        ):
-            holes = compute_hole_mask(frozen.render.alpha, self.state.config.holes)
-            image = frozen.render.image.clamp(0, 1)
-            views.append((View(image, camera, ignore_mask=holes), frozen))
-        return tuple(views)
+        return [cameras[index] for index in order[:MAX_COMPLETED].tolist()]
+
+    @cached_property
+    def frozen_completed(self) -> tuple[FrozenScene, ...]:
+        """The scene frozen at each of `completed_cameras`."""
+        return self.scenes.freeze_at(self.state.parts, self.completed_cameras)
 
     def freeze_views(self, views: Sequence[View]) -> tuple[FrozenScene, ...]:
         """Freeze the scene at the cameras of views."""
