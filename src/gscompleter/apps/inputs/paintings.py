@@ -58,7 +58,7 @@ def check_paintings(folder: Path, num_targets: int) -> None:
         # Named targets need some of the images: those of their cameras, which are not known yet.
         if num_targets == 0:
             for source in find_sources(folder, holes.frames, holes.path):
-                if not is_video(source):
+                if not is_video_file(source):
                     read_colors_and_alpha(source)
     elif num_targets == 0:
         raise InputError(
@@ -111,7 +111,7 @@ def read_paintings(
     ]
 
 
-def is_video(source: Path) -> bool:
+def is_video_file(source: Path) -> bool:
     """Check whether what was painted is a video, rather than an image."""
     return source.suffix.lower() in VIDEO_ENDINGS
 
@@ -151,7 +151,7 @@ def read_video_frames(
     InputError if the repaired one has another number of frames than that.
     """
     numbers = [
-        row.path_frame if is_video(source) else None
+        row.path_frame if is_video_file(source) else None
         for source, row in zip(sources, rows, strict=True)
     ]
     wanted = set(numbers) - {None}
@@ -159,7 +159,7 @@ def read_video_frames(
         return [None] * len(sources)
 
     # All of them are frames of the same video.
-    video = next(filter(is_video, sources))
+    video = next(filter(is_video_file, sources))
     # Only the wanted frames are kept, since all of them would fill the memory.
     frames = {}
     count = 0
