@@ -23,7 +23,8 @@ from gscompleter.system.errors import (
     WorkerError,
     print_error,
 )
-from gscompleter.system.files.writing import FULL_DISK_ERRORS, handle_stop_signals
+from gscompleter.system.files.writing import FULL_DISK_ERRORS
+from gscompleter.system.interrupts import handle_stop_signals
 from gscompleter.system.process import let_idle_threads_sleep, skip_last_collection
 from gscompleter.system.threads import limit_threads
 

@@ -126,12 +126,38 @@ def test_depths_are_compared_in_one_table(room, tmp_path, monkeypatch, capsys):
     assert table["rows"][1]["cells"]["psnr"]["difference"]["num_scenes"] == 1
     assert "| depth | method |" in capsys.readouterr().out
 
+    assert run(monkeypatch, *words, "--depth", "none", DEPTH, "--json") == 0
+    answer = json.loads(capsys.readouterr().out)
+    assert answer == {"results": None, "tables": {"depths": table}, "figures": []}
+
     # The rows of an earlier run are read, not computed again.
     assert run(monkeypatch, *words, "--depth", "none", DEPTH) == 0
     assert "Scored 0, failed 0, done earlier 1" in capsys.readouterr().err
     assert "named twice" in refuse(monkeypatch, capsys, *words, "--depth", "none", "none")
     line = refuse(monkeypatch, capsys, *words, "--depth", "none", DEPTH, "--table", "models")
     assert "methods of their own" in line
+
+
+@pytest.mark.slow
+def test_a_shard_without_cases_leaves_the_comparison_to_the_others(
+    room, tmp_path, monkeypatch, capsys
+):
+    case = {"scene": str(room), "context": [0, 1], "target": 2, "near": 0.5, "far": 20}
+    cases = tmp_path / "cases.json"
+    cases.write_text(json.dumps({"resolution": [32, 32], "cases": [case]}))
+    out = tmp_path / "out"
+    words = ("evaluate", cases, "--methods", "context", "--out", out, "--device", "cpu")
+    compared = (*words, "--depth", "none", DEPTH, "--json", "--shard")
+    assert run(monkeypatch, *compared, "1/2") == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["tables"] == {}
+    assert "Not written yet" in printed.err
+    assert run(monkeypatch, *compared, "0/2") == 0
+    assert list(json.loads(capsys.readouterr().out)["tables"]) == ["depths"]
+
+    paper = ("evaluate", cases, "--out", tmp_path / "paper", "--device", "cpu", "--shard", "1/2")
+    assert run(monkeypatch, *paper, "--table", "models") == 0
+    assert "Not written yet" in capsys.readouterr().err
 
 
 # The test before compares depths by the same code.

@@ -15,8 +15,9 @@ from command import run
 from gscompleter import load_cameras, load_splat, load_views
 from gscompleter.apps.commands.batch_rows import parse_batch_row
 from gscompleter.apps.completing.path_video import FRAME_STEP, plan_path
+from gscompleter.apps.inputs import paintings
 from gscompleter.apps.inputs.holes_file import HoleRow, PathRow
-from gscompleter.apps.inputs.paintings import add_exported_photograph, find_painted
+from gscompleter.apps.inputs.paintings import add_exported_photograph, find_sources
 from gscompleter.apps.inputs.task import Target
 from gscompleter.apps.report.film import FRAMES_PER_SECOND, MIN_LEG_SECONDS
 from gscompleter.data.formats import open_photographs
@@ -24,6 +25,7 @@ from gscompleter.data.photograph_names import name_target
 from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.image import read_depth, read_image, read_pixels, write_depth
+from gscompleter.system.files.reading import hash_file
 from gscompleter.system.files.video import read_video, write_video
 from scenes import Room, camera_at, cast, photographed, view_of
 
@@ -360,10 +362,29 @@ def test_of_several_repaired_videos_none_is_taken(tmp_path):
     path = PathRow("path.mp4", "", 5)
     row = HoleRow("target1.png", "", "b.png", SIZE, SIZE, 0.1, path_frame=2)
     (tmp_path / "path.mov").write_bytes(b"one")
-    assert find_painted(tmp_path, "target1.png", row, path) == tmp_path / "path.mov"
+    assert find_sources(tmp_path, [row], path) == [tmp_path / "path.mov"]
     (tmp_path / "path.mkv").write_bytes(b"another")
     with pytest.raises(InputError, match=r"several repaired videos \(path\.mkv, path\.mov\)"):
-        find_painted(tmp_path, "target1.png", row, path)
+        find_sources(tmp_path, [row], path)
+
+
+def test_the_video_of_many_targets_is_hashed_once(tmp_path, monkeypatch):
+    hashed = []
+
+    def hash_and_note(path):
+        hashed.append(path.name)
+        return hash_file(path)
+
+    monkeypatch.setattr(paintings, "hash_file", hash_and_note)
+    rows = [
+        HoleRow(f"target{number}.png", "", "b.png", SIZE, SIZE, 0.1, path_frame=number)
+        for number in range(3)
+    ]
+    (tmp_path / "path.mov").write_bytes(b"repaired")
+    (tmp_path / "target1.png").write_bytes(b"painted")
+    sources = find_sources(tmp_path, rows, PathRow("path.mp4", "", 5))
+    assert [source.name for source in sources] == ["path.mov", "target1.png", "path.mov"]
+    assert hashed.count("path.mov") == 1
 
 
 def test_a_batch_exports_no_holes(tmp_path):

@@ -390,25 +390,24 @@ def test_a_camera_path_of_nerfstudio_is_a_file_of_cameras(tmp_path):
         assert (camera.width, camera.height) == (WIDTH, HEIGHT)
 
 
-def test_a_camera_path_leads_back_from_the_frame_of_training(tmp_path):
+@pytest.mark.parametrize("applied_scale", [None, 3.0])
+def test_a_camera_path_leads_back_from_the_frame_of_training(tmp_path, applied_scale):
     """The run scaled and moved COLMAP's world, which the transforms.json had rotated before."""
     applied = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0]])
     moved = make_pose([0.2, -0.1, 0.4], yaw=20, pitch=5)
-    run = {"transform": moved[:3].tolist(), "scale": 0.25}
-    to_trained = (
-        np.diag([0.25, 0.25, 0.25, 1]) @ moved @ np.linalg.inv(np.vstack([applied, [0, 0, 0, 1]]))
-    )
+    # As nerfstudio's dataparser composes them: its scale has that of the export as a factor.
+    saved = moved @ np.vstack([applied, [0, 0, 0, 1]])
+    run = {"transform": saved[:3].tolist(), "scale": 0.25 * (applied_scale or 1.0)}
     path = write_camera_path(tmp_path / "camera_paths/a.json")
     content = json.loads(path.read_text())
     for entry in content["camera_path"]:
-        pose = to_trained @ np.array(entry["camera_to_world"]).reshape(4, 4)
-        pose[:3, :3] /= 0.25
+        pose = moved @ np.array(entry["camera_to_world"]).reshape(4, 4)
+        pose[:3, 3] *= 0.25
         entry["camera_to_world"] = pose.flatten().tolist()
     path.write_text(json.dumps(content))
     (tmp_path / "dataparser_transforms.json").write_text(json.dumps(run))
-    (tmp_path / "transforms.json").write_text(
-        json.dumps({"applied_transform": applied.tolist(), "frames": []})
-    )
+    export = {"applied_transform": applied.tolist(), "applied_scale": applied_scale, "frames": []}
+    (tmp_path / "transforms.json").write_text(json.dumps(export))
     for camera, expected in zip(load_cameras(path), CAMERAS, strict=True):
         assert torch.allclose(camera.c2w, torch.from_numpy(expected.c2w).float(), atol=1e-5)
 

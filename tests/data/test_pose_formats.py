@@ -25,6 +25,7 @@ from gscompleter.types import Camera, make_observed
 from pose_files import (
     CAMERAS,
     NAMES,
+    PARAMETERS,
     SIZE,
     VIEWS,
     WRITERS,
@@ -469,6 +470,59 @@ def test_dgp_says_what_is_missing(tmp_path):
     path.write_text(json.dumps(content))
     with pytest.raises(InputError, match="does not name its calibration"):
         open_photographs(scene)
+
+
+def test_images_of_dgp_have_the_lens_of_their_own_sample(tmp_path):
+    scene = dgp(tmp_path / "room")
+    path = scene / "scene_1.json"
+    content = json.loads(path.read_text())
+    for number, datum in enumerate(content["data"]):
+        datum["key"] = f"key{number}"
+    keys = [datum["key"] for datum in content["data"]]
+    # The last image is of no sample, and the lidar comes first.
+    content["samples"] = [
+        {"calibration_key": "abc", "datum_keys": keys[:3]},
+        {"calibration_key": "zoomed", "datum_keys": keys[3:-1]},
+    ]
+    path.write_text(json.dumps(content))
+    lenses = json.loads((scene / "calibration" / "abc.json").read_text())
+    lenses["intrinsics"][1] |= {key: 2 * lenses["intrinsics"][1][key] for key in ("fx", "fy")}
+    (scene / "calibration" / "zoomed.json").write_text(json.dumps(lenses))
+    photographs = open_photographs(scene)
+    focal = PARAMETERS[0]
+    focals = [photographs.camera(frame).K[0, 0].item() for frame in range(len(photographs))]
+    assert focals == pytest.approx([focal, focal, 2 * focal, 2 * focal, focal])
+    (scene / "calibration" / "zoomed.json").unlink()
+    with pytest.raises(InputError, match="calibration of .* is missing; put it at .*zoomed.json"):
+        open_photographs(scene)
+
+
+def test_a_lens_of_dgp_is_undistorted_or_refused(tmp_path):
+    scene = dgp(tmp_path / "room")
+    path = scene / "calibration" / "abc.json"
+    lenses = json.loads(path.read_text())
+    lens = lenses["intrinsics"][1]
+    lens |= {"k1": -0.2, "k2": 0.05, "p1": 0.001, "k4": 0.01, "fisheye": 0, "w": 0.0}
+    path.write_text(json.dumps(lenses))
+    distortion = open_photographs(scene).frame(0).intrinsics.distortion
+    assert distortion.radial == (-0.2, 0.05, 0.0)
+    assert distortion.tangential == (0.001, 0.0)
+    assert distortion.denominator == (0.01, 0.0, 0.0)
+    lens["fisheye"] = 1
+    path.write_text(json.dumps(lenses))
+    with pytest.raises(InputError, match="camera CAMERA_01 .* has `fisheye`, which is not read"):
+        open_photographs(scene)
+
+
+def test_two_scene_files_of_dgp_in_a_folder_are_two_scenes(tmp_path):
+    scene = dgp(tmp_path / "room")
+    content = json.loads((scene / "scene_1.json").read_text())
+    shorter = {**content, "data": content["data"][:3]}
+    (scene / "scene_2.json").write_text(json.dumps(shorter))
+    with pytest.raises(InputError, match="several scenes, such as scene_1 and scene_2"):
+        open_photographs(scene)
+    photographs = open_photographs(scene / "scene_2.json")
+    assert (photographs.name, len(photographs)) == ("room", 2)
 
 
 # Depth from sparse points.

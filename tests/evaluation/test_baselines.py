@@ -90,7 +90,7 @@ def test_a_cluster_keeps_mean_and_covariance_of_its_members():
 SMALL_TURN = torch.tensor([0.99, 0.05, -0.08, 0.03])
 
 
-def test_into_scene_undoes_carried():
+def test_a_scene_that_was_moved_is_moved_back():
     gaussians, camera = random_gaussians(40), camera_at(0.3, yaw=10)
     fit = Similarity(torch.tensor(1.0), SMALL_TURN, torch.tensor([0.2, -0.1, 0.3]))
     back = move_into_scene(move_scene(gaussians, fit), fit, camera)

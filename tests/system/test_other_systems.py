@@ -25,7 +25,8 @@ from gscompleter.evaluation.store import make_file_name
 from gscompleter.system.files import renaming, unfinished
 from gscompleter.system.files.names import fold_name, make_valid_name
 from gscompleter.system.files.output_folder import open_output_folder
-from gscompleter.system.files.writing import defer_interrupts, handle_stop_signals, replace_file
+from gscompleter.system.files.writing import replace_file
+from gscompleter.system.interrupts import defer_interrupts, handle_stop_signals
 from gscompleter.system.jobs.engines import open_local
 from scenes import camera_at, photographed
 

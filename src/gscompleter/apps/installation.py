@@ -23,7 +23,7 @@ from gscompleter.render.device import choose_device
 from gscompleter.render.gsplat_kernels import explain_missing_gpu
 from gscompleter.render.loading import load_renderer
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.writing import get_download_folder
+from gscompleter.system.files.downloads import get_download_folder
 from gscompleter.system.machine import describe_machine
 from gscompleter.types import Camera, Gaussians, make_observed, sh_from_rgb
 

@@ -79,9 +79,10 @@ def give_photographs_depth(
 def give_depth_before_scene(
     geometry: GivenGeometry, views: Sequence[View]
 ) -> tuple[list[View], tuple[str, ...]]:
-    """Give photographs the depth of geometry before a scene is made of them, and say what is so.
+    """Give photographs the depth of geometry before a scene is made of them; also return notes.
 
-    Raises ContradictedError if what they measure by their matches contradicts it.
+    Raises ContradictedError if the geometry covers hardly anything that they show, or if the depth
+    that they measure by their matches contradicts it.
     """
     drawn = [geometry.draw_depth(view.camera) for view in views]
     num_pixels = sum(depth.numel() for depth in drawn)
@@ -106,7 +107,8 @@ def give_depth_before_scene(
     if fit is None:
         note = f"The photographs show too little to compare {geometry.name} with; it is used as "
         return given, (f"{note}it is.",)
-    # The test of every given depth: a pair with errors of its poses measures no better than that.
+    # As every given depth is tested (`fit_depth_factor`): the factor is exactly 1 within the errors
+    # of poses.
     if not fit.is_consistent or fit.factor != 1.0:
         scale = f" by a factor of {1 / fit.factor:.3g}" if fit.is_consistent else ""
         raise ContradictedError(
@@ -150,19 +152,27 @@ def fit_to_surface(drawn: Float[Tensor, "h w"], surface: DepthMap) -> FittedDept
     """Drop the depth of geometry where it disagrees with the scene around, and bend the rest to it.
 
     So no step is left at the border of a hole by a deviation that counts as the same surface.
+    `drawn` is the z-depth of the geometry (`GivenGeometry.draw_depth`), and `surface` that of the
+    scene at the same camera.
     """
     is_there = drawn > 0
     compared = is_there & surface.valid
     if not compared.any():
-        # Nothing is seen here; at the photographs the geometry was the same as the scene.
+        # Nothing tells here; over all photographs the geometry was found to be what they show.
         return FittedDepth(drawn, torch.zeros_like(is_there))
-    ratio = torch.where(compared, surface.depth / drawn, 1.0).clamp_min(1e-6).log()
-    agrees = compared & (ratio.abs().expm1() <= MAX_DEVIATION)
+
+    # In logarithms, in which a factor and its inverse are as far from none.
+    log_ratio = torch.where(compared, surface.depth / drawn, 1.0).clamp_min(1e-6).log()
+    agrees = compared & (log_ratio.abs().expm1() <= MAX_DEVIATION)
+
+    # Where nothing is compared, as in a hole, the compared pixels around it decide.
     radius = max(1, round(COMPARED_AROUND * max(drawn.shape)))
     share = smooth_masked(agrees.to(drawn)[..., None], compared, radius)[..., 0]
     agreement = fill_smoothly(share, compared)
-    bent = drawn * fill_smoothly(ratio, agrees).exp()
     believed = is_there & (agreement >= MIN_AGREEING)
+
+    # The small deviations of the pixels that agree are continued in the same way.
+    bent = drawn * fill_smoothly(log_ratio, agrees).exp()
     return FittedDepth(bent.where(believed, 0.0), is_there & ~believed)
 
 
@@ -172,6 +182,7 @@ def add_geometry_depth(image: GeneratedView, view: TargetView) -> tuple[Generate
     if geometry is None:
         return image, GeometryUse()
     camera = view.camera.padded
+    # A faint surface in a hole is what is to be replaced, and proves nothing.
     seen = replace(view.surfaces, valid=view.surfaces.valid & ~view.holes)
     fit = fit_to_surface(geometry.draw_depth(camera), seen)
     num_holes = int(view.holes.sum().clamp_min(1))

@@ -11,14 +11,12 @@ import pytest
 
 from gscompleter import InputError
 from gscompleter.system.files import unfinished
+from gscompleter.system.files.downloads import get_download_folder
 from gscompleter.system.files.output_file import reserve_file
 from gscompleter.system.files.output_folder import open_output_folder
 from gscompleter.system.files.unfinished import digest_target
-from gscompleter.system.files.writing import (
-    defer_interrupts,
-    get_download_folder,
-    replace_file,
-)
+from gscompleter.system.files.writing import encode_text, replace_file
+from gscompleter.system.interrupts import defer_interrupts
 
 
 def test_events_that_windows_lists_among_the_signals_are_not_asked_for(monkeypatch):
@@ -45,6 +43,12 @@ def test_a_user_without_a_home_folder_is_told_where_to_name_one(monkeypatch):
     monkeypatch.setenv("GSCOMPLETER_HOME", "~nobody of this name/downloads")
     with pytest.raises(InputError, match="no home folder .* GSCOMPLETER_HOME"):
         get_download_folder()
+
+
+def test_a_byte_of_a_name_that_is_no_text_is_one_unknown_character_of_a_page():
+    name = os.fsdecode(b"caf\xe9.jpg")
+    assert encode_text(name).decode() == "caf\N{REPLACEMENT CHARACTER}.jpg"
+    assert encode_text("café \N{GRINNING FACE}").decode() == "café \N{GRINNING FACE}"
 
 
 def test_a_file_written_in_place_of_another_keeps_it_until_the_end(tmp_path):

@@ -403,7 +403,8 @@ def test_a_linked_folder_stays_a_link(tmp_path):
 
 WRITES = """
 import os, signal, sys, time
-from gscompleter.system.files.writing import handle_stop_signals, replace_file
+from gscompleter.system.files.writing import replace_file
+from gscompleter.system.interrupts import handle_stop_signals
 from gscompleter.system.files.output_folder import open_output_folder
 
 for number in (signal.SIGTERM, signal.SIGHUP):
@@ -557,7 +558,7 @@ def test_a_process_that_is_told_to_stop_cleans_up(tmp_path, results, name):
 def test_an_interrupt_while_results_are_replaced_leaves_nothing_behind(results, name):
     code = (
         "import os, shutil, sys\n"
-        "from gscompleter.system.files.writing import handle_stop_signals\n"
+        "from gscompleter.system.interrupts import handle_stop_signals\n"
         "from gscompleter.system.files.output_folder import open_output_folder\n"
         "import signal\nsignal.signal(signal.SIGTERM, signal.SIG_DFL)\n"
         "signal.signal(signal.SIGHUP, signal.SIG_DFL)\n"

@@ -1,16 +1,25 @@
-"""Scores of methods, and from them tables and figures of the paper."""
+"""Tables and figures of the paper, from scores of methods."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from gscompleter.apps.command_line.answers import print_json
-from gscompleter.apps.command_line.exit_codes import choose_exit_code
-from gscompleter.apps.evaluating.scoring import Scored, run_methods, score_methods
+from gscompleter.apps.evaluating.comparison import compare_runs
+from gscompleter.apps.evaluating.scoring import (
+    RUNS,
+    TABLES,
+    Scored,
+    awaits_other_shards,
+    choose_common_exit_code,
+    run_methods,
+    score_methods,
+    write_run_tables,
+)
 from gscompleter.apps.requests.evaluation import (
     CasesRequest,
     ComparisonRequest,
@@ -21,7 +30,6 @@ from gscompleter.config.generators import GeneratorOptions
 from gscompleter.evaluation.claims import CLAIM_COLUMNS, tabulate_claims
 from gscompleter.evaluation.figures import draw_figure
 from gscompleter.evaluation.measured_code import find_commit
-from gscompleter.evaluation.methods import expand_methods
 from gscompleter.evaluation.paper import (
     FigureSpec,
     Requirements,
@@ -31,14 +39,12 @@ from gscompleter.evaluation.paper import (
     select_names,
 )
 from gscompleter.evaluation.paper_tables import (
-    fill_comparison,
     fill_table,
-    format_paper_markdown,
     write_paper_table,
 )
 from gscompleter.evaluation.protocols import FRAME_RULES, list_indices, parse_protocol
 from gscompleter.evaluation.store import make_file_name, read_run_file
-from gscompleter.evaluation.tables import format_markdown, write_tables
+from gscompleter.evaluation.tables import format_markdown
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, NoCaseError, OutputError, WorkerError
 from gscompleter.system.files.writing import encode_text, replace_file
@@ -47,21 +53,8 @@ from gscompleter.system.machine import describe_machine
 
 SEPARATE_KINDS = ("stress", "sequence")
 """Kinds of the protocols that only tables of their own use."""
-TABLES = "tables"
-"""Folder of the tables in OUT."""
 FIGURES = "figures"
 """Folder of the figures in OUT."""
-RUNS = "runs"
-"""Folder in OUT with the scores of each run, as `evaluate` writes them."""
-COMMON_COLUMNS = ("psnr", "hole_psnr", "neighbours", "context_change")
-"""Columns of every table that compares models."""
-COMPARED_COLUMNS = {
-    "depth": (*COMMON_COLUMNS, "depth_observed", "depth_hole", "depth_hole_median"),
-    "generator": (*COMMON_COLUMNS, "st_lpips", "hole_flip", "hole_haarpsi", "hole_gradients"),
-}
-"""Columns of the table that compares models of a kind."""
-COMPARED_TITLES = {"depth": "depth", "generator": "Φ"}
-"""Title of the column that names them."""
 RESULTS_PAGE = "results.md"
 """Page in OUT with all tables, claims and figures."""
 
@@ -73,38 +66,6 @@ def run_evaluation(request: EvaluationRequest | ComparisonRequest | Reproduction
     if isinstance(request, ReproductionRequest):
         return reproduce(request)
     return run_methods(request)
-
-
-def compare_runs(request: ComparisonRequest) -> int:
-    """Run the methods with each model of a kind, and write one table; return the exit code."""
-    shared = request.run
-    kind = request.kind
-    console = make_console(stderr=True, quiet=shared.answer.quiet)
-    folders = {}
-    scored = []
-    for name, models in request.models.items():
-        console.print(f"{kind} {name}")
-        folder = shared.out / RUNS / make_file_name(f"{kind} {name}")
-        scored.append(score_methods(replace(shared, models=models, out=folder)))
-        write_tables(folder)
-        folders[name] = folder
-    methods = expand_methods(shared.methods)
-    title = f"{kind.title()}s compared"
-    columns = COMPARED_COLUMNS[kind]
-    table = fill_comparison(title, COMPARED_TITLES[kind], methods, columns, folders)
-    make_folder(shared.out / TABLES)
-    write_paper_table(shared.out / TABLES / f"{kind}s", table)
-    if shared.answer.json:
-        print_json(collect_outputs(shared.out))
-    elif not shared.answer.quiet:
-        print(format_paper_markdown(table))
-    return choose_common_exit_code(scored)
-
-
-def choose_common_exit_code(scored: Sequence[Scored]) -> int:
-    """Return the exit code of several runs, which counts the rows of each."""
-    failed = sum(len(run.failures) for run in scored)
-    return choose_exit_code(failed, sum(run.num_own_rows for run in scored))
 
 
 def reproduce(request: ReproductionRequest) -> int:
@@ -175,8 +136,13 @@ def collect_outputs(out: Path) -> dict[str, Any]:
 def write_output(
     request: ReproductionRequest, name: str, spec: Requirements, scored: list[Scored]
 ) -> None:
-    """Run what a table or figure needs, append the outcome to `scored`, and write it."""
+    """Run what a table or figure needs, append the outcome to `scored`, and write it.
+
+    Of several shards, the last one writes it.
+    """
     runs = run_all(request, spec, scored)
+    if awaits_other_shards(request.run, runs.values()):
+        return
     try:
         write_from_runs(request, name, spec, runs)
     except OutputError:  # an InputError, too, which keeps its exit code
@@ -230,7 +196,7 @@ def run_all(
             # Tables share runs: rows that an earlier one has scored are read, not computed again.
             run = make_run(request, spec, model, protocol)
             scored.append(score_methods(run))
-            write_tables(run.out)
+            write_run_tables(run.out)
             runs[model, Path(protocol).stem] = run.out
     return runs
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -25,10 +26,15 @@ from gscompleter.evaluation.methods import expand_methods
 from gscompleter.evaluation.protocols import Task
 from gscompleter.evaluation.runner import RunConfig, collect_context_notes, evaluate
 from gscompleter.evaluation.store import get_score_path, list_row_paths
+from gscompleter.evaluation.tables import write_tables
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError
 from gscompleter.system.progress import show_preparation, show_progress
 
+TABLES = "tables"
+"""Folder in OUT of the tables that compare several runs."""
+RUNS = "runs"
+"""Folder in OUT with the scores of each of these runs, as `run_methods` writes them."""
 MAX_NAMED_CASES = 5
 """Most cases of which a line says what Ψ said about their photographs."""
 
@@ -169,3 +175,28 @@ def describe_source(cases: CasesRequest, tasks: Sequence[Task]) -> dict[str, Any
         **({} if cases.near is None else {"near": cases.near}),
         **({} if cases.far is None else {"far": cases.far}),
     }
+
+
+def write_run_tables(folder: Path) -> None:
+    """Write the tables of one of several runs; a shard without cases has none."""
+    if list_row_paths(folder):
+        write_tables(folder)
+
+
+def awaits_other_shards(request: EvaluationRequest, folders: Iterable[Path]) -> bool:
+    """Check whether a table has to wait for other shards, which have all cases of a run; say so.
+
+    `folders` are those of the runs that the table compares.
+    """
+    _, num_shards = request.engine.share
+    if num_shards == 1 or all(list_row_paths(folder) for folder in folders):
+        return False
+    console = make_console(stderr=True, quiet=request.answer.quiet)
+    console.print("Not written yet: all cases of a run are those of other shards.", soft_wrap=True)
+    return True
+
+
+def choose_common_exit_code(scored: Sequence[Scored]) -> int:
+    """Return the exit code of several runs, which counts the rows of each."""
+    failed = sum(len(run.failures) for run in scored)
+    return choose_exit_code(failed, sum(run.num_own_rows for run in scored))

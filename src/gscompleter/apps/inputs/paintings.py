@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
@@ -55,10 +56,10 @@ def check_paintings(folder: Path, num_targets: int) -> None:
     if has_holes(folder):
         holes = read_holes(folder)
         # Named targets need some of the images: those of their cameras, which are not known yet.
-        for row in holes.frames if num_targets == 0 else ():
-            source = find_painted(folder, row.image_path, row, holes.path)
-            if source.suffix.lower() in PAINTING_ENDINGS:
-                read_colors_and_alpha(source)
+        if num_targets == 0:
+            for source in find_sources(folder, holes.frames, holes.path):
+                if not is_video_file(source):
+                    read_colors_and_alpha(source)
     elif num_targets == 0:
         raise InputError(
             f"{quote_value(folder)} has no {HOLES_FILE}, which tells the cameras of the images; "
@@ -76,11 +77,14 @@ def read_paintings(
     `holes.json` the images are called target1, target2, … in the order of the targets.
     """
     if not has_holes(folder):
-        names = [f"target{number}.png" for number in range(1, len(targets) + 1)]
-        return [
-            replace(target, painting=read_painting(find_painted(folder, name), target.camera))
-            for target, name in zip(targets, names, strict=True)
-        ]
+        painted = []
+        for number, target in enumerate(targets, start=1):
+            name = f"target{number}.png"
+            source = find_by_stem(folder, name, PAINTING_ENDINGS)
+            if source is None:
+                raise make_unpainted_error(folder, name)
+            painted.append(replace(target, painting=read_painting(source, target.camera)))
+        return painted
 
     holes = read_holes(folder)
     origin = photographs.origin.tolist()
@@ -96,7 +100,7 @@ def read_paintings(
                 "target",
             )
         rows.append(row)
-    sources = [find_painted(folder, row.image_path, row, holes.path) for row in rows]
+    sources = find_sources(folder, rows, holes.path)
     stills = read_video_frames(sources, rows, holes.path)
     return [
         replace(
@@ -107,23 +111,55 @@ def read_paintings(
     ]
 
 
+def is_video_file(source: Path) -> bool:
+    """Check whether what was painted is a video, rather than an image."""
+    return source.suffix.lower() in VIDEO_ENDINGS
+
+
+def find_sources(folder: Path, rows: Sequence[HoleRow], exported: PathRow | None) -> list[Path]:
+    """Find what was painted for each target: its image, or else the repaired video.
+
+    `exported` describes the video along the targets, None without one. Raise InputError for a
+    target that has neither.
+    """
+    # Telling a repaired video from the exported one reads all of it, so that is done once.
+    find_repaired = cache(partial(find_repaired_video, folder, exported))
+    sources = []
+    for row in rows:
+        source = find_by_stem(folder, row.image_path, PAINTING_ENDINGS, row.sha256)
+        if source is None and row.path_frame is not None:
+            source = find_repaired()
+        if source is None:
+            raise make_unpainted_error(folder, row.image_path, row)
+        sources.append(source)
+    return sources
+
+
+def find_repaired_video(folder: Path, exported: PathRow | None) -> Path | None:
+    """Find the video that was painted in place of images; None if there is only the exported."""
+    if exported is None:
+        return None
+    return find_by_stem(folder, exported.video_path, VIDEO_ENDINGS, exported.sha256)
+
+
 def read_video_frames(
-    sources: Sequence[Path], rows: Sequence[HoleRow], path: PathRow | None
+    sources: Sequence[Path], rows: Sequence[HoleRow], exported: PathRow | None
 ) -> list[UInt8[np.ndarray, "h w 3"] | None]:
     """Read the frame of each target that is painted in the video; None for the others.
 
-    `sources` are the painted image of each target or the repaired video, and `path` describes the
-    exported video. Raise InputError if the repaired one has another number of frames than that.
+    `sources` are those of `find_sources`, and `exported` describes the exported video. Raise
+    InputError if the repaired one has another number of frames than that.
     """
     numbers = [
-        row.path_frame if source.suffix.lower() in VIDEO_ENDINGS else None
+        row.path_frame if is_video_file(source) else None
         for source, row in zip(sources, rows, strict=True)
     ]
     wanted = set(numbers) - {None}
-    if not wanted or path is None:
+    if not wanted or exported is None:
         return [None] * len(sources)
 
-    video = next(source for source in sources if source.suffix.lower() in VIDEO_ENDINGS)
+    # All of them are frames of the same video.
+    video = next(filter(is_video_file, sources))
     # Only the wanted frames are kept, since all of them would fill the memory.
     frames = {}
     count = 0
@@ -131,10 +167,10 @@ def read_video_frames(
         if count in wanted:
             frames[count] = frame
         count += 1
-    if count != path.num_frames:
+    if count != exported.num_frames:
         raise InputError(
-            f"{quote_value(video)} has {count} frames, and {path.num_frames} were exported; keep "
-            "all of them, whatever their size and rate.",
+            f"{quote_value(video)} has {count} frames, and {exported.num_frames} were exported; "
+            "keep all of them, whatever their size and rate.",
             "images",
         )
     return [None if number is None else frames[number] for number in numbers]
@@ -172,30 +208,19 @@ def add_exported_photograph(
     return target
 
 
-def find_painted(
-    folder: Path, name: str, row: HoleRow | None = None, path: PathRow | None = None
-) -> Path:
-    """Find the painted image that is named like `name`, or else the repaired video.
+def make_unpainted_error(folder: Path, name: str, row: HoleRow | None = None) -> InputError:
+    """Make the error of a target without a painted image, which `name` would be.
 
-    The exported image itself, which the checksum of its `row` tells, is not painted. The painted
-    one may lie beside it, with another ending. `path` describes the exported video, which may have
-    been repaired instead; None without one. Raise InputError if there is neither.
+    `row` is its entry in `holes.json`; None without that file.
     """
-    painted = find_by_stem(folder, name, PAINTING_ENDINGS, None if row is None else row.sha256)
-    if painted is not None:
-        return painted
-    if path is not None and row is not None and row.path_frame is not None:
-        video = find_by_stem(folder, path.video_path, VIDEO_ENDINGS, path.sha256)
-        if video is not None:
-            return video
     if row is not None and find_by_stem(folder, name, PAINTING_ENDINGS) is not None:
-        raise InputError(
+        return InputError(
             f"{quote_value(folder / name)} is as it was exported; paint what "
             f"{quote_value(row.hole_mask_path)} shows white, or take its entry out of "
             f"{HOLES_FILE}.",
             "images",
         )
-    raise InputError(
+    return InputError(
         f"{quote_value(folder)} has no {Path(name).stem}.png (or .jpg, .webp); paint it, or name "
         "the targets that are painted.",
         "images",

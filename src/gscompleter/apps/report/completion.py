@@ -13,9 +13,9 @@ from gscompleter import __version__
 from gscompleter.apps.inputs.task import InputSplatFile, Target
 from gscompleter.apps.report.pictures import (
     IMAGES_FOLDER,
+    make_writing_draw,
     write_images,
     write_pictures,
-    write_what_is_drawn,
 )
 from gscompleter.apps.report.record import MAX_PHOTOGRAPHS, make_record, thin_evenly
 from gscompleter.apps.report.removal_pictures import draw_removal
@@ -74,7 +74,7 @@ def write_report(
     if not completion.targets:
         photos = [photo.view for photo in completion.photos]
         shown = [*photos, *(photograph.view for photograph in held_out)]
-        draw = write_what_is_drawn(folder / IMAGES_FOLDER, shown, draw)
+        draw = make_writing_draw(folder / IMAGES_FOLDER, shown, draw)
     scores = make_score_rows(
         completion, targets, at_targets, gaps, renderer, held_out, files, has_searched, draw
     )

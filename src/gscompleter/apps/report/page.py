@@ -191,7 +191,7 @@ def render_completion_page(folder: Path) -> str:
 def list_photographs(summary: CompletionSummary) -> list[tuple[str, ScoreRow, str]]:
     """List the photographs of a page without targets: how names of its images begin, row and use.
 
-    The images are numbered in the order in which `write_what_is_drawn` was given the photographs.
+    The images are numbered in the order in which `make_writing_draw` was given the photographs.
     """
     if summary.targets:
         return []

@@ -46,8 +46,8 @@ def write_pictures(
             write_images(folder, f"context{number}", {ending: paint_ignored(view)})
 
 
-def write_what_is_drawn(folder: Path, views: Sequence[View], draw: Drawing) -> Drawing:
-    """Return a `draw` that also writes the photograph and both renders of what it draws.
+def make_writing_draw(folder: Path, views: Sequence[View], draw: Drawing) -> Drawing:
+    """Make a `draw` that also writes the photograph and both renders of what it draws.
 
     `views` are all views that it may be asked for, the same objects, and number the files from 1.
     So no image has to be kept, or rendered twice.
@@ -83,8 +83,8 @@ def paint_unfilled(result: TargetResult, pair: RenderPair) -> Float[Tensor, "h w
 def paint_reference(result: TargetResult, dilation: int) -> Float[Tensor, "h w 3"] | None:
     """Paint what was synthesized for a target where it was used; None if nothing was.
 
-    Elsewhere it is the scene before: there the image of Φ only guides the registration, and it may
-    look worse than the scene.
+    Elsewhere it is the scene as this target found it, with what earlier ones added: there the image
+    of Φ only guides the registration, and it may look worse than the scene.
     """
     if result.reference is None:
         return None
@@ -97,8 +97,9 @@ def name_target_images(
 ) -> dict[str, Tensor | None]:
     """Name the images of a target: colours [h, w, 3], or grey and masks [h, w]; None to have none.
 
-    `dilation` is that of the hole mask, in pixels. `support` is the trusted part of the scene's
-    alpha, which tells nothing where all of it is trusted.
+    `dilation` is that of the hole mask, in pixels. `before` and `after` are of the whole completion
+    (`pair`), and the rest is of the step of this target (`result`). `support` is the trusted part
+    of the scene's alpha, which tells nothing where all of it is trusted.
     """
     alpha = result.trusted_alpha
     return {

@@ -18,7 +18,8 @@ from http.client import HTTPException
 from pathlib import Path
 
 from gscompleter.system.errors import InputError
-from gscompleter.system.files.writing import get_download_folder, replace_file
+from gscompleter.system.files.downloads import get_download_folder
+from gscompleter.system.files.writing import replace_file
 
 LOCK_FILE = Path(__file__).with_name("package-lock.json")
 BUILT_LIBRARIES = Path(__file__).with_name("libraries.json")

@@ -20,7 +20,7 @@ from torch.autograd.function import once_differentiable
 from gscompleter.numerics.geometry import multiply_quats, quats_to_rotations
 from gscompleter.render.protocols import Renderer
 from gscompleter.system.progress import track
-from gscompleter.types import Camera, Gaussians, View
+from gscompleter.types import Camera, Gaussians, Render, View
 
 EPSILON = 0.1
 """Entropic regularization, in squared scene units as the costs."""
@@ -34,8 +34,13 @@ DEPTH_WEIGHT = 0.1
 """Weight of the summed errors of depth, in scene units, relative to those of colours in [0, 1]."""
 PATIENCE = 10
 """The mixture distance is dropped once it is no less than all of this many steps before."""
+COVERAGE_POWER = 3
+"""Power of the coverage by lifted Gaussians that weights errors of colours."""
 MAX_BATCH = 2**14
 """Matrices whose eigenvalues are computed at a time."""
+MIN_EIGENVALUE = 1e-6
+"""Number that is added to the diagonal of matrices before their root, in their own unit: it keeps
+the roots of flat Gaussians above 0."""
 
 
 @dataclass(frozen=True)
@@ -92,17 +97,13 @@ def register_by_similarity(
     """
     camera = reference.camera
     own = renderer.render(lifted, camera)
-    theirs = renderer.render(scene, camera)
+    is_lifted = own.depth_map().valid
     # Pixels that the lifted Gaussians hardly cover say nothing about their place, so that colours
     # count less than in proportion there.
-    coverage = own.alpha.detach()[..., None] ** 3
+    coverage = own.alpha.detach()[..., None] ** COVERAGE_POWER
 
-    # The scale begins at the ratio of the depths that both see; the pose is known, so that rotation
-    # and translation begin at none.
-    both = own.depth_map().valid & theirs.depth_map().valid
-    ratio = own.depth.new_ones(())
-    if both.any():
-        ratio = theirs.depth[both].median() / own.depth[both].median()
+    # The pose is known, so that rotation and translation begin at none.
+    ratio = measure_depth_ratio(own, renderer.render(scene, camera))
     scale = ratio.detach().clone().requires_grad_()
     quaternion = scale.detach().new_tensor([1.0, 0.0, 0.0, 0.0]).requires_grad_()
     translation = torch.zeros(3, device=scale.device, requires_grad=True)
@@ -122,7 +123,7 @@ def register_by_similarity(
         fit = Similarity(scale, quaternion, translation)
         moved = renderer.render(move_scene(scene, fit), camera)
         colour = ((moved.image - reference.image).abs() * coverage).sum()
-        overlap = own.depth_map().valid & moved.depth_map().valid
+        overlap = is_lifted & moved.depth_map().valid
         depth = (moved.depth - scale * own.depth.detach())[overlap].abs().sum()
         loss = colour + DEPTH_WEIGHT * depth
 
@@ -148,6 +149,17 @@ def register_by_similarity(
         optimizer.step()
     similarity = best or Similarity(scale.detach(), quaternion.detach(), translation.detach())
     return move_into_scene(lifted, similarity, camera)
+
+
+def measure_depth_ratio(lifted: Render, scene: Render) -> Float[Tensor, ""]:
+    """Measure the ratio of the scene's median depth to that of the lifted where both are seen.
+
+    1 if no pixel sees both.
+    """
+    both = lifted.depth_map().valid & scene.depth_map().valid
+    if not both.any():
+        return lifted.depth.new_ones(())
+    return scene.depth[both].median() / lifted.depth[both].median()
 
 
 def move_scene(scene: Gaussians, fit: Similarity) -> Gaussians:
@@ -248,9 +260,9 @@ def compute_pairwise_costs(a: Mixture, b: Mixture) -> Float[Tensor, "n m"]:
 def compute_matrix_root(matrices: Float[Tensor, "*n 3 3"]) -> Float[Tensor, "*n 3 3"]:
     """Compute square roots of positive matrices, differentiable at equal eigenvalues."""
     # The gradient of `eigh` divides by differences of eigenvalues, which are 0 for round Gaussians;
-    # `_MatrixRoot` divides by sums of their roots. The diagonal keeps these above 0 for flat ones.
+    # `_MatrixRoot` divides by sums of their roots.
     identity = torch.eye(3, dtype=matrices.dtype, device=matrices.device)
-    return _MatrixRoot.apply(matrices + 1e-6 * identity)
+    return _MatrixRoot.apply(matrices + MIN_EIGENVALUE * identity)
 
 
 class _MatrixRoot(torch.autograd.Function):

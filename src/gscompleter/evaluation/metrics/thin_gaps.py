@@ -22,10 +22,11 @@ from gscompleter.render.protocols import Renderer
 from gscompleter.types import Camera, Gaussians, Render
 
 OPAQUE_ALPHA = 0.85
-"""Alpha below which black is seen through a surface."""
+"""Alpha below which the black behind a surface is seen through it."""
 FLIGHT_SHARES = (0.2, 0.4, 0.6, 0.8)
 """Places of the cameras of a flight, as shares of the way to the target."""
 AT_TARGET = "at the target"
+"""Place of a render at the target itself, as `WorstGap.where` names it."""
 WINDOW = 64
 """Side in pixels of the window in which the worst place of gaps is looked for."""
 
@@ -79,27 +80,42 @@ def find_worst_gap(renders: Mapping[str, Render]) -> WorstGap | None:
     worst = None
     for where, render in renders.items():
         gaps = find_thin_gaps(render.alpha)
-        height, width = gaps.shape
         # A crop is square, and an image may be smaller than the window.
-        side = min(WINDOW, height, width)
-        # Whole numbers, which add up without rounding: along x, then along y.
-        counts = gaps.to(torch.float64)[None, None]
-        for window in ((1, side), (side, 1)):
-            counts = avg_pool2d(counts, window, stride=1, divisor_override=1)
-        shares = counts[0, 0] / side**2
+        side = min(WINDOW, *gaps.shape)
+        shares = count_in_windows(gaps, side) / side**2
         share = shares.max().item()
         if share > (0.0 if worst is None else worst.share):
             row, column = divmod(int(shares.argmax()), shares.shape[1])
-            # The first such window has its gaps at its lower right. One around their middle has the
-            # same, since none has more.
-            inside = gaps[row : row + side, column : column + side].nonzero()
-            middle = (inside.amin(dim=0) + inside.amax(dim=0) + 1) // 2 - side // 2
-            top = min(max(row + int(middle[0]), 0), height - side)
-            left = min(max(column + int(middle[1]), 0), width - side)
+            top, left = center_window(gaps, row, column, side)
             box = (slice(top, top + side), slice(left, left + side))
             # A copy, so that the image is not kept for it.
             worst = WorstGap(where, share, left, top, render.image[box].clone(), gaps[box].clone())
     return worst
+
+
+def count_in_windows(mask: Bool[Tensor, "h w"], side: int) -> Float[Tensor, "rows columns"]:
+    """Count the True pixels in each square window, by its upper left pixel."""
+    # Whole numbers, which add up without rounding. A box is separable: along x, then along y.
+    counts = mask.to(torch.float64)[None, None]
+    for window in ((1, side), (side, 1)):
+        counts = avg_pool2d(counts, window, stride=1, divisor_override=1)
+    return counts[0, 0]
+
+
+def center_window(gaps: Bool[Tensor, "h w"], top: int, left: int, side: int) -> tuple[int, int]:
+    """Center a window of the most gaps around those in it, as far as the image reaches.
+
+    The first of several such windows has its gaps at its lower right. Return row and column of the
+    upper left pixel. The window that results holds all gaps of the given one, and no more, since
+    none has more.
+    """
+    inside = gaps[top : top + side, left : left + side].nonzero()
+    middle = (inside.amin(dim=0) + inside.amax(dim=0) + 1) // 2 - side // 2
+    height, width = gaps.shape
+    return (
+        min(max(top + int(middle[0]), 0), height - side),
+        min(max(left + int(middle[1]), 0), width - side),
+    )
 
 
 def plan_flight(photographs: Sequence[Camera], target: Camera) -> list[Camera]:

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from gscompleter.models.weights.published import PublishedWeights
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.writing import get_download_folder
+from gscompleter.system.files.downloads import get_download_folder
 
 MAX_RETRIES = 2
 """Number of retries of a request to the hub."""

@@ -47,9 +47,9 @@ from gscompleter.system.files.writing import (
     STROKES_FILE,
     SUMMARY_FILE,
     convert_write_errors,
-    defer_interrupts,
     keep_permissions,
 )
+from gscompleter.system.interrupts import defer_interrupts
 
 FILES = "files"
 """Entry of `summary.json`: the files of the run."""

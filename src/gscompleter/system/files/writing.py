@@ -1,21 +1,17 @@
-"""Atomic writes: a file is written completely or left as it was.
-
-Interrupts (Ctrl-C, `kill`, a scheduler, or a closed terminal) wait while results are renamed.
-"""
+"""Atomic writes: a file is written completely or left as it was; and the names of results."""
 
 from __future__ import annotations
 
 import errno
 import os
-import signal
+import re
 import stat
-import threading
 from collections.abc import Container, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import BinaryIO
 
-from gscompleter.system.errors import FullDiskError, InputError, OutputError, quote_value
+from gscompleter.system.errors import FullDiskError, OutputError, quote_value
 from gscompleter.system.files.renaming import replace
 from gscompleter.system.files.unfinished import give_signs, make_unfinished_name
 
@@ -111,10 +107,8 @@ def encode_text(text: str) -> bytes:
 
     Names of files may hold bytes that are no UTF-8; each becomes the sign for an unknown character.
     """
-    try:
-        return text.encode()
-    except UnicodeEncodeError:
-        return text.encode("utf-8", "surrogatepass").decode("utf-8", "replace").encode()
+    # Python reads a byte that is no UTF-8 as a lone surrogate, which UTF-8 cannot write.
+    return re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", text).encode()
 
 
 def refuse_special_file(path: Path) -> None:
@@ -143,56 +137,4 @@ def convert_write_errors(path: Path | str, numbers: Container[int] | None = None
         raise kind(
             f"Cannot write {quote_value(Path(path))}: {error.strerror or error}; free some space, "
             "or choose another place."
-        ) from error
-
-
-def handle_stop_signals() -> None:
-    """Let the signals that end a process raise KeyboardInterrupt, so that it cleans up.
-
-    Signals that are ignored (`nohup`) or handled already stay so. This works in the main thread
-    only.
-    """
-    for name in ("SIGTERM", "SIGHUP", "SIGBREAK"):
-        number = getattr(signal, name, None)  # only Windows has the last, and no SIGHUP
-        if number is not None and signal.getsignal(number) is signal.SIG_DFL:
-            signal.signal(number, signal.default_int_handler)
-
-
-@contextmanager
-def defer_interrupts(state: str) -> Iterator[None]:
-    """Defer KeyboardInterrupt to the end of a block.
-
-    It has the message `state`; none if the block failed, whose error it then replaces.
-    """
-    came: list[int] = []
-    handled = []
-    if threading.current_thread() is threading.main_thread():
-        numbers = signal.valid_signals()  # on Windows, `Signals` has others
-        handled = [n for n in numbers if signal.getsignal(n) is signal.default_int_handler]
-    for number in handled:
-        signal.signal(number, lambda number, _: came.append(number))
-    is_done = False
-    try:
-        yield
-        is_done = True
-    finally:
-        for number in handled:
-            signal.signal(number, signal.default_int_handler)
-        # After a failure, too: who handles that would go on, though the process was told to end.
-        if came:
-            raise KeyboardInterrupt(*([state] if is_done else []))
-
-
-def get_download_folder() -> Path:
-    """Return $GSCOMPLETER_HOME, or else ~/.cache/gscompleter.
-
-    Raise InputError if a `~` leads nowhere, as for a user without a home folder in a container.
-    """
-    named = os.environ.get("GSCOMPLETER_HOME") or "~/.cache/gscompleter"
-    try:
-        return Path(named).expanduser()
-    except RuntimeError as error:
-        raise InputError(
-            f"There is no home folder for {quote_value(named)}; name a folder for downloads by "
-            "the environment variable GSCOMPLETER_HOME."
         ) from error

@@ -22,7 +22,7 @@ from typing import Any
 
 from gscompleter.system.children import hide_working_folder
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.writing import handle_stop_signals
+from gscompleter.system.interrupts import handle_stop_signals
 from gscompleter.system.jobs.jobs import Pool, WorkerShare
 from gscompleter.system.memory import estimate_bytes, read_memory_bytes
 from gscompleter.system.threads import count_available_cores, limit_threads
