@@ -217,9 +217,11 @@ STEPS_METHODS: dict[str, Method] = {
 }
 """The paper's method with other numbers of denoising steps."""
 
-ABLATION_CONFIGS = {"unconstrained" if config == "3-dof" else config: config for config in ABLATIONS}
-"""Name of the config of each ablation, by the name of its method. They differ for `3-dof`: the paper
-compares its constraint to rays with a registration without it."""
+ABLATION_CONFIGS = {
+    "unconstrained" if config == "3-dof" else config: config for config in ABLATIONS
+}
+"""Config of each ablation by the name of its method. They differ for `3-dof`, with which the paper
+compares its constraint to rays, under the name of what it lacks."""
 
 METHODS: dict[str, Method] = {
     "context": keep_scene,
