@@ -36,6 +36,7 @@ from gscompleter.apps.viewer import page as pages
 from gscompleter.apps.viewer.exhibit import (
     ViewerCamera,
     ViewerContent,
+    add_file_cameras,
     load_viewer_completion,
     load_viewer_files,
     make_frame_thumbnail,
@@ -563,6 +564,13 @@ def test_cameras_bring_their_photographs_as_thumbnails(packed, tmp_path, monkeyp
     ]
     assert shots[0]["thumbnail"] is not None
     assert shots[1]["thumbnail"] is None
+
+
+def test_cameras_of_another_machine_are_called_by_the_names_of_their_photographs(tmp_path):
+    paths = ["images\\left.png", "C:\\Users\\me\\scan\\gone.png"]
+    write_cameras(tmp_path / "transforms.json", [LEFT, TARGET], paths)
+    content = add_file_cameras(room_exhibit(), tmp_path / "transforms.json", None)
+    assert [camera.title for camera in content.cameras[-2:]] == ["left.png", "gone.png"]
 
 
 def test_cameras_of_a_colmap_folder_are_jumped_to(packed, tmp_path, monkeypatch):

@@ -102,9 +102,9 @@ class Capture:
     """Their names as photographs, which the user sees and may give."""
     source: CaptureSource
     where: str
-    """Clause that says which cameras they are."""
+    """Words that say which cameras they are, from "cameras" on."""
     more: str
-    """Clause on what else could be given; empty if the user named the cameras."""
+    """Words on what else could be given, from a semicolon on; empty if the user named them."""
     upward: Upward | None = None
     """What is up for them; None for cameras that are not placed by it."""
     others: Sequence[Camera] = ()
@@ -124,7 +124,7 @@ def find_cameras_beside(splat: Path) -> Path | None:
 
 
 def take_from_file(path: Path, known: Photographs, request: RenderRequest) -> Capture:
-    """Take all cameras of a file, which are those of `known`."""
+    """Take all cameras of the file `path`, which `known` holds relative to its origin."""
     where = f"cameras of {quote_value(path)}"
     more = ""
     if request.cameras is None:
@@ -143,8 +143,9 @@ def find_cameras_alone(
 ) -> Capture:
     """Find cameras by the splat alone.
 
-    That of a pixel-aligned splat, at `pixel_center`, is taken with small moves of it; a trained
-    splat tells no more than from where it looks well.
+    That of a pixel-aligned splat is taken with small moves of it. It stands at `pixel_center`, in
+    the frame of `scene`; None for a trained splat, which tells no more than from where it looks
+    well.
 
     Raises:
         InputError: The camera of a pixel-aligned splat sees too little of it, or a trained splat
@@ -153,7 +154,8 @@ def find_cameras_alone(
     upward = request.find_up(scene, renderer)
     if pixel_center is None:
         return find_standing_cameras(scene, renderer, upward, request)
-    # Two photographs are the fewest, so that no image had more pixels than half of the Gaussians.
+    # Each pixel made a Gaussian, and two photographs are the fewest that make such a splat: none
+    # had more pixels than half of the Gaussians.
     side = max(MIN_FOUND_SIDE, round((len(scene) / 2) ** 0.5))
     if request.reading.resolution is not None:
         side = min(side, choose_side(request.reading.resolution))
@@ -214,10 +216,10 @@ def search_around_place(
 
 
 def choose_side(resolution: tuple[int, int] | int | None) -> int:
-    """Choose the width and height of the square cameras that are found.
+    """Choose the width and height of the square cameras that are found, in pixels.
 
-    They are the largest square in the size that was asked for. A trained splat has no full size,
-    for which None stands: they then have the usual one.
+    They are the largest square in the size that was asked for: height and width, or the longer
+    side. A trained splat has no full size, for which None stands: they then have the usual one.
     """
     if resolution is None:
         return DEFAULT_LONG_SIDE

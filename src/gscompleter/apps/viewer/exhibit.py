@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from jaxtyping import Float
@@ -251,7 +251,7 @@ def add_file_cameras(content: ViewerContent, path: Path, resolution: Resolution)
     shots = [
         ViewerCamera(
             f"camera-{number}",
-            Path(frame.name).name or f"Camera {number}",
+            PurePosixPath(frame.file_name).name or f"Camera {number}",
             camera,
             make_frame_thumbnail(frame),
         )
