@@ -102,7 +102,7 @@ class Capture:
     """Their names as photographs, which the user sees and may give."""
     source: CaptureSource
     where: str
-    """Words that say which cameras they are, from "cameras" on."""
+    """Words that say which cameras they are, and follow that word."""
     more: str
     """Words on what else could be given, from a semicolon on; empty if the user named them."""
     upward: Upward | None = None
@@ -125,7 +125,7 @@ def find_cameras_beside(splat: Path) -> Path | None:
 
 def take_from_file(path: Path, known: Photographs, request: RenderRequest) -> Capture:
     """Take all cameras of the file `path`, which `known` holds relative to its origin."""
-    where = f"cameras of {quote_value(path)}"
+    where = f"of {quote_value(path)}"
     more = ""
     if request.cameras is None:
         where += ", which was found beside the splat,"
@@ -170,7 +170,7 @@ def find_cameras_alone(
             "cameras it was made from with --cameras."
         )
     cameras = move_beside(camera, seen.depth[seen.valid].median().item())
-    where = "cameras that follow from the sizes of its Gaussians"
+    where = "that follow from the sizes of its Gaussians"
     return name_capture(cameras, "pixels", where, request, upward)
 
 
@@ -186,7 +186,7 @@ def find_standing_cameras(
             "--cameras, or which way is up with --up."
         )
     best = cameras[:NUM_STANDPOINTS]
-    where = "cameras from which it looks like a photograph"
+    where = "from which it looks like a photograph"
     found = name_capture(best, "standpoints", where, request, upward)
     return replace(found, others=cameras[NUM_STANDPOINTS:])
 
@@ -212,7 +212,7 @@ def search_around_place(
             "No camera around what is to be removed sees it unhidden; name cameras with --cameras, "
             "or which way is up with --up."
         )
-    return name_capture(cameras, "place", "cameras around what is removed", request, upward)
+    return name_capture(cameras, "place", "around what is removed", request, upward)
 
 
 def choose_side(resolution: tuple[int, int] | int | None) -> int:
@@ -247,7 +247,7 @@ def search_around(
             "scene, or name cameras with --cameras.",
             "target",
         )
-    where = "cameras that were found around the targets"
+    where = "found around the targets"
     return name_capture(cameras, "targets", where, request)
 
 
@@ -269,7 +269,8 @@ def describe_capture(capture: Capture, num_chosen: int) -> str:
     """Write the sentence on the cameras whose renders take the place of photographs."""
     total = len(capture.cameras)
     count = f"{total}" if num_chosen == total else f"{num_chosen} of the {total}"
+    noun = "camera" if total == 1 else "cameras"
     return (
-        f"There are no photographs: renders of the splat at {count} {capture.where} take their "
-        f"place{capture.more}."
+        f"There are no photographs: renders of the splat at {count} {noun} {capture.where} take "
+        f"their place{capture.more}."
     )

@@ -68,7 +68,7 @@ def is_between(
     brightest: Shaped[np.ndarray, "c"],
     spread: float,
 ) -> Bool[np.ndarray, "*shape"]:
-    """Tell the colours that are neither level of a mask, whose brightness has a range `spread`."""
+    """Find the colours that are neither level of a mask whose brightness ranges over `spread`."""
     limit = LEVEL_TOLERANCE * spread
     is_dark = (np.abs(colors - darkest) <= limit).all(axis=-1)
     is_bright = (np.abs(colors - brightest) <= limit).all(axis=-1)
