@@ -35,12 +35,15 @@ def write_depth(path: Path | str, depth: Float[Tensor, "h w"], unit: float) -> N
 
 
 def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
-    """Read z-depth from a 16-bit PNG or a `.npy` file, times `unit`; 0 where unknown."""
-    if path.suffix == ".npy":
+    """Read z-depth from a 16-bit image or a `.npy` file, times `unit`; 0 where unknown.
+
+    The image is a grey PNG, usually, or a TIFF or PGM; a TIFF may hold floating-point values.
+    """
+    if path.suffix.lower() == ".npy":
         values = _read_npy(path)
     else:
         with open_image(path) as image:
-            values = np.array(image)
+            values = _read_levels(image)
     values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
     if values.ndim != 2 or values.dtype.kind not in "uif" or values.dtype == np.uint8:
         raise InputError(
@@ -50,6 +53,18 @@ def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
     with np.errstate(over="ignore", invalid="ignore"):
         depth = (values.astype(np.float64) * unit).astype(np.float32)
     return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
+
+
+def _read_levels(image: Image.Image) -> np.ndarray:
+    """Read the levels of a grey image as they are stored."""
+    # Pillow spreads those of a PGM, from 0 to the largest that its header names, over 16 bits. They
+    # are known until the image is loaded.
+    spread = [tile[3] for tile in getattr(image, "tile", ()) if tile[0] in ("ppm", "ppm_plain")]
+    values = np.array(image)
+    if not spread or image.mode != "I":
+        return values
+    _, largest = spread[0]
+    return np.rint(values * (largest / 65535))
 
 
 def _read_npy(path: Path) -> np.ndarray:
