@@ -16,7 +16,8 @@ from gscompleter import InputError, load_ply, save_ply
 from gscompleter.models.weights.fitting import load_strictly
 from gscompleter.models.weights.published import PUBLISHED
 from gscompleter.models.weights.reading import check_kind, extract_network_tensors
-from gscompleter.system.files.image import read_depth, read_image, read_image_size, read_pixels
+from gscompleter.system.files.depth_file import read_depth
+from gscompleter.system.files.image import read_image, read_image_size, read_pixels
 from gscompleter.system.files.reading import read_json
 from scenes import random_gaussians
 

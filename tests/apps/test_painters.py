@@ -24,7 +24,8 @@ from gscompleter.data.formats import open_photographs
 from gscompleter.data.photograph_names import name_target
 from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.system.errors import InputError
-from gscompleter.system.files.image import read_depth, read_image, read_pixels, write_depth
+from gscompleter.system.files.depth_file import read_depth, write_depth
+from gscompleter.system.files.image import read_image, read_pixels
 from gscompleter.system.files.reading import hash_file
 from gscompleter.system.files.video import read_video, write_video
 from scenes import Room, camera_at, cast, photographed, view_of

@@ -12,7 +12,12 @@ import torch
 
 from command import run
 from gscompleter import load_cameras, load_ply, save_ply
-from gscompleter.apps.inputs.captures import Capture, RenderRequest, choose_side
+from gscompleter.apps.inputs.captures import (
+    Capture,
+    RenderRequest,
+    choose_side,
+    describe_capture,
+)
 from gscompleter.apps.inputs.renders import make_frames, open_renders
 from gscompleter.apps.inputs.splat import read_splat, sort_splat
 from gscompleter.apps.requests.scene import SceneRequest
@@ -334,12 +339,23 @@ def test_cameras_that_are_found_have_the_depth_range_that_was_given(
     assert {(view.camera.near, view.camera.far) for view in task.views} == {(0.01, 300.0)}
 
 
+@pytest.mark.parametrize(
+    ("total", "chosen", "words"),
+    [(1, 1, "at 1 camera found"), (3, 3, "at 3 cameras found"), (3, 1, "at 1 of the 3 cameras f")],
+)
+def test_the_sentence_on_renders_counts_their_cameras(total, chosen, words):
+    cameras = [make_camera(x / 10) for x in range(total)]
+    names = [f"render{number}" for number in range(total)]
+    capture = Capture(cameras, names, "targets", "found around the targets", "")
+    assert f"renders of the splat {words}" in describe_capture(capture, chosen)
+
+
 def test_the_frames_of_cameras_in_float64_leave_these_where_they_stand(folder):
     splat = SplatRequest(folder / "splat.ply")
     scene, _ = sort_splat(read_splat(splat), splat, "cpu")
     camera = make_camera(0.3)
     exact = replace(camera, c2w=camera.c2w.double(), K=camera.K.double())
-    capture = Capture([exact], ["a"], "cameras", "cameras", "")
+    capture = Capture([exact], ["a"], "cameras", "of a file", "")
     (frame,) = make_frames(capture, scene, load_renderer("cpu"), np.array([100.0, 0, 0]))
     assert exact.center.tolist() == camera.center.tolist()
     assert frame.c2w[0, 3] == 100 + exact.center[0].item()

@@ -36,6 +36,7 @@ from gscompleter.apps.viewer import page as pages
 from gscompleter.apps.viewer.exhibit import (
     ViewerCamera,
     ViewerContent,
+    add_file_cameras,
     load_viewer_completion,
     load_viewer_files,
     make_frame_thumbnail,
@@ -375,6 +376,20 @@ def test_the_targets_of_a_completion_are_brought_into_the_frame_of_its_scenes(tm
     assert "gone" in exhibit.notes[0]
 
 
+def test_a_completion_whose_input_splat_is_gone_is_shown_alone_with_a_note(tmp_path):
+    """With `--save-as` that splat is the scene before, and its user may move it."""
+    folder = completion_in(tmp_path / "out", np.eye(4), np.zeros(3))
+    splat = (folder / "context.ply").rename(tmp_path / "input.ply")
+    change_summary(folder, "scene", "context", str(splat))
+    assert load_viewer_completion(folder, False).before is not None
+    splat.unlink()
+    exhibit = load_viewer_completion(folder, False)
+    assert [shot.name for shot in exhibit.cameras] == ["target-1"]
+    assert exhibit.notes[0].startswith("The scene before is not shown")
+    assert str(splat) in exhibit.notes[0]
+    assert "before" not in content_of(make_page(exhibit, NONE)[0])["layers"]
+
+
 def test_photographs_of_a_completion_are_jumped_to(tmp_path):
     folder = completion_in(tmp_path / "out", np.eye(4), np.zeros(3))
     (folder / "gone").mkdir()
@@ -549,6 +564,13 @@ def test_cameras_bring_their_photographs_as_thumbnails(packed, tmp_path, monkeyp
     ]
     assert shots[0]["thumbnail"] is not None
     assert shots[1]["thumbnail"] is None
+
+
+def test_cameras_of_another_machine_are_called_by_the_names_of_their_photographs(tmp_path):
+    paths = ["images\\left.png", "C:\\Users\\me\\scan\\gone.png"]
+    write_cameras(tmp_path / "transforms.json", [LEFT, TARGET], paths)
+    content = add_file_cameras(room_exhibit(), tmp_path / "transforms.json", None)
+    assert [camera.title for camera in content.cameras[-2:]] == ["left.png", "gone.png"]
 
 
 def test_cameras_of_a_colmap_folder_are_jumped_to(packed, tmp_path, monkeypatch):

@@ -247,6 +247,26 @@ def test_soft_and_compressed_edges_are_no_labels(tmp_path):
     assert 0.4 < read_mask(save(tmp_path / "gradient.png", gradient)).mean() < 0.6
 
 
+@pytest.mark.parametrize("quality", [50, 75, 95])
+@pytest.mark.parametrize("color", [(255, 0, 0), (255, 255, 0), (192, 128, 0), (128, 128, 128)])
+def test_a_compressed_mask_of_one_colour_on_black_is_a_mask(tmp_path, color, quality):
+    """Edges of a JPEG overshoot a colour; of pure white and black the overshoot is cut off."""
+    rows, columns = np.mgrid[:240, :320]
+    inside = np.hypot(rows - 120, columns - 160) + 20 * np.sin(columns / 9) < 80
+    colors = np.where(inside[..., None], np.array(color), 0).astype(np.uint8)
+    Image.fromarray(colors).save(tmp_path / "mask.jpg", quality=quality, subsampling=0)
+    assert (read_mask(tmp_path / "mask.jpg") == ~inside).mean() > 0.98
+
+
+def test_a_compressed_map_of_labels_is_refused(tmp_path):
+    labels = np.zeros((240, 320, 3), np.uint8)
+    labels[40:200, 40:120] = (192, 128, 0)
+    labels[40:200, 180:280] = (0, 128, 192)
+    Image.fromarray(labels).save(tmp_path / "labels.jpg", quality=75)
+    with pytest.raises(InputError, match="is no mask .* a map of labels"):
+        read_mask(tmp_path / "labels.jpg")
+
+
 def test_copies_for_colmap_are_masked_as_the_user_means_it(tmp_path):
     save(tmp_path / "a.png", np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
     mask = save(tmp_path / "mask.png", paint(upper_quarter()))

@@ -174,6 +174,16 @@ def test_masks_of_zeros_and_ones_and_soft_masks_mean_the_same(tmp_path):
     assert read_mask(tmp_path / "black.png").all()
 
 
+@pytest.mark.parametrize("speck", [255, 254, 128])
+def test_colours_are_the_mask_where_alpha_makes_nothing_transparent(tmp_path, speck):
+    """Editors that scale or flatten a picture leave specks that are not quite opaque."""
+    colors = np.repeat(upper_quarter()[..., None], 3, axis=-1)
+    alpha = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    alpha[0, 0] = speck
+    save(tmp_path / "mask.png", np.dstack([colors, alpha]))
+    assert np.array_equal(read_mask(tmp_path / "mask.png"), upper_quarter() == 0)
+
+
 def test_a_mask_of_another_size_is_scaled_and_of_another_shape_refused(tmp_path):
     scene = write_transforms(tmp_path, small_cameras())
     mask = scene / "masks/photo_000.png"

@@ -20,7 +20,7 @@ from exact_room import make_cameras, make_pose, write_colmap, write_photographs,
 from gscompleter import InputError, load_camera, load_cameras, load_views
 from gscompleter.data.file_names import list_endings
 from gscompleter.data.formats import open_photographs
-from gscompleter.system.files import image as image_io
+from gscompleter.system.files import image_opening
 from gscompleter.system.files.image import (
     ORIENTATION,
     read_colors_and_alpha,
@@ -277,7 +277,7 @@ def write_brand(path: Path, brand: bytes) -> Path:
 
 
 def test_heic_is_refused_by_name_without_its_reader(tmp_path, monkeypatch):
-    monkeypatch.setattr(image_io, "find_spec", lambda name: None)
+    monkeypatch.setattr(image_opening, "find_spec", lambda name: None)
     path = write_brand(tmp_path / "IMG_1.HEIC", b"heic")
     with pytest.raises(InputError, match=r"IMG_1.HEIC is HEIC.*gscompleter\[heic\].*sips"):
         read_pixels(path)
@@ -324,6 +324,28 @@ def test_a_transparent_colour_of_16_bits_hides_that_colour_alone():
         shown = read_pixels(png, "wide")
         assert (shown[0] == 0).all()
         assert (shown[1:] == colors[1:]).all()
+
+
+@pytest.mark.parametrize(("bits", "row"), [(1, 0b0101_0101), (2, 0b00_01_10_11), (4, 0b0001_1111)])
+def test_a_transparent_grey_of_few_bits_hides_that_grey(bits, row):
+    """Programs that make a PNG small store a few greys in 1, 2 or 4 bits each."""
+    count = 8 // bits
+    header = struct.pack(">IIBBBBB", count, 1, bits, 0, 0, 0, 0)
+    chunks = (
+        (b"IHDR", header),
+        (b"tRNS", struct.pack(">H", 1)),
+        (b"IDAT", zlib.compress(bytes([0, row]))),
+        (b"IEND", b""),
+    )
+    png = b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
+        for kind, data in chunks
+    )
+    colors, alpha = read_colors_and_alpha(png, "small")
+    greys = [(row >> shift) % 2**bits for shift in range(8 - bits, -1, -bits)]
+    assert colors[0, :, 0].tolist() == [grey * 255 // (2**bits - 1) for grey in greys]
+    assert alpha is not None
+    assert alpha[0].tolist() == [0 if grey == 1 else 255 for grey in greys]
 
 
 def test_floats_are_no_colours_and_no_mask_with_nan(tmp_path):

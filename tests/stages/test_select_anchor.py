@@ -135,3 +135,10 @@ def test_a_view_that_shows_something_else_loses_however_wide_its_baseline():
     assert select_anchor(target, views, overlaps=[0.1, 0.05, 0.0]).index == 0
     literal = AnchorConfig(min_overlap=0.0)
     assert select_anchor(target, views, literal, [0.9, 0.5, 0.0]).index == 2
+
+
+@pytest.mark.parametrize("order", [(0.2, 0.6, 2.0), (2.0, 0.2, 0.6), (0.6, 2.0, 0.2)])
+def test_of_views_that_share_nothing_with_the_target_the_widest_baseline_wins(order):
+    """A target that shows only what was generated for others, whatever order photographs have."""
+    views = [view(x=x, yaw=0) for x in order]
+    assert select_anchor(TARGET, views, overlaps=[0.0] * 3).index == order.index(2.0)

@@ -12,7 +12,8 @@ from PIL import Image
 from damage import require_plain
 from gscompleter import InputError
 from gscompleter.system.damage import DamagedError, check_rows, describe_damage
-from gscompleter.system.files.image import open_image, read_depth
+from gscompleter.system.files.depth_file import read_depth
+from gscompleter.system.files.image_opening import open_image
 from gscompleter.system.files.reading import parse_json
 
 

@@ -25,7 +25,7 @@ from gscompleter.data.frame import Frame, find_file
 from gscompleter.data.json_fields import get_number
 from gscompleter.data.limits import MAX_NUMBER, require
 from gscompleter.system.errors import InputError, join_names, quote_value
-from gscompleter.system.files.image import open_image
+from gscompleter.system.files.image_opening import open_image
 from gscompleter.system.files.reading import read_bytes, read_json
 from gscompleter.types import MAX_IMAGE_SIDE
 

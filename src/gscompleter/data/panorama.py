@@ -21,12 +21,12 @@ from gscompleter.data.limits import require
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.image import (
     QUARTER_TURNS,
-    open_image,
     read_brightness,
     read_image_size,
     read_orientation,
     reduce_to_rgb,
 )
+from gscompleter.system.files.image_opening import open_image
 from gscompleter.system.files.reading import read_head
 
 VIEWS = (*((yaw, 0) for yaw in range(0, 360, 60)), *((yaw, 50) for yaw in range(0, 360, 120)))

@@ -20,12 +20,12 @@ from gscompleter.system.files.image import (
     QUARTER_TURNS,
     has_alpha,
     leave_out_constant,
-    open_image,
     read_colors_and_alpha,
     read_image_size,
     read_orientation,
     turn_upright,
 )
+from gscompleter.system.files.image_opening import open_image
 
 FULL_FRAME_DIAGONAL = 43.2666
 """Diagonal of 36 x 24 mm, the reference of EXIF's "focal length in 35 mm film"."""

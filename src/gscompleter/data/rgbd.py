@@ -24,7 +24,7 @@ from gscompleter.data.limits import DEPTH_RANGE, require
 from gscompleter.data.number_files import read_numbers
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.system.errors import quote_value
-from gscompleter.system.files.image import read_depth
+from gscompleter.system.files.depth_file import read_depth
 from gscompleter.system.files.reading import read_json
 
 COLOR = "color"

@@ -31,7 +31,7 @@ from gscompleter.data.limits import DEPTH_RANGE, MAX_COEFFICIENT, MAX_NUMBER, re
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import read_point_cloud
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.image import read_depth
+from gscompleter.system.files.depth_file import read_depth
 from gscompleter.system.files.reading import is_json_list, read_json
 from gscompleter.system.files.result_format import is_marked, refuse_later
 from gscompleter.system.files.writing import replace_file

@@ -16,7 +16,7 @@ from gscompleter.data.file_names import is_photograph_name
 from gscompleter.data.frame import FOLDERS, Frame
 from gscompleter.data.masks import leave_out_masks
 from gscompleter.system.errors import InputError, join_names, quote_value
-from gscompleter.system.files.image import open_image
+from gscompleter.system.files.image_opening import open_image
 from gscompleter.system.files.names import is_hidden_name
 
 DEPTH_FOLDERS = (

@@ -31,7 +31,7 @@ from gscompleter.stages.superfluous import (
     exclude_needed_by_photographs,
     limit_errors,
 )
-from gscompleter.state import Completion
+from gscompleter.state import Completion, Photo
 from gscompleter.system.errors import InputError
 from gscompleter.trust import Trust
 from gscompleter.trust.photometric import gather_observations, load_trust, measure_agreement
@@ -56,11 +56,13 @@ def remove_gaussians(
 ) -> Completion:
     """Remove chosen Gaussians of the context, and those that no photograph showed behind them.
 
-    Those in a region are removed as far as it reaches, and the rest of them is added.
-    A rendered Gaussian that stands for several goes with the last of them.
+    `chosen` has all n Gaussians of the context, of which m are rendered. Those whose centres lie in
+    the region that `contains` tells are removed as far as it reaches, and the rest of them is
+    added. A rendered Gaussian that stands for several goes with the last of them. Raises InputError
+    if nothing would be left.
     """
     source = state.source
-    first = state.rendered_context
+    rendered = state.rendered_context
     # What went earlier, or gave way to photographs, is not there any more.
     chosen = chosen & ~source.gone_mask
 
@@ -83,8 +85,9 @@ def remove_gaussians(
         revealed_mask=is_revealed & ~chosen,
         removed=merge([source.removed, replace(inner, sh=inner.sh[:, :1])]),
     )
-    # As long as nothing is recoloured, the state has that of its source itself, which tells so.
-    context = remaining.rendered if first is source.rendered else first[~gone]
+    # As long as nothing is recoloured, the context of a state is the very object of its source, by
+    # which `recolored_mask` knows it.
+    left = remaining.rendered if rendered is source.rendered else rendered[~gone]
     # Outer pieces are no Gaussians of the file: they are added to it. Those that come to light only
     # now go for good, as parts of a chosen Gaussian that no photograph showed.
     rest = make_part(PartOrigin("piece"), outer[~is_outer_revealed])
@@ -94,31 +97,35 @@ def remove_gaussians(
     changed = replace(
         state,
         source=remaining,
-        rendered_context=context,
+        rendered_context=left,
         added_parts=parts,
         trust=Trust(),
-        trust_elsewhere=trust.thin(kept, torch.ones_like(context.opacities)),
+        trust_elsewhere=trust.thin(kept, torch.ones_like(left.opacities)),
         is_restored=False,
     )
-
-    # The photographs still show the object, and its pixels are ignored.
-    views = [hide_removed(photo.view, remaining, scenes.renderer) for photo in state.photos]
-    shown = scenes.freeze_at(changed.parts, [view.camera for view in views])
-    photos = tuple(
-        # Painted over, so that no model copies from ignored pixels. Budgets of the photographs with
-        # the object would forbid what fills its place.
-        replace(photo, view=view.paint_ignored(scene.render.image.clamp(0, 1)), budgets=())
-        for photo, view, scene in zip(state.photos, views, shown, strict=True)
-    )
-    changed = replace(changed, photos=photos)
+    changed = replace(changed, photos=paint_photos_over(changed, scenes))
     holes = state.config.holes
     if holes.forces_removed and holes.keeps_confirmed:
         # As a trained splat is trusted: a part of the hole may show a wall that photographs know.
         config = replace(state.config, trust="photometric")
-        painted = [photo.view for photo in photos]
+        painted = [photo.view for photo in changed.photos]
         confirmation = load_trust(config, changed.parts, painted, scenes)
         changed = replace(changed, confirmation=confirmation)
     return prepare_guards(changed, scenes)
+
+
+def paint_photos_over(state: Completion, scenes: SceneRenderer) -> tuple[Photo, ...]:
+    """Ignore the pixels of photographs that show what was removed, and paint the scene there.
+
+    They are painted so that no model copies from ignored pixels. Error budgets are dropped: those
+    of the photographs with the object would forbid what fills its place.
+    """
+    views = [hide_removed(photo.view, state.source, scenes.renderer) for photo in state.photos]
+    shown = scenes.freeze_at(state.parts, [view.camera for view in views])
+    return tuple(
+        replace(photo, view=view.paint_ignored(scene.render.image.clamp(0, 1)), budgets=())
+        for photo, view, scene in zip(state.photos, views, shown, strict=True)
+    )
 
 
 def restore_surroundings(state: Completion, scenes: SceneRenderer) -> Completion:
@@ -130,26 +137,27 @@ def restore_surroundings(state: Completion, scenes: SceneRenderer) -> Completion
     again.
     """
     source = state.source
-    views = [photo.view for photo in state.photos]
     if len(source.removed) == 0 or state.is_restored:
         return state
 
     # Outer pieces of what was cut, and what photographs showed before, are among the additions, but
     # were not invented.
-    rest = [part for part in state.added_parts if not part.origin.is_invented]
+    views = [photo.view for photo in state.photos]
+    known_parts = [part for part in state.added_parts if not part.origin.is_invented]
     invented = [part for part in state.added_parts if part.origin.is_invented]
-    first = state.rendered_context
-    known = merge([first[:0], *(part.gaussians for part in rest)])
+    rendered = state.rendered_context
+    # The empty part in front stands for all of these where there are none.
+    known = merge([rendered[:0], *(part.gaussians for part in known_parts)])
     is_revealed = source.revealed_mask
     revealed = source.gaussians[is_revealed]
-    invented = fade_harmful(invented, (first, known, revealed), state, scenes)
+    invented = fade_harmful(invented, (rendered, known, revealed), state, scenes)
 
     # The context is frozen once. What is compared with it is added, since it is much smaller; at
     # one photograph at a time, to save memory.
     cameras = [view.camera for view in views]
     scenes.clear()
-    context = scenes.freeze_at((first,), cameras)
-    added = merge([first[:0], *(part.gaussians for part in invented)])
+    context = scenes.freeze_at((rendered,), cameras)
+    added = merge([rendered[:0], *(part.gaussians for part in invented)])
     is_needed = find_needed_revealed(revealed, context, known, added, views)
 
     # Revealed Gaussians that return follow those that are rendered, as rows of their own. No trust
@@ -167,13 +175,14 @@ def restore_surroundings(state: Completion, scenes: SceneRenderer) -> Completion
         )
         # Names of what was frozen would hold it in memory beside what replaces it.
         del context
-        context = scenes.freeze_at((first, returned), cameras)
-        first = remaining.rendered if first is source.rendered else merge([first, returned])
+        context = scenes.freeze_at((rendered, returned), cameras)
+        is_recolored = rendered is not source.rendered
+        rendered = merge([rendered, returned]) if is_recolored else remaining.rendered
 
     # Additions reach beyond the hole, where photographs tell their colours. Ignored pixels show the
     # scene itself, so that colours stay as they are in the hole.
-    parts = [*rest, *invented]
-    added = merge([first[:0], *(part.gaussians for part in parts)])
+    parts = [*known_parts, *invented]
+    added = merge([rendered[:0], *(part.gaussians for part in parts)])
     images = [
         view.paint_ignored(scene.composite(added).image.clamp(0, 1))
         for view, scene in zip(views, context, strict=True)
@@ -183,7 +192,7 @@ def restore_surroundings(state: Completion, scenes: SceneRenderer) -> Completion
     return replace(
         state,
         source=remaining,
-        rendered_context=first,
+        rendered_context=rendered,
         added_parts=tuple(split_into_parts(fitted, parts)),
         is_restored=True,
     )
@@ -231,11 +240,13 @@ def find_outside(
 
     `others` is the scene without them, frozen at the views.
     """
+    # Their weights in valid pixels, in ignored ones, and a column of zeros. Valid pixels are those
+    # outside of the hole, since those in it are ignored.
     sums = torch.zeros_like(revealed.means)
     for scene, view in zip(others, views, strict=True):
         shown = sum_in_mask(scene.extend(revealed), view.valid_mask.to(sums))
+        # Those by which a frozen scene is extended are its last rows.
         sums += shown[len(shown) - len(revealed) :]
-    # Valid pixels are those outside of the hole, since those in it are ignored.
     return sums[:, 0] > MIN_OUTSIDE * sums.sum(dim=1)
 
 
@@ -270,14 +281,15 @@ def find_revealed(
     outer: Gaussians,
     scenes: SceneRenderer,
 ) -> tuple[Bool[Tensor, "m"], Bool[Tensor, "o"]]:
-    """Add those that only become visible without them to `unused` Gaussians of the context.
+    """Find what goes: the `unused` Gaussians of the context, and those that only they hid.
 
-    Also returns which `outer` pieces do. With `inner` ones they stand for the unused ones.
+    In place of the unused ones, the scene before the removal has their `inner` and `outer` pieces.
+    Returns masks of the m rendered Gaussians that go, and of the outer pieces that come to light.
     """
     # One set of rows for all that may go: the context, in which the unused Gaussians are invisible,
     # then their pieces. Of these, the inner ones go in any case.
-    first = state.rendered_context
-    others = first.hide(unused)
+    rendered = state.rendered_context
+    others = rendered.hide(unused)
     gone = torch.cat([unused, unused.new_ones(len(inner)), unused.new_zeros(len(outer))])
     # Areas do not depend on colours by direction. Those that are left lie in a file as they did, so
     # that frozen views do, too.
@@ -303,7 +315,7 @@ def find_revealed(
         if not revealed.any():
             break
         gone = gone | revealed.to(gone.device)
-    return gone[: len(first)], gone[len(gone) - len(outer) :]
+    return gone[: len(rendered)], gone[len(gone) - len(outer) :]
 
 
 def measure_areas(
@@ -315,7 +327,7 @@ def measure_areas(
     frozen = scenes.freeze_at(parts, [view.camera for view in views])
 
     def measure(k: int) -> None:
-        # No area depends on what agrees.
+        # The area is wanted alone, which no agreement changes.
         nothing = torch.zeros_like(views[k].image[..., 0])
         areas[k], _ = measure_agreement(frozen[k], means, views[k], nothing)
 

@@ -36,7 +36,7 @@ class Models:
     renderer: Renderer
     seed: int = 0
     baseline_iterations: int | None = None
-    """Maximum number of iterations of the baselines; None keeps their own numbers."""
+    """Largest number of iterations of the baselines, for a fast trial; None keeps their own."""
 
     def make_completer(self, config: str = "default") -> GSCompleter:
         """Make our completer with the named config.
@@ -113,20 +113,20 @@ def complete_bare(state: Completion, target: Camera, models: Models) -> Predicti
     Raise InputError if no camera around the target sees what is beside its hole.
     """
     completer = replace(models.make_completer("bare"), keep_registered=True)
-    # The depth range of the photographs is not known without them.
+    # The target has the depth range of the photographs, which is not known without them.
     unranged = replace(target, near=None, far=None)
     with record_seconds() as seconds, timed_stage("context"):
         camera = add_near_plane(unranged, state.scene.means)
         holes = models.renderer.render(state.scene, camera).alpha < COVERED
-        cameras = choose_cameras_around(state.scene, target, models.renderer, holes)
+        cameras = choose_cameras_around(state.scene, unranged, models.renderer, holes)
         views = render_views(state.scene, cameras, models.renderer)
-    if not views and holes.any():
+    if not holes.any():
+        return Prediction(state.scene, state.scene[:0], seconds)
+    if not views:
         raise InputError(
             "No camera around the target sees what is beside its hole, so that there is nothing to "
             "complete it from; leave out the method bare, or choose another target."
         )
-    if not views:
-        return Prediction(state.scene, state.scene[:0], seconds)
     done = completer.advance(completer.begin(views, state.scene), unranged)
     prediction = predict(done.plus_seconds(seconds))
     # The anchor is a render, and not one of the photographs of the state.
@@ -180,11 +180,21 @@ def complete_by_similarity(state: Completion, target: Camera, models: Models) ->
                 pair.gaussians, state.scene, reference, models.renderer, models.seed, config
             )
     scene = merge([state.scene, added])
-    return Prediction(scene, added, seconds, anchor.index, anchor.is_fallback, added)
+    return Prediction(
+        scene,
+        added,
+        seconds,
+        anchor=anchor.index,
+        anchor_fallback=anchor.is_fallback,
+        registered=added,
+    )
 
 
 def mark_target(prediction: Prediction, number: int, before: Gaussians) -> Prediction:
-    """Mark the Gaussians added to `before` as generated for target `number`."""
+    """Label the Gaussians added to `before` as generated for target `number`.
+
+    A method sees one target at a time, and so labels all of its additions alike.
+    """
     if prediction.added is None:
         return prediction
     generated = torch.full_like(prediction.added.generated, number)
@@ -207,26 +217,31 @@ STEPS_METHODS: dict[str, Method] = {
 }
 """The paper's method with other numbers of denoising steps."""
 
-# Method name to config name. Three degrees of freedom are no ablation: the paper compares the ray
-# constraint with them.
-_ABLATIONS = {"unconstrained" if name == "3-dof" else name: name for name in ABLATIONS}
+ABLATION_CONFIGS = {
+    "unconstrained" if config == "3-dof" else config: config for config in ABLATIONS
+}
+"""Config of each ablation by the name of its method. They differ for `3-dof`, with which the paper
+compares its constraint to rays, under the name of what it lacks."""
 
 METHODS: dict[str, Method] = {
     "context": keep_scene,
     "full": make_completion_method("default"),
     "bare": complete_bare,
     "paper": make_completion_method("paper"),
-    **{title: make_completion_method(name) for title, name in _ABLATIONS.items()},
-    **{f"paper/{t}": make_completion_method(f"paper/{name}") for t, name in _ABLATIONS.items()},
+    **{name: make_completion_method(config) for name, config in ABLATION_CONFIGS.items()},
+    **{
+        f"paper/{name}": make_completion_method(f"paper/{config}")
+        for name, config in ABLATION_CONFIGS.items()
+    },
     **STEPS_METHODS,
     **BASELINES,
 }
 """All methods by name, in the order of the tables."""
 
 METHOD_GROUPS: dict[str, tuple[str, ...]] = {
-    "ablations": tuple(_ABLATIONS),
+    "ablations": tuple(ABLATION_CONFIGS),
     "baselines": tuple(BASELINES),
-    "all": ("context", "full", "paper", *_ABLATIONS, *BASELINES),
+    "all": ("context", "full", "paper", *ABLATION_CONFIGS, *BASELINES),
 }
 """Names that stand for several methods. `all` leaves out those with another input (bare), another
 generator (steps-N), or the paper's settings with a change (paper/NAME)."""

@@ -38,10 +38,10 @@ TASKS = "tasks"
 """Folder that holds the tasks."""
 RUN_VERSION = 4
 """Version of the files of a run."""
-FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated")
-"""Tensors of Gaussians that are saved."""
+TENSORS = ("means", "quats", "scales", "opacities", "sh", "generated")
+"""Tensors of Gaussians that are saved; the values as a file of a splat had them are not."""
 GAUSSIANS = ("gaussians", "scene", "added", "registered")
-"""Saved values that are Gaussians."""
+"""Names of saved values that are Gaussians, of `SavedContext` and `Prediction`."""
 
 
 def make_file_name(name: str) -> str:
@@ -109,8 +109,9 @@ def find_difference(
         # Of settings within settings only one may differ, and a sentence holds few.
         if isinstance(old, Mapping) and isinstance(new, Mapping):
             inner = find_difference(old, new)
-            if inner is not None:
-                return f"{key}.{inner[0]}", *inner[1:]
+            if inner is None:
+                continue
+            return f"{key}.{inner[0]}", *inner[1:]
         return key, old, new
     return None
 
@@ -166,10 +167,14 @@ def save_values(path: Path, content: Mapping[str, Any]) -> None:
     for name, value in content.items():
         if isinstance(value, Gaussians):
             # On the CPU, and in torch's own layout, on which the rounding of sums depends.
-            tensors = {field: getattr(value, field).detach().cpu() for field in FIELDS}
+            tensors = {field: getattr(value, field).detach().cpu() for field in TENSORS}
             packed[name] = {
-                field: tensor.clone(memory_format=torch.contiguous_format)
-                for field, tensor in tensors.items()
+                **{
+                    field: tensor.clone(memory_format=torch.contiguous_format)
+                    for field, tensor in tensors.items()
+                },
+                "is_antialiased": value.is_antialiased,
+                "origin": value.origin,
             }
     with replace_file(path) as file:
         torch.save(packed, file)

@@ -37,8 +37,9 @@ class Anchor:
     """The context view that forms the stereo pair with a target, and the scene there."""
 
     index: int
+    """Number of the view among those of the state."""
     is_fallback: bool
-    """True if every view exceeded the rotation limit, so that the smallest rotation won."""
+    """As in `AnchorChoice`."""
     target: TargetView
 
     @property
@@ -48,7 +49,7 @@ class Anchor:
 
     @property
     def render(self) -> Render:
-        """Render of the scene at its camera; targets that are skipped need none."""
+        """Render of the scene at its camera, made when it is first asked for."""
         return self.target.view_renders[self.index]
 
 
@@ -72,9 +73,10 @@ def select_anchor(
 
     Among views rotated by less than `max_rotation`, the widest baseline wins, since it triangulates
     best; if none qualifies, the smallest rotation wins. Beyond the paper, a view needs
-    `min_baseline`, relative to the widest one, and `min_overlap` unless no view has that.
-    `overlaps` has the share of the target's visible surfaces that each view sees, too; without it
-    all views are taken to see all of them. Raises ValueError without views.
+    `min_baseline`, relative to the widest one, and `min_overlap`; if none has that overlap, the
+    largest one wins, and of equal ones the widest baseline. `overlaps` has the share of the
+    target's visible surfaces that each view sees, too; without it all views are taken to see all of
+    them. Raises ValueError without views.
     """
     if not views:
         raise ValueError("select_anchor needs at least one observed view, got none")
@@ -95,7 +97,8 @@ def select_anchor(
     overlap_of = overlaps or [1.0] * len(views)
     overlapping = [i for i in facing if overlap_of[i] >= config.min_overlap]
     if not overlapping:
-        most_overlapping = max(facing, key=lambda i: overlap_of[i])
+        # A target that shows only what was generated for others shares nothing with any view.
+        most_overlapping = max(facing, key=lambda i: (overlap_of[i], baselines[i]))
         return AnchorChoice(most_overlapping, is_fallback=False)
     widest = max(overlapping, key=lambda i: baselines[i])
     return AnchorChoice(widest, is_fallback=False)
@@ -104,14 +107,15 @@ def select_anchor(
 def compute_overlap(camera: Camera, render: Render, anchor: Camera, at_anchor: Render) -> float:
     """Compute the fraction of visible surfaces that the anchor sees, too; 0 if there are none.
 
-    `render` shows the scene at `camera`, `at_anchor` at `anchor`.
+    `render` shows the scene at `camera`, `at_anchor` at `anchor`; depths are in scene units.
     """
     surfaces = render.depth_map()
     points = unproject(surfaces.depth, camera)[surfaces.valid]
     if len(points) == 0:
         return 0.0
 
-    # What lies behind the surface that the anchor sees there is hidden from it.
+    # What lies behind the surface that the anchor sees there is hidden from it. Where it sees
+    # nothing, its depth is 0, and no point counts.
     pixels, z = project(points, anchor)
     surface = sample(at_anchor.depth[..., None], pixels)[:, 0]
     shared = is_inside(pixels, z, anchor) & (z < (1 + SURFACE_TOLERANCE) * surface)

@@ -32,7 +32,8 @@ from gscompleter.stages.refusals import explain_skip
 from gscompleter.stages.target_view import TargetView, render_target
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.image import write_depth, write_image
+from gscompleter.system.files.depth_file import write_depth
+from gscompleter.system.files.image import write_image
 from gscompleter.system.files.reading import hash_file
 from gscompleter.system.files.result_format import RESULT_MARK
 from gscompleter.system.progress import track

@@ -102,9 +102,9 @@ class Capture:
     """Their names as photographs, which the user sees and may give."""
     source: CaptureSource
     where: str
-    """Clause that says which cameras they are."""
+    """Words that say which cameras they are, and follow that word."""
     more: str
-    """Clause on what else could be given; empty if the user named the cameras."""
+    """Words on what else could be given, from a semicolon on; empty if the user named them."""
     upward: Upward | None = None
     """What is up for them; None for cameras that are not placed by it."""
     others: Sequence[Camera] = ()
@@ -124,8 +124,8 @@ def find_cameras_beside(splat: Path) -> Path | None:
 
 
 def take_from_file(path: Path, known: Photographs, request: RenderRequest) -> Capture:
-    """Take all cameras of a file, which are those of `known`."""
-    where = f"cameras of {quote_value(path)}"
+    """Take all cameras of the file `path`, which `known` holds relative to its origin."""
+    where = f"of {quote_value(path)}"
     more = ""
     if request.cameras is None:
         where += ", which was found beside the splat,"
@@ -143,8 +143,9 @@ def find_cameras_alone(
 ) -> Capture:
     """Find cameras by the splat alone.
 
-    That of a pixel-aligned splat, at `pixel_center`, is taken with small moves of it; a trained
-    splat tells no more than from where it looks well.
+    That of a pixel-aligned splat is taken with small moves of it. It stands at `pixel_center`, in
+    the frame of `scene`; None for a trained splat, which tells no more than from where it looks
+    well.
 
     Raises:
         InputError: The camera of a pixel-aligned splat sees too little of it, or a trained splat
@@ -153,7 +154,8 @@ def find_cameras_alone(
     upward = request.find_up(scene, renderer)
     if pixel_center is None:
         return find_standing_cameras(scene, renderer, upward, request)
-    # Two photographs are the fewest, so that no image had more pixels than half of the Gaussians.
+    # Each pixel made a Gaussian, and two photographs are the fewest that make such a splat: none
+    # had more pixels than half of the Gaussians.
     side = max(MIN_FOUND_SIDE, round((len(scene) / 2) ** 0.5))
     if request.reading.resolution is not None:
         side = min(side, choose_side(request.reading.resolution))
@@ -168,7 +170,7 @@ def find_cameras_alone(
             "cameras it was made from with --cameras."
         )
     cameras = move_beside(camera, seen.depth[seen.valid].median().item())
-    where = "cameras that follow from the sizes of its Gaussians"
+    where = "that follow from the sizes of its Gaussians"
     return name_capture(cameras, "pixels", where, request, upward)
 
 
@@ -184,7 +186,7 @@ def find_standing_cameras(
             "--cameras, or which way is up with --up."
         )
     best = cameras[:NUM_STANDPOINTS]
-    where = "cameras from which it looks like a photograph"
+    where = "from which it looks like a photograph"
     found = name_capture(best, "standpoints", where, request, upward)
     return replace(found, others=cameras[NUM_STANDPOINTS:])
 
@@ -210,14 +212,14 @@ def search_around_place(
             "No camera around what is to be removed sees it unhidden; name cameras with --cameras, "
             "or which way is up with --up."
         )
-    return name_capture(cameras, "place", "cameras around what is removed", request, upward)
+    return name_capture(cameras, "place", "around what is removed", request, upward)
 
 
 def choose_side(resolution: tuple[int, int] | int | None) -> int:
-    """Choose the width and height of the square cameras that are found.
+    """Choose the width and height of the square cameras that are found, in pixels.
 
-    They are the largest square in the size that was asked for. A trained splat has no full size,
-    for which None stands: they then have the usual one.
+    They are the largest square in the size that was asked for: height and width, or the longer
+    side. A trained splat has no full size, for which None stands: they then have the usual one.
     """
     if resolution is None:
         return DEFAULT_LONG_SIDE
@@ -245,7 +247,7 @@ def search_around(
             "scene, or name cameras with --cameras.",
             "target",
         )
-    where = "cameras that were found around the targets"
+    where = "found around the targets"
     return name_capture(cameras, "targets", where, request)
 
 
@@ -267,7 +269,8 @@ def describe_capture(capture: Capture, num_chosen: int) -> str:
     """Write the sentence on the cameras whose renders take the place of photographs."""
     total = len(capture.cameras)
     count = f"{total}" if num_chosen == total else f"{num_chosen} of the {total}"
+    noun = "camera" if total == 1 else "cameras"
     return (
-        f"There are no photographs: renders of the splat at {count} {capture.where} take their "
-        f"place{capture.more}."
+        f"There are no photographs: renders of the splat at {count} {noun} {capture.where} take "
+        f"their place{capture.more}."
     )

@@ -42,8 +42,9 @@ class HoleRow:
     frame: int | None = None
     """Frame of the photograph that the target is; None for another camera."""
     derived_from: int | None = None
-    """Frame that a planned camera was derived from. None for a camera that was not planned, and
-    beside renders at cameras that were found: these have no lasting numbers."""
+    """Frame that a planned camera was derived from; None for a camera that was not planned. None,
+    too, where renders at cameras that were found take the place of photographs: each run finds
+    these anew, so that their numbers do not last."""
     offset: str | None = None
     """Move and turn from that frame, in words; None without one."""
     path_frame: int | None = None
@@ -69,8 +70,8 @@ class HolesFile:
     version: str
     """Version of gscompleter that wrote it."""
     context: tuple[int, ...]
-    """Frames of the context; empty for renders at cameras that were found, which have no lasting
-    numbers."""
+    """Frames of the context; empty for renders at cameras that were found, whose numbers do not
+    last."""
     frames: tuple[HoleRow, ...]
     """The targets, at least one."""
     path: PathRow | None = None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, field, replace
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 import numpy as np
 from jaxtyping import Float
@@ -114,15 +114,17 @@ def load_viewer_files(
 
 
 def place_content(content: ViewerContent, frame: ResultFrame | None = None) -> ViewerContent:
-    """Add the way of further cameras into the frame of the scene.
+    """Set the `transform` and `origin` that lead cameras of files to the frame of the scene.
 
-    They are in that of the file, or in that of the photographs of a completion with its `frame`.
+    Such cameras are in the frame of the splat's file, or for a completion in that of its
+    photographs, from which `frame` leads to that of the file.
     """
     origin = np.array(content.after.origin or (0.0, 0.0, 0.0))
     transform = compute_frame_from_photographs(origin)
     if frame is not None:
         transform = transform @ np.array(frame.transform)
-    # What lies at the zero of the scene: cameras beside it are near that, in whatever map they are.
+    # The place of the zero of the scene in the frame of the cameras: those of its photographs are
+    # near it, however large the coordinates of their map are.
     zero = np.linalg.solve(transform[:3, :3], -transform[:3, 3])
     return replace(content, transform=transform, origin=zero)
 
@@ -132,12 +134,20 @@ def load_viewer_completion(folder: Path, drop_nonfinite: bool) -> ViewerContent:
     summary = read_summary(folder)
     # What is shown was completed as it is, whatever further properties it has.
     after = load_splat(find_completed(folder), drop_nonfinite, ignore_properties=True)
+    before = None
+    scene_notes: tuple[str, ...] = ()
+    # With `--save-as` the input splat is the scene before, and stays where the user has it.
     context = Path(summary.scene.context or folder / CONTEXT_FILE)
-    before = load_splat(context, drop_nonfinite, ignore_properties=True)
-    before = before.move_origin(after.origin)
+    if os.path.exists(context):
+        before = load_splat(context, drop_nonfinite, ignore_properties=True)
+        before = before.move_origin(after.origin)
+    else:
+        scene_notes = (
+            f"The scene before is not shown, because {quote_value(context)} is not there any more.",
+        )
     content = place_content(ViewerContent(folder.resolve().name, after, before), summary.frame)
-    cameras, notes = load_known_cameras(folder, summary, content)
-    return replace(content, cameras=cameras, notes=notes)
+    cameras, camera_notes = load_known_cameras(folder, summary, content)
+    return replace(content, cameras=cameras, notes=(*scene_notes, *camera_notes))
 
 
 def load_known_cameras(
@@ -148,17 +158,18 @@ def load_known_cameras(
     Without photographs that can be read, the notes say why they are not shown.
     """
     targets = load_target_cameras(folder, summary, content)
-    # The poses of photographs that had none lie in the folder; others stay where the user has them.
     if summary.scene.renders_from is not None:
         return (*targets, *load_render_cameras(folder, summary, content)), ()
-    if summary.settings.get("folder") is None:
+    given = summary.settings.get("folder")
+    if given is None:
         # `Completion.save` got its photographs as values, which have no file.
         return targets, (
             "The context photographs are not shown, because no folder of them is known.",
         )
-    source = Path(str(summary.settings.get("folder")))
-    if summary.scene.format == "photographs":
-        source = folder / FOUND_POSES_FOLDER
+    # The poses of photographs that had none lie in the output folder; others stay where the user
+    # has them.
+    is_posed_by_us = summary.scene.format == "photographs"
+    source = folder / FOUND_POSES_FOLDER if is_posed_by_us else Path(str(given))
     if not os.path.exists(source):  # also for names that no file can have
         # A path is as the command was given it, and leads elsewhere from another folder.
         cause = "is not in this folder, and was named from another"
@@ -240,7 +251,7 @@ def add_file_cameras(content: ViewerContent, path: Path, resolution: Resolution)
     shots = [
         ViewerCamera(
             f"camera-{number}",
-            Path(frame.name).name or f"Camera {number}",
+            PurePosixPath(frame.file_name).name or f"Camera {number}",
             camera,
             make_frame_thumbnail(frame),
         )

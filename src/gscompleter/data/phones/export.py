@@ -26,7 +26,7 @@ from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.transforms import OPENCV_FROM_OPENGL
 from gscompleter.system.damage import describe_damage
 from gscompleter.system.errors import InputError, join_names, quote_value
-from gscompleter.system.files.image import open_image
+from gscompleter.system.files.image_opening import open_image
 from gscompleter.system.files.names import is_hidden_name
 from gscompleter.system.files.reading import check_file, read_bytes, read_zip_entry
 

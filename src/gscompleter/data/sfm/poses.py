@@ -51,13 +51,8 @@ from gscompleter.data.unused_files import (
 from gscompleter.data.video import extract_frames, is_video
 from gscompleter.system.children import run_module
 from gscompleter.system.errors import InputError, join_names, quote_value
-from gscompleter.system.files.image import (
-    HALF_OPAQUE,
-    ORIENTATION,
-    open_image,
-    reduce_to_rgb,
-    turn_upright,
-)
+from gscompleter.system.files.image import HALF_OPAQUE, ORIENTATION, reduce_to_rgb, turn_upright
+from gscompleter.system.files.image_opening import open_image
 from gscompleter.system.files.names import is_hidden_name, make_colmap_name
 from gscompleter.system.files.output_folder import refuse_later_results, reserve_output
 from gscompleter.system.files.reading import read_json

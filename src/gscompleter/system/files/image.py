@@ -1,42 +1,31 @@
-"""Conversion between image files and tensors."""
+"""Conversion between image files and tensors: colours, alpha, brightness and masks.
+
+Pixels are read as they are stored. Who wants them upright turns them (`turn_upright`), since poses
+and intrinsics usually belong to the stored ones.
+"""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from importlib.util import find_spec
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import torch
 from jaxtyping import Bool, Float, Shaped, UInt8
-from PIL import Image, features
+from PIL import Image
 from torch import Tensor
 
-from gscompleter.system.damage import DamagedError, describe_damage
-from gscompleter.system.errors import InputError, quote_value, refuse_pointer
+from gscompleter.system.damage import DamagedError
+from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.image_opening import open_image
 from gscompleter.system.files.mask_labels import refuse_labels
-from gscompleter.system.files.reading import check_file, make_read_error, read_head
 from gscompleter.system.files.writing import replace_file
-
-IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000")
-"""Image formats that are read. Others in Pillow run programs or are no photographs."""
-HEIF_BRANDS = (b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1")
-AVIF_BRANDS = (b"avif", b"avis")
-"""Brands in the first box of a file, by which HEIC of phones and AVIF are known. `mif1` and `msf1`
-are the general container, which either may name first."""
 
 SHOWN_JPEG_QUALITY = 85
 """JPEG quality of pictures to look at, in a page or a notebook."""
-MAX_IMAGE_PIXELS = 178_956_970
-"""Largest number of pixels of an image, as in Pillow."""
-
 PNG_COMPRESSION = 3
 """zlib level of written PNGs: 6 % more bytes than level 6, in a third of its time."""
-
-HEIC_TO_JPEG = "sips -s format jpeg *.HEIC --out jpeg"
-"""Command of macOS that exports the photographs of a folder."""
 
 ORIENTATION = 0x0112
 """EXIF tag of the orientation; 1 is upright."""
@@ -46,6 +35,9 @@ QUARTER_TURNS = (5, 6, 7, 8)
 HALF_OPAQUE = 128
 """Smallest alpha, of 255, of a pixel that counts as opaque."""
 ALPHA_MODES = ("RGBA", "LA", "PA", "RGBa", "La")
+"""Modes of Pillow with an alpha channel; small letters stand for multiplied colours."""
+FEW_BIT_STEPS = {"L;2": 85, "L;4": 17}
+"""Steps by which Pillow spreads grey of 2 and of 4 bits over 0 to 255, by its name for them."""
 
 
 def read_image(path: Path | str) -> Float[Tensor, "h w 3"]:
@@ -66,20 +58,6 @@ def write_pixels(
     """Write 8-bit colours or grey as a PNG."""
     with replace_file(path) as file:
         Image.fromarray(pixels).save(file, format="PNG", compress_level=PNG_COMPRESSION)
-
-
-def write_depth(path: Path | str, depth: Float[Tensor, "h w"], unit: float) -> None:
-    """Write z-depth as a 16-bit PNG in multiples of `unit`, 0 where it is unknown.
-
-    `read_depth` reads it back. Depths beyond 65535 units are clamped, and so are those below one,
-    which are known.
-    """
-    steps = (depth.detach().cpu().double() / unit + 0.5).floor().clamp(1, 65535)
-    values = steps.where(depth.detach().cpu() > 0, 0.0)
-    with replace_file(path) as file:
-        Image.fromarray(values.numpy().astype(np.uint16)).save(
-            file, format="PNG", compress_level=PNG_COMPRESSION
-        )
 
 
 def convert_to_pixels(
@@ -145,8 +123,9 @@ def read_mask(stored: Path | bytes, name: str = "") -> Bool[np.ndarray, "h w"]:
 
     So a mask of 0 and 1 means the same as one of 0 and 255, and soft or JPEG edges end halfway. A
     mask without any white is black everywhere. Of something that was cut out, over transparency,
-    the alpha channel is the mask, whatever colours it has. A map of labels raises an InputError.
-    `name` is for errors of bytes.
+    the alpha channel is the mask, whatever colours it has. An alpha channel that makes nothing
+    transparent, or is the same everywhere, leaves the colours to decide. A map of labels raises an
+    InputError. `name` is for errors of bytes.
     """
     with open_image(stored, name) as image:
         # 16 bits are not reduced to 8, where 1 would become 0.
@@ -159,6 +138,9 @@ def read_mask(stored: Path | bytes, name: str = "") -> Bool[np.ndarray, "h w"]:
             rgba = _read_rgba(image)
             values = rgba[..., :3]
             alpha = leave_out_constant(rgba[..., 3])
+            # Editors leave specks of 254, where nothing was cut out.
+            if alpha is not None and alpha.min() >= HALF_OPAQUE:
+                alpha = None
         else:
             kind = "L" if image.mode in ("1", "L") else "RGB"
             values = np.array(image.convert(kind)).reshape(image.height, image.width, -1)
@@ -196,95 +178,6 @@ def read_brightness(stored: Path | bytes, side: int) -> Float[np.ndarray, "h w"]
     return np.array(grey.resize(size, Image.Resampling.BOX), np.float32)
 
 
-def read_depth(path: Path, unit: float) -> Float[np.ndarray, "h w"]:
-    """Read z-depth from a 16-bit PNG or a `.npy` file, times `unit`; 0 where unknown."""
-    if path.suffix == ".npy":
-        values = _read_npy(path)
-    else:
-        with open_image(path) as image:
-            values = np.array(image)
-    values = values[..., 0] if values.ndim == 3 and values.shape[-1] == 1 else values
-    if values.ndim != 2 or values.dtype.kind not in "uif" or values.dtype == np.uint8:
-        raise InputError(
-            f"{quote_value(path)} is no depth map: a 16-bit grey PNG or an array [h, w] of numbers "
-            f"is needed, and it holds {values.dtype} of shape {quote_value(list(values.shape))}."
-        )
-    with np.errstate(over="ignore", invalid="ignore"):
-        depth = (values.astype(np.float64) * unit).astype(np.float32)
-    return np.where(np.isfinite(depth) & (depth > 0), depth, np.float32(0))
-
-
-def _read_npy(path: Path) -> np.ndarray:
-    check_file(path)
-    try:
-        # A memory map cannot exceed the file, whatever size its header claims.
-        values = np.lib.format.open_memmap(path, mode="r")
-        if not 0 < values.size <= MAX_IMAGE_PIXELS:
-            raise DamagedError(f"it claims {values.size:,} values")
-    except Exception as error:  # damaged files raise any kind
-        raise InputError(
-            f"The depth map {quote_value(path)} cannot be read ({describe_damage(error)}); copy it "
-            "again."
-        ) from error
-    return values
-
-
-@contextmanager
-def open_image(stored: Path | str | bytes, name: str = "") -> Iterator[Image.Image]:
-    """Open an image file, or its bytes; any failure in the `with` block becomes an InputError.
-
-    `name` stands for bytes in errors.
-    """
-    file = io.BytesIO(stored) if isinstance(stored, bytes) else Path(stored)
-    shown = quote_value(name) if isinstance(file, io.BytesIO) else f"The image {quote_value(file)}"
-    if isinstance(file, Path):
-        check_file(file)
-        refuse_pointer(file)
-    head = stored[:64] if isinstance(stored, bytes) else read_head(Path(stored), 64)
-    formats = _choose_formats(head, shown)
-    # The usual formats; Pillow loads those of all plugins as soon as it misses one of them.
-    Image.preinit()
-    try:
-        with Image.open(file, formats=formats) as image:
-            yield image
-    except PermissionError as error:
-        raise make_read_error(Path(str(file)), error) from error
-    except Exception as error:  # damaged files raise any kind
-        raise InputError(
-            f"{shown} is not an image that can be read ({quote_value(describe_damage(error), 120)})"
-            "; copy it again."
-        ) from error
-
-
-def _choose_formats(head: bytes, shown: str) -> tuple[str, ...]:
-    """Choose the formats to try by the first bytes; refuse HEIC and AVIF that cannot be decoded.
-
-    Pillow reads AVIF where it was built with it, and HEIC with pillow-heif.
-    """
-    # The first box names a main brand, a version, and further brands.
-    brands = [head[start : start + 4] for start in (8, *range(16, len(head), 4))]
-    if head[4:8] != b"ftyp":
-        return IMAGE_FORMATS
-    if any(brand in AVIF_BRANDS for brand in brands):
-        if features.check("avif"):
-            return ("AVIF",)
-        raise InputError(
-            f"{shown} is AVIF, which this Pillow does not read; run pip install -U pillow, or "
-            "export JPEG."
-        )
-    if any(brand in HEIF_BRANDS for brand in brands):
-        if find_spec("pillow_heif") is None:
-            raise InputError(
-                f"{shown} is HEIC, which is read with pillow-heif; run pip install "
-                f"'gscompleter[heic]', or export JPEG (on a Mac: {HEIC_TO_JPEG})."
-            )
-        import pillow_heif
-
-        pillow_heif.register_heif_opener()
-        return ("HEIF",)
-    return IMAGE_FORMATS
-
-
 def _has_alpha(image: Image.Image) -> bool:
     return image.mode in ALPHA_MODES or "transparency" in image.info
 
@@ -308,9 +201,12 @@ def _read_rgba(image: Image.Image) -> UInt8[np.ndarray, "h w 4"]:
         # Pillow would clip the grey, and compare it with the transparent one after that.
         alpha = np.where(np.array(image) == transparent, 0, 255).astype(np.uint8)
         return np.dstack([np.array(reduce_to_rgb(image)), alpha])
-    if image.mode == "RGB" and any(tile[3] == "RGB;16B" for tile in getattr(image, "tile", ())):
-        # Pillow reads the upper 8 of 16 bits, and leaves the transparent colour as it is.
+    # Pillow brings pixels of 2, 4 and 16 bits to 8, but leaves the transparent colour as stored.
+    stored_modes = {tile[3] for tile in getattr(image, "tile", ()) if isinstance(tile[3], str)}
+    if image.mode == "RGB" and "RGB;16B" in stored_modes:
         image.info["transparency"] = tuple(value >> 8 for value in transparent)
+    for mode in stored_modes & FEW_BIT_STEPS.keys():
+        image.info["transparency"] = transparent * FEW_BIT_STEPS[mode]
     return np.array(image.convert("RGBA"))
 
 
