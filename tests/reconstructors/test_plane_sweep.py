@@ -17,6 +17,8 @@ from gscompleter.data.demo_scene import (
 from gscompleter.numerics.geometry import project
 from gscompleter.reconstructors.features.depth_range import estimate_depth_range, get_depth_range
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
+from gscompleter.reconstructors.plane_sweep.gaussians import DISC_SIGMA, compute_normals, make_discs
+from gscompleter.render.loading import load_renderer
 from gscompleter.types import DepthMap
 from scenes import Room, camera_at, view_of
 
@@ -64,6 +66,38 @@ def test_gaussians_are_as_large_as_asked_for_in_pixels():
     assert torch.allclose(large.scales, 2 * small.scales)
     pixel = view.depth.flatten() / view.camera.K[0, 0]
     assert torch.allclose(large.scales[:, 0], pixel)
+
+
+@pytest.mark.parametrize(("stretch", "is_whole"), [(6.0, False), (20.0, True)])
+def test_a_road_is_whole_from_nearer_by(stretch, is_whole):
+    """Its rows stand 8 to 24 times as far apart as its pixels are wide, 13 to 40 units away."""
+    camera = camera_at(size=96)
+    rows = torch.arange(96)[:, None] + 0.5
+    height = 1.65
+    road = (rows > 51.0).expand(96, 96)
+    depth = torch.where(road, height * camera.K[1, 1] / (rows - camera.K[1, 2]), 60.0)
+    view = View(torch.full((96, 96, 3), 0.5), camera)
+    normals = compute_normals(depth, view)
+    discs = make_discs(view, depth, normals, DISC_SIGMA, stretch)[road.flatten()]
+    # From a car 10 units on, the rows there are below its bonnet.
+    nearer = load_renderer("cpu").render(discs, camera_at(z=10.0, size=96)).alpha
+    assert (nearer[57:80, 30:66].min() > 0.8) == is_whole
+
+
+def test_long_discs_are_for_planes_alone():
+    camera = camera_at(size=96)
+    rows = torch.arange(96)[:, None] + 0.5
+    depth = torch.where(rows > 51.0, 1.65 * camera.K[1, 1] / (rows - camera.K[1, 2]), 60.0)
+    noise = 1 + 0.3 * torch.rand(96, 96, generator=torch.Generator().manual_seed(0))
+    view = View(torch.full((96, 96, 3), 0.5), camera)
+    lengths = []
+    for rough in (torch.ones_like(noise), noise):
+        surface = depth * rough
+        discs = make_discs(view, surface, compute_normals(surface, view), DISC_SIGMA, 20.0)
+        stretch = discs.scales[:, 1] / discs.scales[:, 0]
+        lengths.append(stretch.unflatten(0, (96, 96))[54:60, 4:-4].amax().item())
+    assert lengths[0] > 12
+    assert lengths[1] <= 6.001
 
 
 def test_moving_forward_gives_depth_too():

@@ -25,11 +25,13 @@ def fit_colors(
     frozen: Sequence[FrozenScene],
     images: Sequence[View],
     relaxations: Sequence[float],
+    overshoot: float = 0.0,
 ) -> Gaussians:
     """Fit the colours of `new` Gaussians by SIRT (Gilbert 1972), with a step size per round.
 
     `frozen` is the scene in front of and behind them, at the camera of each image. The change is
-    the same in all directions, and makes none brighter than what the images show.
+    the same in all directions, and makes none brighter than what the images show, nor darker than
+    black, but for `overshoot`.
     """
     change = torch.zeros_like(new.means)
 
@@ -37,8 +39,8 @@ def fit_colors(
     # spot from elsewhere.
     brightest = torch.stack([change.new_ones(()), *(view.image.amax() for view in images)]).amax()
     constant = 0.5 + SH_C0 * new.sh[:, 0]
-    most = (brightest - constant).clamp_min(0.0)
-    least = (-constant).clamp_max(0.0)
+    most = (brightest + overshoot - constant).clamp_min(0.0)
+    least = (-overshoot - constant).clamp_max(0.0)
 
     # A GPU keeps the bins of every view, as the host waits for each new one. A CPU makes them anew,
     # since those of many photographs take more memory than time.
