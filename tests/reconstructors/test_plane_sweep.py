@@ -17,7 +17,13 @@ from gscompleter.data.demo_scene import (
 from gscompleter.numerics.geometry import project
 from gscompleter.reconstructors.features.depth_range import estimate_depth_range, get_depth_range
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
-from gscompleter.reconstructors.plane_sweep.gaussians import DISC_SIGMA, compute_normals, make_discs
+from gscompleter.reconstructors.plane_sweep.gaussians import (
+    DISC_SIGMA,
+    MAX_DISC_STRETCH,
+    MAX_PLANE_STRETCH,
+    compute_normals,
+    make_discs,
+)
 from gscompleter.render.loading import load_renderer
 from gscompleter.types import DepthMap
 from scenes import Room, camera_at, view_of
@@ -68,7 +74,9 @@ def test_gaussians_are_as_large_as_asked_for_in_pixels():
     assert torch.allclose(large.scales[:, 0], pixel)
 
 
-@pytest.mark.parametrize(("stretch", "is_whole"), [(6.0, False), (20.0, True)])
+@pytest.mark.parametrize(
+    ("stretch", "is_whole"), [(MAX_DISC_STRETCH, False), (MAX_PLANE_STRETCH, True)]
+)
 def test_a_road_is_whole_from_nearer_by(stretch, is_whole):
     """Its rows stand 8 to 24 times as far apart as its pixels are wide, 13 to 40 units away."""
     camera = camera_at(size=96)
@@ -93,11 +101,13 @@ def test_long_discs_are_for_planes_alone():
     lengths = []
     for rough in (torch.ones_like(noise), noise):
         surface = depth * rough
-        discs = make_discs(view, surface, compute_normals(surface, view), DISC_SIGMA, 20.0)
+        discs = make_discs(
+            view, surface, compute_normals(surface, view), DISC_SIGMA, MAX_PLANE_STRETCH
+        )
         stretch = discs.scales[:, 1] / discs.scales[:, 0]
         lengths.append(stretch.unflatten(0, (96, 96))[54:60, 4:-4].amax().item())
-    assert lengths[0] > 12
-    assert lengths[1] <= 6.001
+    assert lengths[0] == pytest.approx(MAX_PLANE_STRETCH, rel=0.01)
+    assert lengths[1] < 1.001 * MAX_DISC_STRETCH
 
 
 def test_moving_forward_gives_depth_too():

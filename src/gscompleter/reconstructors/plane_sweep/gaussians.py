@@ -52,7 +52,7 @@ DISC_THICKNESS = 0.15
 """Standard deviation along the normal, relative to that across the viewing ray."""
 MAX_DISC_STRETCH = 6.0
 """Largest elongation of a disc on a slanted surface, relative to a frontal one."""
-MAX_PLANE_STRETCH = 20.0
+MAX_PLANE_STRETCH = 12.0
 """Largest elongation where normals around a pixel agree: seen from nearer by, a road whose rows of
 discs do not reach each other breaks up into stripes (decision 150)."""
 FLAT_AGREEMENT = 0.9995
