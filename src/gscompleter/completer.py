@@ -379,7 +379,7 @@ class GSCompleter:
         if config.displacement == 0 or len(added) == 0:
             return nothing
         # The target is not counted as completed yet: what is added here gets its id, and has to be
-        # content with its budgets. Its image is complete.
+        # content with its budgets.
         photos = tuple(
             replace(photo, budgets=budgets)
             for photo, budgets in zip(state.photos, target.budgets, strict=True)
@@ -388,7 +388,7 @@ class GSCompleter:
             state,
             added_parts=(*state.added_parts, added),
             photos=photos,
-            completed_cameras=(*state.completed_cameras, target.camera.target),
+            filled_target=target.camera.target,
         )
         closed = [nothing]
         for camera in displace_camera(target.camera.target, state.views, config.displacement):

@@ -56,9 +56,8 @@ class Completion(Displayed):
     added_parts: tuple[Part, ...] = ()
     """What was added, part by part, in the order of addition."""
     targets: tuple[TargetResult, ...] = ()
-    completed_cameras: tuple[Camera, ...] = ()
-    """Targets for which something was added, with their depth range; what is added for others may
-    not show in their images."""
+    filled_target: Camera | None = None
+    """Target whose holes are filled and whose gaps are being closed; None in between targets."""
     free_space_cameras: tuple[Camera, ...] = ()
     """Further cameras whose free space stays empty, such as the witnesses of a splat; their images
     are not read."""
@@ -160,6 +159,11 @@ class Completion(Displayed):
         return tuple(photo.view for photo in self.photos[: self.num_context])
 
     @property
+    def completed_cameras(self) -> list[Camera]:
+        """Cameras of the targets for which something was added."""
+        return [result.target for result in self.targets if len(result.added)]
+
+    @property
     def parts(self) -> tuple[Gaussians, ...]:
         """Gaussians to render: the context, then the additions, by which frozen scenes grow."""
         return (self.rendered_context, *(part.gaussians for part in self.added_parts))
@@ -257,16 +261,7 @@ class Completion(Displayed):
         """Append the result of one more target, and what it `added`, in the order of addition."""
         parts = (*self.added_parts, *(part for part in added if len(part)))
         targets = (*self.targets, result)
-        cameras = self.completed_cameras
-        if len(result.added):
-            cameras = (*cameras, result.target)
-        changed = replace(
-            self,
-            added_parts=parts,
-            targets=targets,
-            completed_cameras=cameras,
-            is_restored=False,
-        )
+        changed = replace(self, added_parts=parts, targets=targets, is_restored=False)
         return changed.plus_seconds(seconds)
 
     def plus_seconds(self, seconds: Mapping[str, float]) -> Completion:

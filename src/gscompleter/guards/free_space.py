@@ -88,9 +88,9 @@ class FreeSpace(Guard):
         # Completed targets count, or else a later target hangs its additions before those of an
         # earlier one (decision 008), and so do cameras of further photographs (decision 029).
         # Both are rendered small, to save time.
-        completed = [result.target for result in state.targets if len(result.added)]
         side = state.config.next_best_view.image_size
-        small = [shrink_camera(camera, side) for camera in (*state.free_space_cameras, *completed)]
+        further = [*state.free_space_cameras, *state.completed_cameras]
+        small = [shrink_camera(camera, side) for camera in further]
         renders += [frozen.render for frozen in view.scenes.freeze_small(state.parts, small)]
         cameras += small
 

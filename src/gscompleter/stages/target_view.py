@@ -127,8 +127,13 @@ class TargetView:
 
     @cached_property
     def completed_cameras(self) -> list[Camera]:
-        """Cameras of the completed targets nearest to this one."""
+        """Cameras of the completed targets nearest to this one.
+
+        Where gaps are closed, the target that they are beside is one of them.
+        """
         cameras = self.state.completed_cameras
+        if self.state.filled_target is not None:
+            cameras = [*cameras, self.state.filled_target]
         if not cameras:
             return []
         order = measure_distances(cameras, [self.camera.target]).argsort(stable=True)
