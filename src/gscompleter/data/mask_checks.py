@@ -17,6 +17,7 @@ from jaxtyping import Bool
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.masks import hides_white, read_ignored
 from gscompleter.data.photographs import Photographs
+from gscompleter.numerics.sampling import sample_evenly
 from gscompleter.system.errors import InputError, join_names
 from gscompleter.system.files.image import read_mask
 
@@ -66,7 +67,9 @@ def check_hiding_masks(masks: Sequence[Path], reading: MaskReading, num_photogra
     if reading.may_be_large or not masks:
         return
     # All of them are read only where each mask of the sample hides its whole photograph.
-    shares = measure_hidden(sample_evenly(masks), reading) or measure_hidden(masks, reading)
+    shares = measure_hidden(sample_evenly(masks, MAX_READ), reading) or measure_hidden(
+        masks, reading
+    )
     if not shares and len(masks) < num_photographs:
         return  # photographs without a mask are left
     places = name_masks(path.parent for path in masks)
@@ -92,7 +95,9 @@ def check_selecting_masks(masks: Sequence[Path], reading: MaskReading, images: s
     masks are of, for errors.
     """
     # All of them are read only where no mask of the sample selects anything.
-    shares = measure_selected(sample_evenly(masks), reading) or measure_selected(masks, reading)
+    shares = measure_selected(sample_evenly(masks, MAX_READ), reading) or measure_selected(
+        masks, reading
+    )
     taken = "black" if reading.is_inverted else "white"
     left = "white" if reading.is_inverted else "black"
     if not shares:
@@ -116,12 +121,6 @@ def check_selected_share(share: float, reading: MaskReading) -> None:
             f"The masks select {format_share([share])} of the Gaussians of the splat, where what "
             f"is {taken} goes; {name_ways_out(reading)}"
         )
-
-
-def sample_evenly(masks: Sequence[Path]) -> list[Path]:
-    """Sample up to `MAX_READ` masks at even steps."""
-    steps = np.linspace(0, len(masks) - 1, min(len(masks), MAX_READ)).round().astype(int)
-    return [masks[step] for step in steps]
 
 
 def measure_hidden(masks: Iterable[Path], reading: MaskReading) -> list[float]:

@@ -14,6 +14,7 @@ import torch
 
 from gscompleter.data.cameras import Poses
 from gscompleter.data.photographs import Photographs
+from gscompleter.numerics.sampling import sample_evenly
 from gscompleter.reconstructors.features.depth_range import estimate_depth_range
 from gscompleter.render.lod import build_proxy, thin_gaussians
 from gscompleter.render.protocols import Renderer
@@ -146,7 +147,7 @@ def align_splat(
     if best.fit.is_match:
         return best
     # A part of a long drive covers few of its photographs, and the samples may miss them.
-    spread = spread_evenly(range(len(photographs)), MAX_ASKED_VIEWS)
+    spread = sample_evenly(range(len(photographs)), MAX_ASKED_VIEWS)
     others = [view.to(device) for view in read_views(photographs, spread)]
     shown = AlignmentData(splat.scene, others, renderer).find_shown()
     if len(shown) < MIN_SHOWN:
@@ -166,22 +167,14 @@ def sample_views(
     If these are not known, or none can be read, load the first of `frames` and, spread over all,
     further photographs that can be read.
     """
-    views = read_views(photographs, spread_evenly(sources, NUM_SAMPLE_VIEWS))
+    views = read_views(photographs, sample_evenly(sources, NUM_SAMPLE_VIEWS))
     if views:
         return views
     # Half of the samples are the frames of the context, half are from all over.
     named = list(frames)[: NUM_SAMPLE_VIEWS // 2]
-    spread = spread_evenly(range(len(photographs)), NUM_SAMPLE_VIEWS)
+    spread = sample_evenly(range(len(photographs)), NUM_SAMPLE_VIEWS)
     others = [frame for frame in spread if frame not in named][: NUM_SAMPLE_VIEWS - len(named)]
     return photographs.views(named, SAMPLE_SIDE) + read_views(photographs, others)
-
-
-def spread_evenly(frames: Sequence[int], count: int) -> list[int]:
-    """Choose up to `count` of the frames, at even steps from the first to the last."""
-    if not frames:
-        return []
-    steps = np.linspace(0, len(frames) - 1, count).round().astype(int).tolist()
-    return [frames[step] for step in dict.fromkeys(steps)]
 
 
 def read_views(photographs: Photographs, frames: Sequence[int]) -> list[View]:
