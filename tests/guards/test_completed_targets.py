@@ -1,4 +1,4 @@
-"""What is added for one target shows as no spot in the images of those that were completed."""
+"""Guard `completed-targets`: additions show as no spots in the images of completed targets."""
 
 from dataclasses import replace
 from unittest.mock import Mock

@@ -141,7 +141,7 @@ def test_members_of_a_family_with_licences_of_their_own_are_told_apart(name, wor
     ],
 )
 def test_a_full_machine_is_not_told_as_a_fault_of_the_weights(error, tmp_path):
-    """Of the text encoders of PE-Field, which take 10 GB, and of a download."""
+    """Let a lack of memory (text encoders take 10 GB) and a full disk (a download) go on."""
     pytest.importorskip("diffusers", reason="needs gscompleter[diffusion]")
     with pytest.raises(type(error)) as caught, convert_load_errors(KONTEXT):
         try:

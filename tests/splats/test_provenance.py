@@ -100,7 +100,7 @@ def test_convert_carries_the_record_and_plain_drops_it(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("name", NAMES)
 def test_who_made_a_splat_is_known_where_nothing_in_it_was_invented(tmp_path, name, monkeypatch):
-    """What was invented may be cut out again, and a run may add only what photographs show."""
+    """Keep a record without labels: what was invented may be cut out, or only photographs added."""
     if ".usd" in name:
         pytest.importorskip("pxr", reason="needs usd-core (the extra usd)")
     save_splat(tmp_path / "given.ply", plausible(9, 0), RECORD)

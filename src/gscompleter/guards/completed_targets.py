@@ -38,8 +38,11 @@ class CompletedTargets(Guard):
             # What is half transparent there shows a gap, which may be closed.
             covered = frozen.render.alpha >= max_alpha
             for _ in range(NUM_ROUNDS):
-                is_spot = find_in_spots(added, frozen, camera, covered)
-                added = added[~is_spot]
+                kept = added[~find_in_spots(added, frozen, camera, covered)]
+                # Without a loss another round would find the same.
+                if len(kept) == len(added):
+                    break
+                added = kept
         return added
 
 

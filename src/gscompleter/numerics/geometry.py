@@ -314,15 +314,29 @@ def sample_image(small: Camera, large: Camera) -> Camera:
 def select_spread_cameras(cameras: Sequence[Camera], count: int) -> list[int]:
     """Select up to `count` cameras that are far apart (farthest point sampling); return indices."""
     where = embed_cameras(cameras)
-    chosen = [0]
     apart = (where - where[0]).norm(dim=1)
     # A camera is chosen once, also where others stand in its place.
-    apart[0] = -1.0
-    while len(chosen) < min(count, len(cameras)):
-        chosen.append(int(apart.argmax()))
-        # Distance of each camera from the nearest chosen one.
-        apart = torch.minimum(apart, (where - where[chosen[-1]]).norm(dim=1))
-        apart[chosen] = -1.0
+    weights = torch.ones_like(apart)
+    weights[0] = 0.0
+    return [0, *select_apart(where, weights, apart, min(count, len(cameras)) - 1)]
+
+
+def select_apart(
+    where: Float[Tensor, "n 6"], weights: Float[Tensor, "n"], apart: Float[Tensor, "n"], count: int
+) -> list[int]:
+    """Select `count` embedded cameras of large weight that are far from each other.
+
+    `apart` is the distance of each from the nearest one that is known already. At least `count`
+    have a weight above 0, and others are not selected.
+    """
+    chosen: list[int] = []
+    weights = weights.clone()
+    for _ in range(count):
+        # One that stands in the place of another comes last, and before none.
+        best = int((weights * apart.clamp_min(1e-30)).argmax())
+        chosen.append(best)
+        weights[best] = 0.0
+        apart = torch.minimum(apart, (where - where[best]).norm(dim=1))
     return chosen
 
 

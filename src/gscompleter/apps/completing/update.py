@@ -43,7 +43,7 @@ from gscompleter.apps.requests.scene import Names
 from gscompleter.config import CompleterConfig
 from gscompleter.data.formats import find_format
 from gscompleter.data.sfm.placing import place_photographs
-from gscompleter.numerics.geometry import embed_cameras
+from gscompleter.numerics.geometry import embed_cameras, select_apart
 from gscompleter.splats.alignment.similarity import transform_view
 from gscompleter.splats.edits import read_edits
 from gscompleter.stages.add_observed import MIN_ADDED_SHARE, find_lacks, limit_part_photos
@@ -236,18 +236,12 @@ def select_lacking(
     """
     frames = list(cameras)
     where = embed_cameras(list(cameras.values()))
-    is_known = torch.tensor([frame in known for frame in frames])
-    share = torch.tensor([shares.get(frame, 0.0) for frame in frames])
+    is_known = torch.tensor([frame in known for frame in frames], device=where.device)
+    share = torch.tensor([shares.get(frame, 0.0) for frame in frames], device=where.device)
     share[is_known | (share < MIN_ADDED_SHARE)] = 0.0
     apart = torch.cdist(where, where[is_known]).amin(dim=1)
-    chosen: list[int] = []
-    while len(chosen) < count and (share > 0).any():
-        # One that stands in the place of another comes last, and before none.
-        best = int((share * apart.clamp_min(1e-6)).argmax())
-        chosen.append(frames[best])
-        share[best] = 0.0
-        apart = torch.minimum(apart, (where - where[best]).norm(dim=1))
-    return chosen
+    count = min(count, int((share > 0).sum()))
+    return [frames[index] for index in select_apart(where, share, apart, count)]
 
 
 def measure_lacks(loaded: Loaded) -> dict[int, float]:
