@@ -23,10 +23,12 @@ from gscompleter.apps.completing.printing import (
     answer_export,
     answer_plan,
 )
+from gscompleter.apps.completing.refill import find_reopened
 from gscompleter.apps.completing.remove import prepare_removal
 from gscompleter.apps.completing.run_info import describe_run_values, read_held_out
 from gscompleter.apps.completing.update import prepare_update
 from gscompleter.apps.inputs.describing import describe_task, print_lines
+from gscompleter.apps.inputs.earlier_targets import EMPTY_SHARES, measure_empty_share
 from gscompleter.apps.inputs.refined_poses import write_refined_poses
 from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.apps.report.completion import write_report
@@ -61,7 +63,7 @@ from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.files.video import find_ffmpeg
 from gscompleter.system.files.writing import RENDERS_FILE, TARGETS_FILE
 from gscompleter.system.process import release_free_memory
-from gscompleter.system.progress import show_progress, stage
+from gscompleter.system.progress import show_progress, stage, track
 from gscompleter.system.timing import add_seconds
 from gscompleter.types import Camera
 
@@ -299,13 +301,14 @@ def write_done(
         describe_settings(ready),
         ready.inverts_masks,
     )
+    reopened = {"reopened": len(ready.reopened)} if ready.reopened else {}
     with run_in_background(render_pairs, completion, aside, renderer) as looks:
         summary = write_report(
             folder,
             completion,
             task.targets,
             renderer,
-            {**facts, "seed": seed},
+            {**facts, "seed": seed, **reopened},
             task.splat_file,
             cameras,
             looks,
@@ -314,15 +317,17 @@ def write_done(
             has_searched=ready.targets is not None,
             run=describe_maker(ready.work.models, task, completion),
             testing=[completion.with_depth_range(camera) for camera in task.witnesses.testing],
-            edit=EditDraft(command or ready.command, describe_edit(ready)),
+            edit=EditDraft(command or ready.command, describe_edit(ready, completion)),
         )
     write_chosen_cameras(folder, ready.opened, ready.task)
     write_completion_page(folder)
     return summary
 
 
-def describe_edit(ready: Prepared) -> dict[str, Any]:
+def describe_edit(ready: Prepared, completion: Completion) -> dict[str, Any]:
     """Describe what was done for the record of edits: places, cameras, masks, photographs, models.
+
+    Of each camera it also tells the share of its image that stayed empty.
 
     Places are in the coordinates of the splat's file, and cameras in the frame of the photographs.
     Paths are without their folders, which tell about the machine.
@@ -336,10 +341,12 @@ def describe_edit(ready: Prepared) -> dict[str, Any]:
         describe_camera(transform_camera_exactly(target.camera, back))
         for target in ready.task.targets
     ]
+    empty = [round(measure_empty_share(result.after.alpha), 5) for result in completion.targets]
     return {
         **place,
         **{name: strip_folders(value) for name, value in named.items()},
         "cameras": cameras,
+        EMPTY_SHARES: empty,
         "photographs": [files.get(frame) for frame in ready.task.context_frames],
         "reconstructor": strip_folders(ready.work.models.reconstructor),
         "generator": strip_folders(ready.work.models.generator),
@@ -354,19 +361,38 @@ def strip_folders(value: str | Sequence[str]) -> str | list[str]:
 
 
 def complete_targets(ready: Prepared) -> tuple[Completion, Prepared]:
-    """Complete the scene for the named targets, or for targets that it finds."""
+    """Complete the scene for the named targets, or for targets that it finds.
+
+    Then it is completed for those of earlier commands at which holes opened (decision 151).
+    """
     task = ready.task
 
     # What photographs show is added when the completion begins, before any target.
     if ready.targets is None:
-        return ready.begin(), ready
+        completion = ready.begin()
+        return completion, replace(ready, reopened=find_reopened(ready, completion))
 
     check_target_count(ready)
     if task.targets:
-        return ready.completer.complete(ready.begin(), task.target_cameras), ready
-    cameras = list(ready.cameras.values())
-    completion, choices = ready.explorer.explore(ready.begin(), cameras, ready.max_targets)
-    return completion, ready.with_choices(choices)
+        completion = ready.completer.complete(ready.begin(), task.target_cameras)
+    else:
+        cameras = list(ready.cameras.values())
+        completion, choices = ready.explorer.explore(ready.begin(), cameras, ready.max_targets)
+        ready = ready.with_choices(choices)
+    if not fills_anywhere(ready):
+        return completion, ready
+    reopened = find_reopened(ready, completion)
+    for target in track(reopened, "target of an earlier command"):
+        completion = ready.completer.advance(completion, target.camera)
+    return completion, ready.with_targets((*ready.task.targets, *reopened))
+
+
+def fills_anywhere(ready: Prepared) -> bool:
+    """Return True if Φ makes an image for any camera.
+
+    A painter and the oracle have images of the named targets alone.
+    """
+    return ready.work.models.generator not in ("painted", "oracle")
 
 
 def check_target_count(ready: Prepared) -> None:

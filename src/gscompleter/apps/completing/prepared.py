@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -57,6 +57,8 @@ class Prepared:
     """Chooses what goes before anything is completed; None for nothing."""
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Settings of this command alone, for `summary.json`."""
+    reopened: tuple[Target, ...] = ()
+    """Targets of earlier commands at which holes opened, and which an update does not fill."""
 
     @property
     def completer(self) -> GSCompleter:
@@ -103,4 +105,8 @@ class Prepared:
             targets.append(
                 Target(choice.camera, derived_from=frame, offset=offset, reason=choice.describe())
             )
+        return self.with_targets(targets)
+
+    def with_targets(self, targets: Sequence[Target]) -> Prepared:
+        """Return a copy with other targets."""
         return replace(self, task=replace(self.task, targets=targets))

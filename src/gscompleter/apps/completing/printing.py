@@ -85,7 +85,7 @@ def make_score_table(summary: CompletionSummary) -> Table:
     for held_out in () if summary.targets else summary.held_out:
         before = format_number(held_out.psnr_before)
         after = format_number(held_out.psnr_after)
-        rows.append([f"not used: {held_out.photograph}", "", before, after])
+        rows.append([f"{held_out.use}: {held_out.photograph}", "", before, after])
     for number, target in enumerate(summary.targets, start=1):
         before = format_number(target.psnr_before)
         after = format_number(target.psnr_after)

@@ -39,7 +39,7 @@ from gscompleter.evaluation.verdict.numbers import (
     format_number,
     format_percent,
 )
-from gscompleter.evaluation.verdict.rows import ScoreRow
+from gscompleter.evaluation.verdict.rows import CHECK_USE, NO_USE, ScoreRow
 from gscompleter.system.files.image import (
     SHOWN_JPEG_QUALITY,
     encode_jpeg,
@@ -196,12 +196,17 @@ def list_photographs(summary: CompletionSummary) -> list[tuple[str, ScoreRow, st
     if summary.targets:
         return []
     used = [(row, "used") for row in summary.context]
-    checks = [(row, "used in a small copy") for row in summary.checks]
-    held_out = [(row, "not used") for row in summary.held_out]
+    checks = [(row, CHECK_USE) for row in summary.checks]
+    held_out = [(row, row.use) for row in summary.held_out]
     numbered = enumerate([*used, *checks, *held_out], start=1)
-    listed = [(f"photograph{number}", row, use) for number, (row, use) in numbered]
+    # Of a check that also scores the result, the score at full size is shown.
+    scoring = {row.frame for row in summary.held_out}
+    small = [row for row in summary.checks if row.frame in scoring]
+    listed = [
+        (f"photograph{number}", row, use) for number, (row, use) in numbered if row not in small
+    ]
     # Those that were not used come first, since they test the result; the sort is stable.
-    return sorted(listed, key=lambda photograph: photograph[2] != "not used")
+    return sorted(listed, key=lambda photograph: photograph[2] != NO_USE)
 
 
 def find_length_unit(summary: CompletionSummary) -> str:

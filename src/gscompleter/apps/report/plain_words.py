@@ -301,6 +301,16 @@ def describe_replaced(count: int) -> str:
     )
 
 
+def describe_reopened(count: int) -> str:
+    """Write the sentence on targets of earlier commands at which an update opened holes."""
+    cameras = "1 camera" if count == 1 else f"{count} cameras"
+    return (
+        f"Holes opened at {cameras} where an earlier command had filled them: photographs show "
+        "that what was invented is wrong, and not what is there. Complete the result: that fills "
+        "them again."
+    )
+
+
 def list_splat_notes(summary: CompletionSummary) -> Iterator[Note]:
     """List the notes on what photographs bring to a splat."""
     from_photographs = summary.gaussians.get("from_photographs")
@@ -327,6 +337,8 @@ def list_splat_notes(summary: CompletionSummary) -> Iterator[Note]:
     num_replaced = summary.gaussians.get("replaced")
     if num_replaced:
         yield Note("replaced", describe_replaced(num_replaced))
+    if summary.reopened:
+        yield Note("earlier targets", describe_reopened(summary.reopened), is_warning=True)
     num_removed = summary.gaussians.get("removed")
     if num_removed:
         yield Note("removed", f"{num_removed:,} {REMOVED_NOTE}")

@@ -307,6 +307,8 @@ class CompletionSummary:
     """How geometry from elsewhere was moved to the scene; None if it stood there, or without it."""
     context_notes: tuple[str, ...] = ()
     """Sentences of the reconstructor about the context."""
+    reopened: int = 0
+    """Number of targets of earlier commands at which an update opened holes, and left them."""
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,11 @@ from typing import Literal
 
 from gscompleter.data.photograph_names import name_photograph
 
+NO_USE = "not used"
+"""Use of a photograph that only scores the result, in words."""
+CHECK_USE = "used in a small copy"
+"""Use of a photograph of which a small copy checked the input splat, in words."""
+
 
 @dataclass(frozen=True)
 class ScoreRow:
@@ -45,6 +50,11 @@ class HeldOutRow(ScoreRow):
     colour, in a small image; None if it covers too little of it."""
     above_photograph: float | None = None
     """The same beyond the nearest of the photographs that were used, left as they are."""
+
+    @property
+    def use(self) -> str:
+        """What the completion used it for, in words."""
+        return CHECK_USE if self.is_check else NO_USE
 
 
 @dataclass(frozen=True)
