@@ -63,7 +63,7 @@ def find_reopened(ready: Prepared, completion: Completion) -> tuple[Target, ...]
 def make_reopened(ready: Prepared, camera: Camera, share: float) -> Target:
     """Make the target of a camera at which holes opened, with its photograph if it has one."""
     reason = REOPENED.format(share=format_percent(share))
-    frame = find_photograph(ready, camera)
+    frame = find_frame_taken_by(ready, camera)
     if frame is None:
         return Target(camera, reason=reason)
     photographs = ready.opened.photographs
@@ -73,7 +73,7 @@ def make_reopened(ready: Prepared, camera: Camera, share: float) -> Target:
     return replace(target, reason=reason)
 
 
-def find_photograph(ready: Prepared, camera: Camera) -> int | None:
+def find_frame_taken_by(ready: Prepared, camera: Camera) -> int | None:
     """Find the frame of the photograph that was taken by a camera; None if there is none."""
     for frame, known in ready.cameras.items():
         if is_same_camera(known, camera):
