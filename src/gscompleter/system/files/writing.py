@@ -91,15 +91,29 @@ def keep_permissions(old: Path, new: Path) -> None:
     for owner, group in ((-1, status.st_gid), (status.st_uid, -1)):
         with suppress(OSError):
             os.chown(new, owner, group)
-    if hasattr(os, "getxattr"):  # on Linux; without the list its mask would count as the group
-        with suppress(OSError):
-            os.setxattr(new, ACCESS_LIST, os.getxattr(old, ACCESS_LIST))
+    keep_access_list(old, new)
     mode = stat.S_IMODE(status.st_mode) & 0o777
     with suppress(OSError):
         # A group that could not be kept may do no more than everybody.
         if os.lstat(new).st_gid != status.st_gid:
             mode &= 0o707 | (mode & 0o007) << 3
         os.chmod(new, mode)
+
+
+def keep_access_list(old: Path, new: Path) -> None:
+    """Give a file the access list of one that it replaces, and none if that has none.
+
+    Nothing happens on systems without such lists. It comes before the mode: of a file with a list
+    the group's bits of the mode are a bound of the whole list, and not the rights of the group.
+    """
+    if not hasattr(os, "getxattr"):  # on Linux alone
+        return
+    with suppress(OSError):
+        try:
+            os.setxattr(new, ACCESS_LIST, os.getxattr(old, ACCESS_LIST))
+        except OSError:
+            # A folder may give each new file a list, by which others could read a private one.
+            os.removexattr(new, ACCESS_LIST)
 
 
 def encode_text(text: str) -> bytes:
@@ -133,8 +147,7 @@ def convert_write_errors(path: Path | str, numbers: Container[int] | None = None
                 f"Cannot write {quote_value(Path(path))}: there is no folder "
                 f"{quote_value(folder)}; make it, or choose another place."
             ) from error
-        kind = FullDiskError if error.errno in FULL_DISK_ERRORS else OutputError
-        raise kind(
-            f"Cannot write {quote_value(Path(path))}: {error.strerror or error}; free some space, "
-            "or choose another place."
-        ) from error
+        sentence = f"Cannot write {quote_value(Path(path))}: {error.strerror or error}"
+        if error.errno in FULL_DISK_ERRORS:
+            raise FullDiskError(f"{sentence}; free some space, or choose another place.") from error
+        raise OutputError(f"{sentence}; choose another place.") from error
