@@ -158,6 +158,7 @@ def decide_scene(
 
     With a splat (`has_splat`) the default resolution is that of its training, if that is smaller.
     """
+    check_mask_options(options, masks)
     return SceneRequest(
         folder,
         options.format,
@@ -315,6 +316,24 @@ def make_two_splats_error(folder: Path, scene: Path) -> InputError:
         "and as SCENE only its photographs.",
         "scene",
     )
+
+
+def check_mask_options(options: SceneOptions, masks: MaskReading) -> None:
+    """Refuse options on masks of photographs where none is used; `masks` is how they are read."""
+    if not options.no_masks:
+        return
+    if masks.is_inverted:
+        raise InputError(
+            "--no-masks leaves out the masks that would be read the other way round; give one of "
+            "both.",
+            "invert-masks",
+        )
+    if masks.folder is not None:
+        raise InputError(
+            "--no-masks uses all pixels of the photographs, and --ignore names masks of some to "
+            "leave out; give one of both.",
+            "ignore",
+        )
 
 
 def check_context(context: Names | None) -> None:

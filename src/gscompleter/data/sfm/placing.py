@@ -162,7 +162,7 @@ def place_photographs(
             "photos",
         )
 
-    new = find_given(folder, names, reading.folder)
+    new = find_given(folder, names, reading)
     masks = [given.mask for given in new if given.mask is not None]
     check_hiding_masks(masks, reading, len(new))
     identity = identify_input(new, photographs)
