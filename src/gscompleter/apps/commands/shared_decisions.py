@@ -41,7 +41,7 @@ from gscompleter.system.errors import InputError, quote_value
 
 PHOTOGRAPH_OPTIONS = (
     *("format", "frames", "no_refine_poses", "no_masks", "ignore"),
-    # Edits matter to photographs, which still show what was taken out.
+    # It needs both: edits of a splat matter to photographs, which still show what was taken out.
     "forget_edits",
 )
 """Options that only photographs can follow. A default that is typed all the same cannot be told
@@ -133,9 +133,7 @@ def choose_hole_kind(
 
     `config` is that of the options. Raises InputError if both are given and differ.
     """
-    # No preset has another kind than the default, so that the user chose what differs from it.
-    is_given = "kind" in options.config.changes.get("holes", {}) or config.holes.kind != "all"
-    if not is_given:
+    if not options.config.gives("holes", "kind"):
         return options.holes
     if options.holes not in ("auto", config.holes.kind):
         raise InputError(
@@ -188,10 +186,10 @@ def decide_splat(options: SceneOptions, path: Path) -> SplatRequest:
 
     return SplatRequest(
         resolve_splat(path),
-        options.drop_nonfinite,
-        options.ignore_properties,
-        options.forget_edits,
-        options.out,
+        drop_nonfinite=options.drop_nonfinite,
+        ignore_properties=options.ignore_properties,
+        forget_edits=options.forget_edits,
+        beside=options.out,
     )
 
 
