@@ -46,8 +46,8 @@ from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import holds_results, holds_session
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.files.reading import hash_file
+from gscompleter.system.files.result_names import COMPLETED_FILES, STROKES_FILE
 from gscompleter.system.files.typed_json import validate_typed
-from gscompleter.system.files.writing import COMPLETED_FILES, STROKES_FILE
 from gscompleter.system.plugins import is_in_file
 
 DEFAULT_OUT = Path("live")

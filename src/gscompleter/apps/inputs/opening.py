@@ -37,7 +37,7 @@ from gscompleter.splats.foreign import holds_splat_alone
 from gscompleter.splats.formats import has_splat_extension
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import FOUND_POSES_FOLDER, refuse_link
-from gscompleter.system.files.writing import SUMMARY_FILE
+from gscompleter.system.files.result_names import SUMMARY_FILE
 
 NUM_SIZE_PHOTOGRAPHS = 8
 """Number of photographs that are enough to find the size of a training by."""

@@ -56,7 +56,7 @@ from gscompleter.system.files.image_opening import open_image
 from gscompleter.system.files.names import is_hidden_name, make_colmap_name
 from gscompleter.system.files.output_folder import refuse_later_results, reserve_output
 from gscompleter.system.files.reading import read_json
-from gscompleter.system.files.writing import SUMMARY_FILE
+from gscompleter.system.files.result_names import SUMMARY_FILE
 from gscompleter.system.progress import stage, track
 from gscompleter.system.threads import get_thread_count
 
