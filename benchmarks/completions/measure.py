@@ -17,7 +17,7 @@ from gscompleter.render.protocols import Renderer
 from gscompleter.state import Completion
 from gscompleter.system.children import run_python
 from gscompleter.system.errors import InputError
-from gscompleter.system.files.writing import SUMMARY_FILE
+from gscompleter.system.files.result_names import SUMMARY_FILE
 from gscompleter.system.progress import show_progress, track
 from gscompleter.system.timing import wait_for_gpu
 from gscompleter.types import Camera, Gaussians, make_observed, merge, sh_from_rgb

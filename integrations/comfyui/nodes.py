@@ -34,7 +34,7 @@ from gscompleter.splats.edits import EditDraft
 from gscompleter.system.console import make_console
 from gscompleter.system.files.image import read_image, write_image
 from gscompleter.system.files.output_folder import open_output_folder
-from gscompleter.system.files.writing import COMPLETED_FILE, SUMMARY_FILE
+from gscompleter.system.files.result_names import COMPLETED_FILE, SUMMARY_FILE
 
 HANDLE = "GSCOMPLETER_HOLES"
 """Type of the link between the nodes that find holes and that register a painting."""

@@ -117,6 +117,23 @@ def test_depth_that_cannot_be_compared_is_used_and_said(tmp_path):
     assert "show too little to compare" in note
 
 
+def test_photographs_of_one_place_whose_coordinates_are_rounded_are_not_compared(tmp_path):
+    """Two photographs of a tripod: float32 rounds its place by as much as they seem to be apart."""
+    scene = make_scene(tmp_path / "room")
+    path = scene / "transforms.json"
+    transforms = json.loads(path.read_text())
+    for frame, x in zip(transforms["frames"], (2.0, 2.0 + 2**-22, 3.0), strict=True):
+        frame["transform_matrix"][0][3] = x
+        frame["transform_matrix"][1][3] = 0.0
+        frame["transform_matrix"][2][3] = 0.0
+    path.write_text(json.dumps(transforms))
+    photographs = open_photographs(scene)
+    centers = [view.camera.center for view in photographs.views((0, 1))]
+    assert (centers[1] - centers[0]).any()
+    (note,) = read_with_depth(photographs, (0, 1), scoring=(2,)).notes
+    assert "show too little to compare" in note
+
+
 def test_points_of_the_scene_take_part(tmp_path):
     """Photographs without texture have no matches; the points that the file names remain."""
     scene = make_scene(tmp_path / "room", "png", lambda z, _: 2.5 * z)

@@ -2,6 +2,7 @@
 
 import json
 import zipfile
+from pathlib import Path
 
 import pytest
 from PIL import Image
@@ -25,11 +26,13 @@ from scenes import random_gaussians
 CAMERAS = make_cameras(4, width=64, height=48, focal=52.0)
 
 
-def test_photographs_whose_folder_has_cameras_say_so(tmp_path):
+def test_photographs_whose_folder_has_cameras_say_so(tmp_path, monkeypatch):
     scene = write_transforms(tmp_path / "scene", CAMERAS)
     (line,) = describe_cameras_above(scene / "images")
     assert f"{scene} has cameras of these photographs (nerfstudio)" in line
     assert describe_cameras_above(scene) == []
+    monkeypatch.chdir(scene / "images")
+    assert describe_cameras_above(Path()) == [line]
     write_photographs(tmp_path / "plain" / "images", CAMERAS)
     assert describe_cameras_above(tmp_path / "plain" / "images") == []
 

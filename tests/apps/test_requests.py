@@ -124,19 +124,26 @@ def test_a_setting_that_is_typed_wins_over_any_preset(decide):
 
 def test_holes_are_those_of_the_option_or_of_the_setting(decide, tmp_path):
     (tmp_path / "object.yaml").write_text("holes: {kind: enclosed}")
+    (tmp_path / "scene.yaml").write_text("holes: {kind: all}")
     for words, kind in (
         ("", "auto"),
         ("--holes all", "all"),
         ("--config.holes.kind all", "all"),
         ("--config.holes.kind enclosed", "enclosed"),
         ("--config object.yaml", "enclosed"),
+        ("--config scene.yaml", "all"),
+        ("--config paper", "auto"),
         ("--config object.yaml --holes enclosed", "enclosed"),
     ):
         assert decide(f"complete SPLAT {words} --out out").source.holes == kind
         config = decide(f"complete SCENE {words} --out out").work.config
         assert config.holes.kind == ("enclosed" if kind == "enclosed" else "all")
         assert ("hull" in config.guards) == (kind == "enclosed")
-    for words in ("--config.holes.kind all --holes enclosed", "--config object.yaml --holes all"):
+    for words in (
+        "--config.holes.kind all --holes enclosed",
+        "--config object.yaml --holes all",
+        "--config scene.yaml --holes enclosed",
+    ):
         for scene in ("SPLAT", "SCENE"):
             with pytest.raises(InputError, match=r"--holes is \w+, and the setting holes\.kind is"):
                 decide(f"complete {scene} {words} --out out")

@@ -9,9 +9,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 
 from command import run
+from gscompleter.apps.inputs.opening import open_scene
+from gscompleter.apps.requests.scene import PosesRequest, SceneRequest
 from gscompleter.data.formats import open_photographs
+from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.sfm import poses
 from gscompleter.data.sfm.poses import (
     MAX_COPY_SIDE,
@@ -115,6 +119,30 @@ def test_masks_of_the_user_are_not_taken_for_those_of_an_earlier_run(tmp_path, m
     with pytest.raises(InputError, match=r"masks/0\.png\.png"):
         find_poses(given, out, overwrite=True)
     assert (out / "masks" / "0.png.png").read_bytes() == b"mine"
+
+
+def test_masks_of_what_is_removed_hide_nothing_where_cameras_are_searched_for(
+    tmp_path, monkeypatch
+):
+    """They lie where masks of what to ignore are looked for, and show little in white."""
+    given, out = blank(tmp_path / "photos", 4), tmp_path / "out"
+    stand_in(monkeypatch, tmp_path, model_script([f"{number}.png" for number in range(4)]))
+    goes = given / "masks"
+    goes.mkdir()
+    for number in range(4):
+        with Image.open(given / f"{number}.png") as photograph:
+            mask = Image.new("L", photograph.size)
+        mask.putpixel((2, 1), 255)
+        mask.save(goes / f"{number}.png")
+    with pytest.raises(InputError, match="Masks hide .* of the photographs"):
+        find_poses(given, out / "colmap")
+
+    find_poses(given, out / "colmap", reading=MaskReading(left_out=goes))
+    write_colmap_text(out / "colmap" / "sparse" / "0", [f"{number}.png" for number in range(4)])
+    request = SceneRequest(given, removal_masks=goes)
+    opened = open_scene(request, PosesRequest(out), Console(quiet=True))
+    assert opened.photographs.list_masks() == []
+    assert not list((out / "colmap").glob("masks/*"))
 
 
 def find_poses_summary(out: Path) -> dict:

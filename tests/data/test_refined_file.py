@@ -11,7 +11,7 @@ from gscompleter.data.photographs import Photographs
 from gscompleter.data.sfm.refined_file import hash_poses, take_refined, write_refined
 from gscompleter.data.sfm.refining import PoseRefinement
 from gscompleter.system.errors import InputError
-from gscompleter.system.files.writing import REFINED_POSES_FILE
+from gscompleter.system.files.result_names import REFINED_POSES_FILE
 from scenes import camera_at, photographed
 
 DONE = PoseRefinement(2, given_error=0.3, refined_error=0.1, moved=0.05)

@@ -31,6 +31,7 @@ from gscompleter.models.diffusion import pe_field
 from gscompleter.models.diffusion.inpaint import (
     DiffusersInpaint,
     Editor,
+    Painter,
     complete_warp,
     load_painter,
 )
@@ -272,6 +273,20 @@ def test_inpainting_keeps_what_was_warped_and_fills_the_rest(name, tmp_path):
     assert torch.equal(image, answer(generator, context.views[1], TARGET, context).image)
     other = answer(replace(generator, seed=1), context.views[1], TARGET, context).image
     assert not torch.equal(image, other)
+
+
+def test_where_photographs_show_all_no_network_is_asked(inpaint_folder, monkeypatch):
+    """At a photograph's own camera nothing is missing."""
+    context, painter = known_room(), load_painter(str(inpaint_folder))
+    nearest = context.views[1]
+    own = replace(context, target_render=context.view_renders[1])
+    warped = complete_warp(nearest, nearest.camera, own)
+    assert warped.known.all()
+    monkeypatch.setattr(Painter, "fill_hole", lambda *_: pytest.fail("it paints"))
+    output = answer(DiffusersInpaint(painter), nearest, nearest.camera, own)
+    assert torch.equal(output.image, warped.image)
+    assert output.notes == ()
+    assert not output.is_inconsistent
 
 
 def test_flux2_klein_edits_what_is_painted_over_and_gets_no_mask(tmp_path):

@@ -105,6 +105,21 @@ def test_one_gaussian_on_a_pixel_centre_by_hand(renderer):
     assert render.alpha[16, 17] == pytest.approx(expected.item(), abs=1e-5)
 
 
+@pytest.mark.parametrize("scale", [1e3, 1e17, 9e17])
+@pytest.mark.parametrize("mean", [(0.0, 0.0, 2.0), (4.0, -4.0, 2.0)], ids=["before", "beside"])
+def test_a_gaussian_of_any_size_that_a_scene_may_have_is_drawn(scale, mean):
+    """The largest splats are wider than whole numbers of 64 bits count pixels.
+
+    In the reference, whose covariances are squares in float32, they overflow.
+    """
+    huge = one(mean, scale=scale)
+    huge = replace(huge, scales=huge.scales.requires_grad_())
+    render = CPU.render(huge, CAMERA)
+    assert torch.allclose(render.alpha, torch.full_like(render.alpha, 0.8), atol=1e-4)
+    render.image.sum().backward()
+    assert huge.scales.grad.isfinite().all()
+
+
 @pytest.mark.parametrize("renderer", [CPU, REFERENCE], ids=["cpu", "reference"])
 @pytest.mark.parametrize("scales", [(0.05, 0.05, 0.05), (0.05, 0.01, 0.3)], ids=["round", "thin"])
 def test_one_antialiased_gaussian_by_hand(renderer, scales):

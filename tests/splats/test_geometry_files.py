@@ -128,6 +128,20 @@ def test_a_corner_of_another_primitive_is_refused(tmp_path):
         load_geometry(path)
 
 
+@pytest.mark.parametrize("mode", [4, 5, 6])
+def test_a_primitive_of_one_vertex_has_no_triangle(tmp_path, mode):
+    path = write_glb_mesh(tmp_path / "room.glb", mesh_of())
+    whole = load_geometry(path).draw_depth(CAMERA)
+    table, binary = parse_glb(path.read_bytes())
+    primitives = table["meshes"][0]["primitives"]
+    accessor = table["accessors"][primitives[0]["attributes"]["POSITION"]]
+    table["accessors"].append({**accessor, "count": 1})
+    position = {"POSITION": len(table["accessors"]) - 1}
+    primitives.append({"attributes": position, "mode": mode})
+    write_glb(path, table, binary)
+    assert (load_geometry(path).draw_depth(CAMERA) == whole).all()
+
+
 def test_a_line_that_is_no_vertex_is_named(tmp_path):
     path = tmp_path / "room.obj"
     path.write_text("v 0 0 0\nv 1 zero 0\n")

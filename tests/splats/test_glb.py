@@ -228,3 +228,39 @@ def test_labels_may_be_bytes(tmp_path, is_normalized):
     attributes[glb.LABELS_ATTRIBUTE] = len(table["accessors"]) - 1
     read = load_splat(write_glb(path, table, binary + bytes([0, 1, 2, 255])))
     assert read.generated.tolist() == [0, 1, 2, 255]
+
+
+@pytest.mark.parametrize("scale", [[1, 2, 1], [-1, 1, 1], [0, 0, 0]])
+def test_a_mesh_beside_the_splat_may_be_stretched_mirrored_or_hidden(tmp_path, scale):
+    path = tmp_path / "scene.glb"
+    save_splat(path, plausible(5))
+    whole = load_splat(path)
+    table, binary = parse_glb(path.read_bytes())
+    table["meshes"].append({"primitives": [{"attributes": {"POSITION": 0}}]})
+    table["nodes"].append({"mesh": 1, "scale": scale})
+    table["scenes"][0]["nodes"] = [0, 1]
+    assert torch.equal(load_splat(write_glb(path, table, binary)).means, whole.means)
+
+    table["nodes"][0]["scale"] = scale
+    with pytest.raises(InputError, match="has a node that mirrors Gaussians or stretches them"):
+        load_splat(write_glb(path, table, binary))
+
+
+def test_two_nodes_that_mirror_gaussians_together_turn_them(tmp_path):
+    path = tmp_path / "scene.glb"
+    save_splat(path, plausible(5))
+    whole = load_splat(path)
+    table, binary = parse_glb(path.read_bytes())
+    table["nodes"] = [
+        {"children": [1], "scale": [-1, 1, 1]},
+        {"mesh": 0, "scale": [1, -1, 1]},
+    ]
+    turned = load_splat(write_glb(path, table, binary))
+    assert torch.allclose(turned.means, whole.means * torch.tensor([-1.0, -1.0, 1.0]))
+
+
+@pytest.mark.parametrize("scenes", [{}, {"scenes": [{"name": "empty"}]}])
+def test_a_scene_of_nothing_holds_no_gaussians_and_is_not_damaged(tmp_path, scenes):
+    path = write_glb(tmp_path / "scene.glb", {"asset": {"version": "2.0"}, **scenes}, b"")
+    with pytest.raises(InputError, match="holds a mesh or points, no Gaussians"):
+        load_splat(path)

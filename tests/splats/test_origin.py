@@ -18,7 +18,7 @@ from gscompleter.splats.formats import describe_oddities
 from gscompleter.splats.layout import is_same_scene, save_like, save_removed, strip
 from gscompleter.splats.origin import format_corners
 from gscompleter.splats.transform import HALF_TURN_X, rotate_half_turn, transform_gaussians
-from gscompleter.system.files.writing import REMOVED_FILE
+from gscompleter.system.files.result_names import REMOVED_FILE
 from map_scene import PLACE, small_gaussians, write_map_ply
 from scenes import random_gaussians
 

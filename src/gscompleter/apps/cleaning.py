@@ -57,7 +57,7 @@ from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import write_image
 from gscompleter.system.files.output_folder import reserve_output
 from gscompleter.system.files.reading import check_file
-from gscompleter.system.files.writing import COMPLETED_FILE, REMOVED_FILE, SUMMARY_FILE
+from gscompleter.system.files.result_names import COMPLETED_FILE, REMOVED_FILE, SUMMARY_FILE
 from gscompleter.system.progress import show_progress, stage, track
 from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.types import Camera, Gaussians, View

@@ -34,7 +34,7 @@ from gscompleter.splats.streamed import is_streamed, load_level
 from gscompleter.splats.transform import merge_placed
 from gscompleter.splats.upward import USUAL, read_upward
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.writing import REMOVED_FILE
+from gscompleter.system.files.result_names import REMOVED_FILE
 from gscompleter.system.progress import stage
 from gscompleter.types import Gaussians
 

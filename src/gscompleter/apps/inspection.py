@@ -44,7 +44,7 @@ from gscompleter.splats.provenance import ModelRecord, RunRecord
 from gscompleter.splats.row_kinds import count_row_kinds
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.writing import SUMMARY_FILE
+from gscompleter.system.files.result_names import SUMMARY_FILE
 from gscompleter.types import Camera, Gaussians, Origin, sh_from_rgb
 
 ORIGINS = {

@@ -634,15 +634,25 @@ def load_config(
 
     `adapt` changes the named config, as `CompleterConfig.for_removal` does; a file's changes win.
     """
+    changes = read_file_changes(source)
+    if changes is None:
+        return adapt(get_named_config(os.fspath(source), is_splat, has_photographs))
+    base_name = str(changes.pop("base", "default"))
+    base = adapt(get_named_config(base_name, is_splat, has_photographs))
+    return apply_changes(base, changes, f"{quote_value(source)}: ")
+
+
+def read_file_changes(source: Path | str) -> dict[str, Any] | None:
+    """Read the changes of a YAML file, and the name of its `base`; None for a named config.
+
+    Their names and values are not checked yet.
+    """
     # A name is no path, and may be longer than one.
     is_given = isinstance(source, (str, os.PathLike)) and bool(os.fspath(source))
     if is_given and Path(source).suffix not in {".yaml", ".yml"}:
-        return adapt(get_named_config(os.fspath(source), is_splat, has_photographs))
+        return None
     path = require_path(source)
     # Imported here, so that only a file waits for PyYAML.
     from gscompleter.config.yaml_file import read_yaml
 
-    changes = read_yaml(path)
-    base_name = str(changes.pop("base", "default"))
-    base = adapt(get_named_config(base_name, is_splat, has_photographs))
-    return apply_changes(base, changes, f"{quote_value(source)}: ")
+    return read_yaml(path)

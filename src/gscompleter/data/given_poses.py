@@ -21,7 +21,7 @@ from gscompleter.data.transforms import TRANSFORMS_FILE, describe_transforms, wr
 from gscompleter.numerics.two_views import ERROR_SIDE
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.output_folder import reserve_output
-from gscompleter.system.files.writing import SUMMARY_FILE
+from gscompleter.system.files.result_names import SUMMARY_FILE
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,9 @@ class MaskReading:
     """False if `--invert-masks` is for the masks of another option."""
     folder: Path | None = None
     """Folder of masks in place of those that lie beside photographs; white there is ignored."""
+    left_out: Path | None = None
+    """Folder of masks that mean something else, such as what to remove. It may lie where masks are
+    looked for."""
 
     @property
     def ignores_white(self) -> bool:

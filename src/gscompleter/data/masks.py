@@ -22,6 +22,7 @@ from PIL import Image
 from gscompleter.data.cameras import has_same_aspect
 from gscompleter.data.file_names import FolderListings, is_photograph_name, list_endings
 from gscompleter.data.frame import FOLDERS, MASKS, MAX_NAMED_OWNERS, Frame, assign_masks
+from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photograph import StoredPhotograph
 from gscompleter.system.errors import InputError, join_names, quote_value
 from gscompleter.system.files.image import HALF_OPAQUE, read_mask, turn_upright
@@ -61,19 +62,26 @@ class GivenPhotograph:
 
 
 def find_given(
-    folder: Path, names: Sequence[str], named: Path | None = None
+    folder: Path, names: Sequence[str], reading: MaskReading = MaskReading()
 ) -> list[GivenPhotograph]:
-    """Find photographs of a folder and their masks, in the folder `named` by --ignore if any."""
+    """Find photographs of a folder and their masks, where `reading` says that these are."""
     listings = FolderListings()
     paths = [folder / name for name in names]
-    if named is None:
+    if reading.folder is None:
         masks = [find_mask(path, name, listings) for path, name in zip(paths, names, strict=True)]
     else:
-        masks = find_masks_in(named, names, paths)
+        masks = find_masks_in(reading.folder, names, paths)
+    if reading.left_out is not None:
+        masks = [None if mask and lies_in(mask, reading.left_out) else mask for mask in masks]
     return [
         GivenPhotograph(name, StoredPhotograph(path), path, mask)
         for name, path, mask in zip(names, paths, masks, strict=True)
     ]
+
+
+def lies_in(file: Path, folder: Path) -> bool:
+    """Check whether a file lies in a folder or below it, wherever links lead."""
+    return folder.resolve() in file.resolve().parents
 
 
 def find_masks_in(

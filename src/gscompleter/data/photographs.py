@@ -29,6 +29,7 @@ from gscompleter.data.masks import (
     fill_hidden,
     find_masked,
     find_masks_in,
+    lies_in,
     make_no_mask_error,
 )
 from gscompleter.data.moving_boxes import mask_moving
@@ -208,7 +209,7 @@ class Photographs:
         """Return a copy without the masks in a folder, which mean something else."""
         frames = []
         for frame in self.frames:
-            if frame.mask is not None and folder.resolve() in frame.mask.resolve().parents:
+            if frame.mask is not None and lies_in(frame.mask, folder):
                 frame = replace(frame, mask=None)
             frames.append(frame)
         return replace(self, frames=tuple(frames))

@@ -26,14 +26,14 @@ from gscompleter.splats.provenance import RunRecord
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import hash_file
 from gscompleter.system.files.result_format import RESULT_MARK
-from gscompleter.system.files.typed_json import read_typed_json
-from gscompleter.system.files.writing import (
+from gscompleter.system.files.result_names import (
     COMPLETED_FILE,
     EDITS_FILE,
     EDITS_FOLDER,
     REFINED_POSES_FILE,
     REMOVED_FILE,
 )
+from gscompleter.system.files.typed_json import read_typed_json
 from gscompleter.types import Gaussians
 
 EDITS = (EDITS_FILE, f"{EDITS_FOLDER}/*.ply", REFINED_POSES_FILE)

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -164,10 +164,15 @@ def _parse_document(data: bytes) -> GlbDocument:
 def _find_primitives(
     document: GlbDocument,
 ) -> Iterator[tuple[dict[str, Any], Float[Tensor, "4 4"]]]:
-    """Find the primitives of Gaussians in the scene, each with its transform to the scene."""
-    for node, place in _walk_nodes(document, _read_similarity):
+    """Find the primitives of Gaussians in the scene, each with its transform to the scene.
+
+    Of others, such as a mesh beside them, the transform may be any. Gaussians can only follow a
+    similarity: an UnsupportedError is raised if their nodes, taken together, are none.
+    """
+    for node, place in _walk_nodes(document):
         for primitive in _list_primitives(document, node):
             if EXTENSION in primitive.get("extensions", {}):
+                require_similarity(place, "node")
                 yield primitive, place
 
 
@@ -180,17 +185,18 @@ def _list_primitives(document: GlbDocument, node: dict[str, Any]) -> list[dict[s
 
 
 def _walk_nodes(
-    document: GlbDocument, read_transform: Callable[[dict[str, Any]], Float[Tensor, "4 4"]]
+    document: GlbDocument,
 ) -> Iterator[tuple[dict[str, Any], Float[Tensor, "4 4"]]]:
     """Walk through the nodes of the scene, each with its transform to the scene."""
     table = document.table
+    nodes = table.get("nodes", [])
     scenes = table.get("scenes")
     if scenes:
-        roots = scenes[table.get("scene", 0)]["nodes"]
+        roots = scenes[table.get("scene", 0)].get("nodes", [])
     else:
         # All trees of nodes are shown.
-        below = {child for node in table["nodes"] for child in node.get("children", ())}
-        roots = [index for index in range(len(table["nodes"])) if index not in below]
+        below = {child for node in nodes for child in node.get("children", ())}
+        roots = [index for index in range(len(nodes)) if index not in below]
     # Breadth first, with the transform of each node's parent to the scene. In a tree no node comes
     # twice.
     waiting = [(index, torch.eye(4, dtype=torch.float64)) for index in roots]
@@ -200,21 +206,14 @@ def _walk_nodes(
         if index in visited:
             raise DamagedError("its nodes contain each other")
         visited.add(index)
-        node = table["nodes"][index]
-        place = above @ read_transform(node)
+        node = nodes[index]
+        place = above @ _read_transform(node)
         waiting += [(child, place) for child in node.get("children", ())]
         yield node, place
 
 
-def _read_similarity(node: dict[str, Any]) -> Float[Tensor, "4 4"]:
-    """Read the transform of a node, which must not stretch Gaussians unevenly."""
-    place = _read_transform(node)
-    require_similarity(place, "node")
-    return place
-
-
 def _read_transform(node: dict[str, Any]) -> Float[Tensor, "4 4"]:
-    """Read the transform of a node."""
+    """Read the transform of a node to the one above it."""
     if "matrix" in node:
         # Stored column by column.
         return _read_vector(node["matrix"], 16).reshape(4, 4).T
@@ -243,7 +242,7 @@ def read_glb_meshes(path: Path) -> tuple[Float[ndarray, "n 3"], Int[ndarray, "m 
     document = _parse_document(read_bytes(path))
     vertices, faces = [np.empty((0, 3))], [np.empty((0, 3), np.int64)]
     count = num_primitives = 0
-    for node, place in _walk_nodes(document, _read_transform):
+    for node, place in _walk_nodes(document):
         for primitive in _list_primitives(document, node):
             num_primitives += 1
             if num_primitives > MAX_PRIMITIVES:
@@ -267,7 +266,10 @@ def read_glb_meshes(path: Path) -> tuple[Float[ndarray, "n 3"], Int[ndarray, "m 
 def _read_triangles(
     document: GlbDocument, primitive: dict[str, Any], count: int
 ) -> Int[ndarray, "m 3"]:
-    """Read the triangles of a primitive of `count` vertices, as indices of these."""
+    """Read the triangles of a primitive of `count` vertices, as indices of these.
+
+    Which side of a triangle is its front is not kept: every second one of a strip is turned over.
+    """
     order = np.arange(count, dtype=np.int64)
     if "indices" in primitive:
         accessor = document.table["accessors"][primitive["indices"]]
@@ -281,7 +283,9 @@ def _read_triangles(
     if mode == TRIANGLE_STRIP:
         return np.stack([order[:-2], order[1:-1], order[2:]], axis=1)
     if mode == TRIANGLE_FAN:
-        return np.stack([np.broadcast_to(order[:1], len(order) - 2), order[1:-1], order[2:]], 1)
+        # All share the first corner.
+        first = np.full(max(len(order) - 2, 0), order[:1])
+        return np.stack([first, order[1:-1], order[2:]], axis=1)
     # Points; lines are drawn by nobody who measures a surface.
     return np.empty((0, 3), np.int64)
 

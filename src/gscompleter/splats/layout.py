@@ -58,7 +58,7 @@ from gscompleter.splats.table import get_written_format
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.mapping import release_pages
 from gscompleter.system.files.ply import write_ply_file
-from gscompleter.system.files.writing import REMOVED_FILE
+from gscompleter.system.files.result_names import REMOVED_FILE
 from gscompleter.types import NUM_SH, Gaussians, merge
 
 _STORED = ("means", "quats", "scales", "opacities", "sh", "generated")

@@ -17,7 +17,7 @@ from numpy import ndarray
 from gscompleter.splats.edits import Edit, Edits
 from gscompleter.splats.undo import check_counts, compute_keys, split_key
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.writing import EDITS_FILE
+from gscompleter.system.files.result_names import EDITS_FILE
 
 GIVEN = "given"
 """Kind of rows that no edit appended."""

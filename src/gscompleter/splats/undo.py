@@ -30,7 +30,7 @@ from gscompleter.splats.table import get_written_format
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.ply import write_ply_file
 from gscompleter.system.files.reading import hash_file
-from gscompleter.system.files.writing import EDITS_FILE
+from gscompleter.system.files.result_names import EDITS_FILE
 
 Keys = Int64[ndarray, "_n"]
 """Number of the edit that appended each row, and its place among these in the lower 40 bits."""

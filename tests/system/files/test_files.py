@@ -1,8 +1,10 @@
 """A file is written completely or stays as it was."""
 
+import errno
 import os
 import signal
 import stat
+import struct
 import time
 from enum import IntEnum
 from pathlib import Path
@@ -10,12 +12,13 @@ from pathlib import Path
 import pytest
 
 from gscompleter import InputError
+from gscompleter.system.errors import FullDiskError, OutputError
 from gscompleter.system.files import unfinished
 from gscompleter.system.files.downloads import get_download_folder
 from gscompleter.system.files.output_file import reserve_file
 from gscompleter.system.files.output_folder import open_output_folder
 from gscompleter.system.files.unfinished import digest_target
-from gscompleter.system.files.writing import encode_text, replace_file
+from gscompleter.system.files.writing import ACCESS_LIST, encode_text, replace_file
 from gscompleter.system.interrupts import defer_interrupts
 
 
@@ -49,6 +52,15 @@ def test_a_byte_of_a_name_that_is_no_text_is_one_unknown_character_of_a_page():
     name = os.fsdecode(b"caf\xe9.jpg")
     assert encode_text(name).decode() == "caf\N{REPLACEMENT CHARACTER}.jpg"
     assert encode_text("café \N{GRINNING FACE}").decode() == "café \N{GRINNING FACE}"
+
+
+def test_space_is_asked_for_only_where_it_is_missing(tmp_path):
+    of_a_folder = r"Is a directory; choose another place\.$"
+    with pytest.raises(OutputError, match=of_a_folder), replace_file(tmp_path):
+        pass
+    of_a_full_disk = r"No space left .*; free some space, or choose another place\.$"
+    with pytest.raises(FullDiskError, match=of_a_full_disk), replace_file(tmp_path / "scene.ply"):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
 
 def test_a_file_written_in_place_of_another_keeps_it_until_the_end(tmp_path):
@@ -182,6 +194,38 @@ def test_a_group_that_cannot_be_kept_may_do_no_more_than_everybody(tmp_path, mon
 
 def refuse(*_: object) -> None:
     raise PermissionError(1, "Operation not permitted")
+
+
+def make_access_list(user: int) -> bytes:
+    """Make a list of version 2 by which a user reads, as its owner and group do."""
+    nobody = 0xFFFFFFFF
+    rights = ((0x01, 6, nobody), (0x02, 4, user), (0x04, 4, nobody), (0x10, 4, nobody))
+    rows = (*rights, (0x20, 0, nobody))
+    return struct.pack("<I", 2) + b"".join(struct.pack("<HHI", *row) for row in rows)
+
+
+@pytest.mark.linux
+@pytest.mark.parametrize("has_list", [False, True])
+def test_users_who_may_read_a_file_are_those_who_could_read_the_one_in_its_place(
+    tmp_path, has_list
+):
+    path = tmp_path / "scene.ply"
+    path.write_bytes(b"old")
+    path.chmod(0o640)
+    try:
+        if has_list:
+            os.setxattr(path, ACCESS_LIST, make_access_list(12345))
+        # The folder lets another user read every new file.
+        os.setxattr(tmp_path, "system.posix_acl_default", make_access_list(23456))
+    except OSError:
+        pytest.skip("the file system has no access lists")
+    with replace_file(path) as file:
+        file.write(b"new")
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    if has_list:
+        assert os.getxattr(path, ACCESS_LIST) == make_access_list(12345)
+    else:
+        assert ACCESS_LIST not in os.listxattr(path)
 
 
 @pytest.mark.linux

@@ -19,7 +19,7 @@ from tyro.constructors import (
     StructTypeInfo,
 )
 
-from gscompleter.config import CompleterConfig, load_config
+from gscompleter.config import CompleterConfig, load_config, read_file_changes
 from gscompleter.config.settings import Settings, apply_changes
 
 CONFIG_OPTION = "config"
@@ -49,6 +49,14 @@ class ChosenConfig(Settings):
         config = load_config(self.name, is_splat, has_photographs, adapt)
         where = f"{CONFIG_OPTION}."
         return apply_changes(config, self.changes, where, where) if self.changes else config
+
+    def gives(self, group: str, name: str) -> bool:
+        """Check whether the user gives a setting, be it the one of the preset.
+
+        The config was decided on before, so that a YAML file is there and intact.
+        """
+        places = (self.changes, read_file_changes(self.name) or {})
+        return any(name in place.get(group, {}) for place in places)
 
 
 def make_parsing_rule(

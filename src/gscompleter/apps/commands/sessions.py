@@ -46,8 +46,8 @@ from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import holds_results, holds_session
 from gscompleter.system.files.overlap import refuse_overlap
 from gscompleter.system.files.reading import hash_file
+from gscompleter.system.files.result_names import COMPLETED_FILES, STROKES_FILE
 from gscompleter.system.files.typed_json import validate_typed
-from gscompleter.system.files.writing import COMPLETED_FILES, STROKES_FILE
 from gscompleter.system.plugins import is_in_file
 
 DEFAULT_OUT = Path("live")
@@ -61,6 +61,9 @@ OPTIONS_OF_A_RUN = (
     *("device", "renderer_device", "network_device"),
 )
 """Options that each run chooses anew, which a session does not keep."""
+
+CODE_OPTIONS = {"config": "config.guards", "synthesis": "generator"}
+"""Options by which a program is named, of groups of options; others have the name of their own."""
 
 AnyOptions = TypeVar("AnyOptions", bound=CompletingOptions)
 
@@ -244,10 +247,28 @@ def restore_options(options: AnyOptions, saved: StrokesFile, path: Path) -> AnyO
             f"{shown} does not tell of which scene it is; name the scene, as in "
             f"`gscompleter live splat.ply --strokes {shown}`.",
         )
-    kind = type(options)
     known = {**saved.session, **{name: getattr(saved, name) for name in SEPARATE_OPTIONS}}
-    config = validate_typed(CompleterConfig, known.get("config", {}), shown, STROKES_ADVICE)
+    restored = read_known_options(options, known, shown)
+    for name in SCENE_PATHS:
+        scene = getattr(restored, name)
+        if scene is not None and not os.path.exists(scene):
+            raise InputError(
+                f"{quote_value(scene)} is missing, with which the session began; name it where it "
+                f"is now, as in `gscompleter live splat.ply --strokes {shown}`.",
+            )
+    refuse_changes(options, restored, known)
+    return restored
 
+
+def read_known_options(options: AnyOptions, known: Mapping[str, Any], shown: str) -> AnyOptions:
+    """Read the options that a file keeps; those of a run are of `options`.
+
+    `known` is what is kept by name, and `shown` the name of the file. Raises InputError if it is
+    damaged.
+    """
+    kind = type(options)
+    config = validate_typed(CompleterConfig, known.get("config", {}), shown, STROKES_ADVICE)
+    # All settings are changes here, so that no preset decides on any of them again.
     settings = asdict(config)
     if config.holes.kind == "all":
         # It was not given, or the option of the session says so, too.
@@ -261,15 +282,16 @@ def restore_options(options: AnyOptions, saved: StrokesFile, path: Path) -> AnyO
         **{name: getattr(options, name) for name in own},
         "config": ChosenConfig(changes=settings),
     }
-    restored = validate_typed(kind, values, shown, STROKES_ADVICE)
-    for name in SCENE_PATHS:
-        scene = getattr(restored, name)
-        if scene is not None and not os.path.exists(scene):
-            raise InputError(
-                f"{quote_value(scene)} is missing, with which the session began; name it where it "
-                f"is now, as in `gscompleter live splat.ply --strokes {shown}`.",
-            )
+    restored: AnyOptions = validate_typed(kind, values, shown, STROKES_ADVICE)
+    return restored
 
+
+def refuse_changes(options: AnyOptions, restored: AnyOptions, known: Mapping[str, Any]) -> None:
+    """Refuse options of this run that differ from those of a session, and programs that it names.
+
+    `restored` are the options of the session, read from what its file keeps, `known`.
+    """
+    kind = type(options)
     # What is typed are changes of a preset, and which preset depends on the session's options.
     typed_config = decide_config(replace(restored, config=options.config))
     given = {
@@ -283,7 +305,6 @@ def restore_options(options: AnyOptions, saved: StrokesFile, path: Path) -> AnyO
             refuse_other_value(name, value, known.get(name), kind)
     for name, value in known.items():
         refuse_code(name, given.get(name), value)
-    return restored
 
 
 def refuse_other_value(name: str, given: Any, known: Any, kind: type[CompletingOptions]) -> None:
@@ -309,7 +330,7 @@ def refuse_code(name: str, given: Any, known: Any) -> None:
     if words and not set(words) <= set(list_words(given)):
         raise InputError(
             f"The session ran {quote_value(words[0])}, a program; name it again if you trust it.",
-            "config.guards" if name == "config" else "generator" if name == "synthesis" else name,
+            CODE_OPTIONS.get(name, name),
         )
 
 

@@ -41,7 +41,7 @@ from gscompleter.system.errors import InputError, quote_value
 
 PHOTOGRAPH_OPTIONS = (
     *("format", "frames", "no_refine_poses", "no_masks", "ignore"),
-    # Edits matter to photographs, which still show what was taken out.
+    # It needs both: edits of a splat matter to photographs, which still show what was taken out.
     "forget_edits",
 )
 """Options that only photographs can follow. A default that is typed all the same cannot be told
@@ -133,9 +133,7 @@ def choose_hole_kind(
 
     `config` is that of the options. Raises InputError if both are given and differ.
     """
-    # No preset has another kind than the default, so that the user chose what differs from it.
-    is_given = "kind" in options.config.changes.get("holes", {}) or config.holes.kind != "all"
-    if not is_given:
+    if not options.config.gives("holes", "kind"):
         return options.holes
     if options.holes not in ("auto", config.holes.kind):
         raise InputError(
@@ -158,6 +156,7 @@ def decide_scene(
 
     With a splat (`has_splat`) the default resolution is that of its training, if that is smaller.
     """
+    check_mask_options(options, masks)
     return SceneRequest(
         folder,
         options.format,
@@ -187,10 +186,10 @@ def decide_splat(options: SceneOptions, path: Path) -> SplatRequest:
 
     return SplatRequest(
         resolve_splat(path),
-        options.drop_nonfinite,
-        options.ignore_properties,
-        options.forget_edits,
-        options.out,
+        drop_nonfinite=options.drop_nonfinite,
+        ignore_properties=options.ignore_properties,
+        forget_edits=options.forget_edits,
+        beside=options.out,
     )
 
 
@@ -315,6 +314,24 @@ def make_two_splats_error(folder: Path, scene: Path) -> InputError:
         "and as SCENE only its photographs.",
         "scene",
     )
+
+
+def check_mask_options(options: SceneOptions, masks: MaskReading) -> None:
+    """Refuse options on masks of photographs where none is used; `masks` is how they are read."""
+    if not options.no_masks:
+        return
+    if masks.is_inverted:
+        raise InputError(
+            "--no-masks leaves out the masks that would be read the other way round; give one of "
+            "both.",
+            "invert-masks",
+        )
+    if masks.folder is not None:
+        raise InputError(
+            "--no-masks uses all pixels of the photographs, and --ignore names masks of some to "
+            "leave out; give one of both.",
+            "ignore",
+        )
 
 
 def check_context(context: Names | None) -> None:

@@ -13,7 +13,7 @@ from gscompleter.apps.command_line.answers import print_answer
 from gscompleter.apps.commands.shared_options import WritingOptions, list_inputs
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.overlap import refuse_input_file
-from gscompleter.system.files.writing import EDITS_FILE, EDITS_FOLDER, REMOVED_FILE
+from gscompleter.system.files.result_names import EDITS_FILE, EDITS_FOLDER, REMOVED_FILE
 from gscompleter.system.process import import_without_collection
 
 

@@ -60,8 +60,8 @@ from gscompleter.state import Completion
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import print_error, quote_value
 from gscompleter.system.files.output_folder import reserve_output
+from gscompleter.system.files.result_names import RENDERS_FILE, TARGETS_FILE
 from gscompleter.system.files.video import find_ffmpeg
-from gscompleter.system.files.writing import RENDERS_FILE, TARGETS_FILE
 from gscompleter.system.process import release_free_memory
 from gscompleter.system.progress import show_progress, stage, track
 from gscompleter.system.timing import add_seconds

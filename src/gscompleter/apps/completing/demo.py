@@ -26,7 +26,7 @@ from gscompleter.data.demo_scene import write_motorcycle_scene
 from gscompleter.system.console import make_console
 from gscompleter.system.files.image import read_image, write_image
 from gscompleter.system.files.output_folder import open_output_folder, reserve_output
-from gscompleter.system.files.writing import SUMMARY_FILE, TARGETS_FILE
+from gscompleter.system.files.result_names import SUMMARY_FILE, TARGETS_FILE
 from gscompleter.system.progress import show_progress
 
 BEFORE_AFTER_FILE = "before_after.png"

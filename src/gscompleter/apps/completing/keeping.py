@@ -12,7 +12,7 @@ from gscompleter.splats.conversion import convert_splat
 from gscompleter.splats.edits import rename_edited
 from gscompleter.splats.layout import is_same_scene
 from gscompleter.system.files.output_folder import read_listing
-from gscompleter.system.files.writing import COMPLETED_FILE, CONTEXT_FILE, SUMMARY_FILE
+from gscompleter.system.files.result_names import COMPLETED_FILE, CONTEXT_FILE, SUMMARY_FILE
 
 LARGE_BYTES = 100 * 10**6
 """Size of results, in bytes, from which on the terminal says how to keep them smaller."""

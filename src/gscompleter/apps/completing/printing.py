@@ -28,7 +28,7 @@ from gscompleter.apps.requests.completion import ExportRequest, ResultsRequest
 from gscompleter.evaluation.verdict.numbers import format_number, format_percent
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import quote_value
-from gscompleter.system.files.writing import SUMMARY_FILE, TARGETS_FILE
+from gscompleter.system.files.result_names import SUMMARY_FILE, TARGETS_FILE
 
 
 def answer_completion(

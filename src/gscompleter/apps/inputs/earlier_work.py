@@ -15,7 +15,7 @@ from gscompleter.splats.edits import Edits
 from gscompleter.splats.formats import detect_splat_format
 from gscompleter.splats.row_kinds import find_rows_of_kinds, has_recolored, tells_kinds
 from gscompleter.system.errors import quote_value
-from gscompleter.system.files.writing import EDITS_FILE
+from gscompleter.system.files.result_names import EDITS_FILE
 from gscompleter.types import Gaussians
 
 REMAKING = (

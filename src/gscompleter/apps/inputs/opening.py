@@ -21,8 +21,8 @@ from gscompleter.data.frame import FOLDERS
 from gscompleter.data.limits import check_planes
 from gscompleter.data.mask_checks import read_masks_as_asked, refuse_nothing_to_invert
 from gscompleter.data.mask_reading import MaskReading
-from gscompleter.data.masks import describe_unnamed_masks, make_no_mask_error
-from gscompleter.data.photographs import check_resolution
+from gscompleter.data.masks import describe_unnamed_masks, lies_in, make_no_mask_error
+from gscompleter.data.photographs import Photographs, check_resolution
 from gscompleter.data.sfm import NUM_VIDEO_FRAMES
 from gscompleter.data.sfm.poses import (
     find_poses,
@@ -37,7 +37,7 @@ from gscompleter.splats.foreign import holds_splat_alone
 from gscompleter.splats.formats import has_splat_extension
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import FOUND_POSES_FOLDER, refuse_link
-from gscompleter.system.files.writing import SUMMARY_FILE
+from gscompleter.system.files.result_names import SUMMARY_FILE
 
 NUM_SIZE_PHOTOGRAPHS = 8
 """Number of photographs that are enough to find the size of a training by."""
@@ -55,66 +55,88 @@ def open_scene(
     raises what would end the command after it.
 
     Raises:
-        InputError: Options exclude each other, or there are no photographs, cameras or masks as
-            asked for.
+        InputError: There are no photographs, cameras or masks as asked for.
     """
     folder = request.folder
-    is_folder = os.path.isdir(folder)
-    is_splat_file = os.path.isfile(folder) and has_splat_extension(folder)
-    if is_splat_file or (is_folder and holds_splat_alone(folder)):
-        kind = "file" if is_splat_file else "folder"
+    refuse_splat_as_photographs(folder)
+    refuse_frames_of_no_video(folder, search.num_frames)
+    check_planes(request.near, request.far)
+    check_resolution(request.resolution)
+    if request.format is None and find_format(folder) is None and has_photographs(folder):
+        # All that can be refused at once, because the search takes minutes.
+        check_before_search(request, search, console)
+        check()
+        return find_cameras(request, search, console)
+
+    photographs = open_photographs(folder, request.format, request.near, request.far)
+    photographs = read_masks(photographs, request, request.masks)
+    print_lines(console, *photographs.notes)
+    assert photographs.format is not None
+    return Opened(request, photographs, photographs.format, len(photographs))
+
+
+def refuse_splat_as_photographs(folder: Path) -> None:
+    """Raise InputError for a file or folder of Gaussians where photographs are wanted."""
+    is_file = os.path.isfile(folder) and has_splat_extension(folder)
+    if is_file or (os.path.isdir(folder) and holds_splat_alone(folder)):
+        kind = "file" if is_file else "folder"
         raise InputError(
             f"{quote_value(folder, 80)} is a {kind} of Gaussians, which goes to --scene; SCENE has "
             "to be the folder of its photographs, with or without cameras, or a video."
         )
-    refuse_frames_of_no_video(folder, search.num_frames)
-    check_planes(request.near, request.far)
-    check_resolution(request.resolution)
 
-    if request.masks.is_inverted and not request.uses_masks:
-        raise InputError(
-            "--no-masks leaves out the masks that would be read the other way round; give one of "
-            "both.",
-            "invert-masks",
-        )
 
-    if request.masks.folder is not None and not request.uses_masks:
-        raise InputError(
-            "--no-masks uses all pixels of the photographs, and --ignore names masks of some to "
-            "leave out; give one of both.",
-            "ignore",
-        )
+def check_before_search(request: SceneRequest, search: PosesRequest, console: Console) -> None:
+    """Refuse, before cameras are searched for, what would end the command after that."""
+    folder = request.folder
+    refuse_other_exports(folder)
+    refuse_scenes_below(folder)
+    print_lines(console, *describe_cameras_above(folder))
+    refuse_missing_photographs(folder, search.named, search.num_frames)
+    # Frames of a video have no names before they are taken.
+    if request.removal_masks is not None and not is_video(folder):
+        names = list_all_photographs(folder)
+        files = [folder / name for name in names]
+        check_removal_masks(request.removal_masks, names, files, request.removal_reading)
+    if request.masks.folder is not None:
+        print_lines(console, *check_ignoring_masks(request.masks.folder, folder))
 
-    # Photographs without cameras: COLMAP finds them once, and a later run reads them again.
-    num_photographs = None
-    reading = request.masks
-    if request.format is None and find_format(folder) is None and has_photographs(folder):
-        # First all that can be refused at once, because the search takes minutes.
-        refuse_other_exports(folder)
-        refuse_scenes_below(folder)
-        print_lines(console, *describe_cameras_above(folder))
-        refuse_missing_photographs(folder, search.named, search.num_frames)
-        if request.removal_masks is not None and not is_video(folder):
-            names = list_all_photographs(folder)
-            files = [folder / name for name in names]
-            check_removal_masks(request.removal_masks, names, files, request.removal_reading)
-        if reading.folder is not None:
-            print_lines(console, *check_ignoring_masks(reading.folder, folder))
-        check()
-        # A folder of poses with a summary was written by us, and may be continued or replaced.
-        kept = search.out / FOUND_POSES_FOLDER
-        refuse_link(kept)
-        may_replace = search.overwrite or os.path.isfile(kept / SUMMARY_FILE)
-        # Masks that are not used hide nothing, whatever they are.
-        searched = reading if request.uses_masks else replace(reading, may_be_large=True)
-        poses = find_poses(folder, kept, may_replace, search.num_frames, searched)
-        # The masks of the copies are black where something is hidden, and their masks were checked.
-        reading = MaskReading(may_be_large=True)
-        print_lines(console, *poses.notes)
-        folder = kept
-        num_photographs = poses.photographs
 
-    photographs = open_photographs(folder, request.format, request.near, request.far)
+def find_cameras(request: SceneRequest, search: PosesRequest, console: Console) -> Opened:
+    """Open photographs without cameras, or a video: COLMAP finds these once.
+
+    They are kept with copies of the photographs, which a later run reads again.
+    """
+    # A folder of poses with a summary was written by us, and may be continued or replaced.
+    kept = search.out / FOUND_POSES_FOLDER
+    refuse_link(kept)
+    may_replace = search.overwrite or os.path.isfile(kept / SUMMARY_FILE)
+    reading = replace(request.masks, left_out=request.removal_masks)
+    # Masks that are not used hide nothing, whatever they are.
+    if not request.uses_masks:
+        reading = replace(reading, may_be_large=True)
+    poses = find_poses(request.folder, kept, may_replace, search.num_frames, reading)
+    print_lines(console, *poses.notes)
+
+    photographs = open_photographs(kept, None, request.near, request.far)
+    # The masks of the copies are black where something is hidden, and their masks were checked.
+    photographs = read_masks(photographs, request, MaskReading(may_be_large=True))
+    print_lines(console, *photographs.notes)
+    # What lies beside the user's photographs, not beside the copies.
+    unused = list_unused(request.folder, (), has_found_cameras=True)
+    photographs = replace(photographs, unused=unused)
+    # The user gave photographs, of which COLMAP may not have found all cameras. Their number is
+    # reported, and not the format and number of what COLMAP wrote.
+    return Opened(request, photographs, "photographs", poses.photographs)
+
+
+def read_masks(
+    photographs: Photographs, request: SceneRequest, reading: MaskReading
+) -> Photographs:
+    """Return photographs with the masks that hide parts of them, as `reading` says.
+
+    Raises InputError if a folder that is named has no mask, or masks look the other way round.
+    """
     if not request.uses_masks:
         photographs = photographs.leave_out_masks()
     # Masks of what is to be removed may lie in the scene, and are not those of what to ignore.
@@ -127,18 +149,7 @@ def open_scene(
     if reading.folder is not None:
         photographs = photographs.take_masks_of(reading.folder)
     refuse_nothing_to_invert(photographs.list_masks(), reading)
-    photographs = read_masks_as_asked(photographs, reading)
-    print_lines(console, *photographs.notes)
-
-    assert photographs.format is not None
-    if num_photographs is None:
-        return Opened(request, photographs, photographs.format, len(photographs))
-    # What lies beside the user's photographs, not beside the copies.
-    unused = list_unused(request.folder, (), has_found_cameras=True)
-    photographs = replace(photographs, unused=unused)
-    # The user gave photographs, of which COLMAP may not have found all cameras. Their number is
-    # reported, and not the format and number of what COLMAP wrote.
-    return Opened(request, photographs, "photographs", num_photographs)
+    return read_masks_as_asked(photographs, reading)
 
 
 def check_ignoring_masks(masks: Path, folder: Path) -> list[str]:
@@ -153,13 +164,13 @@ def check_ignoring_masks(masks: Path, folder: Path) -> list[str]:
             "ignore",
         )
     names = list_all_photographs(folder)
-    if any(masks.resolve() in (folder / name).resolve().parents for name in names):
+    if any(lies_in(folder / name, masks) for name in names):
         raise InputError(
             f"{quote_value(masks)} lies among the photographs, and would be taken for some; move "
             "it out of their folder.",
             "ignore",
         )
-    found = list_given_masks(folder, names, masks)
+    found = list_given_masks(folder, names, MaskReading(folder=masks))
     if not found:
         raise make_no_mask_error(masks, names)
     return describe_unnamed_masks(masks, found, [folder / name for name in names])
@@ -191,9 +202,11 @@ def choose_working_size(opened: Opened, splat: Path, console: Console) -> Opened
 
 def describe_cameras_above(folder: Path) -> list[str]:
     """Say that the folder above one of photographs has their cameras, which are not used."""
-    if folder.name.casefold() not in FOLDERS:
+    # The working folder is named as `.`, which is no name.
+    whole = Path(os.path.abspath(folder))
+    if whole.name.casefold() not in FOLDERS:
         return []
-    above = folder.resolve().parent
+    above = whole.parent
     format = find_format(above)
     # Any folder with one image has the format `photograph`, which needs no cameras.
     if format is None or format == "photograph":

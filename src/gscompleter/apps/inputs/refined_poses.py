@@ -33,7 +33,7 @@ from gscompleter.splats.alignment.estimate import sample_views
 from gscompleter.splats.alignment.similarity import transform_view
 from gscompleter.splats.alignment.witness import compare_poses
 from gscompleter.system.errors import quote_value
-from gscompleter.system.files.writing import REFINED_POSES_FILE
+from gscompleter.system.files.result_names import REFINED_POSES_FILE
 from gscompleter.system.progress import show_preparation
 
 

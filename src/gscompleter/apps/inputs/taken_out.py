@@ -11,7 +11,7 @@ from gscompleter.editing.taken_out import TakenOut
 from gscompleter.render.protocols import Renderer
 from gscompleter.splats.formats import load_splat, read_provenance
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.writing import EDITS_FILE
+from gscompleter.system.files.result_names import EDITS_FILE
 from gscompleter.types import Gaussians, merge
 
 

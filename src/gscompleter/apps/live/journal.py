@@ -18,7 +18,8 @@ from gscompleter.apps.live.strokes import (
     write_masks,
 )
 from gscompleter.system.files.output_folder import list_session
-from gscompleter.system.files.writing import STROKES_FILE, convert_write_errors, replace_file
+from gscompleter.system.files.result_names import STROKES_FILE
+from gscompleter.system.files.writing import convert_write_errors, replace_file
 
 
 class Journal:

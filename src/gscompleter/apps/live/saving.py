@@ -22,7 +22,7 @@ from gscompleter.data.scene import write_cameras
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import check_output, open_output_folder
 from gscompleter.system.files.reading import hash_file
-from gscompleter.system.files.writing import TARGETS_FILE
+from gscompleter.system.files.result_names import TARGETS_FILE
 
 LIVE_RESULTS = (*COMPLETION_RESULTS, *STROKES)
 """Globs of the files that a session may write."""

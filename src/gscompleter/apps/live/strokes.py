@@ -32,8 +32,8 @@ from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import STROKES_FOLDER
 from gscompleter.system.files.reading import read_bytes
 from gscompleter.system.files.result_format import RESULT_MARK
+from gscompleter.system.files.result_names import STROKES_FILE
 from gscompleter.system.files.typed_json import read_typed_json
-from gscompleter.system.files.writing import STROKES_FILE
 from gscompleter.types import Camera
 
 STROKES = (STROKES_FILE, f"{STROKES_FOLDER}/stroke*.png")

@@ -34,9 +34,7 @@ from gscompleter.splats.provenance import RunRecord
 from gscompleter.state import Completion
 from gscompleter.system.files.image import write_pixels
 from gscompleter.system.files.result_format import RESULT_MARK
-from gscompleter.system.files.writing import (
-    SUMMARY_FILE,
-)
+from gscompleter.system.files.result_names import SUMMARY_FILE
 from gscompleter.types import Camera
 
 

@@ -45,15 +45,15 @@ from gscompleter.splats.layout import has_same_values
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value, require_path
 from gscompleter.system.files.output_folder import open_output_folder
-from gscompleter.system.files.writing import (
+from gscompleter.system.files.result_names import (
     COMPLETED_FILES,
     CONTEXT_FILE,
     REMOVED_FILE,
     RENDERS_FILE,
     SUMMARY_FILE,
     TARGETS_FILE,
-    replace_file,
 )
+from gscompleter.system.files.writing import replace_file
 from gscompleter.system.progress import show_in_notebook, stage
 from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.types import Camera, View

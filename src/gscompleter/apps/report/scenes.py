@@ -17,11 +17,7 @@ from gscompleter.splats.layout import save_like, save_removed
 from gscompleter.splats.ply import save_parts, save_ply
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, RunRecord
 from gscompleter.state import Completion
-from gscompleter.system.files.writing import (
-    COMPLETED_FILE,
-    CONTEXT_FILE,
-    REMOVED_FILE,
-)
+from gscompleter.system.files.result_names import COMPLETED_FILE, CONTEXT_FILE, REMOVED_FILE
 from gscompleter.types import Gaussians, merge
 
 GENERATED_FILE = "generated.ply"

@@ -21,8 +21,8 @@ from gscompleter.evaluation.verdict.rows import HeldOutRow, OutcomeRow, ScoreRow
 from gscompleter.numerics.given_geometry import GeometryPlacement
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import read_command, refuse_later_results
+from gscompleter.system.files.result_names import COMPLETED_FILES, SUMMARY_FILE
 from gscompleter.system.files.typed_json import read_typed_json
-from gscompleter.system.files.writing import COMPLETED_FILES, SUMMARY_FILE
 
 RECORD_FILE = "report.json"
 SUMMARY_ADVICE = "complete the scene again"

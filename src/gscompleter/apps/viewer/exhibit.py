@@ -29,7 +29,7 @@ from gscompleter.splats.formats import load_splat
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import encode_jpeg, read_pixels, turn_upright
 from gscompleter.system.files.output_folder import FOUND_POSES_FOLDER
-from gscompleter.system.files.writing import (
+from gscompleter.system.files.result_names import (
     CONTEXT_FILE,
     REFINED_POSES_FILE,
     RENDERS_FILE,

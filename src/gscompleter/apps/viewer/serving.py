@@ -30,7 +30,8 @@ from gscompleter.splats.sog import META
 from gscompleter.splats.upward import Direction
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.output_file import reserve_file
-from gscompleter.system.files.writing import SUMMARY_FILE, replace_file
+from gscompleter.system.files.result_names import SUMMARY_FILE
+from gscompleter.system.files.writing import replace_file
 from gscompleter.types import Camera
 from gscompleter.virtual_capture.upward import find_upward, require_direction
 

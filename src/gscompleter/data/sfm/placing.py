@@ -46,7 +46,7 @@ from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import convert_to_pixels
 from gscompleter.system.files.names import make_colmap_name
 from gscompleter.system.files.output_folder import reserve_output
-from gscompleter.system.files.writing import SUMMARY_FILE
+from gscompleter.system.files.result_names import SUMMARY_FILE
 from gscompleter.system.progress import track
 from gscompleter.types import Camera, View
 
@@ -162,7 +162,7 @@ def place_photographs(
             "photos",
         )
 
-    new = find_given(folder, names, reading.folder)
+    new = find_given(folder, names, reading)
     masks = [given.mask for given in new if given.mask is not None]
     check_hiding_masks(masks, reading, len(new))
     identity = identify_input(new, photographs)

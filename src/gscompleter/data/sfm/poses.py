@@ -56,7 +56,7 @@ from gscompleter.system.files.image_opening import open_image
 from gscompleter.system.files.names import is_hidden_name, make_colmap_name
 from gscompleter.system.files.output_folder import refuse_later_results, reserve_output
 from gscompleter.system.files.reading import read_json
-from gscompleter.system.files.writing import SUMMARY_FILE
+from gscompleter.system.files.result_names import SUMMARY_FILE
 from gscompleter.system.progress import stage, track
 from gscompleter.system.threads import get_thread_count
 
@@ -199,11 +199,11 @@ def find_poses(
             f"There is no {quote_value(photographs)}; name a folder of photographs, or a video."
         )
     names = [] if is_video(photographs) else list_all_photographs(photographs)
-    masks = list_given_masks(photographs, names, reading.folder)
+    masks = list_given_masks(photographs, names, reading)
     refuse_nothing_to_invert(masks, reading)
     check_hiding_masks(masks, reading, len(names))
     # The same photographs in the same folder have the same cameras: minutes of work are reused.
-    known = _identify_input(photographs, num_frames, reading.folder)
+    known = _identify_input(photographs, num_frames, reading)
     if reading.ignores_white:
         known["inverted masks"] = []
     earlier = read_earlier(out, "poses", known)
@@ -224,17 +224,17 @@ def find_poses(
     return replace(poses, kept=" ".join(output.describe_others()))
 
 
-def list_given_masks(folder: Path, names: Sequence[str], named: Path | None = None) -> list[Path]:
-    """List the masks of photographs in a folder; `named` is as in `find_given`."""
-    return [given.mask for given in find_given(folder, names, named) if given.mask is not None]
+def list_given_masks(folder: Path, names: Sequence[str], reading: MaskReading) -> list[Path]:
+    """List the masks of photographs in a folder, where `reading` says that they are."""
+    return [given.mask for given in find_given(folder, names, reading) if given.mask is not None]
 
 
-def _identify_input(path: Path, num_frames: int, masks: Path | None) -> dict[str, list[int]]:
+def _identify_input(path: Path, num_frames: int, reading: MaskReading) -> dict[str, list[int]]:
     """Identify photographs by size and time of change, a video also by the number of frames."""
     if is_video(path):
         stat = path.stat()
         return {path.name: [stat.st_size, stat.st_mtime_ns, num_frames]}
-    return identify_files(find_given(path, list_photograph_files(path), masks))
+    return identify_files(find_given(path, list_photograph_files(path), reading))
 
 
 def identify_files(photographs: Sequence[GivenPhotograph]) -> dict[str, list[int]]:
@@ -392,7 +392,7 @@ def _run(photographs: Path, folder: Path, given: Path, reading: MaskReading) -> 
     """Write `images` and `sparse/0` of photographs, made from what was `given`, into `folder`."""
     names = list_photograph_files(photographs)
     is_panoramic = has_panoramas([photographs / name for name in names])
-    given_photographs = find_given(photographs, names, reading.folder)
+    given_photographs = find_given(photographs, names, reading)
     copies = [
         copy
         for shown in track(given_photographs, "Turning photographs upright")

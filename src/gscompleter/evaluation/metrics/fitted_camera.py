@@ -133,16 +133,18 @@ def measure_fitted(
     pose = move_camera_by(small.camera, move, unit).c2w
 
     truth = target.image.cpu().numpy()
-    shown = observed.cpu().numpy()
+    observed_pixels = observed.cpu().numpy()
     image = clamp_image(renderer.render(scene, replace(target.camera, c2w=pose)))
     # A small image does not show all that the whole one does.
     if move.any():
         unmoved = clamp_image(renderer.render(scene, target.camera))
-        if measure_loss(unmoved, truth, shown) <= measure_loss(image, truth, shown):
+        loss = measure_loss(image, truth, observed_pixels)
+        if measure_loss(unmoved, truth, observed_pixels) <= loss:
             image = unmoved
             move = np.zeros(6)
-    gains = fit_gains(image, truth, shown)
+    gains = fit_gains(image, truth, observed_pixels)
     fitted = torch.from_numpy(np.clip(image * gains, 0, 1)).to(target.image)
+    # Scored are the pixels of the scores without a fit, with the margin around holes.
     whole = compute_masked_psnr(fitted, target.image, target.valid_mask)
     outside = compute_masked_psnr(fitted, target.image, ~holes & target.valid_mask)
     # At least `MIN_POSE_PIXELS` count.

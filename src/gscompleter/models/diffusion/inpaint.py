@@ -70,7 +70,7 @@ class Painter:
         seed: int,
         steps: int | None,
     ) -> Float[Tensor, "h w 3"]:
-        """Inpaint the hole; other pixels may change too.
+        """Inpaint the hole of an image in [0, 1]; other pixels may change too.
 
         A pipeline that takes a reference image sees one, the nearest photograph.
         """
@@ -174,6 +174,11 @@ class DiffusersInpaint:
         """Synthesize the image of one target."""
         nearest = request.nearest
         observed = complete_warp(nearest, request.target, request.context)
+        if observed.known.all():
+            # Nothing is left to paint. A network that repaints the photographs in other colours
+            # would have them marked as inconsistent with themselves.
+            return GeneratorOutput(observed.image)
+
         # Depth is unsure at the rim of the hole, so that colours warped there neither lead the
         # network nor take part in the comparison. The image keeps them, as all that is known.
         hole = dilate(~observed.known, BORDER_WIDTH)

@@ -72,16 +72,6 @@ def fill_windows(
     return image
 
 
-def run_inpainting_network(network: OnnxNetwork, image: ndarray, mask: ndarray) -> ndarray:
-    """Run a network on an image and a mask; raise InputError if its answer is of another size."""
-    (result,) = network(image=image, mask=mask)
-    if result.shape != image.shape:
-        raise InputError(
-            f"The network answered an image of shape {image.shape} by {result.shape}; {ADVICE}."
-        )
-    return result
-
-
 def place_windows(height: int, width: int) -> Iterator[tuple[slice, slice]]:
     """Cover an image by windows that overlap by at least half, in equal distances."""
 
@@ -103,3 +93,13 @@ def match_tone(
     if not ring.any():
         return filled
     return filled + fit_membrane(observed - filled, ring.float())
+
+
+def run_inpainting_network(network: OnnxNetwork, image: ndarray, mask: ndarray) -> ndarray:
+    """Run a network on an image and a mask; raise InputError if its answer is of another size."""
+    (result,) = network(image=image, mask=mask)
+    if result.shape != image.shape:
+        raise InputError(
+            f"The network answered an image of shape {image.shape} by {result.shape}; {ADVICE}."
+        )
+    return result

@@ -9,7 +9,8 @@ from gscompleter.numerics.kernels.cache import njit
 from gscompleter.numerics.kernels.simd import MIN_ALPHA
 
 TANGENT_MARGIN = np.float32(0.15)
-"""Border at which the Jacobian is clamped, relative to the image size."""
+"""Border around the image, relative to its size, at which the Jacobian is clamped: as 3DGS does at
+1.3 times the tangent of half the field of view, which is 0.15 of a width beyond either side."""
 
 X, Y, U, V, W, DEPTH, RED, GREEN, BLUE = range(9)
 """Columns of the splats, see `simd.py`."""
@@ -251,8 +252,11 @@ def _basis_backward(direction, g):
 def project_splats(begin, end, gaussians, pinhole, splats, boxes, factors):
     """Project the Gaussians begin..end to `splats` and `boxes`, empty if invisible.
 
-    A box encloses the pixels in which alpha reaches 1/255 at the given opacity. factors [n]
-    receives the factors on the opacities of antialiased Gaussians, and is None for classic ones.
+    splats [n, 9] receives the centre in pixels, U of the falloff (`simd.py`), z-depth and RGB. Its
+    row is not written where the box is empty. A box [n, 4] is (left, right, top, bottom) in whole
+    pixels, right and bottom excluded; it encloses the pixels in which alpha reaches 1/255 at the
+    given opacity. factors [n] receives the factors on the opacities of antialiased Gaussians, and
+    is None for classic ones.
     """
     means, quats, scales, opacities, sh = gaussians
     view = pinhole.rotation
@@ -307,10 +311,14 @@ def project_splats(begin, end, gaussians, pinhole, splats, boxes, factors):
         center_x, center_y = fx * tan_x + cx, fy * tan_y + cy
         sigmas = math.sqrt(np.float32(2) * math.log(opacity / MIN_ALPHA)) + np.float32(1e-3)
         radius_x, radius_y = sigmas * deviation_x, sigmas * deviation_y
-        left = max(math.ceil(center_x - radius_x - half), zero)
-        right = min(math.floor(center_x + radius_x + half), width)
-        top = max(math.ceil(center_y - radius_y - half), zero)
-        bottom = min(math.floor(center_y + radius_y + half), height)
+        if not (abs(center_x) + radius_x < np.inf and abs(center_y) + radius_y < np.inf):
+            continue
+        # The centre of pixel j is j + 0.5. The sides are cut to the image before they become whole
+        # numbers: those of a splat of scale 1e17, which a scene may have, fit in none.
+        left = max(np.ceil(center_x - radius_x - half), zero)
+        right = min(np.floor(center_x + radius_x + half), width)
+        top = max(np.ceil(center_y - radius_y - half), zero)
+        bottom = min(np.floor(center_y + radius_y + half), height)
         if not (left < right and top < bottom):
             continue
         boxes[i, 0], boxes[i, 1] = np.int32(left), np.int32(right)
@@ -361,7 +369,13 @@ def _compensation_backward(flat, blur, q):
 def project_backward(
     begin, end, gaussians, pinhole, factors, splats, slot_start, gradients, written, d_gaussians
 ):
-    """Write gradients of the Gaussians begin..end to `d_gaussians` from those of entries."""
+    """Write gradients of the Gaussians begin..end to `d_gaussians` from those of their entries.
+
+    A Gaussian has an entry in the list of each tile that it touches. Those of Gaussian i have the
+    slots slot_start[i] to slot_start[i + 1] of gradients [slots, 10], which count where `written`.
+    factors and splats are those that `project_splats` wrote. `d_gaussians` are zero before, and
+    stay zero for Gaussians without a written slot.
+    """
     means, quats, scales, opacities, sh = gaussians
     d_means, d_quats, d_scales, d_opacities, d_sh = d_gaussians
     view = pinhole.rotation

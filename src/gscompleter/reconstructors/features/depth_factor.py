@@ -14,11 +14,13 @@ import numpy as np
 from jaxtyping import Float, Int
 from torch import Tensor
 
-from gscompleter.numerics.geometry import measure_baseline
 from gscompleter.numerics.robust import MAD_TO_SIGMA
 from gscompleter.reconstructors.features.matches import triangulate
 from gscompleter.reconstructors.features.neighbours import find_neighbours
-from gscompleter.reconstructors.features.stereo_image import make_stereo_images
+from gscompleter.reconstructors.features.stereo_image import (
+    has_distinct_centers,
+    make_stereo_images,
+)
 from gscompleter.types import View
 
 MIN_SAMPLES = 24
@@ -102,10 +104,11 @@ def compare_with_matches(
     """Compare depth maps with the triangulated feature matches of neighbouring photographs.
 
     Features are used instead of the plane sweep: it searches between a near and a far plane, and
-    these may come from the very depths that are compared.
+    these may come from the very depths that are compared. Photographs of one place, or a single
+    one, measure nothing. Views and depth maps are on the CPU; a map has the size of its photograph,
+    and 0 where nothing is known.
     """
-    baselines = [measure_baseline(views[0].camera, view.camera) for view in views[1:]]
-    if not any(baselines):
+    if len(views) < 2 or not has_distinct_centers(views):
         return join_samples([])
     images, unit = make_stereo_images(views)
     neighbours = find_neighbours(images)
@@ -116,9 +119,10 @@ def compare_with_matches(
         for a, b, in_a, in_b in ((i, j, in_i, in_j), (j, i, in_j, in_i)):
             if len(in_a) == 0:
                 continue
+            # Inverse z-depths, one over the widest baseline, whose length is `unit`.
             inverse, is_valid = triangulate(images[a], images[b], in_a, in_b)
             columns, rows = in_a.astype(int).T
-            given = depths[a].double().numpy()[rows, columns]
+            given = depths[a].numpy()[rows, columns].astype(np.float64)
             known = is_valid & (given > 0)
             number = np.full(int(known.sum()), a)
             parts.append(DepthSamples(given[known], unit / inverse[known], number))
@@ -149,7 +153,10 @@ def fit_depth_factor(samples: DepthSamples) -> DepthFactor | None:
 
 
 def find_densest(ratios: Float[np.ndarray, "n"]) -> float:
-    """Find the median of the ratios in the window around one of them that holds the most."""
+    """Find the median of the ratios in the fullest window.
+
+    Windows are `RATIO_WINDOW` wide to either side of one of the ratios, which are logarithms.
+    """
     ordered = np.sort(ratios)
     first = np.searchsorted(ordered, ordered - RATIO_WINDOW)
     last = np.searchsorted(ordered, ordered + RATIO_WINDOW)

@@ -14,11 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from gscompleter.system.files.writing import (
-    COMPLETED_FILE,
-    REMOVED_FILE,
-    SUMMARY_FILE,
-)
+from gscompleter.system.files.result_names import COMPLETED_FILE, REMOVED_FILE, SUMMARY_FILE
 
 COMPLETION_ENTRIES = frozenset(
     ("version", "settings", "seed", "device", "scene", "frame", "targets", "gaussians", "seconds")

@@ -33,6 +33,7 @@ from gscompleter.system.files.early_results import describe_early
 from gscompleter.system.files.names import is_hidden_name
 from gscompleter.system.files.renaming import rename
 from gscompleter.system.files.result_format import RESULT_MARK, is_marked, refuse_later
+from gscompleter.system.files.result_names import STROKES_FILE, SUMMARY_FILE
 from gscompleter.system.files.unfinished import (
     REPLACED_SUFFIX,
     UNFINISHED_PREFIX,
@@ -43,12 +44,7 @@ from gscompleter.system.files.unfinished import (
     make_unfinished_name,
     remove_left_behind,
 )
-from gscompleter.system.files.writing import (
-    STROKES_FILE,
-    SUMMARY_FILE,
-    convert_write_errors,
-    keep_permissions,
-)
+from gscompleter.system.files.writing import convert_write_errors, keep_permissions
 from gscompleter.system.interrupts import defer_interrupts
 
 FILES = "files"

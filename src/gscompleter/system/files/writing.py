@@ -1,4 +1,4 @@
-"""Atomic writes: a file is written completely or left as it was; and the names of results."""
+"""Atomic writes: a file is written completely or left as it was."""
 
 from __future__ import annotations
 
@@ -14,29 +14,6 @@ from typing import BinaryIO
 from gscompleter.system.errors import FullDiskError, OutputError, quote_value
 from gscompleter.system.files.renaming import replace
 from gscompleter.system.files.unfinished import give_signs, make_unfinished_name
-
-SUMMARY_FILE = "summary.json"
-"""File that marks a folder as complete: it is removed first and written last."""
-TARGETS_FILE = "targets.json"
-"""File of a completion with the target cameras."""
-RENDERS_FILE = "renders.json"
-"""Cameras at which renders of the splat took the place of photographs."""
-REFINED_POSES_FILE = "refined_poses.json"
-"""Poses of photographs that were refined, in the frame of those that were given."""
-CONTEXT_FILE = "context.ply"
-"""Scene before its completion."""
-COMPLETED_FILE = "completed.ply"
-"""Scene after its completion."""
-COMPLETED_FILES = (COMPLETED_FILE, "completed.spz", "completed.sog")
-"""Files of the scene after its completion, of which there is one."""
-REMOVED_FILE = "removed.ply"
-"""Originals of changed and removed Gaussians of a given scene, beside the completed one."""
-EDITS_FILE = "edits.json"
-"""What commands did to the scene, in their order."""
-EDITS_FOLDER = "edits"
-"""Folder beside it with what earlier commands removed or changed."""
-STROKES_FILE = "strokes.json"
-"""Steps of a session of `live`, which is written after each of them, before anything is saved."""
 
 ACCESS_LIST = "system.posix_acl_access"
 """Attribute of a file that lists further users who may read or write it."""
@@ -91,15 +68,29 @@ def keep_permissions(old: Path, new: Path) -> None:
     for owner, group in ((-1, status.st_gid), (status.st_uid, -1)):
         with suppress(OSError):
             os.chown(new, owner, group)
-    if hasattr(os, "getxattr"):  # on Linux; without the list its mask would count as the group
-        with suppress(OSError):
-            os.setxattr(new, ACCESS_LIST, os.getxattr(old, ACCESS_LIST))
+    keep_access_list(old, new)
     mode = stat.S_IMODE(status.st_mode) & 0o777
     with suppress(OSError):
         # A group that could not be kept may do no more than everybody.
         if os.lstat(new).st_gid != status.st_gid:
             mode &= 0o707 | (mode & 0o007) << 3
         os.chmod(new, mode)
+
+
+def keep_access_list(old: Path, new: Path) -> None:
+    """Give a file the access list of one that it replaces, and none if that has none.
+
+    Nothing happens on systems without such lists. It comes before the mode: of a file with a list
+    the group's bits of the mode are a bound of the whole list, and not the rights of the group.
+    """
+    if not hasattr(os, "getxattr"):  # on Linux alone
+        return
+    with suppress(OSError):
+        try:
+            os.setxattr(new, ACCESS_LIST, os.getxattr(old, ACCESS_LIST))
+        except OSError:
+            # A folder may give each new file a list, by which others could read a private one.
+            os.removexattr(new, ACCESS_LIST)
 
 
 def encode_text(text: str) -> bytes:
@@ -133,8 +124,7 @@ def convert_write_errors(path: Path | str, numbers: Container[int] | None = None
                 f"Cannot write {quote_value(Path(path))}: there is no folder "
                 f"{quote_value(folder)}; make it, or choose another place."
             ) from error
-        kind = FullDiskError if error.errno in FULL_DISK_ERRORS else OutputError
-        raise kind(
-            f"Cannot write {quote_value(Path(path))}: {error.strerror or error}; free some space, "
-            "or choose another place."
-        ) from error
+        sentence = f"Cannot write {quote_value(Path(path))}: {error.strerror or error}"
+        if error.errno in FULL_DISK_ERRORS:
+            raise FullDiskError(f"{sentence}; free some space, or choose another place.") from error
+        raise OutputError(f"{sentence}; choose another place.") from error

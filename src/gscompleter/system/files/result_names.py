@@ -1,0 +1,26 @@
+"""Names of the files that commands write to their output folders."""
+
+from __future__ import annotations
+
+SUMMARY_FILE = "summary.json"
+"""File that marks a folder as complete: it is removed first and written last."""
+TARGETS_FILE = "targets.json"
+"""File of a completion with the target cameras."""
+RENDERS_FILE = "renders.json"
+"""Cameras at which renders of the splat took the place of photographs."""
+REFINED_POSES_FILE = "refined_poses.json"
+"""Poses of photographs that were refined, in the frame of those that were given."""
+CONTEXT_FILE = "context.ply"
+"""Scene before its completion."""
+COMPLETED_FILE = "completed.ply"
+"""Scene after its completion."""
+COMPLETED_FILES = (COMPLETED_FILE, "completed.spz", "completed.sog")
+"""Files of the scene after its completion, of which there is one."""
+REMOVED_FILE = "removed.ply"
+"""Originals of changed and removed Gaussians of a given scene, beside the completed one."""
+EDITS_FILE = "edits.json"
+"""What commands did to the scene, in their order."""
+EDITS_FOLDER = "edits"
+"""Folder beside it with what earlier commands removed or changed."""
+STROKES_FILE = "strokes.json"
+"""Steps of a session of `live`, which is written after each of them, before anything is saved."""
