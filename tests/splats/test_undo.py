@@ -195,6 +195,20 @@ def test_edits_after_a_change_by_another_program_are_taken_off(states, tmp_path,
     assert read_rows(InputSplatFile(third), load_ply(third), ["target"]) is None
 
 
+@pytest.mark.parametrize("number", [4, 5, 6])
+def test_without_a_record_what_the_last_edit_took_of_the_scene_comes_back(states, tmp_path, number):
+    folder = shutil.copytree(states[number].parent, tmp_path / "moved")
+    (folder / "edits.json").unlink()
+    # It took out Gaussians that earlier edits had invented as well.
+    assert load_ply(folder / "removed.ply").generated.any()
+    strip_edits(folder / "completed.ply", tmp_path / "out.ply")
+    before = load_ply(states[number - 1])
+    observed = before[before.generated == 0]
+    assert torch.equal(load_ply(tmp_path / "out.ply").means, observed.means)
+    strip_edits(folder / "completed.ply", tmp_path / "out.spz")
+    assert len(load_splat(tmp_path / "out.spz")) == len(observed)
+
+
 def save_in_format(splat: Path, suffix: str) -> Path:
     """Write the last state of a splat in another format, as commands keep results."""
     small = splat.with_suffix(suffix)
