@@ -99,6 +99,15 @@ def test_cameras_of_photographs_are_listed_once_in_the_order_of_their_frames(com
     assert len(prepare_judged(checked, nameless).cameras) == 4
 
 
+def test_a_photograph_scores_each_target_at_its_camera(completion, room):
+    (view,) = gsc.load_views(room, frames=[2], **NEAR_FAR)
+    twice = replace(completion, targets=completion.targets * 2)
+    judged = prepare_judged(twice, [replace(view, frame=None)])
+    assert [target.photograph is not None for target in judged.targets] == [True, True]
+    assert judged.held_out == []
+    assert len(judged.cameras) == 3
+
+
 def test_photographs_of_the_context_do_not_test_it_under_no_name(completion, room):
     views = gsc.load_views(room, frames=[0, 2], **NEAR_FAR)
     nameless = [replace(view, frame=None) for view in views]

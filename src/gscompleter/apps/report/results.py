@@ -90,8 +90,10 @@ class Judged:
         without a frame come last.
         """
         photos = [photo.view for photo in self.completion.photos]
+        # Targets at one camera have one photograph.
+        at_targets = {id(target.photograph): target.view for target in self.targets}
         unused = [
-            *(target.view for target in self.targets if target.view is not None),
+            *(view for view in at_targets.values() if view is not None),
             *(photograph.view for photograph in self.held_out),
         ]
         # A photograph that checked the splat, in a smaller size, may be among the unused ones. Only
@@ -105,8 +107,8 @@ class Judged:
 def prepare_judged(completion: Completion, unused_views: Sequence[View]) -> Judged:
     """Finish a removal that is not yet restored, and give targets their photographs.
 
-    An unused view at the camera of a target is that of the target, which it alone scores; the
-    others are held out. Raises InputError if an unused view is none, or is a part of the context.
+    The first unused view at the camera of a target is that of the target, and scores nothing else;
+    the others are held out. Raises InputError if an unused view is none, or is part of the context.
     """
     held_out = prepare_held_out(completion, unused_views)
     renderer = load_renderer(completion.context.means.device.type)
@@ -115,16 +117,19 @@ def prepare_judged(completion: Completion, unused_views: Sequence[View]) -> Judg
     completion = restore_surroundings(completion, SceneRenderer(renderer))
 
     targets = []
-    others = list(held_out)
+    at_targets = set()
     for result in completion.targets:
-        is_here = [is_same_camera(photo.view.camera, result.target) for photo in others]
         target = Target(result.target)
+        is_here = [is_same_camera(photo.view.camera, result.target) for photo in held_out]
         if any(is_here):
-            view = others.pop(is_here.index(True)).view
+            number = is_here.index(True)
+            at_targets.add(number)
+            view = held_out[number].view
             target = replace(
                 target, frame=view.frame, photograph=view.image, ignore_mask=view.ignore_mask
             )
         targets.append(target)
+    others = [photo for number, photo in enumerate(held_out) if number not in at_targets]
     return Judged(completion, targets, others, renderer)
 
 
