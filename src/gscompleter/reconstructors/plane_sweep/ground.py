@@ -312,6 +312,24 @@ def hold_view(
     distances = [np.linalg.norm(hits - foot, axis=-1) for foot in feet]
     is_ground &= np.min(distances, axis=0) < GROUND_REACH * float(np.median(heights))
 
+    is_confirmed, is_compared = confirm_ground(rig, number, inverse, is_ground)
+    is_beyond = (measured.inverse < BEYOND * inverse) & (measured.index < index - BEYOND_PLANES)
+    held = is_confirmed & (is_beyond | (measured.weight == 0))
+    # What others confirm counts as measured, so that each place of the ground is kept once.
+    confidence = np.where(is_compared, BACKGROUND_WEIGHT, np.float32(0))
+    return replace(
+        measured,
+        index=np.where(held, index, measured.index),
+        weight=np.where(held, BACKGROUND_WEIGHT, measured.weight),
+        confidence=np.where(held, confidence, measured.confidence),
+    )
+
+
+def confirm_ground(rig: Rig, number: int, inverse: Map, is_ground: Mask) -> tuple[Mask, Mask]:
+    """Find the ground of a view that other photographs confirm, and that which any of them shows.
+
+    `inverse` are its inverse depths, and `is_ground` marks the pixels that are judged.
+    """
     difference = measure_difference(rig, number, inverse)
     is_compared = is_ground & np.isfinite(difference)
     agrees = is_ground & (difference < MAX_GROUND_DIFFERENCE)
@@ -319,17 +337,7 @@ def hold_view(
     is_right = agrees.sum() >= MIN_AGREEING_GROUND * is_compared.sum()
     if is_right and is_compared.mean() >= MIN_COMPARED_GROUND:
         agrees |= is_ground & ~is_compared
-
-    is_beyond = (measured.inverse < BEYOND * inverse) & (measured.index < index - BEYOND_PLANES)
-    held = agrees & (is_beyond | (measured.weight == 0))
-    # What others confirm counts as measured, so that each place of the ground is kept once.
-    confirmed = np.where(is_compared, BACKGROUND_WEIGHT, np.float32(0))
-    return replace(
-        measured,
-        index=np.where(held, index, measured.index),
-        weight=np.where(held, BACKGROUND_WEIGHT, measured.weight),
-        confidence=np.where(held, confirmed, measured.confidence),
-    )
+    return agrees, is_compared
 
 
 def measure_difference(rig: Rig, number: int, inverse: Map) -> Float32[np.ndarray, "h w"]:
