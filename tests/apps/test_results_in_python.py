@@ -99,6 +99,29 @@ def test_cameras_of_photographs_are_listed_once_in_the_order_of_their_frames(com
     assert len(prepare_judged(checked, nameless).cameras) == 4
 
 
+def test_a_photograph_scores_each_target_at_its_camera(completion, room):
+    (view,) = gsc.load_views(room, frames=[2], **NEAR_FAR)
+    twice = replace(completion, targets=completion.targets * 2)
+    judged = prepare_judged(twice, [replace(view, frame=None)])
+    assert [target.photograph is not None for target in judged.targets] == [True, True]
+    assert judged.held_out == []
+    assert len(judged.cameras) == 3
+
+
+def test_photographs_of_the_context_do_not_test_it_under_no_name(completion, room):
+    views = gsc.load_views(room, frames=[0, 2], **NEAR_FAR)
+    nameless = [replace(view, frame=None) for view in views]
+    with pytest.raises(InputError, match="^Unused view 1 is part of the context"):
+        completion.score([views[1], nameless[0]])
+    # So it is where those of the context have no names.
+    photos = [replace(photo, view=replace(photo.view, frame=None)) for photo in completion.photos]
+    with pytest.raises(InputError, match="unused view of frame 0 is part of the context"):
+        gsc.judge(replace(completion, photos=tuple(photos)), views)
+    named, unnamed = (gsc.judge(completion, views[1:]) for views in (views, nameless))
+    assert "the unused photograph 2 gains" in named.headline
+    assert unnamed.headline == named.headline.replace("photograph 2", "photograph")
+
+
 def test_the_page_alone(completion, tmp_path):
     page = completion.report(tmp_path / "page.html")
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]

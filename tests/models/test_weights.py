@@ -454,6 +454,19 @@ def test_depth_networks_lie_under_another_entry_without_a_prefix(tmp_path: Path)
     load_strictly(network(), read_state_dict(path, weights), path)
 
 
+@pytest.mark.parametrize(
+    ("entries", "sentence"),
+    [({"decoder.step": 3}, "more than the network .*: decoder.step"), ({}, "holds no tensors;")],
+)
+def test_every_entry_of_a_network_without_a_prefix_has_to_be_a_tensor(
+    tmp_path: Path, entries: dict[str, object], sentence: str
+):
+    path = tmp_path / "depth.pth"
+    torch.save({"model": entries}, path)
+    weights = replace(PUBLISHED["depthsplat-depth-base-352x640"], sha256=None)
+    refused(path, weights, sentence)
+
+
 def test_older_files_of_torch_are_read_too(tmp_path: Path):
     path = tmp_path / "old.ckpt"
     torch.save(published_tensors(), path, _use_new_zipfile_serialization=False)
@@ -588,9 +601,10 @@ def write_safetensors(path: Path, tensors: dict[str, Tensor]) -> None:
     path.write_bytes(struct.pack("<Q", len(text)) + text + data)
 
 
-def test_a_conversion_to_safetensors_needs_no_hash_but_has_to_fit(tmp_path: Path):
+@pytest.mark.parametrize("name", ["weights.safetensors", "WEIGHTS.SAFETENSORS"])
+def test_a_conversion_to_safetensors_needs_no_hash_but_has_to_fit(tmp_path: Path, name: str):
     pytest.importorskip("safetensors", reason="needs gscompleter[models]")
-    path = tmp_path / "weights.safetensors"
+    path = tmp_path / name
     tensors = published_tensors()
     write_safetensors(path, tensors)
     found = read_state_dict(path, DEPTHSPLAT)

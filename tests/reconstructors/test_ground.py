@@ -12,6 +12,7 @@ from gscompleter.reconstructors.features.stereo_image import (
 )
 from gscompleter.reconstructors.plane_sweep.ground import (
     BACKGROUND_WEIGHT,
+    compute_rays,
     find_ground,
     hold_to_ground,
     measure_difference,
@@ -143,6 +144,30 @@ def test_given_depth_is_left(drive):
         np.testing.assert_array_equal(after.weight[80:90], before.weight[80:90])
 
 
+def test_ignored_pixels_are_left(drive):
+    rig, measured, inverses = drive
+    ignored = np.zeros((SIZE, SIZE), bool)
+    ignored[80:90] = True
+    images = [replace(image, ignore_mask=ignored) for image in rig.images]
+    measured = [measurement.exclude(ignored) for measurement in measured]
+    held = hold_to_ground(make_rig(images), measured, skies_of(inverses))
+    for after in held:
+        assert (after.weight[80:90] == 0).all()
+        assert (after.weight[75:80] > 0).all()
+
+
+def test_ignored_pixels_of_other_photographs_confirm_no_ground(drive):
+    rig, measured, inverses = drive
+    everything = np.ones((SIZE, SIZE), bool)
+    images = [
+        image if number == 1 else replace(image, ignore_mask=everything)
+        for number, image in enumerate(rig.images)
+    ]
+    held = hold_to_ground(make_rig(images), measured, skies_of(inverses))[1]
+    np.testing.assert_array_equal(held.weight, measured[1].weight)
+    np.testing.assert_array_equal(held.index, measured[1].index)
+
+
 def test_cameras_at_different_heights_have_no_ground_below_them():
     seen = [see_road(0.0), see_road(2.0, 1.5 * HEIGHT), see_road(4.0, 2 * HEIGHT)]
     images = [image for image, _ in seen]
@@ -151,6 +176,26 @@ def test_cameras_at_different_heights_have_no_ground_below_them():
     assert find_ground(images, measured, skies_of(inverses)) is None
     held = hold_to_ground(make_rig(images), measured, skies_of(inverses))
     assert all(after is before for before, after in zip(measured, held, strict=True))
+
+
+def see_slope(z: float, is_back: bool, degrees: float) -> tuple[StereoImage, Measurement]:
+    """Photograph a slope that leans to the right of the way, forward or back; measure all of it."""
+    rotation = np.diag([-1.0, 1.0, -1.0]) if is_back else np.eye(3)
+    image = replace(see_road(z)[0], rotation=rotation)
+    normal = np.array([np.sin(np.radians(degrees)), -np.cos(np.radians(degrees)), 0.0])
+    inverse = np.maximum(-(compute_rays(image) @ normal) / HEIGHT, 0).astype(np.float32)
+    confidence = (inverse > 0).astype(np.float32)
+    return image, Measurement(PLANES, compute_plane_index(PLANES, inverse), confidence, confidence)
+
+
+@pytest.mark.parametrize("is_back", [(False, False, False), (True, True, True), (False, True) * 2])
+def test_what_leans_far_to_a_side_is_no_ground_whichever_way_cameras_look(is_back):
+    for degrees, is_ground in ((8, True), (17, False)):
+        seen = [see_slope(2.0 * number, back, degrees) for number, back in enumerate(is_back)]
+        images, measured = zip(*seen, strict=True)
+        assert moves_forward(images)
+        ground = find_ground(images, measured, [m.confidence == 0 for m in measured])
+        assert (ground is not None) == is_ground
 
 
 def test_cameras_that_move_to_a_side_are_left_alone(drive):

@@ -13,7 +13,8 @@ import pytest
 import torch
 
 from command import run
-from gscompleter import load_ply, save_ply
+from gscompleter import load_ply, load_splat, save_ply, save_splat
+from gscompleter.apps.inputs.earlier_work import read_rows
 from gscompleter.apps.inputs.task import InputSplatFile
 from gscompleter.apps.report.scenes import save_completed_splat
 from gscompleter.splats.edits import (
@@ -22,6 +23,7 @@ from gscompleter.splats.edits import (
     hash_given,
     read_edits,
     record_edit,
+    rename_edited,
 )
 from gscompleter.splats.provenance import RunRecord
 from gscompleter.splats.row_kinds import count_row_kinds
@@ -36,7 +38,7 @@ NUM_EDITS = 6
 
 def edit(splat: Path, folder: Path, number: int, has_record: bool = True) -> Path:
     """Remove some Gaussians of a splat at random, and add others."""
-    context = load_ply(splat)
+    context = load_splat(splat)
     generator = torch.Generator().manual_seed(number)
     # The third edit only adds, and the fourth only removes.
     changed = torch.rand(len(context), generator=generator) < (0.0 if number == 3 else 0.2)
@@ -155,7 +157,7 @@ def test_a_record_that_does_not_fit_is_refused(states, tmp_path):
             change(content)
             record.write_text(json.dumps(content))
             with pytest.raises(InputError, match=sentence):
-                strip_edits(states[-1], tmp_path / "out.ply", [NUM_EDITS - 1])
+                strip_edits(states[-1], tmp_path / "out.ply", [1, NUM_EDITS - 1])
     finally:
         record.write_text(text)
 
@@ -169,6 +171,101 @@ def test_gaussians_that_labels_do_not_tell_are_counted(states, tmp_path):
     # What the first edit left out stays out.
     assert undone.kept == len(load_ply(tmp_path / "out.ply"))
     assert undone.missing == len(load_ply(states[0])) - undone.kept > 0
+
+
+@pytest.mark.parametrize("keeps_labels", [True, False])
+def test_edits_after_a_change_by_another_program_are_taken_off(states, tmp_path, keeps_labels):
+    changed = shutil.copytree(states[1].parent, tmp_path / "changed") / "completed.ply"
+    scene = load_ply(changed)[:-1]
+    if not keeps_labels:
+        scene = replace(scene, generated=torch.zeros_like(scene.generated))
+    save_ply(changed, scene)
+    between = changed.read_bytes()
+    assert (b"generated" in between) == keeps_labels
+    second = edit(changed, tmp_path / "second", 2)
+    third = edit(second, tmp_path / "third", 3)
+    out = tmp_path / "out.ply"
+    for numbers, expected in (([3], second.read_bytes()), ([2, 3], between)):
+        assert strip_edits(third, out, numbers).is_same_file
+        assert out.read_bytes() == expected
+    # The rows that the first edit added have no place any more, nor a kind.
+    with pytest.raises(InputError, match="changed by another program after edit 1"):
+        strip_edits(third, out, [1])
+    assert count_kinds(third) is None
+    assert read_rows(InputSplatFile(third), load_ply(third), ["target"]) is None
+
+
+@pytest.mark.parametrize("number", [4, 5, 6])
+def test_without_a_record_what_the_last_edit_took_of_the_scene_comes_back(states, tmp_path, number):
+    folder = shutil.copytree(states[number].parent, tmp_path / "moved")
+    (folder / "edits.json").unlink()
+    # It took out Gaussians that earlier edits had invented as well.
+    assert load_ply(folder / "removed.ply").generated.any()
+    strip_edits(folder / "completed.ply", tmp_path / "out.ply")
+    before = load_ply(states[number - 1])
+    observed = before[before.generated == 0]
+    assert torch.equal(load_ply(tmp_path / "out.ply").means, observed.means)
+    strip_edits(folder / "completed.ply", tmp_path / "out.spz")
+    assert len(load_splat(tmp_path / "out.spz")) == len(observed)
+
+
+def save_in_format(splat: Path, suffix: str) -> Path:
+    """Write the last state of a splat in another format, as commands keep results."""
+    small = splat.with_suffix(suffix)
+    save_splat(small, load_ply(splat))
+    splat.unlink()
+    rename_edited(splat.parent, small)
+    return small
+
+
+@pytest.mark.parametrize("has_record", [True, False])
+def test_labels_of_a_splat_in_another_format_stay(states, tmp_path, has_record):
+    folder = shutil.copytree(states[1].parent, tmp_path / "1")
+    small = save_in_format(folder / "completed.ply", ".spz")
+    if not has_record:
+        (folder / "edits.json").unlink()
+    second = edit(small, tmp_path / "second", 2)
+    third = edit(second, tmp_path / "third", 3)
+    strip_edits(third, tmp_path / "out.ply", [2, 3] if has_record else [1, 2])
+    assert load_ply(tmp_path / "out.ply").generated.tolist() == load_splat(small).generated.tolist()
+
+
+def test_rows_that_a_format_sorted_are_not_taken_off(states, tmp_path):
+    small = save_in_format(
+        shutil.copytree(states[1].parent, tmp_path / "1") / "completed.ply", ".sog"
+    )
+    again = edit(small, tmp_path / "again", 2)
+    with pytest.raises(InputError, match="in a format that sorts Gaussians"):
+        strip_edits(again, tmp_path / "out.ply", [1])
+    strip_edits(again, tmp_path / "out.ply", [2])
+    assert len(load_ply(tmp_path / "out.ply")) == len(load_splat(small))
+
+
+def test_all_edits_at_once_are_taken_off_another_format_than_ply(states, tmp_path):
+    small = save_in_format(
+        shutil.copytree(states[2].parent, tmp_path / "2") / "completed.ply", ".spz"
+    )
+    with pytest.raises(InputError, match=r"is no \.ply, of which alone edits"):
+        strip_edits(small, tmp_path / "out.ply", [2])
+    strip_edits(small, tmp_path / "out.ply")
+    assert not load_ply(tmp_path / "out.ply").generated.any()
+
+
+def test_an_edit_that_left_out_everything_is_taken_off(tmp_path):
+    splat = tmp_path / "splat.ply"
+    save_ply(splat, random_gaussians(20))
+    first = edit(splat, tmp_path / "first", 1)
+    context = load_ply(first)
+    (tmp_path / "second").mkdir()
+    splat_file = InputSplatFile(first)
+    everything = torch.ones(len(context), dtype=torch.bool)
+    save_completed_splat(tmp_path / "second", context, everything, context[:0], splat_file, None)
+    record_edit(
+        tmp_path / "second", EditDraft("remove"), len(context), [], first, splat_file.edits, None
+    )
+    emptied = tmp_path / "second" / "completed.ply"
+    assert strip_edits(emptied, tmp_path / "out.ply", [2]).is_same_file
+    assert (tmp_path / "out.ply").read_bytes() == first.read_bytes()
 
 
 def edit_in_another_degree(splat: Path, folder: Path) -> Path:

@@ -264,6 +264,17 @@ def test_labels_are_in_a_file_of_usd(pxr, tmp_path, monkeypatch, capsys):
     assert load_splat(tmp_path / "B.USDZ").generated.tolist() == [0] * 4 + [1] + [0] * 4
 
 
+@pytest.mark.parametrize(("kind", "value"), [("Bool", True), ("String", "by a scanner")])
+def test_what_another_program_calls_generated_is_no_label(pxr, tmp_path, kind, value):
+    from pxr import Sdf
+
+    def name_generated(stage, prim) -> None:
+        prim.CreateAttribute("generated", getattr(Sdf.ValueTypeNames, kind)).Set(value)
+
+    change_stage(tmp_path / "scene.usda", name_generated)
+    assert load_splat(tmp_path / "scene.usda").generated.tolist() == [0, 0]
+
+
 def test_without_usd_core_nothing_is_written(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "pxr", None)
     with pytest.raises(InputError, match=r"pip install 'gscompleter\[usd\]'"):

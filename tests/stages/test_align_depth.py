@@ -5,7 +5,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from gscompleter.config import AlignmentConfig, CompleterConfig
+from gscompleter.config import AlignmentConfig, CompleterConfig, DepthAgreementConfig
 from gscompleter.guards import Attempt
 from gscompleter.guards.agreement import DepthAgreement
 from gscompleter.stages.additions import Refined
@@ -110,6 +110,16 @@ def test_an_affine_that_the_target_contradicts_is_fitted_there():
     assert affine.is_refitted_at_target
     assert affine.scale == pytest.approx(0.2, rel=0.01)
     assert affine.inliers > 0.9
+    assert (affine.agreement, affine.coverage) == (affine.inliers, 1.0)
+
+
+def test_a_fit_at_the_target_is_held_to_the_wanted_agreement():
+    like = torch.rand(64, 64, generator=torch.Generator().manual_seed(6)) < 0.5
+    affine = checked(1.2, torch.where(like, depths() / 5, unlike()))
+    assert affine.is_refitted_at_target
+    assert 0.4 < affine.agreement < 0.6
+    assert not is_rejected(affine)
+    assert is_rejected(affine, reject_below=0.8)
 
 
 def test_an_affine_that_the_target_confirms_or_cannot_judge_stays():
@@ -125,9 +135,10 @@ def unlike() -> torch.Tensor:
     return torch.rand(64, 64, generator=torch.Generator().manual_seed(5)) * 50
 
 
-def is_rejected(affine: DepthAffine) -> bool:
+def is_rejected(affine: DepthAffine, **settings: float) -> bool:
     """Ask the guard whether Gaussians with this alignment may be added."""
-    seen = observe(SOME, [View(torch.zeros(8, 8, 3), CAMERA)], CAMERA)
+    config = CompleterConfig(depth_agreement=DepthAgreementConfig(**settings))
+    seen = observe(SOME, [View(torch.zeros(8, 8, 3), CAMERA)], CAMERA, config)
     image = GeneratedView(torch.zeros(8, 8, 3), CAMERA)
     attempt = Attempt(seen, image, affine, Refined(SOME, (), ()))
     return len(DepthAgreement().verify(SOME, attempt)) == 0

@@ -23,6 +23,7 @@ from gscompleter.parts import PartKind
 from gscompleter.splats.formats import detect_splat_format, read_provenance
 from gscompleter.splats.ply import LABEL_COLUMN, read_labels, read_scene, save_ply
 from gscompleter.splats.provenance import RunRecord
+from gscompleter.splats.table import SPLAT_FORMATS
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import hash_file
 from gscompleter.system.files.result_format import RESULT_MARK
@@ -84,8 +85,8 @@ class Edit:
     settings: Mapping[str, Any] = field(default_factory=dict)
     """Place, cameras, masks and photographs, as options of the command."""
     can_be_undone: bool = True
-    """False if its rows are not known: another program changed the splat after it, or rows that it
-    changed stand where they stood."""
+    """False if its rows are not known: another program changed the splat after it, a format sorted
+    its rows, or rows that it changed stand where they stood."""
 
     @property
     def files(self) -> tuple[str, ...]:
@@ -276,10 +277,17 @@ def write_edits(folder: Path, splat: Path, earlier: Edits, edit: Edit) -> None:
 
 
 def rename_edited(folder: Path, splat: Path) -> None:
-    """Let the record in a folder be that of a splat in another format."""
+    """Let the record in a folder be that of a splat in another format.
+
+    In a format that sorts Gaussians, the rows of its edits have no place any more.
+    """
     path = folder / EDITS_FILE
     content = json.loads(path.read_bytes())
-    text = json.dumps({**content, "sha256": hash_file(splat), "file": splat.name}, indent=2)
+    content.update(sha256=hash_file(splat), file=splat.name)
+    if SPLAT_FORMATS[detect_splat_format(splat)].is_sorted:
+        for edit in content["edits"]:
+            edit["can_be_undone"] = False
+    text = json.dumps(content, indent=2)
     path.write_bytes(text.encode() + b"\n")
 
 

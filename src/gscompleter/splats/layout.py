@@ -251,7 +251,7 @@ def strip(path: Path, out: Path) -> tuple[int, int]:
     layout = None if layout is None else drop_generated(layout)
     removed = path.parent / REMOVED_FILE
     if removed.is_file():
-        scene, layout = reinsert(scene, layout, removed)
+        scene, layout = reinsert(scene, layout, removed, completed.generated.numpy() > 0)
     if len(scene) == 0:
         raise InputError(
             f"{quote_value(path)} holds only generated Gaussians: there is no input scene to "
@@ -297,7 +297,7 @@ def strip_rows(path: Path, layout: SceneFile, out: Path) -> tuple[int, int] | No
     if removed.is_file():
         source = read_scene(removed)
         is_antialiased = has_mode_comment(layout.header)
-        rows = find_places(source, removed, len(numbers), is_antialiased)
+        rows = find_observed_places(source, removed, labels > 0, is_antialiased)
         originals = drop_generated(source).rows
         if originals.dtype != dtype or len(originals) != len(rows):
             return None
@@ -348,6 +348,27 @@ def find_places(
     return rows
 
 
+def find_observed_places(
+    source: SceneFile, path: Path, is_generated: Bool[ndarray, "m"], is_antialiased: bool
+) -> Int64[ndarray, "_n"]:
+    """Find the rows of the observed originals of a file among the observed rows of a splat.
+
+    `is_generated` marks rows of the splat. Originals that are generated, which an edit took out
+    after another one had added them, have no row. Raises the errors of `find_places`.
+    """
+    is_observed = np.ones(len(source.rows), np.bool_)
+    if LABEL_COLUMN in (source.rows.dtype.names or ()):
+        is_observed = read_labels(source.rows) == 0
+    if is_observed.all():
+        # All that is generated came after them.
+        return find_places(source, path, int((~is_generated).sum()), is_antialiased)
+    places = find_places(source, path, len(is_generated), is_antialiased)
+    # Of the rows of the splat that stand before an original, only the observed ones stay.
+    before = places - np.arange(len(places))
+    num_observed = np.append(0, (~is_generated).cumsum())[before]
+    return num_observed[is_observed] + np.arange(is_observed.sum())
+
+
 def drop_sh_padding(completed: Gaussians) -> Gaussians:
     """Select the observed Gaussians, without the SH padding of a scene of lower degree."""
     observed = completed[completed.generated == 0]
@@ -391,12 +412,16 @@ def save_removed(
 
 
 def reinsert(
-    kept: Gaussians, layout: SceneFile | None, path: Path
+    kept: Gaussians, layout: SceneFile | None, path: Path, is_generated: Bool[ndarray, "m"]
 ) -> tuple[Gaussians, SceneFile | None]:
-    """Insert the replaced originals of the file `path` at their rows; None if columns differ."""
+    """Insert the replaced originals of the file `path` at their rows; None if columns differ.
+
+    `kept` are the observed Gaussians of a splat whose generated rows are marked.
+    """
     source = read_scene(path)
-    rows = find_places(source, path, len(kept), kept.is_antialiased)
+    rows = find_observed_places(source, path, is_generated, kept.is_antialiased)
     removed = decode_gaussians(source)
+    removed = removed[removed.generated == 0]
     total = len(kept) + len(removed)
     # Place of each Gaussian: the originals take their rows, the others the rest, in their order.
     taken = torch.zeros(total, dtype=torch.bool)

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Int64
 from numpy import ndarray
 
 from gscompleter.splats.edits import Edit, Edits
-from gscompleter.splats.undo import check_counts, compute_keys, split_key
+from gscompleter.splats.undo import check_counts, compute_keys, has_lost_rows, split_key
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.result_names import EDITS_FILE
 
@@ -28,7 +28,7 @@ def count_row_kinds(path: Path, edits: Edits, total: int) -> dict[str, int] | No
 
     Raise InputError for a record that contradicts itself.
     """
-    if not tells_kinds(edits) or not edits.is_unchanged:
+    if not tells_rows(edits):
         return None
     counts: Counter[str] = Counter()
     for kind, rows in iterate_kinds(path, edits, total):
@@ -43,8 +43,7 @@ def find_rows_of_kinds(
 
     Raise InputError for a record that contradicts itself.
     """
-    assert tells_kinds(edits)
-    assert edits.is_unchanged
+    assert tells_rows(edits)
     found = np.zeros(total, bool)
     for own, rows in iterate_kinds(path, edits, total):
         found[rows] = own in kinds
@@ -54,6 +53,14 @@ def find_rows_of_kinds(
 def tells_kinds(edits: Edits) -> bool:
     """Return True if a record tells the kinds of all rows that its edits appended."""
     return bool(edits) and all(edit.appended for edit in edits.edits if edit.added)
+
+
+def tells_rows(edits: Edits) -> bool:
+    """Return True if a record tells the kind of each row of its splat, by its place.
+
+    Not after another program changed the splat, whether since the last edit or before it.
+    """
+    return edits.is_unchanged and tells_kinds(edits) and not has_lost_rows(edits)
 
 
 def has_recolored(edits: Edits) -> bool:

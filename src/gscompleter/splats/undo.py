@@ -3,20 +3,25 @@
 A row is known by a key: the number of the edit that appended it, 0 for the splat at first, and its
 place among these. Every edit keeps rows in their order and appends others, so that the keys of each
 state ascend. Without some of the edits, the splat has the rows that none of the others left out.
+
+The splat at first is that before the first edit that is taken off: the edits before it stay, and
+their rows need not be known.
 """
 
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Int64
+from jaxtyping import Bool, Int64
 from numpy import ndarray
 
 from gscompleter.splats.edits import Edit, Edits, read_edits
 from gscompleter.splats.foreign import resolve_splat
+from gscompleter.splats.formats import detect_splat_format
 from gscompleter.splats.layout import LABEL_LINES, find_places, iterate_rows, strip
 from gscompleter.splats.ply import (
     LABEL_COLUMN,
@@ -24,6 +29,7 @@ from gscompleter.splats.ply import (
     SceneFile,
     has_mode_comment,
     iterate_blocks,
+    read_labels,
     read_scene,
 )
 from gscompleter.splats.table import get_written_format
@@ -78,7 +84,9 @@ def strip_edits(path: Path, out: Path, numbers: Collection[int] | None = None) -
     every = range(1, len(edits.edits) + 1)
     chosen = every if numbers is None else numbers
     is_all = numbers is None or (bool(edits) and set(numbers) == set(every))
-    if not is_all or (len(every) > 1 and can_undo(edits, 1)):
+    # Rows of other formats than .ply have no columns that could be copied.
+    has_rows = detect_splat_format(path) == PLY.name
+    if not is_all or (len(every) > 1 and has_rows and can_undo(edits, 1)):
         return undo_edits(path, edits, chosen, out)
     kept, dropped = strip(path, out)
     if not edits:
@@ -93,35 +101,49 @@ def can_undo(edits: Edits, first: int) -> bool:
     return edits.is_unchanged and all(edit.can_be_undone for edit in edits.edits[first - 1 :])
 
 
+def has_lost_rows(edits: Edits) -> bool:
+    """Return True if the rows of an edit have no known places in what the next edit was given.
+
+    Another program changed the splat in between, or a format sorted its rows.
+    """
+    for edit, following in pairwise(edits.edits):
+        # A reconstruction whose colours changed in place cannot be undone, and keeps its rows.
+        is_recolored = edit.given is None and following.rows == count_rows_after(edits, edit)
+        if not edit.can_be_undone and not is_recolored:
+            return True
+    return False
+
+
 def undo_edits(path: Path, edits: Edits, numbers: Collection[int], out: Path) -> Undone:
     """Write a splat without some of its edits, row by row; errors as those of `strip_edits`."""
     check_undone(path, edits, numbers, out)
     layout = read_scene(path)
-    all_edits = edits.edits
-    check_counts(path, edits, len(layout.rows))
-    states, left_out = compute_keys(edits)
+    first = min(numbers)
+    # From here on, `later` are all edits there are, and are counted from the first that goes.
+    later = replace(edits, edits=edits.edits[first - 1 :])
+    check_counts(path, later, len(layout.rows))
+    states, left_out = compute_keys(later)
 
-    remaining = [index for index in range(len(all_edits)) if index + 1 not in numbers]
-    appended = [make_keys(0, all_edits[0].rows)]
-    appended += [make_keys(index + 1, all_edits[index].added) for index in remaining]
+    remaining = [index for index in range(len(later.edits)) if first + index not in numbers]
+    appended = [make_keys(0, later.edits[0].rows)]
+    appended += [make_keys(index + 1, later.edits[index].added) for index in remaining]
     # What an edit left out comes back with it, unless another edit left it out; no row is left out
     # twice.
     gone = [left_out[index].keys for index in remaining]
     keys = np.setdiff1d(np.concatenate(appended), np.concatenate([NO_KEYS, *gone]))
     originals = join_originals(left_out)
 
-    had_labels = all_edits[0].had_labels
-    header, dtype = make_remaining_header(layout, all_edits, remaining, had_labels)
+    is_kept = np.isin(states[-1], keys, assume_unique=True)
+    header, dtype = make_remaining_header(layout, later.edits, remaining, is_kept)
 
     def generate_blocks() -> Iterator[ndarray]:
         for block in iterate_blocks(len(keys)):
             yield copy_rows(layout, states[-1], originals, keys[block], dtype)
 
     write_ply_file(out, header, len(keys), generate_blocks(), layout.trailer)
-    # The first edits alone are a state that was a file once.
-    is_state = remaining == list(range(len(remaining)))
-    earlier = all_edits[len(remaining)].given if is_state else None
-    dropped = len(np.setdiff1d(states[-1], keys, assume_unique=True))
+    # Without all edits from the first on, it is a state that was a file once.
+    earlier = None if remaining else later.edits[0].given
+    dropped = int(np.count_nonzero(~is_kept))
     return Undone(len(keys), dropped, earlier is not None and hash_file(out) == earlier)
 
 
@@ -140,12 +162,17 @@ def check_undone(path: Path, edits: Edits, numbers: Collection[int], out: Path) 
                 f"1 to {count}.",
                 "edit",
             )
+    if detect_splat_format(path) != PLY.name:
+        raise InputError(
+            f"{quote_value(path)} is no .ply, of which alone edits can be taken off one by one; "
+            "undo all edits at once."
+        )
     first = min(numbers)
     if not can_undo(edits, first):
         raise InputError(
-            f"{quote_value(path)} was changed by another program after edit {first}, or its "
-            "reconstruction got new colours, so that this edit cannot be taken off alone; undo all "
-            "edits at once."
+            f"{quote_value(path)} was changed by another program after edit {first}, was written "
+            "in a format that sorts Gaussians, or its reconstruction got new colours, so that this "
+            "edit cannot be taken off alone; undo all edits at once."
         )
     if get_written_format(out) is not PLY:
         raise InputError("An earlier state is a .ply; name such a file.", "out")
@@ -169,9 +196,7 @@ def check_counts(path: Path, edits: Edits, total: int) -> None:
     count = edits.edits[0].rows
     is_right = count >= 0
     for edit in edits.edits:
-        gone = 0
-        if edit.originals is not None:
-            gone = len(read_scene(edits.find(edit.originals)).rows)
+        gone = count_originals(edits, edit)
         is_right &= edit.rows == count and 0 <= gone <= count and edit.added >= 0
         count += edit.added - gone
     if not is_right or count != total:
@@ -179,6 +204,18 @@ def check_counts(path: Path, edits: Edits, total: int) -> None:
             f"{quote_value(path)} has {total:,} Gaussians, to which the numbers of {EDITS_FILE} "
             "beside it do not lead; fetch all files of its folder again."
         )
+
+
+def count_rows_after(edits: Edits, edit: Edit) -> int:
+    """Count the rows that an edit wrote, as its record tells."""
+    return edit.rows + edit.added - count_originals(edits, edit)
+
+
+def count_originals(edits: Edits, edit: Edit) -> int:
+    """Count the rows that an edit left out."""
+    if edit.originals is None:
+        return 0
+    return len(read_scene(edits.find(edit.originals)).rows)
 
 
 def compute_keys(edits: Edits) -> tuple[list[Keys], list[Originals]]:
@@ -219,23 +256,32 @@ def join_originals(parts: Sequence[Originals]) -> Originals:
     return Originals(keys[order], scenes, np.concatenate(places)[order])
 
 
+def has_labels(layout: SceneFile, mask: Bool[ndarray, "n"]) -> bool:
+    """Return True if any of the rows in a mask is labelled as generated."""
+    return any(
+        bool(read_labels(layout.rows[block])[mask[block]].any())
+        for block in iterate_blocks(len(mask))
+    )
+
+
 def make_remaining_header(
-    layout: SceneFile, edits: Sequence[Edit], remaining: Sequence[int], had_labels: str | None
+    layout: SceneFile,
+    edits: Sequence[Edit],
+    remaining: Sequence[int],
+    is_kept: Bool[ndarray, "n"],
 ) -> tuple[bytes, np.dtype]:
     """Make header and type of rows without the comments of the edits that are taken off.
 
-    `remaining` are the indices of the other edits. Without any edit, the labels are what they were
-    at first: `had_labels` is the type of their column then, or None if there was none.
+    `edits` are those from the first that is taken off, and `remaining` the indices of those that
+    stay. Without any, the column of labels is what it was before the first. `is_kept` marks the
+    rows of the splat that stay.
     """
+    had_labels = edits[0].had_labels
     found = LABEL_LINES.search(layout.header)
     if found is None:
         return layout.header, layout.rows.dtype
     columns = layout.rows.dtype.descr
-    if not remaining and had_labels is None:
-        header = layout.header[: found.start()] + layout.header[found.end() :]
-        return header, np.dtype([column for column in columns if column[0] != LABEL_COLUMN])
-
-    # Comments of the splat at first, then those of each edit.
+    # Comments of the splat before the first edit, then those of each.
     comments = found[1].splitlines(keepends=True)
     start = len(comments) - sum(edit.records for edit in edits)
     kept = comments[:start]
@@ -243,6 +289,11 @@ def make_remaining_header(
         if index in remaining:
             kept += comments[start : start + edit.records]
         start += edit.records
+    # No column is recorded of a splat in another format either, whose labels and comments stay.
+    is_new = not remaining and had_labels is None and not kept
+    if is_new and not has_labels(layout, is_kept):
+        header = layout.header[: found.start()] + layout.header[found.end() :]
+        return header, np.dtype([column for column in columns if column[0] != LABEL_COLUMN])
     line = layout.header[found.start() : found.start(1)]
     dtype = layout.rows.dtype
     if not remaining and had_labels == "uchar":
@@ -257,10 +308,10 @@ def copy_rows(
 ) -> ndarray:
     """Copy rows by their keys, from the splat or from what was left out of it."""
     rows = np.zeros(len(keys), dtype)
-    # Keys ascend, so that each is found by bisection. A key beyond the last one meets the last row,
-    # which has another key.
-    places = np.searchsorted(final, keys).clip(max=len(final) - 1)
-    is_there = final[places] == keys
+    # Keys ascend, so that each is found by bisection.
+    places = np.searchsorted(final, keys)
+    is_there = places < len(final)
+    is_there[is_there] = final[places[is_there]] == keys[is_there]
     for block, copied in iterate_rows(layout, places[is_there]):
         fill_columns(rows, np.flatnonzero(is_there)[block], copied)
     missing = np.flatnonzero(~is_there)

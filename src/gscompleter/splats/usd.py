@@ -51,9 +51,11 @@ if TYPE_CHECKING:
     from pxr import Usd
 
 KIND = "ParticleField3DGaussianSplat"
+"""Type of the prims of Gaussians."""
 SH_NAME = "radiance:sphericalHarmonics"
-LABELS_PRIMVAR = "generated"
-"""Attribute of the labels, if anything was generated; ours alone."""
+"""Start of the names of the attributes of their colours."""
+LABELS_NAME = "generated"
+"""Attribute of the labels, an array of bytes, if anything was generated; ours alone."""
 PROBE_BYTES = 2**20
 """Bytes that are written to find out why OpenUSD could not."""
 LAYER_ENDINGS = (".usdc", ".usda", ".usd")
@@ -61,9 +63,9 @@ USD_ENDINGS = (*LAYER_ENDINGS, ".usdz")
 LINEAR = "lin_"
 """Start of the names of linear colour spaces."""
 Y_FROM_Z_UP = ((1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1))
-"""Turn from z up to y up, about x."""
+"""Turn from z up to y up, about x; acts on columns."""
 EXTENT = 3
-"""Standard deviations of the Gaussians that lie within the bounds of the prim."""
+"""Standard deviations of each Gaussian that lie within the bounds of the prim."""
 PACKAGED = (2000, 1, 1, 0, 0, 0, 0, 0, -1)
 """Time of the .usdc in a .usdz, so that the same Gaussians give the same bytes."""
 
@@ -79,8 +81,8 @@ def write_usd(path: Path, gaussians: Gaussians, made_by: Provenance = NOTHING_KN
         stage.GetRootLayer().customLayerData = {KEY: json.dumps(made_by.to_json())}
     ending = path.suffix.lower()
     with _make_folder_beside(path) as folder:
-        # A .usdz is made of a .usdc.
-        layer = folder / f"splat{ending.replace('z', 'c')}"
+        # A .usdz is a package of one .usdc.
+        layer = folder / ("splat.usdc" if ending == ".usdz" else f"splat{ending}")
         result = layer
         with _convert_usd_errors(path, folder):
             stage.GetRootLayer().Export(str(layer))
@@ -125,7 +127,7 @@ def _convert_usd_errors(path: Path, folder: Path) -> Iterator[None]:
 
 
 def _make_stage(gaussians: Gaussians) -> Usd.Stage:
-    """Make a stage of one prim, from Gaussians in its axes."""
+    """Make a stage of one prim from Gaussians with y up, whose unit is taken for a metre."""
     from pxr import Gf, Sdf, Usd, UsdGeom, Vt
 
     stage = Usd.Stage.CreateInMemory()
@@ -137,11 +139,14 @@ def _make_stage(gaussians: Gaussians) -> Usd.Stage:
     if gaussians.origin is not None:
         UsdGeom.Xformable(prim).AddTranslateOp().Set(Gf.Vec3d(*gaussians.origin))
     means = gaussians.means
+    # The largest deviation reaches as far in any direction, however a Gaussian is turned.
     reach = EXTENT * gaussians.scales.amax(1, keepdim=True)
+    # From wxyz: in its arrays, OpenUSD has the real part last.
+    quats = torch.nn.functional.normalize(gaussians.quats, dim=1).roll(-1, dims=1)
     values = {
         "extent": torch.stack([(means - reach).amin(0), (means + reach).amax(0)]),
         "positions": means,
-        "orientations": torch.nn.functional.normalize(gaussians.quats, dim=1).roll(-1, dims=1),
+        "orientations": quats,
         "scales": gaussians.scales,
         "opacities": gaussians.opacities,
         f"{SH_NAME}Coefficients": gaussians.sh.reshape(-1, 3),
@@ -150,7 +155,7 @@ def _make_stage(gaussians: Gaussians) -> Usd.Stage:
         prim.GetAttribute(name).Set(np.ascontiguousarray(value.numpy()))
     prim.GetAttribute(f"{SH_NAME}Degree").Set(gaussians.sh_degree)
     if gaussians.generated.any():
-        labels = prim.CreateAttribute(LABELS_PRIMVAR, Sdf.ValueTypeNames.UCharArray, custom=True)
+        labels = prim.CreateAttribute(LABELS_NAME, Sdf.ValueTypeNames.UCharArray, custom=True)
         labels.Set(Vt.UCharArray.FromNumpy(gaussians.generated.numpy()))
     return stage
 
@@ -194,8 +199,11 @@ def read_usd_record(path: Path) -> object:
 
 @contextmanager
 def _open_stage(path: Path) -> Iterator[Usd.Stage]:
-    """Open a stage; OpenUSD knows the format of a file by its ending alone."""
-    from pxr import Usd, UsdUtils
+    """Open a stage; OpenUSD knows the format of a file by its ending alone.
+
+    Raise DamagedError where it is found damaged, which may be when its arrays are read.
+    """
+    from pxr import Tf, Usd, UsdUtils
 
     with ExitStack() as stack:
         place = path
@@ -211,13 +219,13 @@ def _open_stage(path: Path) -> Iterator[Usd.Stage]:
         stack.callback(delegate.TakeUncoalescedDiagnostics)
         try:
             yield Usd.Stage.Open(str(place))
-        except RuntimeError as error:  # of OpenUSD, about its own sources
+        except Tf.ErrorException as error:  # its message names source files of OpenUSD
             raise DamagedError("OpenUSD finds it damaged") from error
 
 
 def _read_prim(prim: Usd.Prim, has_z_up: bool) -> Gaussians:
-    """Read the Gaussians of a prim, in the world with y up."""
-    from pxr import Usd, UsdGeom
+    """Read the Gaussians of a prim, in the world with y up and the unit of the stage."""
+    from pxr import Sdf, Usd, UsdGeom
 
     space = _find_color_space(prim)
     if space.startswith(LINEAR):
@@ -235,8 +243,10 @@ def _read_prim(prim: Usd.Prim, has_z_up: bool) -> Gaussians:
         _read_prim_array(prim, "opacities", 1)[:, 0],
         _read_prim_array(prim, f"{SH_NAME}Coefficients", 3).reshape(count, width, 3),
     )
-    labels = prim.GetAttribute(LABELS_PRIMVAR)
-    if labels and labels.HasAuthoredValue():
+    labels = prim.GetAttribute(LABELS_NAME)
+    # Other programs may use that name for something else.
+    is_ours = bool(labels) and labels.GetTypeName() == Sdf.ValueTypeNames.UCharArray
+    if is_ours and labels.HasAuthoredValue():
         gaussians = with_labels(gaussians, np.asarray(labels.Get(Usd.TimeCode.EarliestTime())))
 
     # Matrices of OpenUSD act on rows.

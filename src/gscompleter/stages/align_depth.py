@@ -2,6 +2,7 @@
 
 Eq. 8 itself, with all that acts in `paper()`, is in `align_paper.py`. Here is what we add, a check
 at the target and a second fit there, and the ablations that fit elsewhere or nowhere (`align_at`).
+Depths are z-depths in scene units.
 """
 
 from __future__ import annotations
@@ -26,6 +27,9 @@ from gscompleter.stages.target_view import TargetView
 from gscompleter.system.timing import timed_stage
 from gscompleter.types import DepthAffine, DepthPairs, Lift
 
+MIN_AGREEMENT_RATIO = 2.0
+"""Smallest agreement of a fit at the target, relative to that of the fit at the anchor, to replace
+it: it is fitted to what it is judged by, and agrees a little more with any depths."""
 MAX_DEPTH_PAIRS = 1000
 """Most compared depths that are kept as a sample."""
 
@@ -61,7 +65,8 @@ def refit_at_target(
     """Replace an affine that contradicts the context at the target by a fit at the target.
 
     With little overlap or pose drift, Ψ's two depth maps differ in scale. If no fit at the target
-    is better, the paper's choice stays.
+    is clearly better, the paper's choice stays. Either way the result tells how much of the context
+    at the target agrees with it, unless too few pixels can be compared.
     """
     if len(at_target) < MIN_FIT_PIXELS:
         return affine
@@ -72,19 +77,25 @@ def refit_at_target(
     if agree >= config.min_agreement:
         return affine
     refitted = fit_affine(at_target, rng)
-    if refitted.inliers < max(MIN_INLIER_SHARE, 2 * agree):
+    if refitted.inliers < max(MIN_INLIER_SHARE, MIN_AGREEMENT_RATIO * agree):
         return affine
-    return replace(refitted, agreement=refitted.inliers, is_refitted_at_target=True)
+    return replace(
+        refitted,
+        agreement=refitted.inliers,
+        coverage=affine.coverage,
+        is_refitted_at_target=True,
+    )
 
 
 def sample_depth_pairs(
     fit_view: Literal["anchor", "target"], depths: ComparedDepths, affine: DepthAffine
 ) -> DepthPairs:
-    """Sample the depths that `affine` was fitted to."""
+    """Sample the depths that `affine` was fitted to, at even steps."""
+    # Rounded up, so that there are at most as many.
     step = max(1, -(-len(depths) // MAX_DEPTH_PAIRS))
     x = depths.predicted[::step]
     y = depths.context[::step]
     inlier_mask = find_affine_inliers(x, y, affine.scale, affine.shift)
-    # All tensors of a completion lie on one device.
+    # Depths are compared on the CPU, and all tensors of a completion lie on one device.
     x, y, inlier_mask = (part.to(depths.device, non_blocking=True) for part in (x, y, inlier_mask))
     return DepthPairs(fit_view, x, y, inlier_mask)

@@ -13,7 +13,12 @@ from gscompleter.apps.inputs.task import CompletionTask, InputSplatFile
 from gscompleter.parts import INVENTED_KINDS, NOT_INVENTED, OBSERVED, EarlierWork
 from gscompleter.splats.edits import Edits
 from gscompleter.splats.formats import detect_splat_format
-from gscompleter.splats.row_kinds import find_rows_of_kinds, has_recolored, tells_kinds
+from gscompleter.splats.row_kinds import (
+    find_rows_of_kinds,
+    has_recolored,
+    tells_kinds,
+    tells_rows,
+)
 from gscompleter.system.errors import quote_value
 from gscompleter.system.files.result_names import EDITS_FILE
 from gscompleter.types import Gaussians
@@ -60,7 +65,7 @@ def read_rows(
     """Find the Gaussians of a splat whose rows are of some kinds; None if nothing tells."""
     edits = splat_file.edits
     path = splat_file.path
-    if not tells_kinds(edits) or not edits.is_unchanged or detect_splat_format(path) != "ply":
+    if not tells_rows(edits) or detect_splat_format(path) != "ply":
         return None
     # The rows of the file, then those of the context, which may be fewer and sorted.
     kept = splat_file.context_mask

@@ -86,25 +86,29 @@ class Judged:
     def cameras(self) -> tuple[Camera, ...]:
         """Cameras of all photographs, those of targets included, in the order of their frames.
 
-        It is that of the command, so that coverage is measured from the same places.
+        It is that of the command, so that coverage is measured from the same places. Photographs
+        without a frame come last.
         """
         photos = [photo.view for photo in self.completion.photos]
+        # Targets at one camera have one photograph.
+        at_targets = {id(target.photograph): target.view for target in self.targets}
         unused = [
-            *(target.view for target in self.targets if target.view is not None),
+            *(view for view in at_targets.values() if view is not None),
             *(photograph.view for photograph in self.held_out),
         ]
-        # A photograph that checked the splat, in a smaller size, may be among the unused ones.
+        # A photograph that checked the splat, in a smaller size, may be among the unused ones. Only
+        # its frame tells, and the unused one counts, as in the command.
         known = {view.frame for view in unused} - {None}
         views = [*(view for view in photos if view.frame not in known), *unused]
-        # Those without a frame come last, as they were given.
         views.sort(key=lambda view: math.inf if view.frame is None else view.frame)
         return tuple(view.camera for view in views)
 
 
 def prepare_judged(completion: Completion, unused_views: Sequence[View]) -> Judged:
-    """Finish a removal that is not yet restored, and tell photographs of targets from others.
+    """Finish a removal that is not yet restored, and give targets their photographs.
 
-    Raises InputError if an unused view is none, or is a part of the context.
+    The first unused view at the camera of a target is that of the target, and scores nothing else;
+    the others are held out. Raises InputError if an unused view is none, or is part of the context.
     """
     held_out = prepare_held_out(completion, unused_views)
     renderer = load_renderer(completion.context.means.device.type)
@@ -113,16 +117,19 @@ def prepare_judged(completion: Completion, unused_views: Sequence[View]) -> Judg
     completion = restore_surroundings(completion, SceneRenderer(renderer))
 
     targets = []
-    others = list(held_out)
+    at_targets = set()
     for result in completion.targets:
-        is_here = [is_same_camera(photo.view.camera, result.target) for photo in others]
         target = Target(result.target)
+        is_here = [is_same_camera(photo.view.camera, result.target) for photo in held_out]
         if any(is_here):
-            view = others.pop(is_here.index(True)).view
+            number = is_here.index(True)
+            at_targets.add(number)
+            view = held_out[number].view
             target = replace(
                 target, frame=view.frame, photograph=view.image, ignore_mask=view.ignore_mask
             )
         targets.append(target)
+    others = [photo for number, photo in enumerate(held_out) if number not in at_targets]
     return Judged(completion, targets, others, renderer)
 
 
@@ -206,8 +213,8 @@ def describe_judged(judged: Judged, splat_file: InputSplatFile | None) -> Mappin
     """Describe the input and the settings for `summary.json`, as `describe_run_values` does.
 
     What only a command is told is missing: format, frames and context of a folder, the use of
-    masks, of given depth and of refined poses, and the change of these. `near` and `far` are those
-    that were used, which the command has in `depth_range` alone if it found them.
+    masks, of given depth and of refined poses, and the change of these. `near` and `far`, in scene
+    units, are those that were used, which the command has in `depth_range` alone if it found them.
     """
     completion = judged.completion
     camera = completion.views[0].camera
@@ -232,7 +239,8 @@ def describe_judged(judged: Judged, splat_file: InputSplatFile | None) -> Mappin
             "renders_from": None,
             "notes": [],
         },
-        # Values are in one frame, that of the result, whose files add its origin.
+        # Photographs and result are in one frame, without the origin of the scene, which is added
+        # when files are written: from photographs to files is a shift by it.
         "frame": {
             "method": "given",
             "transform": compute_frame_from_photographs(-origin).tolist(),

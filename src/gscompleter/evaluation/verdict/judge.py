@@ -8,6 +8,7 @@ from gscompleter.completer import check_state
 from gscompleter.evaluation.verdict.held_out import HeldOut, score_context, score_held_out
 from gscompleter.evaluation.verdict.outcome import judge_completion
 from gscompleter.evaluation.verdict.rows import OutcomeRow
+from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.numerics.value_checks import check_views
 from gscompleter.render.loading import load_renderer
 from gscompleter.state import Completion
@@ -45,15 +46,24 @@ def prepare_held_out(completion: Completion, unused_views: Sequence[View]) -> li
     """Check photographs that score a completion, and give them its depth range; as in `judge`."""
     check_views(unused_views, "unused")
     device = completion.views[0].image.device
-    used = {view.frame for view in completion.views if view.frame is not None}
     held_out = []
-    for view in unused_views:
-        if view.frame in used:
+    for number, view in enumerate(unused_views):
+        if any(is_same_photograph(view, used) for used in completion.views):
+            name = f"Unused view {number}"
+            if view.frame is not None:
+                name = f"The unused view of frame {view.frame}"
             raise InputError(
-                f"The unused view of frame {view.frame} is part of the context, which cannot test "
-                "itself; give photographs that were not used."
+                f"{name} is part of the context, which cannot test itself; give photographs that "
+                "were not used."
             )
         camera = completion.with_depth_range(view.camera)
         plain = View(view.image, camera, view.frame, ignore_mask=view.ignore_mask)
         held_out.append(HeldOut(plain.to(device)))
     return held_out
+
+
+def is_same_photograph(view: View, other: View) -> bool:
+    """Check whether views are one photograph: by their frames, or their cameras if one has none."""
+    if view.frame is None or other.frame is None:
+        return is_same_camera(view.camera, other.camera)
+    return view.frame == other.frame

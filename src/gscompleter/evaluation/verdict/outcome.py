@@ -288,8 +288,9 @@ def select_testing(held_out: Sequence[HeldOutRow]) -> list[HeldOutRow]:
 
 
 def name_unused(rows: Sequence[HeldOutRow]) -> str:
-    """Name photographs that only score, by their number."""
+    """Name photographs that only score, by their number if it is one that has any."""
     use = "checking" if rows[0].is_check else "unused"
     if len(rows) == 1:
-        return f"the {use} photograph {rows[0].frame}"
+        name = f"the {use} photograph"
+        return name if rows[0].frame is None else f"{name} {rows[0].frame}"
     return f"the {len(rows)} nearest {use} photographs"

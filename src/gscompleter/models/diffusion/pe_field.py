@@ -1,7 +1,8 @@
 """PE-Field: a diffusion transformer that reads the photograph at its target positions.
 
 The camera motion enters only by positions: each token of the photograph is placed where the
-target camera sees its content. Attention fills the holes.
+target camera sees its content (`position_ids`). Attention fills the holes. Of the photographs, only
+the one nearest to the target is read.
 """
 
 from __future__ import annotations
@@ -37,12 +38,14 @@ GUIDANCE = 3.5
 
 @dataclass(frozen=True)
 class Condition:
-    """Input of the model for one target: the resized photograph, output size, and positions."""
+    """Input of the model for one target."""
 
     photograph: Float[Tensor, "h w 3"]
+    """The nearest photograph in a size of the training, with colours in [0, 1]."""
     size: tuple[int, int]
+    """Height and width in pixels of the image to generate, also of the training."""
     source_positions: Float[Tensor, "m 63"]
-    """Positions of the photograph's tokens in the target camera."""
+    """Positions of the photograph's m tokens in the target camera, 21 of 3 numbers each."""
 
 
 @dataclass(frozen=True)
@@ -79,7 +82,7 @@ class PEField:
             images = self.generate_images([conditions[i] for i in group], self.seed)
             first.update(zip(group, images, strict=True))
 
-        def answer(i: int) -> GeneratorOutput:
+        def complete(i: int) -> GeneratorOutput:
             nearest = requests[i].nearest
             target = requests[i].target
 
@@ -88,15 +91,16 @@ class PEField:
                     image = first[i]
                 else:
                     image = self.generate_images([conditions[i]], seed)[0]
-                back = resize_antialiased(image, (target.height, target.width)).clamp(0, 1)
-                return back.to(nearest.image.device)
+                # From the size of the model to that of the target.
+                resized = resize_antialiased(image, (target.height, target.width)).clamp(0, 1)
+                return resized.to(nearest.image.device)
 
             # Photographs, warped to the target, judge the image and correct its colours.
             observed = warp_photographs(nearest, target, requests[i].context)
             correct = requests[i].synthesis.correct_color
             return paint_consistently(paint, self.seed, observed, self.retries, correct)
 
-        return [answer(i) for i in range(len(requests))]
+        return [complete(i) for i in range(len(requests))]
 
     def create_condition(self, request: GeneratorRequest) -> Condition:
         """Create the model input for a target; raises the errors of `synthesize`."""
@@ -104,17 +108,22 @@ class PEField:
         target = request.target
         size = self.model.compute_size(target.height, target.width)
         source_size = self.model.compute_size(nearest.camera.height, nearest.camera.width)
-        grids = self.model.compute_grid(source_size), self.model.compute_grid(size)
-        source = self.depth or load_source_depth(request.synthesis.source_depth, self.device)
-        depth = source(nearest, find_render(nearest, request.context))
+        source_grid = self.model.compute_grid(source_size)
+        target_grid = self.model.compute_grid(size)
+        estimate = self.depth or load_source_depth(request.synthesis.source_depth, self.device)
+        depth = estimate(nearest, find_render(nearest, request.context))
         # Where the target sees what the photograph shows; the network draws it there.
-        positions = compute_source_ids(depth, nearest.camera, target, *grids).cpu()
-        return Condition(resize_antialiased(nearest.image, source_size), size, positions)
+        positions = compute_source_ids(depth, nearest.camera, target, source_grid, target_grid)
+        photograph = resize_antialiased(nearest.image, source_size)
+        return Condition(photograph, size, positions.cpu())
 
     def generate_images(
         self, conditions: Sequence[Condition], seed: int
     ) -> Float[Tensor, "b h w 3"]:
-        """Generate an image for each condition; all sizes must be equal."""
+        """Generate an image for each condition, in the size of the model.
+
+        All of them must have equal sizes, as in a group of `group_by_size`.
+        """
         size = conditions[0].size
         return self.model.generate(
             torch.stack([one.photograph for one in conditions]),
@@ -128,7 +137,7 @@ class PEField:
 
 
 def group_by_size(conditions: Sequence[Condition], max_size: int) -> list[list[int]]:
-    """Group the indices of conditions of equal size into batches of at most `max_size`."""
+    """Group the indices of conditions of equal sizes into batches of at most `max_size`."""
     alike: dict[tuple[tuple[int, int], torch.Size], list[int]] = {}
     for i, one in enumerate(conditions):
         alike.setdefault((one.size, one.photograph.shape), []).append(i)

@@ -20,7 +20,8 @@ from gscompleter.system.errors import InputError, join_names, quote_value, refus
 from gscompleter.system.files.reading import hash_file, is_zip_file, open_file
 
 IGNORED_PREFIXES = ("decoder.", "losses.")
-"""Prefixes of tensors of other parts that training checkpoints contain."""
+"""Prefixes of tensors of other parts that training checkpoints contain, beside those of the network
+with a prefix of its own."""
 
 
 def read_state_dict(path: Path, weights: PublishedWeights) -> dict[str, Tensor]:
@@ -34,13 +35,18 @@ def read_state_dict(path: Path, weights: PublishedWeights) -> dict[str, Tensor]:
     """
     check_kind(path, weights.file)
     # A converted file has no published hash.
-    converted = path.suffix == ".safetensors" and not weights.file.endswith(".safetensors")
-    if weights.sha256 is not None and not converted:
+    is_converted = is_safetensors(path) and not is_safetensors(Path(weights.file))
+    if weights.sha256 is not None and not is_converted:
         check_sha256(path, weights.sha256, weights.file)
     else:
         check_archive(path, weights.file)
-    read = read_safetensors if path.suffix == ".safetensors" else read_tensors
+    read = read_safetensors if is_safetensors(path) else read_tensors
     return extract_network_tensors(read(path, weights.file), path, weights)
+
+
+def is_safetensors(path: Path) -> bool:
+    """Return True for a file that is read as safetensors, by its ending."""
+    return path.suffix.lower() == ".safetensors"
 
 
 def fetch_checked(weights: PublishedWeights, local: Path | None = None) -> Path:
@@ -136,36 +142,38 @@ def extract_network_tensors(
     content: Any, path: Path, weights: PublishedWeights
 ) -> dict[str, Tensor]:
     """Extract the network's tensors, without the prefix of their names; others are refused."""
+    prefix = weights.prefix
 
-    def other(held: str) -> InputError:
+    def create_error(held: str) -> InputError:
         return InputError(f"{quote_value(path)} holds {held}; give {weights.file}.")
+
+    def is_known(key: str, value: object) -> bool:
+        if key.startswith(prefix):
+            return isinstance(value, Tensor)
+        return key.startswith(IGNORED_PREFIXES)
 
     # Some files have the tensors in an entry, beside the state of the training.
     inner = content.get(weights.entry, content) if isinstance(content, Mapping) else None
     if not isinstance(inner, Mapping) or not all(isinstance(key, str) for key in inner):
-        raise other("no named tensors")
-    prefix = weights.prefix
+        raise create_error("no named tensors")
+    if not inner:
+        raise create_error("no tensors")
     tensors = {k.removeprefix(prefix): v for k, v in inner.items() if k.startswith(prefix)}
     if not tensors:
-        raise other(f"no tensors named {prefix}…, but {_list_some(list(inner))}")
-    unknown = [
-        key
-        for key, value in inner.items()
-        if not (key.startswith(prefix) and isinstance(value, Tensor))
-        and not key.startswith(IGNORED_PREFIXES)
-    ]
+        raise create_error(f"no tensors named {prefix}…, but {_list_some(list(inner))}")
+    unknown = [key for key, value in inner.items() if not is_known(key, value)]
     if unknown:
-        raise other(f"more than the network {weights.name}: {_list_some(unknown)}")
+        raise create_error(f"more than the network {weights.name}: {_list_some(unknown)}")
     # Only dense tensors with numbers of their own can be loaded.
     odd = [key for key, value in tensors.items() if not is_plain(value)]
     if odd:
         kinds = "empty shells, sparse or quantized ones"
-        raise other(f"tensors without plain numbers ({_list_some(odd)}): {kinds}")
+        raise create_error(f"tensors without plain numbers ({_list_some(odd)}): {kinds}")
     return tensors
 
 
 def is_plain(tensor: Tensor) -> bool:
-    """Return True for a dense, real, materialized tensor."""
+    """Return True for a dense, real tensor that holds its numbers (a meta tensor holds none)."""
     strided = tensor.layout == torch.strided and not tensor.is_nested
     return strided and not (tensor.is_meta or tensor.is_quantized or tensor.is_complex())
 
@@ -179,4 +187,4 @@ def _create_file_error(path: Path, wrong: str, name: str) -> InputError:
 
 
 def _list_some(keys: list[str]) -> str:
-    return join_names(keys, 3) or "nothing"
+    return join_names(keys, 3)

@@ -1,12 +1,17 @@
 """Compositing of splats tile by tile, front to back, and its gradients, back to front.
 
 Splats are listed in the 16 × 16 tiles that they touch (`tiles.py`). Two lists are merged by
-depth: the frozen `context`, and `new`, which gets gradients.
+depth: the frozen `context`, and `new`, which gets gradients. Names of the former begin with `c_`,
+those of the latter with `n_`; `c` and `n` are places in their lists. Depths are z-depths, and
+`position` counts the splats of both lists from the front of a tile.
 
 Kernels work on tiles[begin:end], the numbers of tiles row by row. Of one tile they keep `state`
 [row, value, column], whose values the functions of `simd.py` name, and `row_limit` [row]: a splat
 behind the limit of a row, by its position in the merged list, is skipped there. Front to back
 it only tells full rows, -1, from others; back to front it is the last contribution of a row.
+
+Each entry of `new` has a slot, in which its sums over a tile are written. The slots of a splat are
+summed afterwards (`tiles.sum_entries`), so that tiles can be worked on in any order.
 """
 
 from typing import NamedTuple
@@ -58,7 +63,7 @@ class RasterFrame(NamedTuple):
 
 @njit()
 def _get_depth(splats, entries, place, begin, end, beyond):
-    """Return the depth of an entry, or `beyond` for places outside begin..end."""
+    """Return the z-depth of an entry, or `beyond` for places outside begin..end (excluded)."""
     if place < begin or place >= end:
         return beyond
     return splats[entries[place], DEPTH]
@@ -78,7 +83,8 @@ def merge_lists(begin, end, context, new, used, full, tile_start, entries, depth
     for tile in range(begin, end):
         c = c_start[tile]
         n = n_start[tile]
-        c_end, n_end = c + used[tile, 0], n + used[tile, 1]
+        c_end = c + used[tile, 0]
+        n_end = n + used[tile, 1]
         place = tile_start[tile]
         depth = infinity
         c_depth = _get_depth(c_splats, c_entries, c, c, c_end, infinity)
@@ -112,13 +118,18 @@ def merge_lists(begin, end, context, new, used, full, tile_start, entries, depth
 def _locate_tile(tile, height, width):
     """Return left and top pixel of a tile, and its rows and columns inside the image."""
     tiles_x = (width + TILE - 1) // TILE
-    left, top = (tile % tiles_x) * TILE, (tile // tiles_x) * TILE
+    left = (tile % tiles_x) * TILE
+    top = (tile // tiles_x) * TILE
     return left, top, min(TILE, height - top), min(TILE, width - left)
 
 
 @njit()
 def _open_pixels(state, columns):
-    """Reset the pixels of a tile. Those beyond the border of the image are full from the start."""
+    """Reset the pixels of a tile, of which the first `columns` of each row lie in the image.
+
+    The others are full from the start, so that they keep no row open. Rows beyond the border are
+    touched by no splat, as boxes end there.
+    """
     state[:] = 0
     state[:, 0, :columns] = 1
     state[:, 0, columns:] = -1
@@ -126,7 +137,11 @@ def _open_pixels(state, columns):
 
 @njit(fastmath={"contract"})
 def _place(splats, opacities, boxes, i, left, top):
-    """Return the rows of the tile at (left, top) that splat i touches, and the relative splat."""
+    """Return the rows of the tile at (left, top) that splat i touches, and the relative splat.
+
+    The rows are first and stop (excluded). Of the splat, x and y are those of its centre from the
+    first pixel centre of the tile; the other values are as `simd.composite_rows` takes them.
+    """
     half = np.float32(0.5)
     return (
         max(np.int64(boxes[i, 2]) - top, 0),
@@ -166,8 +181,10 @@ def composite(begin, end, tiles, context, new, frame):
         row_limit[:] = np.iinfo(np.int32).max
         open_rows = rows
 
-        c_begin, c_end = c_start[tile], c_start[tile + 1]
-        n_begin, n_end = n_start[tile], n_start[tile + 1]
+        c_begin = c_start[tile]
+        c_end = c_start[tile + 1]
+        n_begin = n_start[tile]
+        n_end = n_start[tile + 1]
         c = c_begin
         n = n_begin
         c_depth = _get_depth(c_splats, c_entries, c, c_begin, c_end, infinity)
@@ -184,14 +201,17 @@ def composite(begin, end, tiles, context, new, frame):
                 n_depth = _get_depth(n_splats, n_entries, n, n_begin, n_end, infinity)
             open_rows -= simd.composite_rows(first, stop, position, state, last, row_limit, splat)
 
-        used[tile, 0], used[tile, 1] = c - c_begin, n - n_begin
+        used[tile, 0] = c - c_begin
+        used[tile, 1] = n - n_begin
         full[tile] = open_rows == 0
-        # A negative transmittance marks a pixel that is full. The depth is the mean over alpha.
+        # A negative transmittance marks a pixel that is full. The depth is the mean of those of the
+        # splats by their weights, whose sum is alpha.
         for row in range(rows):
             for column in range(columns):
                 transmittance = abs(state[row, 0, column])
                 alpha = np.float32(1) - transmittance
-                y, x = top + row, left + column
+                y = top + row
+                x = left + column
                 for channel in range(3):
                     image[y, x, channel] = state[row, 1 + channel, column]
                 depths[y, x] = state[row, 4, column] / alpha if alpha > 0 else np.float32(0)
@@ -216,8 +236,8 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
     most = 1
     for index in range(begin, end):
         most = max(most, n_start[tiles[index] + 1] - n_start[tiles[index]] + 1)
-    # Rows of weights, up to TILE for each splat, and for one of the context after them. Those never
-    # written take no memory.
+    # Rows of weights, up to TILE for each splat of `new`, and for one of the context after them.
+    # Those never written take no memory.
     kept = np.empty((most * TILE, TILE), np.float32)
     row_limit = np.empty(TILE, np.int32)
     totals = np.zeros(TILE, np.float32)
@@ -226,6 +246,7 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
         tile = tiles[index]
         left, top, rows, columns = _locate_tile(tile, height, width)
         _open_pixels(state, columns)
+        # Any number from 0 on marks an open row here.
         row_limit[:] = 0
         open_rows = rows
 
@@ -243,7 +264,7 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
                 first, stop, splat = _place(c_splats, c_opacities, c_boxes, c_entries[c], left, top)
                 c += 1
                 c_depth = _get_depth(c_splats, c_entries, c, c_begin, c_end, infinity)
-                # The next splat overwrites its weights.
+                # `place` stays: its weights are not needed, and the next splat overwrites them.
                 open_rows -= simd.weigh_rows(first, stop, place, state, row_limit, kept, splat)
                 continue
             first, stop, splat = _place(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
@@ -307,7 +328,8 @@ def composite_backward(
         # gets -dL/dD D / A besides its own gradient.
         for row in range(rows):
             for column in range(columns):
-                y, x = top + row, left + column
+                y = top + row
+                x = left + column
                 alpha = alphas[y, x]
                 d_depth_sum = d_depth[y, x] / alpha if alpha > 0 else np.float32(0)
                 state[row, 0, column] = transmittances[y, x]
@@ -346,14 +368,22 @@ def composite_backward(
             simd.revert_rows(*rows_of_splat)
             # Moments of the gradient over the pixels, in x and y relative to the splat, become
             # moments in s = u x + v y and t = w y, in which the splat is round.
-            u, v, w = splat[2], splat[3], splat[4]
-            x, y, xx, xy, yy = sums[1], sums[2], sums[3], sums[4], sums[5]
+            u = splat[2]
+            v = splat[3]
+            w = splat[4]
+            sum_x = sums[1]
+            sum_y = sums[2]
+            sum_xx = sums[3]
+            sum_xy = sums[4]
+            sum_yy = sums[5]
+            sum_sx = u * sum_xx + v * sum_xy
+            sum_sy = u * sum_xy + v * sum_yy
             gradients[slot, project.SUM] = sums[0]
-            gradients[slot, project.SUM_S] = u * x + v * y
-            gradients[slot, project.SUM_T] = w * y
-            gradients[slot, project.SUM_SS] = u * (u * xx + v * xy) + v * (u * xy + v * yy)
-            gradients[slot, project.SUM_ST] = w * (u * xy + v * yy)
-            gradients[slot, project.SUM_TT] = w * w * yy
+            gradients[slot, project.SUM_S] = u * sum_x + v * sum_y
+            gradients[slot, project.SUM_T] = w * sum_y
+            gradients[slot, project.SUM_SS] = u * sum_sx + v * sum_sy
+            gradients[slot, project.SUM_ST] = w * sum_sy
+            gradients[slot, project.SUM_TT] = w * w * sum_yy
             for channel in range(4):
                 gradients[slot, project.SUM_DEPTH + channel] = sums[6 + channel]
 
@@ -364,6 +394,8 @@ def backpropagate_images(
 ):
     """Traverse tiles[begin:end] back to front, as `composite_backward`, for opacities alone.
 
+    The state is in several arrays, since some values are those of a pixel, and others those of a
+    pixel in one image; they are as `simd.revert_images` takes them.
     d_images [count, h, w, 3]: gradients of the image of as many functions. gradients [slots, count]
     receives the sum of alpha dL/dalpha of each function, in one walk for all of them.
     """
@@ -393,7 +425,8 @@ def backpropagate_images(
         row_limit[:] = -1
         for row in range(rows):
             for column in range(columns):
-                y, x = top + row, left + column
+                y = top + row
+                x = left + column
                 passing[row, column] = transmittances[y, x]
                 last[row, column] = lasts[y, x]
                 row_limit[row] = max(row_limit[row], last[row, column])

@@ -81,7 +81,8 @@ def measure_pose_fit(views: Sequence[View]) -> PoseFit | None:
         rays = (make_rays(reference, in_i[is_true]), make_rays(source, in_j[is_true]))
         focals = (reference.K.diagonal()[:2], source.K.diagonal()[:2])
         pose = compute_relative_pose(reference, source)
-        # The smaller of both photographs limits how well features can be located.
+        # Sampson distances mix pixels of both photographs. The smaller one limits how well features
+        # can be located, so that its pixels are counted.
         scale = ERROR_SIDE / min(*reference.size, *source.size)
         given.append(np.abs(compute_sampson_distances(*pose, rays, focals)) * scale)
         pairs.append((pose, rays, focals, scale))
@@ -105,7 +106,11 @@ def make_rays(image: StereoImage, pixels: Pixels) -> Rays:
 
 
 def compute_relative_pose(reference: StereoImage, source: StereoImage) -> RelativePose:
-    """Compute the rotation, and the direction of the shift, from reference to source."""
+    """Compute the rotation, and the direction of the shift, from reference to source.
+
+    The cameras have to be in different places, as those of matched pairs are.
+    """
+    # A point x of the world is Rᵀ (x - c) in a camera with rotation R to world axes and centre c.
     shift = source.rotation.T @ (reference.center - source.center)
     return source.rotation.T @ reference.rotation, shift / np.linalg.norm(shift)
 
@@ -115,17 +120,19 @@ def fit_relative_pose(
     rays: tuple[Rays, Rays],
     focals: tuple[Focals, Focals],
 ) -> RelativePose:
-    """Fit the relative pose with the smallest distances.
+    """Fit the relative pose with the smallest Sampson distances, by robust least squares.
 
-    Those above a pixel of the photographs, as `focals` are in, count less.
+    Distances are in pixels of the photographs, as `focals` are, and above one they count less.
     """
     # Imported here, as most poses need no fit.
     from scipy.optimize import least_squares
 
-    # Two directions across the shift, whose length matches do not tell.
+    # Two directions across the shift, the rows that complete it to an orthonormal basis: matches do
+    # not tell its length.
     across = np.linalg.svd(start[1][None])[2][1:]
 
     def change(step: Float[np.ndarray, "5"]) -> RelativePose:
+        # A rotation vector in camera axes of the source, then the parts across the shift.
         turn: Float[np.ndarray, "3 3"] = cv2.Rodrigues(step[:3])[0]
         shift = start[1] + step[3:] @ across
         return turn @ start[0], shift / np.linalg.norm(shift)

@@ -5,7 +5,9 @@ matches itself at the same pixel, as if it stood at infinity, and is built hundr
 But cameras that keep one height move over ground: the plane below all of them on which most of
 what is measured lies. A photograph far from all others is held to it where these show the same
 colours (decision 138).
-Lengths are in widest baselines.
+
+Lengths are in widest baselines and inverse depths in their inverse, as in `sweep.py`. Places and
+directions are in world axes.
 """
 
 from __future__ import annotations
@@ -47,7 +49,8 @@ MIN_UPWARDS = 0.8
 """Smallest cosine between the normal of the ground and the mean upward axis of the cameras, which
 may look down."""
 MAX_SIDEWAYS = 0.2
-"""Largest sine of the angle by which it leans to a side, since people keep horizons level."""
+"""Largest sine of the angle by which it leans to the side of most cameras, since people keep
+horizons level."""
 MIN_GROUND_SHARE = 0.1
 """Smallest share of the points that lies on the ground."""
 MAX_GROUND_SLOPE = 0.1
@@ -115,9 +118,20 @@ class Ground:
         """Measure how high points are above the ground."""
         return centers @ self.normal - self.offset
 
+    def compute_inverse(
+        self, rays: Float[np.ndarray, "*n 3"], heights: Float[np.ndarray, "*#n"]
+    ) -> Float[np.ndarray, "*n"]:
+        """Compute the inverse depths at which rays of z-depth 1 meet the ground.
+
+        `heights` are those of their cameras above it. Rays above the horizon have negative ones.
+        """
+        # A ray meets it where its height, that of the camera and depth times ray · normal, is 0.
+        inverse: Float[np.ndarray, "*n"] = -(rays @ self.normal) / heights
+        return inverse
+
     def find_inliers(self, points: MeasuredPoints) -> Bool[np.ndarray, "n"]:
         """Find the points on the ground, apart from those near the horizon."""
-        inverse = -(points.rays @ self.normal) / self.measure_heights(points.centers)
+        inverse = self.compute_inverse(points.rays, self.measure_heights(points.centers))
         is_judged = inverse > MIN_GROUND_INDEX * points.step
         is_near = np.abs(points.inverse - inverse) < points.step + MAX_GROUND_MISS * inverse
         found: Bool[np.ndarray, "n"] = is_judged & is_near
@@ -148,13 +162,16 @@ def moves_forward(images: Sequence[StereoImage]) -> bool:
 
 
 def find_ways(images: Sequence[StereoImage]) -> Places:
-    """Find the direction from each camera to the nearest other one, in world axes; 0 at its own."""
+    """Find the direction from each camera to the nearest one in another place.
+
+    They are zero if all cameras are in one place.
+    """
     centers = np.stack([image.center for image in images])
     ways = []
     for center in centers:
         offsets = centers - center
         distances = np.linalg.norm(offsets, axis=1)
-        # Cameras in one place are no way apart.
+        # Others in the same place, and the camera itself, have no direction.
         nearest = np.where(distances > 0, distances, np.inf).argmin()
         ways.append(offsets[nearest] / max(float(distances[nearest]), 1e-9))
     return np.stack(ways)
@@ -169,8 +186,11 @@ def find_ground(
     """
     centers = np.stack([image.center for image in images])
     ways = find_ways(images)
-    # Rotations are from camera to world axes, and y points down in a camera.
-    sideways, downwards, _ = np.mean([image.rotation for image in images], axis=0).T
+    # Rotations are from camera to world axes: their columns are the axes of cameras, of which x
+    # points to the right and y down.
+    rotations = np.stack([image.rotation for image in images])
+    sideways = rotations[:, :, 0]
+    downwards = rotations[:, :, 1].mean(axis=0)
     upwards = -downwards / max(float(np.linalg.norm(downwards)), 1e-9)
     generator = np.random.default_rng(0)
     points = sample_points(images, measured, skies, upwards, generator)
@@ -181,9 +201,10 @@ def find_ground(
         """Check that cameras move along a plane, upright and at about the same height above it."""
         heights = ground.measure_heights(centers)
         lowest = float(heights.min())
+        # Cameras may look along the way and back, so that their axes to the side have no mean.
         return (
             float(ground.normal @ upwards) > MIN_UPWARDS
-            and abs(float(ground.normal @ sideways)) < MAX_SIDEWAYS
+            and float(np.median(np.abs(sideways @ ground.normal))) < MAX_SIDEWAYS
             and float(np.median(np.abs(ways @ ground.normal))) < MAX_GROUND_SLOPE
             and 0 < float(heights.max()) < MAX_HEIGHT_RATIO * lowest
         )
@@ -253,11 +274,11 @@ def make_ground(
 
 
 def refit_ground(ground: Ground, points: MeasuredPoints, upwards: Float[np.ndarray, "3"]) -> Ground:
-    """Fit the plane to its inliers by least squares of their heights above it."""
+    """Fit the plane to its inliers by least squares of their distances from it."""
     found = ground.find_inliers(points)
     places = points.places[found]
-    # A step of the sweep moves a point along its ray by step / inverse², and so in height by its
-    # share of the height of the camera.
+    # A step of the sweep changes a depth, 1 / inverse, by step / inverse², and so the height of a
+    # point of the ground by step / inverse times that of the camera: its weight is 1 / that².
     heights = ground.measure_heights(points.centers[found])
     weight = (points.inverse[found] / (points.step[found] * heights)) ** 2
     middle = weight @ places / weight.sum()
@@ -278,10 +299,12 @@ def hold_view(
     if float(distances_to_others.min()) < MIN_STRIDE * heights[number]:
         return measured
     rays = compute_rays(image)
-    inverse = (-(rays @ ground.normal) / heights[number]).astype(np.float32)
+    inverse = ground.compute_inverse(rays, heights[number]).astype(np.float32)
     index = compute_plane_index(measured.planes, inverse)
     step = measured.planes[1] - measured.planes[0]
     is_ground = (inverse > MIN_GROUND_INDEX * step) & ~sky & (image.given == 0)
+    if image.ignore_mask is not None:
+        is_ground &= ~image.ignore_mask
 
     # Ground is known where cameras passed: within reach of the places below them.
     hits = image.center + rays / np.maximum(inverse, step)[..., None]
@@ -289,6 +312,24 @@ def hold_view(
     distances = [np.linalg.norm(hits - foot, axis=-1) for foot in feet]
     is_ground &= np.min(distances, axis=0) < GROUND_REACH * float(np.median(heights))
 
+    is_confirmed, is_compared = confirm_ground(rig, number, inverse, is_ground)
+    is_beyond = (measured.inverse < BEYOND * inverse) & (measured.index < index - BEYOND_PLANES)
+    held = is_confirmed & (is_beyond | (measured.weight == 0))
+    # What others confirm counts as measured, so that each place of the ground is kept once.
+    confidence = np.where(is_compared, BACKGROUND_WEIGHT, np.float32(0))
+    return replace(
+        measured,
+        index=np.where(held, index, measured.index),
+        weight=np.where(held, BACKGROUND_WEIGHT, measured.weight),
+        confidence=np.where(held, confidence, measured.confidence),
+    )
+
+
+def confirm_ground(rig: Rig, number: int, inverse: Map, is_ground: Mask) -> tuple[Mask, Mask]:
+    """Find the ground of a view that other photographs confirm, and that which any of them shows.
+
+    `inverse` are its inverse depths, and `is_ground` marks the pixels that are judged.
+    """
     difference = measure_difference(rig, number, inverse)
     is_compared = is_ground & np.isfinite(difference)
     agrees = is_ground & (difference < MAX_GROUND_DIFFERENCE)
@@ -296,38 +337,32 @@ def hold_view(
     is_right = agrees.sum() >= MIN_AGREEING_GROUND * is_compared.sum()
     if is_right and is_compared.mean() >= MIN_COMPARED_GROUND:
         agrees |= is_ground & ~is_compared
-
-    is_beyond = (measured.inverse < BEYOND * inverse) & (measured.index < index - BEYOND_PLANES)
-    held = agrees & (is_beyond | (measured.weight == 0))
-    # What others confirm counts as measured, so that each place of the ground is kept once.
-    confirmed = np.where(is_compared, BACKGROUND_WEIGHT, np.float32(0))
-    return replace(
-        measured,
-        index=np.where(held, index, measured.index),
-        weight=np.where(held, BACKGROUND_WEIGHT, measured.weight),
-        confidence=np.where(held, confirmed, measured.confidence),
-    )
+    return agrees, is_compared
 
 
 def measure_difference(rig: Rig, number: int, inverse: Map) -> Float32[np.ndarray, "h w"]:
     """Measure how much a view differs from the most similar other one at some inverse depths.
 
     Colour differences are averaged over a window, since an edge may be a pixel off. Infinite where
-    no other photograph shows the place.
+    no other photograph shows the place in a pixel that is not ignored.
     """
     own = rig.images[number].image
     least = np.full(inverse.shape, np.inf, np.float32)
     for other, image in enumerate(rig.images):
         if other != number:
-            seen, is_inside = sample_at(image.image, inverse, rig.transforms[number, other])
+            transform = rig.transforms[number, other]
+            seen, is_seen = sample_at(image.image, inverse, transform)
+            if image.ignore_mask is not None:
+                ignored, _ = sample_at(image.ignore_mask.astype(np.float32), inverse, transform)
+                is_seen &= ignored == 0
             difference = cv2.blur(np.abs(seen - own).mean(axis=-1), (GROUND_WINDOW, GROUND_WINDOW))
-            least = np.where(is_inside, np.minimum(least, difference), least)
+            least = np.where(is_seen, np.minimum(least, difference), least)
     return least
 
 
 def sample_at(
-    image: Float32[np.ndarray, "H W 3"], inverse: Map, transform: Transform
-) -> tuple[Float32[np.ndarray, "h w 3"], Mask]:
+    image: Float32[np.ndarray, "H W *channels"], inverse: Map, transform: Transform
+) -> tuple[Float32[np.ndarray, "h w *channels"], Mask]:
     """Sample another image at the inverse depths of a view, and mark what lies inside of it."""
     height, width = inverse.shape
     x = np.arange(width, dtype=np.float32) + np.float32(0.5)
