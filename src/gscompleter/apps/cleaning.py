@@ -51,6 +51,7 @@ from gscompleter.evaluation.verdict.numbers import describe_measured
 from gscompleter.numerics.image_ops import compute_mask_fraction
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
+from gscompleter.splats.alignment.trainer_files import TRAINER_FILES, keep_trainer_files
 from gscompleter.splats.edits import EDITS, EditDraft, record_edit
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, quote_value
@@ -63,7 +64,11 @@ from gscompleter.system.timing import record_seconds, timed_stage
 from gscompleter.types import Camera, Gaussians, View
 
 CLEAN_COMMAND = "clean"
-CLEANING_FILES = (COMPLETED_FILE, REMOVED_FILE, REMOVED_PICTURE_FILE, SUMMARY_FILE, *EDITS)
+CLEANING_FILES = (
+    *(COMPLETED_FILE, REMOVED_FILE, REMOVED_PICTURE_FILE, SUMMARY_FILE),
+    *EDITS,
+    *TRAINER_FILES,
+)
 """Files that it may write."""
 
 
@@ -126,6 +131,7 @@ def clean_splat(request: CleaningRequest) -> None:
                     cleaning.given[:0],
                     cleaning.splat_file,
                 )
+                keep_trainer_files(cleaning.splat_file.path, folder)
                 record_edit(
                     folder,
                     EditDraft(CLEAN_COMMAND),

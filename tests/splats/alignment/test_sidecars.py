@@ -111,10 +111,9 @@ def test_one_wrong_camera_in_the_list_changes_nothing(room, splat, tmp_path):
     assert np.allclose(found.transform, ARBITRARY, atol=1e-6)
 
 
-def test_cameras_of_another_splat_are_not_looked_at(tmp_path, splat):
+def test_cameras_of_another_splat_are_not_looked_at(tmp_path):
     (tmp_path / "cameras_small.json").write_text("[]")
-    given = InputSplat(tmp_path / "splat.ply", splat, np.zeros(3), tmp_path)
-    assert find_camera_lists(given.path, given.photographs) == []
+    assert find_camera_lists(tmp_path / "splat.ply", [tmp_path]) == []
 
 
 @pytest.mark.parametrize("world", NERFSTUDIO_WORLDS)

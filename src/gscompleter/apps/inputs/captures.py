@@ -16,14 +16,13 @@ from gscompleter.apps.inputs.removal import select_without_masks
 from gscompleter.apps.requests.scene import DEFAULT_LONG_SIDE, SceneRequest
 from gscompleter.apps.requests.splat import Selection
 from gscompleter.config import HoleConfig
-from gscompleter.data.camera_files import INRIA_CAMERAS_FILE, has_camera_list
-from gscompleter.data.file_names import list_homes_of
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photograph_names import name_render
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.scene import load_cameras
 from gscompleter.numerics.geometry import add_near_plane, is_same_camera
 from gscompleter.render.protocols import Renderer
+from gscompleter.splats.alignment.trainer_frames import find_camera_lists, list_model_folders
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.types import Camera, Gaussians
 from gscompleter.virtual_capture.around_target import MAX_CHOSEN_CAMERAS, choose_cameras_around
@@ -112,15 +111,11 @@ class Capture:
 
 
 def find_cameras_beside(splat: Path) -> Path | None:
-    """Find the cameras.json beside a splat, or in the folder of its trainer; None without one."""
-    folders = []
-    for folder in list_homes_of(splat):
-        folders.append(folder)
-        # Trainers of 3DGS write point_cloud/iteration_30000/point_cloud.ply beside cameras.json.
-        if folder.parent.name == "point_cloud":
-            folders.append(folder.parent.parent)
-    files = [folder / INRIA_CAMERAS_FILE for folder in folders]
-    return next((file for file in files if has_camera_list(file)), None)
+    """Find the list of cameras beside a splat, or in the folder of its trainer; None without one.
+
+    Of several it is the one whose name matches the splat, as `find_camera_lists` tells.
+    """
+    return next(iter(find_camera_lists(splat, list_model_folders(splat))), None)
 
 
 def take_from_file(path: Path, known: Photographs, request: RenderRequest) -> Capture:

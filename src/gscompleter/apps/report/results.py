@@ -39,6 +39,7 @@ from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
+from gscompleter.splats.alignment.trainer_files import TRAINER_FILES
 from gscompleter.splats.edits import EDITS, EditDraft
 from gscompleter.splats.formats import load_splat
 from gscompleter.splats.layout import has_same_values
@@ -66,6 +67,7 @@ COMPLETION_RESULTS = (
     *(REPORT_FILE, RECORD_FILE, SUMMARY_FILE, VIDEO_FILE, "images/target*.png"),
     *("images/photograph*.png", "images/context*.png", "images/removal*.png"),
     *EDITS,
+    *TRAINER_FILES,
 )
 """Globs of the files that a completion may write."""
 VALUES_FORMAT = "python"

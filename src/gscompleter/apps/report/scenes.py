@@ -12,6 +12,7 @@ from torch import Tensor
 
 from gscompleter.apps.inputs.task import InputSplatFile
 from gscompleter.numerics.kernels.parallel import map_in_parallel
+from gscompleter.splats.alignment.trainer_files import keep_trainer_files
 from gscompleter.splats.edits import AppendedRows, EditDraft, Edits, record_edit
 from gscompleter.splats.layout import save_like, save_removed
 from gscompleter.splats.ply import save_parts, save_ply
@@ -32,6 +33,8 @@ def write_scenes(
     edit: EditDraft,
 ) -> None:
     """Write the three scenes, the originals of changed Gaussians, and `edits.json`.
+
+    Of an input splat, what its trainer left beside it goes with it.
 
     `run` is what the completed scene and the additions say about who made them.
     """
@@ -66,6 +69,8 @@ def write_scenes(
         partial(save_ply, folder / GENERATED_FILE, added, provenance=True, made_by=made_by),
     ]
     map_in_parallel(lambda write: write(), writing)
+    if input_splat is not None:
+        keep_trainer_files(input_splat.path, folder)
     record_edit(
         folder,
         replace(edit, seed=completion.seed),

@@ -33,6 +33,8 @@ from gscompleter.types import Gaussians
 
 CAMERA_LIST_PREFIX = "cameras"
 """Prefix of camera lists; the rest may match the splat: `cameras_2.json` for `splat_2.ply`."""
+TRAINER_FOLDER = "trainer"
+"""Folder beside a result with copies of what lay beside the splat that it was made of."""
 ITERATION_PREFIX = "iteration_"
 """Prefix of the folders of Inria's trainer, two levels below its cameras.json."""
 MAX_COMPARED_PHOTOGRAPHS = 200
@@ -70,7 +72,8 @@ def list_model_folders(splat: Path) -> list[Path]:
     """List the folders of the model that a splat belongs to, the nearest to the splat first."""
     near = list_homes_of(splat)
     model = [home.parent.parent for home in near if home.name.startswith(ITERATION_PREFIX)]
-    return [*near, *model]
+    kept = [home / TRAINER_FOLDER for home in near]
+    return [*near, *model, *kept]
 
 
 def read_trainer_frames(
@@ -84,12 +87,13 @@ def read_trainer_frames(
     to_photographs = np.linalg.inv(compute_frame_from_photographs(photographs.origin))
     to_splat = compute_frame_from_photographs(splat.origin)
     ours = dict(collect_poses(photographs))
-    for file in find_camera_lists(splat.path, splat.photographs):
+    folders = list_trainer_folders(splat.path, splat.photographs)
+    for file in find_camera_lists(splat.path, folders):
         theirs = {frame.name: to_splat @ frame.c2w for frame in read_camera_list(file)}
         transform = fit_named_cameras(ours, theirs)
         if transform is not None:
             yield "cameras", transform
-    for folder in list_trainer_folders(splat.path, splat.photographs):
+    for folder in folders:
         if (folder / DATAPARSER_FILE).is_file():
             transform = read_dataparser_transforms(folder / DATAPARSER_FILE)
             # Right to left: local photographs, their world, COLMAP's world, nerfstudio's, local
@@ -109,12 +113,15 @@ def collect_poses(photographs: Photographs) -> list[tuple[str, Matrix]]:
     ]
 
 
-def find_camera_lists(splat: Path, photographs: Path) -> list[Path]:
-    """Find the camera lists whose name matches the splat, the best match first."""
+def find_camera_lists(splat: Path, folders: Sequence[Path]) -> list[Path]:
+    """Find the camera lists in folders whose name matches the splat, the best match first.
+
+    Those of the first folder come before those of the next one.
+    """
     pattern = f"{CAMERA_LIST_PREFIX}*.json"
     return [
         file
-        for folder in list_trainer_folders(splat, photographs)
+        for folder in folders
         for file in sorted(folder.glob(pattern), key=lambda file: (-len(file.stem), file))
         if splat.stem.endswith(file.stem.removeprefix(CAMERA_LIST_PREFIX)) and has_camera_list(file)
     ]

@@ -113,7 +113,7 @@ def read_listed_scale(
     `own` is the longer side of most photographs in pixels.
     """
     names = [frame.name for frame in photographs.frames]
-    for file in find_camera_lists(splat, folder):
+    for file in find_camera_lists(splat, list_trainer_folders(splat, folder)):
         with suppress(InputError):
             listed = {frame.name: frame.intrinsics.size for frame in read_camera_list(file)}
             matched = [listed[name] for _, name in match_names(names, list(listed))]
@@ -125,9 +125,14 @@ def read_listed_scale(
 
 def read_trainer_settings(splat: Path, folder: Path, name: str) -> str:
     """Read a small text file of the trainer from the nearest folder that has it, or nothing."""
-    near = list_trainer_folders(splat, folder)
-    for place in [*near, near[0].parent]:  # gsplat keeps its files in folders beside `cfg.yml`
+    for place in list_settings_folders(splat, list_trainer_folders(splat, folder)):
         content = read_head(place / name, MAX_SETTINGS_BYTES)
         if content:
             return content.decode(errors="replace")
     return ""
+
+
+def list_settings_folders(splat: Path, folders: Sequence[Path]) -> list[Path]:
+    """List the folders where trainers of a splat leave settings: `folders`, and the one above."""
+    # gsplat keeps its files in folders beside `cfg.yml`.
+    return [*folders, splat.parent.resolve().parent]

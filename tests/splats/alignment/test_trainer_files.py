@@ -1,0 +1,83 @@
+"""Files of a trainer that go with its splat."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from command import run
+from gscompleter import save_ply
+from gscompleter.apps.inputs.captures import find_cameras_beside
+from gscompleter.splats.alignment.trainer_files import find_trainer_files, keep_trainer_files
+from scenes import random_gaussians
+
+LIST = '[{"img_name": "a"}]'
+
+
+def write(path: Path, text: str = "x") -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(text)
+    return path
+
+
+def test_of_several_lists_the_one_with_the_name_of_the_splat_goes_with_it(tmp_path):
+    write(tmp_path / "cameras.json", LIST)
+    own = write(tmp_path / "cameras_2.json", LIST.replace("a", "b"))
+    write(tmp_path / "cameras_3.json", LIST)
+    splat = tmp_path / "splat_2.ply"
+    # A splat alone looks from there, too.
+    assert find_cameras_beside(splat) == own
+    (tmp_path / "out").mkdir()
+    keep_trainer_files(splat, tmp_path / "out")
+    kept = tmp_path / "out" / "trainer" / "cameras.json"
+    assert kept.read_text() == own.read_text()
+    # The result has another name, and finds it.
+    assert find_cameras_beside(tmp_path / "out" / "completed.ply") == kept
+    # Whatever lies beside the result comes first.
+    near = write(tmp_path / "out" / "cameras.json", LIST)
+    assert find_cameras_beside(tmp_path / "out" / "completed.ply") == near
+
+
+def test_all_that_tells_of_a_training_goes_from_result_to_result(tmp_path):
+    model = tmp_path / "model"
+    splat = model / "point_cloud" / "iteration_30000" / "point_cloud.ply"
+    write(splat)
+    write(model / "cameras.json", LIST)
+    write(model / "cfg_args", "Namespace(resolution=2)")
+    write(splat.parent / "dataparser_transforms.json", "{}")
+    # gsplat's example trainer keeps its settings above the folder of its splats.
+    write(splat.parent.parent / "cfg.yml", "data_factor: 2\n")
+    first = tmp_path / "first"
+    second = tmp_path / "second"
+    for folder, given in ((first, splat), (second, first / "completed.ply")):
+        folder.mkdir()
+        keep_trainer_files(given, folder)
+        kept = {path.name: path.read_text() for path in (folder / "trainer").iterdir()}
+        assert kept == {
+            "cameras.json": LIST,
+            "cfg_args": "Namespace(resolution=2)",
+            "dataparser_transforms.json": "{}",
+            "cfg.yml": "data_factor: 2\n",
+        }
+
+
+def test_beside_a_splat_alone_there_is_nothing_to_keep(tmp_path):
+    splat = write(tmp_path / "lone" / "splat.ply")
+    write(tmp_path / "lone" / "cameras.json", '{"not": "a list"}')
+    assert list(find_trainer_files(splat)) == []
+    keep_trainer_files(splat, tmp_path)
+    assert not (tmp_path / "trainer").exists()
+
+
+def test_a_command_keeps_them_and_replaces_them_with_its_results(tmp_path, monkeypatch):
+    splat = tmp_path / "given" / "splat.ply"
+    splat.parent.mkdir()
+    save_ply(splat, random_gaussians(2000))
+    write(tmp_path / "given" / "cameras.json", LIST)
+    out = tmp_path / "out"
+    words = ("clean", "--scene", splat, "--out", out, "--quiet")
+    assert run(monkeypatch, *words) == 0
+    kept = out / "trainer" / "cameras.json"
+    assert kept.read_text() == LIST
+    (tmp_path / "given" / "cameras.json").unlink()
+    assert run(monkeypatch, *words, "--overwrite") == 0
+    assert not kept.exists()
