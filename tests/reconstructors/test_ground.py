@@ -229,12 +229,12 @@ def see_road_behind(z: float) -> tuple[StereoImage, np.ndarray]:
     places = image.center + rays * depth
     road = paint_road(places[..., 0], places[..., 2])
     colors = np.where(inverse[..., None] > 0, road, 0.9).astype(np.float32)
-    center = image.center + [2.0**-16, 0, 0]
+    center = image.center + np.array([2.0**-16, 0, 0])
     return replace(image, image=colors, rotation=np.diag([-1.0, 1, -1]), center=center), inverse
 
 
 def test_photographs_backward_from_the_same_places_leave_the_near_road_on_the_ground(drive):
-    rig, measured, inverses = drive
+    rig, _, inverses = drive
     behind = [see_road_behind(z) for z in (0.0, 2.0, 4.0)]
     images = [*rig.images, *(image for image, _ in behind)]
     all_inverses = [*inverses, *(inverse for _, inverse in behind)]
