@@ -174,13 +174,13 @@ def find_ways(images: Sequence[StereoImage]) -> Places:
     centers = np.stack([image.center for image in images])
     ways = []
     for number, center in enumerate(centers):
-        distances = measure_distances(images, number)
+        distances = measure_baselines_from(images, number)
         nearest = int(distances.argmin())
         ways.append((centers[nearest] - center) / distances[nearest])
     return np.stack(ways)
 
 
-def measure_distances(images: Sequence[StereoImage], number: int) -> Float[np.ndarray, "n"]:
+def measure_baselines_from(images: Sequence[StereoImage], number: int) -> Float[np.ndarray, "n"]:
     """Measure how far cameras are from that of image `number`; infinite if in the same place."""
     centers = np.stack([image.center for image in images])
     distances = np.linalg.norm(centers - images[number].center, axis=1)
@@ -305,7 +305,7 @@ def hold_view(
     image = rig.images[number]
     centers = np.stack([other.center for other in rig.images])
     heights = ground.measure_heights(centers)
-    if float(measure_distances(rig.images, number).min()) < MIN_STRIDE * heights[number]:
+    if float(measure_baselines_from(rig.images, number).min()) < MIN_STRIDE * heights[number]:
         return measured
     rays = compute_rays(image)
     inverse = ground.compute_inverse(rays, heights[number]).astype(np.float32)
@@ -359,7 +359,7 @@ def measure_difference(rig: Rig, number: int, inverse: Map) -> Float32[np.ndarra
     no photograph from another place shows the surface in a pixel that is not ignored.
     """
     own = rig.images[number].image
-    is_elsewhere = np.isfinite(measure_distances(rig.images, number))
+    is_elsewhere = np.isfinite(measure_baselines_from(rig.images, number))
     least = np.full(inverse.shape, np.inf, np.float32)
     for other, image in enumerate(rig.images):
         if is_elsewhere[other]:
