@@ -85,9 +85,9 @@ def strip_edits(path: Path, out: Path, numbers: Collection[int] | None = None) -
     every = range(1, len(edits.edits) + 1)
     chosen = every if numbers is None else numbers
     is_all = numbers is None or (bool(edits) and set(numbers) == set(every))
-    # Rows of other formats than .ply have no columns that could be copied. Labels tell as much as
-    # the record of a single edit, and its additions may have harmonics of a higher degree, which
-    # rows cannot lose again.
+    # Rows of other formats than .ply have no columns that could be copied. Of a single edit, labels
+    # tell as much as rows if nothing had one before it, also where its additions have harmonics of
+    # a higher degree, which rows cannot lose again.
     has_rows = detect_splat_format(path) == PLY.name and bool(edits) and can_undo(edits, 1)
     if not is_all or (has_rows and (len(every) > 1 or had_generated(path, edits))):
         return undo_edits(path, edits, chosen, out)

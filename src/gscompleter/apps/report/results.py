@@ -44,6 +44,7 @@ from gscompleter.splats.formats import load_splat
 from gscompleter.splats.layout import has_same_values
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value, require_path
+from gscompleter.system.files.output_file import reserve_file
 from gscompleter.system.files.output_folder import open_output_folder
 from gscompleter.system.files.result_names import (
     COMPLETED_FILES,
@@ -189,13 +190,15 @@ def write_result_page(
 ) -> Path:
     """Write the page of a completion alone; see `Completion.report`."""
     file = require_path(file)
-    judged = prepare_judged(completion, unused_views)
-    with stage("report"), tempfile.TemporaryDirectory(prefix="gscompleter-") as place:
-        folder = Path(place)
-        write_result(folder, judged, None)
-        page = (folder / REPORT_FILE).read_bytes()
-        with replace_file(file) as output:
-            output.write(page)
+    # A place where nothing can be written is refused before the scene is rendered.
+    with reserve_file(file, overwrite=True):
+        judged = prepare_judged(completion, unused_views)
+        with stage("report"), tempfile.TemporaryDirectory(prefix="gscompleter-") as place:
+            folder = Path(place)
+            write_result(folder, judged, None)
+            page = (folder / REPORT_FILE).read_bytes()
+            with replace_file(file) as output:
+                output.write(page)
     return file
 
 

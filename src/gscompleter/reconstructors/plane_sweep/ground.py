@@ -3,8 +3,8 @@
 From one photograph of a drive to the next the near road leaves the image. Its even asphalt then
 matches itself at the same pixel, as if it stood at infinity, and is built hundreds of metres away.
 But cameras that keep one height move over ground: the plane below all of them on which most of
-what is measured lies. A photograph far from all others is held to it where these show the same
-colours (decision 138).
+what is measured lies. A photograph far from all others, but for those from its own place, is held
+to it where they show the same colours (decision 138).
 
 Lengths are in widest baselines and inverse depths in their inverse, as in `sweep.py`. Places and
 directions are in world axes.
@@ -64,8 +64,8 @@ GROUND_REFITS = 5
 """Number of least-squares fits to the inliers, each to those of the last one."""
 
 MAX_CENTER_SHIFT = 2.0**-15
-"""Largest distance of cameras in one place: their centres are rounded to 2^-16 in each axis. From
-there all depths look alike, so that they neither measure the ground nor confirm it."""
+"""Largest distance of cameras in one place: their centres are rounded to 2^-16 in each axis. They
+have no parallax, and so see the same colours at any depth, which confirm none."""
 MIN_STRIDE = 1.0
 """Smallest distance to the nearest camera in another place, in heights above the ground, of a
 photograph that is held to it. Nearer ones see the near ground with parallax, and its colours hardly
