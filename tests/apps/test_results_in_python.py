@@ -13,6 +13,7 @@ import torch
 import gscompleter as gsc
 from command import run
 from gscompleter.apps.inputs.task import InputSplatFile
+from gscompleter.apps.report import results
 from gscompleter.apps.report.results import find_splat_file, prepare_judged
 from gscompleter.apps.report.schema import read_summary
 from gscompleter.numerics.geometry import is_same_camera
@@ -126,6 +127,14 @@ def test_the_page_alone(completion, tmp_path):
     page = completion.report(tmp_path / "page.html")
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
     assert "<html" in page.read_text()
+
+
+def test_a_page_that_cannot_be_written_is_refused_before_it_is_made(
+    completion, tmp_path, monkeypatch
+):
+    monkeypatch.setattr(results, "prepare_judged", lambda *_: pytest.fail("it was made"))
+    with pytest.raises(InputError, match="there is no folder"):
+        completion.report(tmp_path / "missing" / "page.html")
 
 
 def test_a_folder_is_replaced_on_request_only(completion, saved):

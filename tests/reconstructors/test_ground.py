@@ -221,6 +221,37 @@ def test_a_photograph_with_another_one_near_it_is_left(drive):
     assert held[1] is not measured[1]
 
 
+def see_road_behind(z: float) -> tuple[StereoImage, np.ndarray]:
+    """Photograph the road backward from beside (0, 0, z), as near as rounding puts one place."""
+    image, inverse = see_road(z)
+    rays = compute_rays(image) * [-1, 1, -1]
+    depth = 1 / np.maximum(inverse, 1e-3)[..., None]
+    places = image.center + rays * depth
+    road = paint_road(places[..., 0], places[..., 2])
+    colors = np.where(inverse[..., None] > 0, road, 0.9).astype(np.float32)
+    center = image.center + np.array([2.0**-16, 0, 0])
+    return replace(image, image=colors, rotation=np.diag([-1.0, 1, -1]), center=center), inverse
+
+
+def test_photographs_backward_from_the_same_places_leave_the_near_road_on_the_ground(drive):
+    rig, _, inverses = drive
+    behind = [see_road_behind(z) for z in (0.0, 2.0, 4.0)]
+    images = [*rig.images, *(image for image, _ in behind)]
+    all_inverses = [*inverses, *(inverse for _, inverse in behind)]
+    all_measured = [measure_road(inverse) for inverse in all_inverses]
+    held = hold_to_ground(make_rig(images), all_measured, skies_of(all_inverses))
+    for after, inverse in zip(held, all_inverses, strict=True):
+        assert (after.weight[NEAR_ROAD:] == BACKGROUND_WEIGHT).all()
+        np.testing.assert_allclose(after.inverse[NEAR_ROAD:], inverse[NEAR_ROAD:], rtol=0.02)
+
+
+def test_a_photograph_from_the_same_place_confirms_no_ground(drive):
+    rig, _, inverses = drive
+    again = make_rig([*rig.images, rig.images[1]])
+    expected = measure_difference(rig, 1, inverses[1])
+    np.testing.assert_array_equal(measure_difference(again, 1, inverses[1]), expected)
+
+
 def test_two_photographs_stay_as_they_are(drive):
     rig, measured, inverses = drive
     pair = make_rig(rig.images[:2])

@@ -230,6 +230,51 @@ def test_labels_of_a_splat_in_another_format_stay(states, tmp_path, has_record):
     assert load_ply(tmp_path / "out.ply").generated.tolist() == load_splat(small).generated.tolist()
 
 
+@pytest.mark.parametrize("suffix", [".ply", ".spz"])
+@pytest.mark.parametrize("numbers", [None, [1]])
+def test_labels_before_the_only_edit_stay(tmp_path, suffix, numbers):
+    """Another program put what was generated first, so that no edit explains these labels."""
+    scene = random_gaussians(20)
+    scene.generated[:5] = 1
+    splat = tmp_path / f"given{suffix}"
+    save_splat(splat, scene)
+    completed = edit(splat, tmp_path / "first", 2)
+    assert len(read_edits(completed).edits) == 1
+    out = tmp_path / "out.ply"
+    undone = strip_edits(completed, out, numbers)
+    assert (undone.kept, undone.missing) == (20, 0)
+    assert load_ply(out).generated.tolist() == scene.generated.tolist()
+    assert undone.is_same_file == (suffix == ".ply")
+
+
+def test_labels_that_the_only_edit_left_out_come_back(tmp_path):
+    scene = random_gaussians(20)
+    scene.generated[:5] = 1
+    splat = tmp_path / "given.ply"
+    save_ply(splat, scene)
+    (tmp_path / "first").mkdir()
+    splat_file = InputSplatFile(splat)
+    changed = scene.generated > 0
+    save_completed_splat(tmp_path / "first", scene, changed, scene[:0], splat_file, None)
+    record_edit(tmp_path / "first", EditDraft("clean"), 20, [], splat, splat_file.edits, None)
+    assert strip_edits(tmp_path / "first" / "completed.ply", tmp_path / "out.ply").is_same_file
+    assert (tmp_path / "out.ply").read_bytes() == splat.read_bytes()
+
+
+def test_a_column_of_bytes_comes_back_whatever_white_space_its_line_has(tmp_path):
+    scene = random_gaussians(20)
+    scene.generated[:5] = 1
+    splat = tmp_path / "given.ply"
+    save_ply(splat, scene)
+    layout = read_ply_file(splat, (), "scene")
+    header = layout.header.replace(b"property float generated", b"property\tuchar\tgenerated")
+    columns = [(c[0], "u1" if c[0] == "generated" else c[1]) for c in layout.rows.dtype.descr]
+    write_ply_file(splat, header, 20, [layout.rows.astype(columns)], layout.trailer)
+    second = edit(edit(splat, tmp_path / "first", 1), tmp_path / "second", 2)
+    assert strip_edits(second, tmp_path / "out.ply").is_same_file
+    assert (tmp_path / "out.ply").read_bytes() == splat.read_bytes()
+
+
 def test_rows_that_a_format_sorted_are_not_taken_off(states, tmp_path):
     small = save_in_format(
         shutil.copytree(states[1].parent, tmp_path / "1") / "completed.ply", ".sog"

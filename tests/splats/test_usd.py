@@ -212,6 +212,7 @@ UNREADABLE = {
     "cannot be read": lambda stage, prim: prim.GetAttribute("opacities").Set([0.5]),
     "opacity outside": lambda stage, prim: prim.GetAttribute("opacities").Set([0.5, 7.0]),
     "linear space": lambda stage, prim: set_space(prim, "lin_rec709_scene"),
+    "the linear space lin_ap1_scene": lambda stage, prim: set_own_space(prim, "lin_ap1_scene"),
 }
 
 
@@ -225,6 +226,20 @@ def set_space(prim, name: str) -> None:
     from pxr import Usd
 
     Usd.ColorSpaceAPI(prim).GetColorSpaceNameAttr().Set(name)
+
+
+def set_own_space(prim, name: str) -> None:
+    """Set the colour space of the attribute of colours, which counts before that of its prim."""
+    prim.GetAttribute(f"{SH_NAME}Coefficients").SetColorSpace(name)
+
+
+def test_colours_with_a_space_of_their_own_are_not_in_that_of_their_prim(pxr, tmp_path):
+    def set_both(stage, prim) -> None:
+        set_space(prim, "lin_rec709_scene")
+        set_own_space(prim, "srgb_rec709_display")
+
+    change_stage(tmp_path / "scene.usda", set_both)
+    assert torch.equal(load_splat(tmp_path / "scene.usda").sh, plausible(2, 1).sh)
 
 
 @pytest.mark.parametrize("sentence", UNREADABLE)

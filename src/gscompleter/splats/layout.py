@@ -66,7 +66,7 @@ LABEL_LINES = re.compile(
     rb"^property\s+\w+\s+generated\s*?\n((?:comment gscompleter-provenance/[^\n]*\n)*)", re.M
 )
 """The line of the labels, with the comments of runs that follow it as its group."""
-_LABEL_TYPE = re.compile(rb"^(property\s+)\w+(\s+generated\s*?\n)", re.M)
+LABEL_TYPE = re.compile(rb"^(property\s+)\w+(\s+generated\s*?\n)", re.M)
 """The line of the labels, with its type in the middle."""
 _ELEMENT_LINE = re.compile(rb"^(?:element|end_header)", re.M)
 
@@ -193,7 +193,7 @@ def _add_labels(layout: SceneFile) -> tuple[bytes, np.dtype]:
         for column in layout.rows.dtype.descr
     ]
     if LABEL_COLUMN in (layout.rows.dtype.names or ()):
-        return _LABEL_TYPE.sub(rb"\g<1>float\g<2>", layout.header, 1), np.dtype(columns)
+        return LABEL_TYPE.sub(rb"\g<1>float\g<2>", layout.header, 1), np.dtype(columns)
     first, others, end = split_header(layout.header)
     ending = b"\r\n" if end.endswith(b"\r\n") else b"\n"
     header = b"".join([first, b"property float generated", ending, others, end])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +16,7 @@ from jaxtyping import Bool, Int64
 from numpy import ndarray
 
 from gscompleter.splats.edits import Edit, Edits
-from gscompleter.splats.undo import check_counts, compute_keys, has_lost_rows, split_key
+from gscompleter.splats.undo import check_counts, compute_keys, count_originals, split_key
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.result_names import EDITS_FILE
 
@@ -61,6 +62,24 @@ def tells_rows(edits: Edits) -> bool:
     Not after another program changed the splat, whether since the last edit or before it.
     """
     return edits.is_unchanged and tells_kinds(edits) and not has_lost_rows(edits)
+
+
+def has_lost_rows(edits: Edits) -> bool:
+    """Return True if the rows of an edit have no known places in what the next edit was given.
+
+    Another program changed the splat in between, or a format sorted its rows.
+    """
+    for edit, following in pairwise(edits.edits):
+        # A reconstruction whose colours changed in place cannot be undone, and keeps its rows.
+        is_recolored = edit.given is None and following.rows == count_rows_after(edits, edit)
+        if not edit.can_be_undone and not is_recolored:
+            return True
+    return False
+
+
+def count_rows_after(edits: Edits, edit: Edit) -> int:
+    """Count the rows that an edit wrote, as its record tells."""
+    return edit.rows + edit.added - count_originals(edits, edit)
 
 
 def has_recolored(edits: Edits) -> bool:

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,7 @@ from numpy import ndarray
 from gscompleter.splats.edits import Edit, Edits, read_edits
 from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import detect_splat_format
-from gscompleter.splats.layout import LABEL_LINES, find_places, iterate_rows, strip
+from gscompleter.splats.layout import LABEL_LINES, LABEL_TYPE, find_places, iterate_rows, strip
 from gscompleter.splats.ply import (
     LABEL_COLUMN,
     PLY,
@@ -34,6 +33,7 @@ from gscompleter.splats.ply import (
 )
 from gscompleter.splats.table import get_written_format
 from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.files.mapping import release_pages
 from gscompleter.system.files.ply import write_ply_file
 from gscompleter.system.files.reading import hash_file
 from gscompleter.system.files.result_names import EDITS_FILE
@@ -73,8 +73,9 @@ class Undone:
 def strip_edits(path: Path, out: Path, numbers: Collection[int] | None = None) -> Undone:
     """Write a splat without some of its edits, which are numbered from 1; None for all of them.
 
-    If all edits go, a splat with at most one, or whose earlier states are not known, is stripped by
-    its labels. They do not tell what edits before the last one left out, which is then missing.
+    If all edits go, a splat is stripped by its labels where these tell what its only edit added, or
+    where there is no record, or its earlier states are not known. They do not tell what edits
+    before the last one left out, which is then missing.
 
     `numbers` has one at least. Raises InputError if there is no such edit, or if the states before
     it are not known.
@@ -84,9 +85,11 @@ def strip_edits(path: Path, out: Path, numbers: Collection[int] | None = None) -
     every = range(1, len(edits.edits) + 1)
     chosen = every if numbers is None else numbers
     is_all = numbers is None or (bool(edits) and set(numbers) == set(every))
-    # Rows of other formats than .ply have no columns that could be copied.
-    has_rows = detect_splat_format(path) == PLY.name
-    if not is_all or (len(every) > 1 and has_rows and can_undo(edits, 1)):
+    # Rows of other formats than .ply have no columns that could be copied. Of a single edit, labels
+    # tell as much as rows if nothing had one before it, also where its additions have harmonics of
+    # a higher degree, which rows cannot lose again.
+    has_rows = detect_splat_format(path) == PLY.name and bool(edits) and can_undo(edits, 1)
+    if not is_all or (has_rows and (len(every) > 1 or had_generated(path, edits))):
         return undo_edits(path, edits, chosen, out)
     kept, dropped = strip(path, out)
     if not edits:
@@ -101,17 +104,21 @@ def can_undo(edits: Edits, first: int) -> bool:
     return edits.is_unchanged and all(edit.can_be_undone for edit in edits.edits[first - 1 :])
 
 
-def has_lost_rows(edits: Edits) -> bool:
-    """Return True if the rows of an edit have no known places in what the next edit was given.
+def had_generated(path: Path, edits: Edits) -> bool:
+    """Return True if a splat had labelled Gaussians before its only edit.
 
-    Another program changed the splat in between, or a format sorted its rows.
+    By labels alone, these would go with what the edit added.
     """
-    for edit, following in pairwise(edits.edits):
-        # A reconstruction whose colours changed in place cannot be undone, and keeps its rows.
-        is_recolored = edit.given is None and following.rows == count_rows_after(edits, edit)
-        if not edit.can_be_undone and not is_recolored:
-            return True
-    return False
+    (edit,) = edits.edits
+    layout = read_scene(path)
+    # The rows that an edit appended are the last ones.
+    is_given = np.arange(len(layout.rows)) < len(layout.rows) - edit.added
+    if has_labels(layout, is_given):
+        return True
+    if edit.originals is None or not (edits.folder / edit.originals).is_file():
+        return False
+    left_out = read_scene(edits.find(edit.originals))
+    return has_labels(left_out, np.ones(len(left_out.rows), bool))
 
 
 def undo_edits(path: Path, edits: Edits, numbers: Collection[int], out: Path) -> Undone:
@@ -206,11 +213,6 @@ def check_counts(path: Path, edits: Edits, total: int) -> None:
         )
 
 
-def count_rows_after(edits: Edits, edit: Edit) -> int:
-    """Count the rows that an edit wrote, as its record tells."""
-    return edit.rows + edit.added - count_originals(edits, edit)
-
-
 def count_originals(edits: Edits, edit: Edit) -> int:
     """Count the rows that an edit left out."""
     if edit.originals is None:
@@ -258,10 +260,15 @@ def join_originals(parts: Sequence[Originals]) -> Originals:
 
 def has_labels(layout: SceneFile, mask: Bool[ndarray, "n"]) -> bool:
     """Return True if any of the rows in a mask is labelled as generated."""
-    return any(
-        bool(read_labels(layout.rows[block])[mask[block]].any())
-        for block in iterate_blocks(len(mask))
-    )
+    if LABEL_COLUMN not in (layout.rows.dtype.names or ()):
+        return False
+    for block in iterate_blocks(len(mask)):
+        rows = layout.rows[block]
+        is_found = bool(read_labels(rows)[mask[block]].any())
+        release_pages(rows)
+        if is_found:
+            return True
+    return False
 
 
 def make_remaining_header(
@@ -281,6 +288,7 @@ def make_remaining_header(
     if found is None:
         return layout.header, layout.rows.dtype
     columns = layout.rows.dtype.descr
+    label_line = layout.header[found.start() : found.start(1)]
     # Comments of the splat before the first edit, then those of each.
     comments = found[1].splitlines(keepends=True)
     start = len(comments) - sum(edit.records for edit in edits)
@@ -289,18 +297,18 @@ def make_remaining_header(
         if index in remaining:
             kept += comments[start : start + edit.records]
         start += edit.records
-    # No column is recorded of a splat in another format either, whose labels and comments stay.
-    is_new = not remaining and had_labels is None and not kept
-    if is_new and not has_labels(layout, is_kept):
-        header = layout.header[: found.start()] + layout.header[found.end() :]
-        return header, np.dtype([column for column in columns if column[0] != LABEL_COLUMN])
-    line = layout.header[found.start() : found.start(1)]
     dtype = layout.rows.dtype
-    if not remaining and had_labels == "uchar":
-        line = line.replace(b" float ", b" uchar ")
+    if not remaining and had_labels is None:
+        # The edits added the column, unless the splat before them was of another format: it had no
+        # column then, but may have had labels and comments, which are in this one since.
+        if not kept and not has_labels(layout, is_kept):
+            label_line = b""
+            dtype = np.dtype([column for column in columns if column[0] != LABEL_COLUMN])
+    elif not remaining and had_labels == "uchar":
+        label_line = LABEL_TYPE.sub(rb"\g<1>uchar\g<2>", label_line, count=1)
         dtype = np.dtype([(c[0], "u1") if c[0] == LABEL_COLUMN else c for c in columns])
-    header = layout.header[: found.start()] + line + b"".join(kept) + layout.header[found.end() :]
-    return header, dtype
+    parts = [layout.header[: found.start()], label_line, *kept, layout.header[found.end() :]]
+    return b"".join(parts), dtype
 
 
 def copy_rows(

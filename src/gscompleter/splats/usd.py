@@ -57,7 +57,7 @@ SH_NAME = "radiance:sphericalHarmonics"
 LABELS_NAME = "generated"
 """Attribute of the labels, an array of bytes, if anything was generated; ours alone."""
 PROBE_BYTES = 2**20
-"""Bytes that are written to find out why OpenUSD could not."""
+"""Fewest bytes that are written to find out why OpenUSD could not."""
 LAYER_ENDINGS = (".usdc", ".usda", ".usd")
 USD_ENDINGS = (*LAYER_ENDINGS, ".usdz")
 LINEAR = "lin_"
@@ -67,7 +67,8 @@ Y_FROM_Z_UP = ((1, 0, 0, 0), (0, 0, 1, 0), (0, -1, 0, 0), (0, 0, 0, 1))
 EXTENT = 3
 """Standard deviations of each Gaussian that lie within the bounds of the prim."""
 PACKAGED = (2000, 1, 1, 0, 0, 0, 0, 0, -1)
-"""Time of the .usdc in a .usdz, so that the same Gaussians give the same bytes."""
+"""Local time of the .usdc in a .usdz, as of `time.mktime`: the first of January 2000, in every run,
+so that the same Gaussians give the same bytes."""
 
 
 def write_usd(path: Path, gaussians: Gaussians, made_by: Provenance = NOTHING_KNOWN) -> None:
@@ -110,10 +111,14 @@ def _make_folder_beside(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def _convert_usd_errors(path: Path, folder: Path) -> Iterator[None]:
-    """Convert the errors of OpenUSD, which have no numbers, by trying to write as much."""
+    """Convert the errors of OpenUSD, which do not tell a full disk from others.
+
+    The system tells, when as many bytes as OpenUSD had written are written once more.
+    """
     try:
         yield
     except Exception as error:
+        # Ends with the error of the system, if it has one.
         with convert_write_errors(path):
             size = sum(file.stat().st_size for file in folder.iterdir())
             with (folder / "probe").open("wb") as probe:
@@ -227,7 +232,7 @@ def _read_prim(prim: Usd.Prim, has_z_up: bool) -> Gaussians:
     """Read the Gaussians of a prim, in the world with y up and the unit of the stage."""
     from pxr import Sdf, Usd, UsdGeom
 
-    space = _find_color_space(prim)
+    space = _find_color_space(_find_array(prim, f"{SH_NAME}Coefficients"))
     if space.startswith(LINEAR):
         raise UnsupportedError(f"has colours in the linear space {quote_value(space)}")
     positions = _read_prim_array(prim, "positions", 3)
@@ -258,11 +263,17 @@ def _read_prim(prim: Usd.Prim, has_z_up: bool) -> Gaussians:
     return place_gaussians(gaussians, place)
 
 
-def _find_color_space(prim: Usd.Prim) -> str:
-    """Find the name of the colour space of a prim or the nearest one above; empty for none."""
+def _find_color_space(colors: Usd.Attribute) -> str:
+    """Find the name of the colour space of an attribute; empty for none.
+
+    It is that of the attribute itself, or else of its prim or the nearest one above.
+    """
     from pxr import Usd
 
+    if colors.HasColorSpace():
+        return str(colors.GetColorSpace())
     # Not by `ComputeColorSpaceName`, which prints a warning about names that it does not know.
+    prim = colors.GetPrim()
     while prim:
         attribute = Usd.ColorSpaceAPI(prim).GetColorSpaceNameAttr()
         if attribute and attribute.HasAuthoredValue():
@@ -271,15 +282,20 @@ def _find_color_space(prim: Usd.Prim) -> str:
     return ""
 
 
-def _read_prim_array(prim: Usd.Prim, name: str, width: int) -> Float[ndarray, "n w"]:
-    """Read an array of a prim, that of single precision if there are both."""
-    from pxr import Usd
-
+def _find_array(prim: Usd.Prim, name: str) -> Usd.Attribute:
+    """Find an array of a prim, that of single precision if there are both."""
     for attribute in (prim.GetAttribute(name), prim.GetAttribute(f"{name}h")):
         if attribute and attribute.HasAuthoredValue():
-            values = np.asarray(attribute.Get(Usd.TimeCode.EarliestTime()), np.float32)
-            return values.reshape(-1, width)
+            return attribute
     raise UnsupportedError(f"has Gaussians without {name}")
+
+
+def _read_prim_array(prim: Usd.Prim, name: str, width: int) -> Float[ndarray, "n w"]:
+    """Read an array of a prim as rows of `width` numbers."""
+    from pxr import Usd
+
+    values = _find_array(prim, name).Get(Usd.TimeCode.EarliestTime())
+    return np.asarray(values, np.float32).reshape(-1, width)
 
 
 def is_usdz(path: Path, head: bytes) -> bool:

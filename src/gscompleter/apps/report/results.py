@@ -45,6 +45,7 @@ from gscompleter.splats.formats import load_splat
 from gscompleter.splats.layout import has_same_values
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value, require_path
+from gscompleter.system.files.output_file import reserve_file
 from gscompleter.system.files.output_folder import open_output_folder
 from gscompleter.system.files.result_names import (
     COMPLETED_FILES,
@@ -61,11 +62,22 @@ from gscompleter.types import Camera, View
 
 COMPLETE_COMMAND = "complete"
 COMPLETION_RESULTS = (
-    *(*COMPLETED_FILES, *(f"{name}.generated.json" for name in COMPLETED_FILES[1:])),
-    *(CONTEXT_FILE, GENERATED_FILE, REMOVED_FILE, TARGETS_FILE),
+    *COMPLETED_FILES,
+    # The first one is a .ply, which holds its labels itself.
+    *(f"{name}.generated.json" for name in COMPLETED_FILES[1:]),
+    CONTEXT_FILE,
+    GENERATED_FILE,
+    REMOVED_FILE,
+    TARGETS_FILE,
     RENDERS_FILE,
-    *(REPORT_FILE, RECORD_FILE, SUMMARY_FILE, VIDEO_FILE, "images/target*.png"),
-    *("images/photograph*.png", "images/context*.png", "images/removal*.png"),
+    REPORT_FILE,
+    RECORD_FILE,
+    SUMMARY_FILE,
+    VIDEO_FILE,
+    "images/target*.png",
+    "images/photograph*.png",
+    "images/context*.png",
+    "images/removal*.png",
     *EDITS,
     *TRAINER_FILES,
 )
@@ -98,8 +110,9 @@ class Judged:
             *(view for view in at_targets.values() if view is not None),
             *(photograph.view for photograph in self.held_out),
         ]
-        # A photograph that checked the splat, in a smaller size, may be among the unused ones. Only
-        # its frame tells, and the unused one counts, as in the command.
+        # A photograph that checked the splat, in a smaller size, may be among the unused ones. Its
+        # camera then has that size, too, so that only its frame tells. The unused one counts, as in
+        # the command.
         known = {view.frame for view in unused} - {None}
         views = [*(view for view in photos if view.frame not in known), *unused]
         views.sort(key=lambda view: math.inf if view.frame is None else view.frame)
@@ -179,13 +192,15 @@ def write_result_page(
 ) -> Path:
     """Write the page of a completion alone; see `Completion.report`."""
     file = require_path(file)
-    judged = prepare_judged(completion, unused_views)
-    with stage("report"), tempfile.TemporaryDirectory(prefix="gscompleter-") as place:
-        folder = Path(place)
-        write_result(folder, judged, None)
-        page = (folder / REPORT_FILE).read_bytes()
-        with replace_file(file) as output:
-            output.write(page)
+    # A place where nothing can be written is refused before the scene is rendered.
+    with reserve_file(file, overwrite=True):
+        judged = prepare_judged(completion, unused_views)
+        with stage("report"), tempfile.TemporaryDirectory(prefix="gscompleter-") as place:
+            folder = Path(place)
+            write_result(folder, judged, None)
+            page = (folder / REPORT_FILE).read_bytes()
+            with replace_file(file) as output:
+                output.write(page)
     return file
 
 
@@ -204,6 +219,7 @@ def write_result(folder: Path, judged: Judged, splat_file: InputSplatFile | None
         partial(render_pairs, completion, aside, judged.renderer),
         judged.held_out,
         run=describe_python_run(completion, None if splat_file is None else splat_file.path),
+        # Only a removal takes out Gaussians that were chosen.
         edit=EditDraft("remove" if len(completion.source.removed) else "complete"),
     )
     if completion.targets:
@@ -262,7 +278,8 @@ def find_splat_file(path: Path, completion: Completion) -> InputSplatFile:
     if not os.path.exists(path):
         raise InputError(f"There is no splat {quote_value(path)}; name the file of the scene.")
     context = completion.context
-    # It was completed as it is, and perhaps relative to another origin.
+    # Whoever completed it has accepted what a file is refused for otherwise, and may have moved its
+    # origin.
     loaded = load_splat(path, drop_nonfinite=True, ignore_properties=True)
     if not has_same_values(loaded.move_origin(context.origin), context.to("cpu")):
         raise InputError(

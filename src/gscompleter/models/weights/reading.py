@@ -50,7 +50,11 @@ def is_safetensors(path: Path) -> bool:
 
 
 def fetch_checked(weights: PublishedWeights, local: Path | None = None) -> Path:
-    """Fetch a file and check it, by its published SHA-256 unless the user names it by `local`."""
+    """Fetch a file and check it, by its published SHA-256 unless the user names it by `local`.
+
+    Such a file may be another network than the published one, of the same inputs and outputs; its
+    graph is in it, so that no tensors have to fit ours as in `read_state_dict`.
+    """
     path = fetch(weights, local)
     check_kind(path, weights.file)
     if local is None and weights.sha256 is not None:
@@ -167,7 +171,7 @@ def extract_network_tensors(
     # Only dense tensors with numbers of their own can be loaded.
     odd = [key for key, value in tensors.items() if not is_plain(value)]
     if odd:
-        kinds = "empty shells, sparse or quantized ones"
+        kinds = "they are empty shells, nested, sparse, quantized or complex"
         raise create_error(f"tensors without plain numbers ({_list_some(odd)}): {kinds}")
     return tensors
 

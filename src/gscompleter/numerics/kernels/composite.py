@@ -8,7 +8,8 @@ those of the latter with `n_`; `c` and `n` are places in their lists. Depths are
 Kernels work on tiles[begin:end], the numbers of tiles row by row. Of one tile they keep `state`
 [row, value, column], whose values the functions of `simd.py` name, and `row_limit` [row]: a splat
 behind the limit of a row, by its position in the merged list, is skipped there. Front to back
-it only tells full rows, -1, from others; back to front it is the last contribution of a row.
+it only tells full rows, -1, from others; back to front it is the last contribution of a row. Those
+functions that go front to back return how many rows a splat filled, which are open no longer.
 
 Each entry of `new` has a slot, in which its sums over a tile are written. The slots of a splat are
 summed afterwards (`tiles.sum_entries`), so that tiles can be worked on in any order.
@@ -136,8 +137,8 @@ def _open_pixels(state, columns):
 
 
 @njit(fastmath={"contract"})
-def _place(splats, opacities, boxes, i, left, top):
-    """Return the rows of the tile at (left, top) that splat i touches, and the relative splat.
+def _shift(splats, opacities, boxes, i, left, top):
+    """Shift splat i to the tile at (left, top); return the rows that it touches there, and itself.
 
     The rows are first and stop (excluded). Of the splat, x and y are those of its centre from the
     first pixel centre of the tile; the other values are as `simd.composite_rows` takes them.
@@ -192,11 +193,11 @@ def composite(begin, end, tiles, context, new, frame):
         while open_rows > 0 and (c < c_end or n < n_end):
             position = np.int32(c - c_begin + n - n_begin)
             if c_depth <= n_depth:
-                first, stop, splat = _place(c_splats, c_opacities, c_boxes, c_entries[c], left, top)
+                first, stop, splat = _shift(c_splats, c_opacities, c_boxes, c_entries[c], left, top)
                 c += 1
                 c_depth = _get_depth(c_splats, c_entries, c, c_begin, c_end, infinity)
             else:
-                first, stop, splat = _place(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
+                first, stop, splat = _shift(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
                 n += 1
                 n_depth = _get_depth(n_splats, n_entries, n, n_begin, n_end, infinity)
             open_rows -= simd.composite_rows(first, stop, position, state, last, row_limit, splat)
@@ -258,20 +259,22 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
         n_end = n_start[tile + 1]
         c_depth = _get_depth(c_splats, c_entries, c, c_begin, c_end, infinity)
         n_depth = _get_depth(n_splats, n_entries, n, n_begin, n_end, infinity)
-        place = np.int64(0)  # with a plain 0, its callees are compiled twice
+        # Row of `kept` at which the weights of the next splat begin. Started from a plain 0, it
+        # would have the functions that take it compiled twice.
+        kept_row = np.int64(0)
         while open_rows > 0 and (c < c_end or n < n_end):
             if c_depth <= n_depth:
-                first, stop, splat = _place(c_splats, c_opacities, c_boxes, c_entries[c], left, top)
+                first, stop, splat = _shift(c_splats, c_opacities, c_boxes, c_entries[c], left, top)
                 c += 1
                 c_depth = _get_depth(c_splats, c_entries, c, c_begin, c_end, infinity)
-                # `place` stays: its weights are not needed, and the next splat overwrites them.
-                open_rows -= simd.weigh_rows(first, stop, place, state, row_limit, kept, splat)
+                # `kept_row` stays: its weights are not needed, and the next splat overwrites them.
+                open_rows -= simd.weigh_rows(first, stop, kept_row, state, row_limit, kept, splat)
                 continue
-            first, stop, splat = _place(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
+            first, stop, splat = _shift(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
             n += 1
             n_depth = _get_depth(n_splats, n_entries, n, n_begin, n_end, infinity)
-            open_rows -= simd.weigh_rows(first, stop, place, state, row_limit, kept, splat)
-            place += max(stop - first, 0)
+            open_rows -= simd.weigh_rows(first, stop, kept_row, state, row_limit, kept, splat)
+            kept_row += max(stop - first, 0)
 
         # The image of the tile becomes its residual, in place.
         for row in range(rows):
@@ -281,14 +284,14 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
                     state[row, 1 + channel, column] = wanted - state[row, 1 + channel, column]
 
         # The rows of weights lie in the order in which they were written.
-        place = 0
+        kept_row = 0
         for entry in range(n_begin, n):
             i = n_entries[entry]
             slot = slots[entry]
             first = max(np.int64(n_boxes[i, 2]) - top, 0)
             stop = min(np.int64(n_boxes[i, 3]) - top, TILE)
-            simd.sum_weighted_rows(first, stop, place, state, kept, totals)
-            place += max(stop - first, 0)
+            simd.sum_weighted_rows(first, stop, kept_row, state, kept, totals)
+            kept_row += max(stop - first, 0)
             written[slot] = True
             for column in range(4):
                 sums[slot, column] = totals[column]
@@ -350,12 +353,12 @@ def composite_backward(
             # splats get no gradients, but change the transmittance.
             if c_depth > n_depth:
                 c -= 1
-                first, stop, splat = _place(c_splats, c_opacities, c_boxes, c_entries[c], left, top)
+                first, stop, splat = _shift(c_splats, c_opacities, c_boxes, c_entries[c], left, top)
                 c_depth = _get_depth(c_splats, c_entries, c - 1, c_begin, c, nothing)
                 simd.pass_rows(first, stop, position, state, last, row_limit, sums, splat)
                 continue
             n -= 1
-            first, stop, splat = _place(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
+            first, stop, splat = _shift(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
             n_depth = _get_depth(n_splats, n_entries, n - 1, n_begin, n, nothing)
             slot = slots[n]
             written[slot] = True
@@ -368,6 +371,7 @@ def composite_backward(
             simd.revert_rows(*rows_of_splat)
             # Moments of the gradient over the pixels, in x and y relative to the splat, become
             # moments in s = u x + v y and t = w y, in which the splat is round.
+            # These are its third to fifth values.
             u = splat[2]
             v = splat[3]
             w = splat[4]
@@ -443,13 +447,13 @@ def backpropagate_images(
             position = np.int32(c - c_begin + n - n_begin - 1)
             if c_depth > n_depth:
                 c -= 1
-                first, stop, splat = _place(c_splats, c_opacities, c_boxes, c_entries[c], left, top)
+                first, stop, splat = _shift(c_splats, c_opacities, c_boxes, c_entries[c], left, top)
                 c_depth = _get_depth(c_splats, c_entries, c - 1, c_begin, c, nothing)
                 of_splat = first, stop, position, count
                 simd.pass_images(*of_splat, passing, behinds, images, last, row_limit, sums, splat)
                 continue
             n -= 1
-            first, stop, splat = _place(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
+            first, stop, splat = _shift(n_splats, n_opacities, n_boxes, n_entries[n], left, top)
             n_depth = _get_depth(n_splats, n_entries, n - 1, n_begin, n, nothing)
             of_splat = first, stop, position, count
             simd.revert_images(*of_splat, passing, behinds, images, last, row_limit, sums, splat)

@@ -3,8 +3,8 @@
 From one photograph of a drive to the next the near road leaves the image. Its even asphalt then
 matches itself at the same pixel, as if it stood at infinity, and is built hundreds of metres away.
 But cameras that keep one height move over ground: the plane below all of them on which most of
-what is measured lies. A photograph far from all others is held to it where these show the same
-colours (decision 138).
+what is measured lies. A photograph far from all others, but for those from its own place, is held
+to it where they show the same colours (decision 138).
 
 Lengths are in widest baselines and inverse depths in their inverse, as in `sweep.py`. Places and
 directions are in world axes.
@@ -63,9 +63,13 @@ MAX_GROUND_MISS = 0.03
 GROUND_REFITS = 5
 """Number of least-squares fits to the inliers, each to those of the last one."""
 
+MAX_CENTER_SHIFT = 2.0**-15
+"""Largest distance of cameras in one place: their centres are rounded to 2^-16 in each axis. They
+have no parallax, and so see the same colours at any depth, which confirm none."""
 MIN_STRIDE = 1.0
-"""Smallest distance to the nearest other camera, in heights above the ground, of a photograph that
-is held to it. Nearer ones see the near ground with parallax, and its colours hardly tell depth."""
+"""Smallest distance to the nearest camera in another place, in heights above the ground, of a
+photograph that is held to it. Nearer ones see the near ground with parallax, and its colours hardly
+tell depth."""
 MIN_GROUND_INDEX = 4.0
 """Smallest inverse depth of ground that is judged, in planes of the sweep. Nearer to the horizon
 all that is far lies on it."""
@@ -76,7 +80,8 @@ BEYOND = 0.85
 BEYOND_PLANES = 1.5
 """Distance of such a surface from the ground, in planes of the sweep."""
 MAX_GROUND_DIFFERENCE = 0.06
-"""Largest colour difference from another photograph at the depth of the ground."""
+"""Largest colour difference from another photograph at the depth of the ground, as a mean over the
+channels and a window, of colours in [0, 1]."""
 GROUND_WINDOW = 9
 """Side of the window over which differences are averaged, in pixels."""
 MIN_AGREEING_GROUND = 0.6
@@ -168,13 +173,18 @@ def find_ways(images: Sequence[StereoImage]) -> Places:
     """
     centers = np.stack([image.center for image in images])
     ways = []
-    for center in centers:
-        offsets = centers - center
-        distances = np.linalg.norm(offsets, axis=1)
-        # Others in the same place, and the camera itself, have no direction.
-        nearest = np.where(distances > 0, distances, np.inf).argmin()
-        ways.append(offsets[nearest] / max(float(distances[nearest]), 1e-9))
+    for number, center in enumerate(centers):
+        distances = measure_baselines_from(images, number)
+        nearest = int(distances.argmin())
+        ways.append((centers[nearest] - center) / distances[nearest])
     return np.stack(ways)
+
+
+def measure_baselines_from(images: Sequence[StereoImage], number: int) -> Float[np.ndarray, "n"]:
+    """Measure how far cameras are from that of image `number`; infinite if in the same place."""
+    centers = np.stack([image.center for image in images])
+    distances = np.linalg.norm(centers - images[number].center, axis=1)
+    return np.where(distances > MAX_CENTER_SHIFT, distances, np.inf)
 
 
 def find_ground(
@@ -220,9 +230,9 @@ def find_ground(
             if count > most:
                 best = ground
                 most = count
+    if best is None:
+        return None
     for _ in range(GROUND_REFITS):
-        if best is None:
-            break
         refitted = refit_ground(best, points, upwards)
         if not is_possible(refitted):
             break
@@ -295,12 +305,10 @@ def hold_view(
     image = rig.images[number]
     centers = np.stack([other.center for other in rig.images])
     heights = ground.measure_heights(centers)
-    distances_to_others = np.delete(np.linalg.norm(centers - image.center, axis=1), number)
-    if float(distances_to_others.min()) < MIN_STRIDE * heights[number]:
+    if float(measure_baselines_from(rig.images, number).min()) < MIN_STRIDE * heights[number]:
         return measured
     rays = compute_rays(image)
     inverse = ground.compute_inverse(rays, heights[number]).astype(np.float32)
-    index = compute_plane_index(measured.planes, inverse)
     step = measured.planes[1] - measured.planes[0]
     is_ground = (inverse > MIN_GROUND_INDEX * step) & ~sky & (image.given == 0)
     if image.ignore_mask is not None:
@@ -313,9 +321,13 @@ def hold_view(
     is_ground &= np.min(distances, axis=0) < GROUND_REACH * float(np.median(heights))
 
     is_confirmed, is_compared = confirm_ground(rig, number, inverse, is_ground)
+    index = compute_plane_index(measured.planes, inverse)
     is_beyond = (measured.inverse < BEYOND * inverse) & (measured.index < index - BEYOND_PLANES)
-    held = is_confirmed & (is_beyond | (measured.weight == 0))
-    # What others confirm counts as measured, so that each place of the ground is kept once.
+    is_unmeasured = measured.weight == 0
+    held = is_confirmed & (is_beyond | is_unmeasured)
+    # Fusion keeps a place that several photographs measured in the finest of them alone, and tells
+    # what is measured by its confidence. So ground that others show has some. That which nobody
+    # else shows has none, as depths between measured ones, and gives way to any measurement.
     confidence = np.where(is_compared, BACKGROUND_WEIGHT, np.float32(0))
     return replace(
         measured,
@@ -344,12 +356,13 @@ def measure_difference(rig: Rig, number: int, inverse: Map) -> Float32[np.ndarra
     """Measure how much a view differs from the most similar other one at some inverse depths.
 
     Colour differences are averaged over a window, since an edge may be a pixel off. Infinite where
-    no other photograph shows the place in a pixel that is not ignored.
+    no photograph from another place shows the surface in a pixel that is not ignored.
     """
     own = rig.images[number].image
+    is_elsewhere = np.isfinite(measure_baselines_from(rig.images, number))
     least = np.full(inverse.shape, np.inf, np.float32)
     for other, image in enumerate(rig.images):
-        if other != number:
+        if is_elsewhere[other]:
             transform = rig.transforms[number, other]
             seen, is_seen = sample_at(image.image, inverse, transform)
             if image.ignore_mask is not None:
