@@ -145,6 +145,39 @@ def test_masks_of_what_is_removed_hide_nothing_where_cameras_are_searched_for(
     assert not list((out / "colmap").glob("masks/*"))
 
 
+def test_masks_of_what_is_removed_that_lie_among_the_photographs_are_no_photographs(tmp_path):
+    given = blank(tmp_path / "photos", 4)
+    goes = blank(given / "goes", 4)
+    request = SceneRequest(given, removal_masks=goes)
+    with pytest.raises(InputError, match="goes lies among the photographs, .* move it") as told:
+        open_scene(request, PosesRequest(tmp_path / "out"), Console(quiet=True))
+    assert told.value.argument == "mask"
+
+
+def test_masks_and_alpha_that_are_not_used_hide_nothing_where_cameras_are_searched_for(
+    tmp_path, monkeypatch
+):
+    """`--no-masks` is the advice for masks that hide everything: then no feature would be left."""
+    given, out = blank(tmp_path / "photos", 4), tmp_path / "out"
+    stand_in(monkeypatch, tmp_path, model_script([f"{number}.png" for number in range(4)]))
+    (given / "masks").mkdir()
+    for number in range(3):
+        with Image.open(given / f"{number}.png") as photograph:
+            Image.new("L", photograph.size).save(given / "masks" / f"{number}.png")
+    with Image.open(given / "3.png") as photograph:
+        transparent = photograph.convert("RGBA")
+    transparent.putpixel((2, 1), (0, 0, 0, 0))
+    transparent.save(given / "3.png")
+    reading = SceneRequest(given, uses_masks=False).search_masks
+    found = find_poses(given, out, reading=reading)
+    assert found.masked == 0
+    assert not list(out.glob("masks/*"))
+    assert find_poses(given, out, reading=reading).reused
+    # With masks, another search is due.
+    found = find_poses(given, out, overwrite=True, reading=MaskReading(may_be_large=True))
+    assert (found.masked, found.reused) == (4, False)
+
+
 def find_poses_summary(out: Path) -> dict:
     return json.loads((out / "summary.json").read_text())
 

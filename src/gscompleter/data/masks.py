@@ -67,7 +67,10 @@ def find_given(
     """Find photographs of a folder and their masks, where `reading` says that these are."""
     listings = FolderListings()
     paths = [folder / name for name in names]
-    if reading.folder is None:
+    masks: list[Path | None]
+    if not reading.is_used:
+        masks = [None] * len(names)
+    elif reading.folder is None:
         masks = [find_mask(path, name, listings) for path, name in zip(paths, names, strict=True)]
     else:
         masks = find_masks_in(reading.folder, names, paths)

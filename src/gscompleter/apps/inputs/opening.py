@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -97,6 +97,7 @@ def check_before_search(request: SceneRequest, search: PosesRequest, console: Co
     if request.removal_masks is not None and not is_video(folder):
         names = list_all_photographs(folder)
         files = [folder / name for name in names]
+        refuse_masks_among_photographs(request.removal_masks, files, "mask")
         check_removal_masks(request.removal_masks, names, files, request.removal_reading)
     if request.masks.folder is not None:
         print_lines(console, *check_ignoring_masks(request.masks.folder, folder))
@@ -111,11 +112,7 @@ def find_cameras(request: SceneRequest, search: PosesRequest, console: Console) 
     kept = search.out / FOUND_POSES_FOLDER
     refuse_link(kept)
     may_replace = search.overwrite or os.path.isfile(kept / SUMMARY_FILE)
-    reading = replace(request.masks, left_out=request.removal_masks)
-    # Masks that are not used hide nothing, whatever they are.
-    if not request.uses_masks:
-        reading = replace(reading, may_be_large=True)
-    poses = find_poses(request.folder, kept, may_replace, search.num_frames, reading)
+    poses = find_poses(request.folder, kept, may_replace, search.num_frames, request.search_masks)
     print_lines(console, *poses.notes)
 
     photographs = open_photographs(kept, None, request.near, request.far)
@@ -153,7 +150,7 @@ def read_masks(
 
 
 def check_ignoring_masks(masks: Path, folder: Path) -> list[str]:
-    """Refuse a folder of masks that is of no photograph in `folder`, or would be taken for some.
+    """Refuse a folder of masks to ignore, unless it has masks of photographs in `folder`.
 
     Returns a line on masks that are named as none.
     """
@@ -164,16 +161,25 @@ def check_ignoring_masks(masks: Path, folder: Path) -> list[str]:
             "ignore",
         )
     names = list_all_photographs(folder)
-    if any(lies_in(folder / name, masks) for name in names):
-        raise InputError(
-            f"{quote_value(masks)} lies among the photographs, and would be taken for some; move "
-            "it out of their folder.",
-            "ignore",
-        )
+    files = [folder / name for name in names]
+    refuse_masks_among_photographs(masks, files, "ignore")
     found = list_given_masks(folder, names, MaskReading(folder=masks))
     if not found:
         raise make_no_mask_error(masks, names)
-    return describe_unnamed_masks(masks, found, [folder / name for name in names])
+    return describe_unnamed_masks(masks, found, files)
+
+
+def refuse_masks_among_photographs(masks: Path, photographs: Sequence[Path], option: str) -> None:
+    """Raise InputError if a folder of masks, named by `option`, lies where photographs are found.
+
+    The search for cameras would take its masks for photographs.
+    """
+    if any(lies_in(photograph, masks) for photograph in photographs):
+        raise InputError(
+            f"{quote_value(masks)} lies among the photographs, and would be taken for some; move "
+            "it out of their folder.",
+            option,
+        )
 
 
 def choose_working_size(opened: Opened, splat: Path, console: Console) -> Opened:
