@@ -369,7 +369,11 @@ def test_settings_that_an_early_session_did_not_know_are_no_difference(splat, tm
     del content["session"]["config"]["margin"]
     del content["session"]["config"]["refine"]["rel_tol"]
     (out / "strokes.json").write_text(json.dumps(content))
-    for given in ((out,), (out, *words), (splat, "--strokes", out, "--out", tmp_path / "b", *words)):
+    for given in (
+        (out,),
+        (out, *words),
+        (splat, "--strokes", out, "--out", tmp_path / "b", *words),
+    ):
         opening = find_opening(*given)
         assert opening.completion.work.config.refine.iterations == 7
         (note,) = opening.notes

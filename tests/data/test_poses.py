@@ -13,6 +13,7 @@ from rich.console import Console
 
 from command import run
 from gscompleter.apps.inputs.opening import open_scene
+from gscompleter.apps.inputs.removal import find_masks_of
 from gscompleter.apps.requests.scene import PosesRequest, SceneRequest
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.mask_reading import MaskReading
@@ -152,6 +153,28 @@ def test_masks_of_what_is_removed_that_lie_among_the_photographs_are_no_photogra
     with pytest.raises(InputError, match="goes lies among the photographs, .* move it") as told:
         open_scene(request, PosesRequest(tmp_path / "out"), Console(quiet=True))
     assert told.value.argument == "mask"
+
+
+def test_a_copy_in_another_format_is_known_by_the_name_of_its_photograph(tmp_path, monkeypatch):
+    """COLMAP may not read WebP: its copy has the ending of a PNG behind the other one."""
+    given, out = tmp_path / "photos", tmp_path / "out"
+    goes = blank(tmp_path / "goes", 0)
+    given.mkdir()
+    mask = Image.new("L", (64, 48))
+    mask.putpixel((2, 1), 255)
+    for number in range(4):
+        Image.new("RGB", (64, 48), "grey").save(given / f"{number}a.webp")
+        mask.save(goes / f"{number}a.png")
+    copies = [f"{number}a.webp.png" for number in range(4)]
+    stand_in(monkeypatch, tmp_path, model_script(copies))
+    request = SceneRequest(given, removal_masks=goes)
+    find_poses(given, out / "colmap", reading=request.search_masks)
+    write_colmap_text(out / "colmap" / "sparse" / "0", copies)
+    opened = open_scene(request, PosesRequest(out), Console(quiet=True))
+    found = find_masks_of(opened.photographs, goes)
+    assert found == {number: goes / f"{number}a.png" for number in range(4)}
+    for word in ("2a", "2a.webp", "2a.webp.png"):
+        assert opened.photographs.find_frame(word) == 2
 
 
 def test_masks_and_alpha_that_are_not_used_hide_nothing_where_cameras_are_searched_for(

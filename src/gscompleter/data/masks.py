@@ -20,7 +20,12 @@ from jaxtyping import Bool, UInt8
 from PIL import Image
 
 from gscompleter.data.cameras import has_same_aspect
-from gscompleter.data.file_names import FolderListings, is_photograph_name, list_endings
+from gscompleter.data.file_names import (
+    FolderListings,
+    is_photograph_name,
+    list_endings,
+    list_stems,
+)
 from gscompleter.data.frame import FOLDERS, MASKS, MAX_NAMED_OWNERS, Frame, assign_masks
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photograph import StoredPhotograph
@@ -186,13 +191,15 @@ def list_mask_names(photograph: PurePosixPath, is_beside: bool = True) -> list[s
 
     Beside it no name is that of the photograph with another ending, which may be a photograph.
     """
-    stem = str(photograph.with_suffix(""))
+    stem, *original = list_stems(str(photograph))
     named = [f"{photograph}.png", *(form.format(stem) + end for form, end in FORMS)]
     if is_beside:
         inverted = photograph.with_name(INVERTED + photograph.stem)
         return [*named, *(f"{inverted}{ending}" for ending in MASK_ENDINGS)]
     same = [f"{path}{ending}" for path in (photograph, stem) for ending in MASK_ENDINGS]
-    return [*same, *named]
+    # The mask of a copy for COLMAP may be named as the photograph was.
+    of_copy = [f"{path}{ending}" for path in original for ending in MASK_ENDINGS]
+    return [*same, *named, *of_copy]
 
 
 def leave_out_masks(names: Collection[str]) -> list[str]:
