@@ -272,6 +272,8 @@ def test_steps_are_done_on_a_scene_that_is_named(saved, room, splat, tmp_path):
         other = tmp_path / "strokes.json"
         shutil.copyfile(saved / "strokes.json", other)
         find_opening(saved, "--strokes", other)
+    with pytest.raises(InputError, match="holds steps of its own"):
+        find_opening(saved, "--strokes", tmp_path / "missing.json")
 
 
 @pytest.mark.parametrize(

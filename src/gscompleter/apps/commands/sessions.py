@@ -92,7 +92,7 @@ def decide_session(options: AnyOptions, strokes: Path | None) -> SessionRequest:
     saved = read_strokes(path)
     is_named = options.folder is not None or options.scene is not None
     out = options.out or (DEFAULT_OUT if is_named else path.parent)
-    continues = path.name == STROKES_FILE and os.path.realpath(path.parent) == os.path.realpath(out)
+    continues = path.name == STROKES_FILE and is_same_path(path.parent, out)
     if is_named:
         options = add_saved_options(options, saved)
     else:
@@ -213,7 +213,7 @@ def find_session(options: AnyOptions, strokes: Path | None) -> tuple[AnyOptions,
     if os.path.isdir(folder):
         if holds_session(folder):
             own = folder / STROKES_FILE
-            if path is not None and not os.path.samefile(own, path):
+            if path is not None and not is_same_path(own, path):
                 raise InputError(
                     f"{quote_value(folder)} holds steps of its own; name its scene, or leave "
                     "the others out.",
@@ -225,9 +225,14 @@ def find_session(options: AnyOptions, strokes: Path | None) -> tuple[AnyOptions,
             return replace(options, folder=completed), path
     elif is_saved_session(folder):
         own = folder.with_name(STROKES_FILE)
-        if path is None or os.path.realpath(own) == os.path.realpath(path):
+        if path is None or is_same_path(own, path):
             return replace(options, folder=None), own
     return options, path
+
+
+def is_same_path(one: Path, other: Path) -> bool:
+    """Check whether two paths lead to the same place, be there anything or not."""
+    return os.path.realpath(one) == os.path.realpath(other)
 
 
 def is_saved_session(path: Path) -> bool:

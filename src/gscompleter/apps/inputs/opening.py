@@ -21,7 +21,12 @@ from gscompleter.data.frame import FOLDERS
 from gscompleter.data.limits import check_planes
 from gscompleter.data.mask_checks import read_masks_as_asked, refuse_nothing_to_invert
 from gscompleter.data.mask_reading import MaskReading
-from gscompleter.data.masks import describe_unnamed_masks, lies_in, make_no_mask_error
+from gscompleter.data.masks import (
+    describe_unnamed_masks,
+    find_masks_in,
+    lies_in,
+    make_no_mask_error,
+)
 from gscompleter.data.photographs import Photographs, check_resolution
 from gscompleter.data.sfm import NUM_VIDEO_FRAMES
 from gscompleter.data.sfm.poses import (
@@ -97,7 +102,10 @@ def check_before_search(request: SceneRequest, search: PosesRequest, console: Co
     if request.removal_masks is not None and not is_video(folder):
         names = list_all_photographs(folder)
         files = [folder / name for name in names]
-        refuse_masks_among_photographs(request.removal_masks, files, "mask")
+        # No photograph is taken for a mask, so that masks among photographs are not found.
+        found = find_masks_in(request.removal_masks, names, files, "mask")
+        if not any(found) and holds_photographs(request.removal_masks, files):
+            raise make_among_photographs_error(request.removal_masks, "mask")
         check_removal_masks(request.removal_masks, names, files, request.removal_reading)
     if request.masks.folder is not None:
         print_lines(console, *check_ignoring_masks(request.masks.folder, folder))
@@ -162,24 +170,26 @@ def check_ignoring_masks(masks: Path, folder: Path) -> list[str]:
         )
     names = list_all_photographs(folder)
     files = [folder / name for name in names]
-    refuse_masks_among_photographs(masks, files, "ignore")
+    if holds_photographs(masks, files):
+        raise make_among_photographs_error(masks, "ignore")
     found = list_given_masks(folder, names, MaskReading(folder=masks))
     if not found:
         raise make_no_mask_error(masks, names)
     return describe_unnamed_masks(masks, found, files)
 
 
-def refuse_masks_among_photographs(masks: Path, photographs: Sequence[Path], option: str) -> None:
-    """Raise InputError if a folder of masks, named by `option`, lies where photographs are found.
+def holds_photographs(masks: Path, photographs: Sequence[Path]) -> bool:
+    """Check whether images in a folder of masks are among the photographs that are found."""
+    return any(lies_in(photograph, masks) for photograph in photographs)
 
-    The search for cameras would take its masks for photographs.
-    """
-    if any(lies_in(photograph, masks) for photograph in photographs):
-        raise InputError(
-            f"{quote_value(masks)} lies among the photographs, and would be taken for some; move "
-            "it out of their folder.",
-            option,
-        )
+
+def make_among_photographs_error(masks: Path, option: str) -> InputError:
+    """Make the error for masks that the search for cameras would take for photographs."""
+    return InputError(
+        f"{quote_value(masks)} lies among the photographs, and would be taken for some; move it "
+        "out of their folder.",
+        option,
+    )
 
 
 def choose_working_size(opened: Opened, splat: Path, console: Console) -> Opened:
