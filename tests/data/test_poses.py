@@ -155,6 +155,23 @@ def test_masks_of_what_is_removed_that_lie_among_the_photographs_are_no_photogra
     assert told.value.argument == "mask"
 
 
+def test_masks_of_what_is_removed_may_lie_beside_their_photographs(tmp_path, monkeypatch):
+    """The copies for COLMAP are called as the photographs are, which are no masks of them."""
+    given, out = blank(tmp_path / "photos", 4), tmp_path / "out"
+    names = [f"{number}.png" for number in range(4)]
+    stand_in(monkeypatch, tmp_path, model_script(names))
+    mask = Image.new("L", (64, 48))
+    mask.putpixel((2, 1), 255)
+    for number in range(4):
+        mask.save(given / f"{number}_mask.png")
+    request = SceneRequest(given, removal_masks=given)
+    find_poses(given, out / "colmap", reading=request.search_masks)
+    write_colmap_text(out / "colmap" / "sparse" / "0", names)
+    opened = open_scene(request, PosesRequest(out), Console(quiet=True))
+    found = find_masks_of(opened.photographs, given)
+    assert found == {number: given / f"{number}_mask.png" for number in range(4)}
+
+
 def test_a_copy_in_another_format_is_known_by_the_name_of_its_photograph(tmp_path, monkeypatch):
     """COLMAP may not read WebP: its copy has the ending of a PNG behind the other one."""
     given, out = tmp_path / "photos", tmp_path / "out"

@@ -98,7 +98,8 @@ def find_masks_in(
     """Find the mask of each photograph in a folder of masks that the user named by an option.
 
     `photographs` are the files of these `names`, None for one without a file. No photograph is
-    taken for a mask. Raises InputError if a mask may be of several photographs.
+    taken for a mask, nor is an image beside which its own mask lies. Raises InputError if a mask
+    may be of several photographs.
     """
     listings = FolderListings()
     taken = {os.path.realpath(path) for path in photographs if path is not None}
@@ -107,7 +108,13 @@ def find_masks_in(
         named = list_mask_names(PurePosixPath(ending), is_beside=False)
         found = (listings.find(folder, mask) for mask in named)
         masks = (mask for mask in found if mask is not None and os.path.isfile(mask))
-        return next((mask for mask in masks if os.path.realpath(mask) not in taken), None)
+        return next((mask for mask in masks if not is_photograph(mask)), None)
+
+    def is_photograph(path: Path) -> bool:
+        # Of copies for COLMAP, the photographs themselves may lie here, with their masks.
+        beside = list_mask_names(PurePosixPath(path.name))
+        has_mask = any(listings.find(path.parent, name) is not None for name in beside)
+        return has_mask or os.path.realpath(path) in taken
 
     return assign_masks(names, photographs, list_inner_endings, find_one, option)
 
