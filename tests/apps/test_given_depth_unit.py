@@ -166,6 +166,28 @@ def test_noise_of_the_measurement_is_no_factor():
     assert fit_depth_factor(sample(TRUE, noisy)).factor == 1.0
 
 
+def test_a_factor_among_noise_is_used_where_1_would_be_refused():
+    """Of poses that are as noisy as the factor is large, most samples agree with the factor."""
+    noise = np.random.default_rng(0).normal(0.27, 0.3, 400)
+    fit = fit_depth_factor(sample(TRUE, TRUE * np.exp(noise)))
+    assert fit is not None
+    assert fit.is_consistent
+    assert 1.1 < fit.factor < 1.5
+
+
+def test_a_flat_wall_is_not_taken_for_inverted_depth():
+    """All of it is equally far, so that noise alone orders its depths: here, most in reverse."""
+    random = np.random.default_rng(15)
+    given = 2 + 0.01 * random.normal(size=24)
+    measured = 2 * np.exp(0.05 * random.normal(size=24))
+    fit = fit_depth_factor(sample(given, measured))
+    assert fit is not None
+    assert fit.is_consistent
+    # The inverted depth of a scene that is hardly deep has one factor as well, and another order.
+    depth = np.sort(random.uniform(1.8, 2.2, 24))
+    assert not fit_depth_factor(sample(4 / depth, depth)).is_consistent
+
+
 def test_false_matches_on_one_side_do_not_move_the_factor():
     measured = np.where(np.arange(400) < 140, TRUE * RANDOM.uniform(1, 4, 400), TRUE) / 2.5
     fit = fit_depth_factor(sample(TRUE, measured))

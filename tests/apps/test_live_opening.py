@@ -272,6 +272,8 @@ def test_steps_are_done_on_a_scene_that_is_named(saved, room, splat, tmp_path):
         other = tmp_path / "strokes.json"
         shutil.copyfile(saved / "strokes.json", other)
         find_opening(saved, "--strokes", other)
+    with pytest.raises(InputError, match="holds steps of its own"):
+        find_opening(saved, "--strokes", tmp_path / "missing.json")
 
 
 @pytest.mark.parametrize(
@@ -360,6 +362,27 @@ def test_an_option_that_an_early_session_did_not_know_is_refused_and_not_ignored
         with pytest.raises(InputError, match="began with"):
             find_opening(out, *words)
     assert find_opening(out).completion.work.geometry is None
+
+
+def test_settings_that_an_early_session_did_not_know_are_no_difference(splat, tmp_path):
+    words = ("--config.refine.iterations", 7)
+    out = begin(tmp_path / "out", splat, *words)
+    content = json.loads((out / "strokes.json").read_text())
+    del content["session"]["config"]["margin"]
+    del content["session"]["config"]["refine"]["rel_tol"]
+    (out / "strokes.json").write_text(json.dumps(content))
+    for given in (
+        (out,),
+        (out, *words),
+        (splat, "--strokes", out, "--out", tmp_path / "b", *words),
+    ):
+        opening = find_opening(*given)
+        assert opening.completion.work.config.refine.iterations == 7
+        (note,) = opening.notes
+        assert note.startswith("Going on")
+    for other in (("--config.refine.iterations", 8), ("--config.margin", 0.3)):
+        with pytest.raises(InputError, match="began with"):
+            find_opening(out, *other)
 
 
 def test_functions_of_ones_own_are_named_again_from_any_folder(room, tmp_path, monkeypatch):

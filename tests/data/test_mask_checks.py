@@ -270,6 +270,6 @@ def test_a_compressed_map_of_labels_is_refused(tmp_path):
 def test_copies_for_colmap_are_masked_as_the_user_means_it(tmp_path):
     save(tmp_path / "a.png", np.full((HEIGHT, WIDTH, 3), 90, np.uint8))
     mask = save(tmp_path / "mask.png", paint(upper_quarter()))
-    assert write_upright(tmp_path, "a.png", tmp_path, mask, has_inverted_mask=True).is_masked
+    assert write_upright(tmp_path, "a.png", tmp_path, mask, INVERTED).is_masked
     written = np.asarray(Image.open(tmp_path / "masks/a.png.png"))
     assert np.array_equal(written == 0, upper_quarter())

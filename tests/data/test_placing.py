@@ -10,10 +10,17 @@ import pytest
 from PIL import Image
 
 from gscompleter.data.formats import open_photographs
+from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.masks import find_given
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.sfm import placing, poses
-from gscompleter.data.sfm.placing import NewCopy, identify_input, name_new, place_photographs
+from gscompleter.data.sfm.placing import (
+    NewCopy,
+    identify_input,
+    name_new,
+    place_photographs,
+    write_new_copies,
+)
 from gscompleter.numerics.geometry import resize_camera
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.image import write_image
@@ -198,6 +205,20 @@ def test_a_missing_package_is_told_how_to_install(known, new, tmp_path, monkeypa
     monkeypatch.setattr(poses, "find_spec", lambda name: None)
     with pytest.raises(InputError, match=r"pip install 'gscompleter\[poses\]'"):
         place_photographs(new, known, tmp_path / "colmap")
+
+
+@pytest.mark.parametrize("is_used", [True, False])
+def test_masks_that_are_not_used_hide_nothing_of_new_photographs(known, new, tmp_path, is_used):
+    """`update --photos --no-masks` uses all pixels to place them as well."""
+    (new / "masks").mkdir()
+    mask = Image.new("L", (160, 160))
+    mask.putpixel((80, 80), 255)
+    mask.save(new / "masks" / "new 2.png")
+    reading = MaskReading(may_be_large=True, is_used=is_used)
+    given = find_given(new, [f"new {number}.png" for number in NEW], reading)
+    copies = write_new_copies(given, known, tmp_path, reading)
+    assert any(copy.is_masked for copy in copies) is is_used
+    assert bool(list(tmp_path.rglob("masks/**/*new*2.png.png"))) is is_used
 
 
 @pytest.mark.slow

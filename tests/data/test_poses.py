@@ -13,6 +13,7 @@ from rich.console import Console
 
 from command import run
 from gscompleter.apps.inputs.opening import open_scene
+from gscompleter.apps.inputs.removal import find_masks_of
 from gscompleter.apps.requests.scene import PosesRequest, SceneRequest
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.mask_reading import MaskReading
@@ -143,6 +144,78 @@ def test_masks_of_what_is_removed_hide_nothing_where_cameras_are_searched_for(
     opened = open_scene(request, PosesRequest(out), Console(quiet=True))
     assert opened.photographs.list_masks() == []
     assert not list((out / "colmap").glob("masks/*"))
+
+
+def test_masks_of_what_is_removed_that_lie_among_the_photographs_are_no_photographs(tmp_path):
+    given = blank(tmp_path / "photos", 4)
+    goes = blank(given / "goes", 4)
+    request = SceneRequest(given, removal_masks=goes)
+    with pytest.raises(InputError, match="goes lies among the photographs, .* move it") as told:
+        open_scene(request, PosesRequest(tmp_path / "out"), Console(quiet=True))
+    assert told.value.argument == "mask"
+
+
+def test_masks_of_what_is_removed_may_lie_beside_their_photographs(tmp_path, monkeypatch):
+    """The copies for COLMAP are called as the photographs are, which are no masks of them."""
+    given, out = blank(tmp_path / "photos", 4), tmp_path / "out"
+    names = [f"{number}.png" for number in range(4)]
+    stand_in(monkeypatch, tmp_path, model_script(names))
+    mask = Image.new("L", (64, 48))
+    mask.putpixel((2, 1), 255)
+    for number in range(4):
+        mask.save(given / f"{number}_mask.png")
+    request = SceneRequest(given, removal_masks=given)
+    find_poses(given, out / "colmap", reading=request.search_masks)
+    write_colmap_text(out / "colmap" / "sparse" / "0", names)
+    opened = open_scene(request, PosesRequest(out), Console(quiet=True))
+    found = find_masks_of(opened.photographs, given)
+    assert found == {number: given / f"{number}_mask.png" for number in range(4)}
+
+
+def test_a_copy_in_another_format_is_known_by_the_name_of_its_photograph(tmp_path, monkeypatch):
+    """COLMAP may not read WebP: its copy has the ending of a PNG behind the other one."""
+    given, out = tmp_path / "photos", tmp_path / "out"
+    goes = blank(tmp_path / "goes", 0)
+    given.mkdir()
+    mask = Image.new("L", (64, 48))
+    mask.putpixel((2, 1), 255)
+    for number in range(4):
+        Image.new("RGB", (64, 48), "grey").save(given / f"{number}a.webp")
+        mask.save(goes / f"{number}a.png")
+    copies = [f"{number}a.webp.png" for number in range(4)]
+    stand_in(monkeypatch, tmp_path, model_script(copies))
+    request = SceneRequest(given, removal_masks=goes)
+    find_poses(given, out / "colmap", reading=request.search_masks)
+    write_colmap_text(out / "colmap" / "sparse" / "0", copies)
+    opened = open_scene(request, PosesRequest(out), Console(quiet=True))
+    found = find_masks_of(opened.photographs, goes)
+    assert found == {number: goes / f"{number}a.png" for number in range(4)}
+    for word in ("2a", "2a.webp", "2a.webp.png"):
+        assert opened.photographs.find_frame(word) == 2
+
+
+def test_masks_and_alpha_that_are_not_used_hide_nothing_where_cameras_are_searched_for(
+    tmp_path, monkeypatch
+):
+    """`--no-masks` is the advice for masks that hide everything: then no feature would be left."""
+    given, out = blank(tmp_path / "photos", 4), tmp_path / "out"
+    stand_in(monkeypatch, tmp_path, model_script([f"{number}.png" for number in range(4)]))
+    (given / "masks").mkdir()
+    for number in range(3):
+        with Image.open(given / f"{number}.png") as photograph:
+            Image.new("L", photograph.size).save(given / "masks" / f"{number}.png")
+    with Image.open(given / "3.png") as photograph:
+        transparent = photograph.convert("RGBA")
+    transparent.putpixel((2, 1), (0, 0, 0, 0))
+    transparent.save(given / "3.png")
+    reading = SceneRequest(given, uses_masks=False).search_masks
+    found = find_poses(given, out, reading=reading)
+    assert found.masked == 0
+    assert not list(out.glob("masks/*"))
+    assert find_poses(given, out, reading=reading).reused
+    # With masks, another search is due.
+    found = find_poses(given, out, overwrite=True, reading=MaskReading(may_be_large=True))
+    assert (found.masked, found.reused) == (4, False)
 
 
 def find_poses_summary(out: Path) -> dict:

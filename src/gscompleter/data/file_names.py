@@ -87,6 +87,16 @@ def is_photograph_name(name: str) -> bool:
     return not is_hidden_name(name) and name.lower().endswith(PHOTOGRAPH_ENDINGS)
 
 
+def list_stems(name: str) -> list[str]:
+    """List the name of a photograph without its ending, and without that of what it is a copy of.
+
+    COLMAP may not read `x.webp`, and its copy is called `x.webp.png`: both `x.webp` and `x`.
+    """
+    stem, _ = os.path.splitext(name)
+    is_of_copy = stem.lower().endswith(PHOTOGRAPH_ENDINGS)
+    return [stem, os.path.splitext(stem)[0]] if is_of_copy else [stem]
+
+
 def list_endings(written: str) -> list[str]:
     r"""List the relative paths that a written path may mean here, the longest first.
 

@@ -14,6 +14,8 @@ class MaskReading:
     """True to read white as black, and black as white."""
     may_be_large: bool = False
     """True to take masks that look as if they were the other way round as they are."""
+    is_used: bool = True
+    """False if neither masks nor alpha channels hide anything of photographs."""
     is_turned_by_option: bool = True
     """False if `--invert-masks` is for the masks of another option."""
     folder: Path | None = None

@@ -20,7 +20,12 @@ from jaxtyping import Bool, UInt8
 from PIL import Image
 
 from gscompleter.data.cameras import has_same_aspect
-from gscompleter.data.file_names import FolderListings, is_photograph_name, list_endings
+from gscompleter.data.file_names import (
+    FolderListings,
+    is_photograph_name,
+    list_endings,
+    list_stems,
+)
 from gscompleter.data.frame import FOLDERS, MASKS, MAX_NAMED_OWNERS, Frame, assign_masks
 from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photograph import StoredPhotograph
@@ -67,7 +72,10 @@ def find_given(
     """Find photographs of a folder and their masks, where `reading` says that these are."""
     listings = FolderListings()
     paths = [folder / name for name in names]
-    if reading.folder is None:
+    masks: list[Path | None]
+    if not reading.is_used:
+        masks = [None] * len(names)
+    elif reading.folder is None:
         masks = [find_mask(path, name, listings) for path, name in zip(paths, names, strict=True)]
     else:
         masks = find_masks_in(reading.folder, names, paths)
@@ -90,7 +98,8 @@ def find_masks_in(
     """Find the mask of each photograph in a folder of masks that the user named by an option.
 
     `photographs` are the files of these `names`, None for one without a file. No photograph is
-    taken for a mask. Raises InputError if a mask may be of several photographs.
+    taken for a mask, nor is an image beside which its own mask lies. Raises InputError if a mask
+    may be of several photographs.
     """
     listings = FolderListings()
     taken = {os.path.realpath(path) for path in photographs if path is not None}
@@ -99,7 +108,13 @@ def find_masks_in(
         named = list_mask_names(PurePosixPath(ending), is_beside=False)
         found = (listings.find(folder, mask) for mask in named)
         masks = (mask for mask in found if mask is not None and os.path.isfile(mask))
-        return next((mask for mask in masks if os.path.realpath(mask) not in taken), None)
+        return next((mask for mask in masks if not is_photograph(mask)), None)
+
+    def is_photograph(path: Path) -> bool:
+        # Of copies for COLMAP, the photographs themselves may lie here, with their masks.
+        beside = list_mask_names(PurePosixPath(path.name))
+        has_mask = any(listings.find(path.parent, name) is not None for name in beside)
+        return has_mask or os.path.realpath(path) in taken
 
     return assign_masks(names, photographs, list_inner_endings, find_one, option)
 
@@ -183,13 +198,15 @@ def list_mask_names(photograph: PurePosixPath, is_beside: bool = True) -> list[s
 
     Beside it no name is that of the photograph with another ending, which may be a photograph.
     """
-    stem = str(photograph.with_suffix(""))
+    stem, *original = list_stems(str(photograph))
     named = [f"{photograph}.png", *(form.format(stem) + end for form, end in FORMS)]
     if is_beside:
         inverted = photograph.with_name(INVERTED + photograph.stem)
         return [*named, *(f"{inverted}{ending}" for ending in MASK_ENDINGS)]
     same = [f"{path}{ending}" for path in (photograph, stem) for ending in MASK_ENDINGS]
-    return [*same, *named]
+    # The mask of a copy for COLMAP may be named as the photograph was.
+    of_copy = [f"{path}{ending}" for path in original for ending in MASK_ENDINGS]
+    return [*same, *named, *of_copy]
 
 
 def leave_out_masks(names: Collection[str]) -> list[str]:

@@ -21,6 +21,7 @@ from PIL import Image
 from torch import Tensor
 
 from gscompleter.data.cameras import compute_fov, compute_undistortion_map, find_pose_defect, remap
+from gscompleter.data.file_names import list_stems
 from gscompleter.data.frame import Frame
 from gscompleter.data.ignored_regions import IgnoredRegions
 from gscompleter.data.local_origin import choose_local_origin, is_near
@@ -315,7 +316,8 @@ class Photographs:
                 exact.append(number)
             # The word may lack folders, and so may the name: either may be the end of the other.
             full = [fold_name(path), fold_name(frame.file_name)]
-            names = [(name, wanted) for name in (*full, *(os.path.splitext(n)[0] for n in full))]
+            names = [(name, wanted) for name in full]
+            names += [(stem, wanted) for name in full for stem in list_stems(name)]
             # A file of cameras may name photographs without the endings of their files.
             names += [(name, wanted_stem) for name in full if not os.path.splitext(name)[1]]
             if any(_ends_alike(PurePosixPath(name).parts, given) for name, given in names):

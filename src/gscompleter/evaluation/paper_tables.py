@@ -31,7 +31,8 @@ from gscompleter.evaluation.tables import (
     read_run_rows,
     summarize_run,
 )
-from gscompleter.system.files.writing import encode_text, replace_file
+from gscompleter.system.files.text import encode_text
+from gscompleter.system.files.writing import replace_file
 
 SIGNIFICANCE = 0.05
 """Largest two-sided p at which a difference is more than noise."""

@@ -37,7 +37,8 @@ from gscompleter.evaluation.store import (
 )
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.image import read_image
-from gscompleter.system.files.writing import encode_text, replace_file
+from gscompleter.system.files.text import encode_text
+from gscompleter.system.files.writing import replace_file
 from gscompleter.system.timing import STAGES
 
 Fids = dict[str, float] | str

@@ -65,6 +65,8 @@ KNOWN_ATTRIBUTES = {
     *(f"{EXTENSION}:{name}" for name in ("ROTATION", "SCALE", "OPACITY")),
 }
 """Attributes that are read, and what viewers of points show."""
+KERNEL = "ellipse"
+"""The shape of all Gaussians of 3DGS."""
 COLOR_SPACE = "srgb_rec709_display"
 """The colour space in which all splat trainers work."""
 COMPONENT_TYPES = {
@@ -311,8 +313,8 @@ def _decode_packed(
     if view.get("buffer") != 0:
         raise UnsupportedError("holds its Gaussians in another file")
     start = int(view.get("byteOffset", 0))
-    # Its own axes are converted to those of glTF, as the extension demands.
     packed = document.binary[start : start + int(view["byteLength"])]
+    # With the axes of a .ply, which are turned to those of glTF: a node gives its transform there.
     gaussians = decode_spz(packed, 4 if leaves_out_band_4 else 3)
     if len(gaussians) != _get_accessor(document, primitive, "POSITION")["count"]:
         raise DamagedError("its .spz has another number of Gaussians than its accessors")
@@ -327,9 +329,12 @@ def _decode_primitive(
     if compression is not None:
         return _decode_packed(document, primitive, compression, leaves_out_band_4)
     extension = primitive["extensions"][EXTENSION]
-    packed = ", ".join({**extension.get("extensions", {}), **primitive["extensions"]})
-    stored = (packed, extension.get("kernel", "ellipse"), extension.get("colorSpace", COLOR_SPACE))
-    if stored != (EXTENSION, "ellipse", COLOR_SPACE):
+    # Any further extension may store the same attributes in another way.
+    extensions = ", ".join({**extension.get("extensions", {}), **primitive["extensions"]})
+    kernel = extension.get("kernel", KERNEL)
+    color_space = extension.get("colorSpace", COLOR_SPACE)
+    stored = (extensions, kernel, color_space)
+    if stored != (EXTENSION, KERNEL, COLOR_SPACE):
         raise UnsupportedError(f"stores Gaussians in an unknown way, {quote_value(stored)}")
     if f"{EXTENSION}:ROTATION" not in primitive["attributes"]:
         raise UnsupportedError(f"stores Gaussians as a draft of {EXTENSION} did")
@@ -361,19 +366,21 @@ def _decode_primitive(
 def _read_accessor(
     document: GlbDocument, accessor: dict[str, Any], what: str = "Gaussians"
 ) -> Float[ndarray, "n k"]:
-    """Read the numbers of an accessor as float32; integers may stand for fractions.
+    """Read the numbers of an accessor as float32.
 
-    `what` its rows are is for errors.
+    Integers that are `normalized` stand for fractions of the largest one; others for themselves,
+    which positions, sizes and SH may be. `what` its rows are is for errors.
     """
-    values = _read_numbers(document, accessor, what)
-    kind = values.dtype
-    if kind.kind == "f":
-        return values.astype(np.float32)
-    if not accessor.get("normalized") and values.shape[1] != 3:
+    stored = _read_numbers(document, accessor, what)
+    values = stored.astype(np.float32)
+    if stored.dtype.kind == "f":
+        return values
+    if accessor.get("normalized"):
+        # Signed ones are symmetric: the lowest one stands for -1, too.
+        return np.maximum(values / np.iinfo(stored.dtype).max, -1)
+    if values.shape[1] != 3:
         raise UnsupportedError("has rotations or opacities that are no fractions")
-    # Signed normalized integers are symmetric: the lowest one stands for -1, too.
-    largest = np.iinfo(kind).max if accessor.get("normalized") else 1
-    return np.maximum(values.astype(np.float32) / largest, -1 if largest > 1 else -np.inf)
+    return values
 
 
 def _read_numbers(
@@ -459,7 +466,7 @@ def _describe_scene(
     primitive = {
         "attributes": {name: index for index, name in enumerate(columns)},
         "mode": POINTS,
-        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": COLOR_SPACE}},
+        "extensions": {EXTENSION: {"kernel": KERNEL, "colorSpace": COLOR_SPACE}},
     }
     return {
         "asset": {"version": "2.0", "generator": "gscompleter"},

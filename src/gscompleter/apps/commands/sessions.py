@@ -92,7 +92,7 @@ def decide_session(options: AnyOptions, strokes: Path | None) -> SessionRequest:
     saved = read_strokes(path)
     is_named = options.folder is not None or options.scene is not None
     out = options.out or (DEFAULT_OUT if is_named else path.parent)
-    continues = path.name == STROKES_FILE and os.path.realpath(path.parent) == os.path.realpath(out)
+    continues = path.name == STROKES_FILE and is_same_path(path.parent, out)
     if is_named:
         options = add_saved_options(options, saved)
     else:
@@ -152,7 +152,7 @@ def describe_session(options: CompletingOptions, completion: CompletionRequest) 
     splat = completion.work.splat
     scene = None if splat is None else os.path.abspath(splat.path)
     folder = None if has_splat_alone(options) else describe_value("folder", options.folder)
-    config = describe_value("config", asdict(completion.work.config))
+    config = describe_config(completion.work.config)
     described = {**describe_options(options), "folder": folder, "scene": scene, "config": config}
     if isinstance(completion.source, AloneRequest):
         # A setting may have said so in place of the option.
@@ -165,6 +165,12 @@ def describe_options(options: CompletingOptions) -> dict[str, Any]:
     names = [field.name for field in fields(CompletingOptions)]
     chosen = [name for name in names if name not in (*SEPARATE_OPTIONS, *OPTIONS_OF_A_RUN)]
     return {name: describe_value(name, getattr(options, name)) for name in chosen}
+
+
+def describe_config(config: CompleterConfig) -> dict[str, Any]:
+    """Describe all settings of the method as JSON."""
+    described: dict[str, Any] = describe_value("config", asdict(config))
+    return described
 
 
 def describe_value(name: str, value: Any) -> Any:
@@ -207,7 +213,7 @@ def find_session(options: AnyOptions, strokes: Path | None) -> tuple[AnyOptions,
     if os.path.isdir(folder):
         if holds_session(folder):
             own = folder / STROKES_FILE
-            if path is not None and not os.path.samefile(own, path):
+            if path is not None and not is_same_path(own, path):
                 raise InputError(
                     f"{quote_value(folder)} holds steps of its own; name its scene, or leave "
                     "the others out.",
@@ -219,9 +225,14 @@ def find_session(options: AnyOptions, strokes: Path | None) -> tuple[AnyOptions,
             return replace(options, folder=completed), path
     elif is_saved_session(folder):
         own = folder.with_name(STROKES_FILE)
-        if path is None or os.path.realpath(own) == os.path.realpath(path):
+        if path is None or is_same_path(own, path):
             return replace(options, folder=None), own
     return options, path
+
+
+def is_same_path(one: Path, other: Path) -> bool:
+    """Check whether two paths lead to the same place, be there anything or not."""
+    return os.path.realpath(one) == os.path.realpath(other)
 
 
 def is_saved_session(path: Path) -> bool:
@@ -267,12 +278,16 @@ def read_known_options(options: AnyOptions, known: Mapping[str, Any], shown: str
     damaged.
     """
     kind = type(options)
-    config = validate_typed(CompleterConfig, known.get("config", {}), shown, STROKES_ADVICE)
-    # All settings are changes here, so that no preset decides on any of them again.
-    settings = asdict(config)
+    kept = known.get("config", {})
+    config = validate_typed(CompleterConfig, kept, shown, STROKES_ADVICE)
+    # All settings are changes here, so that no preset decides on any of them again, but on those
+    # that an earlier version did not know.
+    settings = select_settings(asdict(config), kept)
+    # A kind of holes that only the option decided on is not among the settings, which have "all"
+    # then. As a change, that would contradict the option. Where "all" was given, the option as it
+    # is kept says so, too, or has the same effect.
     if config.holes.kind == "all":
-        # It was not given, or the option of the session says so, too.
-        del settings["holes"]["kind"]
+        settings.get("holes", {}).pop("kind", None)
 
     # Of this run are its own options, and those of the command that no completion has.
     own = {field.name for field in fields(kind)}
@@ -286,6 +301,15 @@ def read_known_options(options: AnyOptions, known: Mapping[str, Any], shown: str
     return restored
 
 
+def select_settings(settings: Mapping[str, Any], kept: Mapping[str, Any]) -> dict[str, Any]:
+    """Select the settings, also of groups, that a session has kept."""
+    return {
+        name: select_settings(value, kept[name]) if isinstance(value, Mapping) else value
+        for name, value in settings.items()
+        if name in kept
+    }
+
+
 def refuse_changes(options: AnyOptions, restored: AnyOptions, known: Mapping[str, Any]) -> None:
     """Refuse options of this run that differ from those of a session, and programs that it names.
 
@@ -297,8 +321,10 @@ def refuse_changes(options: AnyOptions, restored: AnyOptions, known: Mapping[str
     given = {
         **describe_options(options),
         **{name: describe_value(name, getattr(options, name)) for name in SEPARATE_OPTIONS},
-        "config": describe_value("config", asdict(typed_config)),
+        "config": describe_config(typed_config),
     }
+    # With the settings that an earlier version did not know.
+    known = {**known, "config": describe_config(decide_config(restored))}
     for name, value in given.items():
         # A config that was not typed is the one of the session.
         if name != "config" or options.config != ChosenConfig():
@@ -397,6 +423,16 @@ def list_differences(record: Mapping[str, Any], known: Mapping[str, Any]) -> lis
             continue
         if name == "synthesis" and isinstance(known[name], Mapping):
             names += list_differences(value, known[name])
-        elif value != known[name]:
+        elif has_other_value(value, known[name]):
             names.append(f"--{name.replace('_', '-')}")
     return names
+
+
+def has_other_value(value: Any, known: Any) -> bool:
+    """Return True if a value, as JSON, differs from that of a session.
+
+    Settings that the session does not have, of an earlier version, do not count.
+    """
+    if isinstance(value, Mapping) and isinstance(known, Mapping):
+        return any(has_other_value(value[name], known[name]) for name in value if name in known)
+    return bool(value != known)

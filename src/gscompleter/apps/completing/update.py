@@ -110,7 +110,7 @@ def add_new_photographs(
     kept = results.out / FOUND_POSES_FOLDER
     refuse_link(kept)
     photographs, placed = place_photographs(
-        photos, opened.photographs, kept, results.overwrite, opened.request.masks
+        photos, opened.photographs, kept, results.overwrite, opened.request.search_masks
     )
     print_lines(console, *placed.notes)
     photographs = replace(photographs, notes=(*photographs.notes, *placed.notes))

@@ -47,7 +47,8 @@ from gscompleter.evaluation.store import make_file_name, read_run_file
 from gscompleter.evaluation.tables import format_markdown
 from gscompleter.system.console import make_console
 from gscompleter.system.errors import InputError, NoCaseError, OutputError, WorkerError
-from gscompleter.system.files.writing import encode_text, replace_file
+from gscompleter.system.files.text import encode_text
+from gscompleter.system.files.writing import replace_file
 from gscompleter.system.jobs.jobs import make_folder
 from gscompleter.system.machine import describe_machine
 

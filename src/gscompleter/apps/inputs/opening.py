@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +21,12 @@ from gscompleter.data.frame import FOLDERS
 from gscompleter.data.limits import check_planes
 from gscompleter.data.mask_checks import read_masks_as_asked, refuse_nothing_to_invert
 from gscompleter.data.mask_reading import MaskReading
-from gscompleter.data.masks import describe_unnamed_masks, lies_in, make_no_mask_error
+from gscompleter.data.masks import (
+    describe_unnamed_masks,
+    find_masks_in,
+    lies_in,
+    make_no_mask_error,
+)
 from gscompleter.data.photographs import Photographs, check_resolution
 from gscompleter.data.sfm import NUM_VIDEO_FRAMES
 from gscompleter.data.sfm.poses import (
@@ -97,6 +102,10 @@ def check_before_search(request: SceneRequest, search: PosesRequest, console: Co
     if request.removal_masks is not None and not is_video(folder):
         names = list_all_photographs(folder)
         files = [folder / name for name in names]
+        # No photograph is taken for a mask, so that masks among photographs are not found.
+        found = find_masks_in(request.removal_masks, names, files, "mask")
+        if not any(found) and holds_photographs(request.removal_masks, files):
+            raise make_among_photographs_error(request.removal_masks, "mask")
         check_removal_masks(request.removal_masks, names, files, request.removal_reading)
     if request.masks.folder is not None:
         print_lines(console, *check_ignoring_masks(request.masks.folder, folder))
@@ -111,11 +120,7 @@ def find_cameras(request: SceneRequest, search: PosesRequest, console: Console) 
     kept = search.out / FOUND_POSES_FOLDER
     refuse_link(kept)
     may_replace = search.overwrite or os.path.isfile(kept / SUMMARY_FILE)
-    reading = replace(request.masks, left_out=request.removal_masks)
-    # Masks that are not used hide nothing, whatever they are.
-    if not request.uses_masks:
-        reading = replace(reading, may_be_large=True)
-    poses = find_poses(request.folder, kept, may_replace, search.num_frames, reading)
+    poses = find_poses(request.folder, kept, may_replace, search.num_frames, request.search_masks)
     print_lines(console, *poses.notes)
 
     photographs = open_photographs(kept, None, request.near, request.far)
@@ -153,7 +158,7 @@ def read_masks(
 
 
 def check_ignoring_masks(masks: Path, folder: Path) -> list[str]:
-    """Refuse a folder of masks that is of no photograph in `folder`, or would be taken for some.
+    """Refuse a folder of masks to ignore, unless it has masks of photographs in `folder`.
 
     Returns a line on masks that are named as none.
     """
@@ -164,16 +169,27 @@ def check_ignoring_masks(masks: Path, folder: Path) -> list[str]:
             "ignore",
         )
     names = list_all_photographs(folder)
-    if any(lies_in(folder / name, masks) for name in names):
-        raise InputError(
-            f"{quote_value(masks)} lies among the photographs, and would be taken for some; move "
-            "it out of their folder.",
-            "ignore",
-        )
+    files = [folder / name for name in names]
+    if holds_photographs(masks, files):
+        raise make_among_photographs_error(masks, "ignore")
     found = list_given_masks(folder, names, MaskReading(folder=masks))
     if not found:
         raise make_no_mask_error(masks, names)
-    return describe_unnamed_masks(masks, found, [folder / name for name in names])
+    return describe_unnamed_masks(masks, found, files)
+
+
+def holds_photographs(masks: Path, photographs: Sequence[Path]) -> bool:
+    """Check whether images in a folder of masks are among the photographs that are found."""
+    return any(lies_in(photograph, masks) for photograph in photographs)
+
+
+def make_among_photographs_error(masks: Path, option: str) -> InputError:
+    """Make the error for masks that the search for cameras would take for photographs."""
+    return InputError(
+        f"{quote_value(masks)} lies among the photographs, and would be taken for some; move it "
+        "out of their folder.",
+        option,
+    )
 
 
 def choose_working_size(opened: Opened, splat: Path, console: Console) -> Opened:

@@ -48,7 +48,8 @@ from gscompleter.system.files.image import (
 )
 from gscompleter.system.files.output_folder import refuse_foreign_file
 from gscompleter.system.files.result_names import SUMMARY_FILE
-from gscompleter.system.files.writing import encode_text, replace_file
+from gscompleter.system.files.text import encode_text
+from gscompleter.system.files.writing import replace_file
 from gscompleter.system.jobs.jobs import JOBS, Job, read_row
 
 # Files of a completion: its page, and the viewer with its scene inside, which is optional.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -50,6 +50,11 @@ class SceneRequest:
     """Folder of masks that show what to remove; lying in the scene, they hide nothing."""
     removal_reading: MaskReading = MaskReading()
     """How masks of what to remove are read."""
+
+    @property
+    def search_masks(self) -> MaskReading:
+        """How masks of photographs are read where the cameras of these are searched for."""
+        return replace(self.masks, is_used=self.uses_masks, left_out=self.removal_masks)
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from gscompleter.numerics.geometry import embed_cameras, is_inside, look_along, 
 from gscompleter.splats.spz import ENCODED_BLOCK, encode_spz_blocks
 from gscompleter.splats.upward import USUAL, Direction
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.files.writing import encode_text
+from gscompleter.system.files.text import encode_text
 from gscompleter.types import Camera, Gaussians
 
 ASSETS = Path(__file__).with_name("assets")

@@ -168,6 +168,9 @@ def place_photographs(
     identity = identify_input(new, photographs)
     if reading.ignores_white:
         identity["inverted masks"] = True
+    # An alpha channel is no file of its own, by which its use could be told.
+    if not reading.is_used:
+        identity["unused masks"] = True
     earlier = read_earlier(out, "placed", identity)
     if earlier is not None:
         placed = replace(Placed(**earlier), reused=True)
@@ -383,7 +386,10 @@ def write_new_copy(
         mask=given.mask,
         has_inverted_mask=reading.ignores_white,
     )
-    (view,) = build_photographs(given.name, title, [frame]).views([0], MAX_COPY_SIDE)
+    shown = build_photographs(given.name, title, [frame])
+    if not reading.is_used:
+        shown = shown.leave_out_masks()
+    (view,) = shown.views([0], MAX_COPY_SIDE)
 
     # Two photographs may differ in their endings alone; then the second copy has both endings.
     plain = make_colmap_name(given.name)

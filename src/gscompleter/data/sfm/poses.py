@@ -206,6 +206,9 @@ def find_poses(
     known = _identify_input(photographs, num_frames, reading)
     if reading.ignores_white:
         known["inverted masks"] = []
+    # An alpha channel is no file of its own, by which its use could be told.
+    if not reading.is_used:
+        known["unused masks"] = []
     earlier = read_earlier(out, "poses", known)
     if earlier is not None:
         found = FoundPoses(**earlier)
@@ -451,9 +454,9 @@ def write_copies(
     What masks hide is written into `folder`/masks.
     """
     if not is_panoramic:
-        return [write_upright(root, given.name, folder, given.mask, reading.ignores_white)]
+        return [write_upright(root, given.name, folder, given.mask, reading)]
     copies = []
-    hidden = read_hidden(given.path, given.mask, reading.ignores_white)
+    hidden = read_hidden(given.path, given.mask, reading)
     for number, (pixels, shade) in enumerate(split_panorama(given.path, hidden)):
         kind = f"view_{number}"
         name = Path(make_colmap_name(given.name)).with_suffix(".jpg")
@@ -472,7 +475,7 @@ def write_upright(
     source: str,
     folder: Path,
     mask: Path | None = None,
-    has_inverted_mask: bool = False,
+    reading: MaskReading = MaskReading(),
 ) -> UprightCopy:
     """Write an upright copy of the photograph `root`/`source` to the same place in `folder`/images.
 
@@ -503,18 +506,22 @@ def write_upright(
         written = "JPEG" if kind == "JPEG" else "PNG"
         copy.save(target, format=written, quality=COPY_JPEG_QUALITY, subsampling=0)
 
-    hidden = read_hidden(path, mask, has_inverted_mask)
+    hidden = read_hidden(path, mask, reading)
     is_masked = hidden is not None and _write_mask(folder, name, hidden, copy.size)
     diagonal = math.hypot(*copy.size)
     return UprightCopy(name, source, *copy.size, focal and focal * diagonal, lens, is_masked)
 
 
 def read_hidden(
-    path: Path, mask: Path | None, has_inverted_mask: bool = False
+    path: Path, mask: Path | None, reading: MaskReading = MaskReading()
 ) -> Bool[np.ndarray, "h w"] | None:
-    """Read what a mask or the alpha of a photograph hides, upright; None if it has neither."""
+    """Read what a mask or the alpha of a photograph hides, upright; None if nothing does.
+
+    `mask` is the one that `find_given` found by the same `reading`.
+    """
     photograph = StoredPhotograph(path)
-    if mask is None and not photograph.has_alpha:
+    reads_alpha = reading.is_used and photograph.has_alpha
+    if mask is None and not reads_alpha:
         return None
     orientation = photograph.orientation
     size = photograph.upright_size
@@ -522,8 +529,8 @@ def read_hidden(
     hidden = np.zeros((size[1], size[0]), dtype=bool)
     if mask is not None:
         title = f"the photograph {quote_value(path)}"
-        hidden |= load_mask(mask, size, title, orientation, has_inverted_mask)
-    alpha = photograph.read_pixels()[1] if photograph.has_alpha else None
+        hidden |= load_mask(mask, size, title, orientation, reading.ignores_white)
+    alpha = photograph.read_pixels()[1] if reads_alpha else None
     if alpha is not None:
         hidden |= turn_upright(alpha < HALF_OPAQUE, orientation)
     return hidden

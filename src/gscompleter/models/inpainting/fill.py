@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Shaped
 from numpy import ndarray
 from torch import Tensor
 
@@ -73,7 +73,10 @@ def fill_windows(
 
 
 def place_windows(height: int, width: int) -> Iterator[tuple[slice, slice]]:
-    """Cover an image by windows that overlap by at least half, in equal distances."""
+    """Cover an image by windows that overlap by at least half, in equal distances.
+
+    Where the image is smaller than a window, the slices reach beyond it, and are cut by indexing.
+    """
 
     def place(length: int) -> list[slice]:
         # Steps of half a window at most; rounded up, as -(-a // b) does.
@@ -95,8 +98,13 @@ def match_tone(
     return filled + fit_membrane(observed - filled, ring.float())
 
 
-def run_inpainting_network(network: OnnxNetwork, image: ndarray, mask: ndarray) -> ndarray:
-    """Run a network on an image and a mask; raise InputError if its answer is of another size."""
+def run_inpainting_network(
+    network: OnnxNetwork, image: Shaped[ndarray, "1 3 h w"], mask: Shaped[ndarray, "1 1 h w"]
+) -> Shaped[ndarray, "1 3 h w"]:
+    """Run a network on an image and a mask; raise InputError if its answer is of another size.
+
+    Types, and the ranges of colours and masks, are those of the network.
+    """
     (result,) = network(image=image, mask=mask)
     if result.shape != image.shape:
         raise InputError(

@@ -128,9 +128,9 @@ def _scale_columns(a, scales, i):
 
 @njit(fastmath={"contract"}, error_model="numpy")
 def _compute_tangent_limits(pinhole):
-    """Compute the range of x/z and of y/z at which the Jacobian is evaluated.
+    """Compute the smallest and largest x/z, and y/z, at which the Jacobian is evaluated.
 
-    It is that of the image without its padding.
+    They are those of the image without its padding, and `TANGENT_MARGIN` around it.
     """
     fx, fy, cx, cy = pinhole.intrinsics
     left, top = pinhole.padding
@@ -273,7 +273,8 @@ def project_splats(begin, end, gaussians, pinhole, splats, boxes, factors):
     root_half = np.float32(math.sqrt(0.5))
     for i in range(begin, end):
         boxes[i, 0] = boxes[i, 1] = boxes[i, 2] = boxes[i, 3] = 0
-        # Conditions are written so that NaN fails them. What is hidden reads nothing else.
+        # Conditions are written so that NaN fails them. The cheapest one comes first: of Gaussians
+        # that are too transparent to be drawn, nothing else is read.
         if not opacities[i] >= MIN_ALPHA:
             continue
         x, y, z = _apply_matrix(

@@ -7,6 +7,7 @@ of relative depth, or an inverted depth is none, and cannot be used.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -27,6 +28,7 @@ MIN_SAMPLES = 24
 """Fewest compared depths from which a factor is estimated."""
 MIN_OWN_SAMPLES = 12
 """Fewest compared depths from which a single photograph is judged."""
+# Ratios are compared by their natural logarithms: those of r and 1 / r are equally far from 0.
 RATIO_WINDOW = np.log(1.1)
 """Half the width of the window, in logarithms, that is moved to where most ratios lie."""
 AGREEMENT = np.log(1.25)
@@ -38,6 +40,9 @@ MIN_AGREEMENT = 0.5
 same share tells that it has another one, as relative depth has in each."""
 MIN_CORRELATION = -0.3
 """Smallest rank correlation of given and measured depths. Inverted depth comes near -1."""
+CORRELATION_SIGMAS = 3.0
+"""Standard deviations of the rank correlation of unrelated depths, such as those of a flat wall,
+beyond which a smaller one is no chance."""
 POSE_NOISE = np.log(1.1)
 """Largest logarithm that counts as no factor: errors of poses scale all depths of a pair."""
 
@@ -114,7 +119,8 @@ def compare_with_matches(
     neighbours = find_neighbours(images)
     parts = []
     for i, j in neighbours.pairs:
-        # Each match gives a depth in either photograph of the pair.
+        # Each match gives a depth in either photograph of the pair. A pixel (x, y) lies in column
+        # floor(x) and row floor(y); stereo images have the size of their photographs.
         in_i, in_j = neighbours.matches[i, j]
         for a, b, in_a, in_b in ((i, j, in_i, in_j), (j, i, in_j, in_i)):
             if len(in_a) == 0:
@@ -140,16 +146,18 @@ def fit_depth_factor(samples: DepthSamples) -> DepthFactor | None:
     ratios = np.log(samples.measured) - np.log(samples.given)
     log_factor = find_densest(ratios)
 
-    # A factor within the noise of the poses, or of the ratios themselves, counts as 1.
+    # A factor within the noise of the poses, or of the ratios themselves, counts as 1, unless the
+    # samples do not agree with that.
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(ratios - log_factor)))
-    if abs(log_factor) <= max(POSE_NOISE, sigma):
+    is_within_noise = abs(log_factor) <= max(POSE_NOISE, sigma)
+    if is_within_noise and compute_agreement(ratios, 0.0) >= MIN_AGREEMENT:
         log_factor = 0.0
 
     agreement = compute_agreement(ratios, log_factor)
-    is_consistent = agreement >= MIN_AGREEMENT and correlate_ranks(samples) >= MIN_CORRELATION
+    is_consistent = agreement >= MIN_AGREEMENT and not is_inverted(samples)
     for number in np.flatnonzero(np.bincount(samples.photograph) >= MIN_OWN_SAMPLES).tolist():
-        is_consistent &= not contradicts_factor(samples.select(number), log_factor)
-    return DepthFactor(float(np.exp(log_factor)), agreement, bool(is_consistent))
+        is_consistent = is_consistent and not contradicts_factor(samples.select(number), log_factor)
+    return DepthFactor(float(np.exp(log_factor)), agreement, is_consistent)
 
 
 def find_densest(ratios: Float[np.ndarray, "n"]) -> float:
@@ -180,7 +188,14 @@ def contradicts_factor(samples: DepthSamples, log_factor: float) -> bool:
     if compute_agreement(ratios, log_factor) >= MIN_AGREEMENT:
         return False
     in_core = np.abs(ratios - find_densest(ratios)) <= RATIO_WINDOW
-    return bool(in_core.mean() >= MIN_AGREEMENT) or correlate_ranks(samples) < MIN_CORRELATION
+    return bool(in_core.mean() >= MIN_AGREEMENT) or is_inverted(samples)
+
+
+def is_inverted(samples: DepthSamples) -> bool:
+    """Return True if given depths fall where measured ones rise, and not by chance."""
+    # The rank correlation of n unrelated pairs has the variance 1 / (n - 1).
+    chance = CORRELATION_SIGMAS / math.sqrt(len(samples) - 1)
+    return correlate_ranks(samples) < min(MIN_CORRELATION, -chance)
 
 
 def correlate_ranks(samples: DepthSamples) -> float:

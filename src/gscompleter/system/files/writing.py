@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import os
-import re
 import stat
 from collections.abc import Container, Iterator
 from contextlib import contextmanager, suppress
@@ -32,9 +31,9 @@ def replace_file(path: Path | str, keep_existing: bool = False) -> Iterator[Bina
     """
     # The target of a symbolic link is replaced, not the link.
     target = Path(os.path.realpath(path))
-    temporary = target.with_name(make_unfinished_name(target.name))
     with convert_write_errors(path):
         refuse_special_file(target)
+        temporary = target.with_name(make_unfinished_name(target.name))
         try:
             with temporary.open("xb") as file, give_signs(temporary):
                 # Before anything is written: a private file has no moment at which others read it.
@@ -93,15 +92,6 @@ def keep_access_list(old: Path, new: Path) -> None:
             os.removexattr(new, ACCESS_LIST)
 
 
-def encode_text(text: str) -> bytes:
-    """Encode a text for a page or a table as UTF-8.
-
-    Names of files may hold bytes that are no UTF-8; each becomes the sign for an unknown character.
-    """
-    # Python reads a byte that is no UTF-8 as a lone surrogate, which UTF-8 cannot write.
-    return re.sub("[\ud800-\udfff]", "\N{REPLACEMENT CHARACTER}", text).encode()
-
-
 def refuse_special_file(path: Path) -> None:
     """Raise an OSError if there is something other than a regular file at the path."""
     if os.path.isdir(path):
@@ -112,7 +102,10 @@ def refuse_special_file(path: Path) -> None:
 
 @contextmanager
 def convert_write_errors(path: Path | str, numbers: Container[int] | None = None) -> Iterator[None]:
-    """Convert errors of the operating system, or those of the numbers, to OutputError."""
+    """Convert errors of the operating system in the block to OutputError: `path` is not written.
+
+    With `numbers`, those of other error numbers (`errno`) are left as they are.
+    """
     try:
         yield
     except OSError as error:
