@@ -87,6 +87,7 @@ def test_out_holds_all_that_the_contract_names(completed):
         "report.json",
         "summary.json",
         "targets.json",
+        "trainer",
     }
     names = ("before", "after", "reference", "hole_mask", "gaps", "truth")
     images = {p.name for p in (completed / "images").iterdir()}

@@ -13,10 +13,11 @@
 
 from __future__ import annotations
 
+import json
 import math
 import os
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -57,6 +58,8 @@ from gscompleter.system.files.reading import (
     read_json,
     read_zip_entry,
 )
+from gscompleter.system.files.writing import replace_file
+from gscompleter.types import Camera
 
 INRIA_CAMERAS_FILE = "cameras.json"
 CAMERAS_ADVICE = "export the cameras again"
@@ -153,6 +156,31 @@ def read_camera_list(path: Path) -> list[Frame]:
         f"{quote_value(path)} lists no cameras; a list of cameras is needed, {CAMERAS_ADVICE}.",
     )
     return [_parse_inria_camera(entry, number, path) for number, entry in enumerate(content)]
+
+
+def write_camera_list(path: Path, cameras: Mapping[str, Camera]) -> None:
+    """Write cameras by the names of their photographs, as trainers do beside a splat.
+
+    The format has no principal point: it is the image centre.
+    """
+    entries = []
+    for number, (name, camera) in enumerate(cameras.items()):
+        (fx, _, _), (_, fy, _), _ = camera.K.double().tolist()
+        c2w = camera.c2w.detach().cpu().double()
+        entries.append(
+            {
+                "id": number,
+                "img_name": name,
+                "width": camera.width,
+                "height": camera.height,
+                "position": c2w[:3, 3].tolist(),
+                "rotation": c2w[:3, :3].tolist(),
+                "fx": fx,
+                "fy": fy,
+            }
+        )
+    with replace_file(path) as file:
+        file.write((json.dumps(entries) + "\n").encode())
 
 
 def _parse_inria_camera(entry: Any, number: int, path: Path) -> Frame:

@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+
+import numpy as np
 
 from command import run
 from gscompleter import save_ply
 from gscompleter.apps.inputs.captures import find_cameras_beside
-from gscompleter.splats.alignment.trainer_files import find_trainer_files, keep_trainer_files
-from scenes import random_gaussians
+from gscompleter.data.camera_files import read_cameras
+from gscompleter.splats.alignment.trainer_files import (
+    find_trainer_files,
+    keep_trainer_files,
+    write_trainer_cameras,
+)
+from scenes import camera_at, random_gaussians
 
 LIST = '[{"img_name": "a"}]'
 
@@ -81,3 +89,28 @@ def test_a_command_keeps_them_and_replaces_them_with_its_results(tmp_path, monke
     (tmp_path / "given" / "cameras.json").unlink()
     assert run(monkeypatch, *words, "--overwrite") == 0
     assert not kept.exists()
+
+
+def test_cameras_are_written_as_they_are_read(tmp_path):
+    cameras = {"a/1.jpg": camera_at(x=0.5, yaw=20), "b/1.jpg": camera_at(y=-0.25, size=64)}
+    write_trainer_cameras(tmp_path, cameras)
+    frames = read_cameras(tmp_path / "trainer" / "cameras.json")
+    assert [frame.name for frame in frames] == list(cameras)
+    for frame, camera in zip(frames, cameras.values(), strict=True):
+        np.testing.assert_allclose(frame.c2w, camera.c2w.numpy(), atol=1e-6)
+        assert frame.intrinsics.size == (camera.width, camera.height)
+        assert frame.intrinsics.focal == (camera.K[0, 0].item(), camera.K[1, 1].item())
+
+
+def test_a_scene_of_photographs_is_completed_further_without_them(
+    completed_room, tmp_path, monkeypatch, capsys
+):
+    summary = json.loads((completed_room / "summary.json").read_text())
+    splat = completed_room / "completed.ply"
+    words = ("complete", "--scene", splat, "--auto", 1, "--dry-run", "--out", tmp_path / "plan")
+    assert run(monkeypatch, *words) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert f"at {len(summary['context'])} cameras of " in said
+    # Its photographs are found to be where they were.
+    listed = json.loads((completed_room / "trainer" / "cameras.json").read_text())
+    assert [entry["img_name"] for entry in listed] == [row["file"] for row in summary["context"]]

@@ -9,6 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import torch
 from rich.console import Console
 
 from gscompleter.apps.command_line.exit_codes import DONE, ERROR
@@ -55,6 +56,7 @@ from gscompleter.editing.removal import restore_surroundings
 from gscompleter.evaluation.metrics.coverage import render_pairs, sample_held_out_cameras
 from gscompleter.numerics.kernels.parallel import run_in_background
 from gscompleter.splats.alignment.similarity import transform_camera_exactly
+from gscompleter.splats.alignment.trainer_files import write_trainer_cameras
 from gscompleter.splats.edits import EditDraft
 from gscompleter.state import Completion
 from gscompleter.system.console import make_console
@@ -320,8 +322,30 @@ def write_done(
             edit=EditDraft(command or ready.command, describe_edit(ready, completion)),
         )
     write_chosen_cameras(folder, ready.opened, ready.task)
+    # A scene that Ψ made has its photographs as the splat of a trainer has its own.
+    if task.scene is None or completion.is_remade:
+        write_trainer_cameras(folder, list_sources(ready, completion))
     write_completion_page(folder)
     return summary
+
+
+def list_sources(ready: Prepared, completion: Completion) -> dict[str, Camera]:
+    """List the cameras of the photographs that a scene was reconstructed from, by their names.
+
+    They are in the frame of the scene's file, and in the size of the photographs: a later command
+    takes the size of the list for that which the scene is sharp at.
+    """
+    photographs = ready.opened.photographs
+    origin = torch.from_numpy(ready.task.splat_origin)
+    cameras = {}
+    for view in completion.views:
+        if view.frame is None:
+            continue
+        c2w = view.camera.c2w.detach().cpu().double()
+        c2w[:3, 3] += origin
+        own = photographs.camera(view.frame)
+        cameras[photographs.frame(view.frame).file_name] = replace(own, c2w=c2w, K=own.K.double())
+    return cameras
 
 
 def describe_edit(ready: Prepared, completion: Completion) -> dict[str, Any]:

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from pathlib import Path
 
-from gscompleter.data.camera_files import INRIA_CAMERAS_FILE
+from gscompleter.data.camera_files import INRIA_CAMERAS_FILE, write_camera_list
 from gscompleter.data.transforms import DATAPARSER_FILE
 from gscompleter.splats.alignment.trainer_frames import (
     TRAINER_FOLDER,
@@ -25,6 +25,7 @@ from gscompleter.splats.alignment.training_size import (
     INRIA_FILE,
     list_settings_folders,
 )
+from gscompleter.types import Camera
 
 KEPT_NAMES = (INRIA_CAMERAS_FILE, DATAPARSER_FILE, INRIA_FILE, GSPLAT_FILE)
 TRAINER_FILES = tuple(f"{TRAINER_FOLDER}/{name}" for name in KEPT_NAMES)
@@ -58,3 +59,12 @@ def find_trainer_files(splat: Path) -> Iterator[tuple[Path, str]]:
         files = [place / name for place in among if os.path.isfile(place / name)]
         for file in files[:1]:
             yield file, name
+
+
+def write_trainer_cameras(folder: Path, cameras: Mapping[str, Camera]) -> None:
+    """Write the cameras that a scene was reconstructed from to the folder of a result.
+
+    `cameras`, by the names of their photographs, are in the frame of the scene's file.
+    """
+    (folder / TRAINER_FOLDER).mkdir(exist_ok=True)
+    write_camera_list(folder / TRAINER_FOLDER / INRIA_CAMERAS_FILE, cameras)
