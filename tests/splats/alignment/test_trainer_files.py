@@ -40,6 +40,8 @@ def test_of_several_lists_the_one_with_the_name_of_the_splat_goes_with_it(tmp_pa
     assert kept.read_text() == own.read_text()
     # The result has another name, and finds it.
     assert find_cameras_beside(tmp_path / "out" / "completed.ply") == kept
+    # Another splat beside it may be in another frame.
+    assert find_cameras_beside(tmp_path / "out" / "moved.ply") is None
     # Whatever lies beside the result comes first.
     near = write(tmp_path / "out" / "cameras.json", LIST)
     assert find_cameras_beside(tmp_path / "out" / "completed.ply") == near

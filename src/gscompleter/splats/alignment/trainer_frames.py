@@ -29,6 +29,7 @@ from gscompleter.splats.alignment.similarity import (
     make_similarity,
     transform_pose,
 )
+from gscompleter.system.files.result_names import COMPLETED_FILES, CONTEXT_FILE
 from gscompleter.types import Gaussians
 
 CAMERA_LIST_PREFIX = "cameras"
@@ -72,7 +73,9 @@ def list_model_folders(splat: Path) -> list[Path]:
     """List the folders of the model that a splat belongs to, the nearest to the splat first."""
     near = list_homes_of(splat)
     model = [home.parent.parent for home in near if home.name.startswith(ITERATION_PREFIX)]
-    kept = [home / TRAINER_FOLDER for home in near]
+    # What `convert` writes there may be moved, and is in another frame.
+    is_result = splat.name in (*COMPLETED_FILES, CONTEXT_FILE)
+    kept = [home / TRAINER_FOLDER for home in near if is_result]
     return [*near, *model, *kept]
 
 
