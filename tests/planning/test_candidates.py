@@ -14,7 +14,11 @@ from gscompleter.numerics.geometry import (
     select_spread_cameras,
     shrink_camera,
 )
-from gscompleter.planning.candidates import make_moves, propose_candidates
+from gscompleter.planning.candidates import (
+    find_ground_height,
+    make_moves,
+    propose_candidates,
+)
 from gscompleter.types import Render
 from scenes import Room, camera_at, cast
 
@@ -64,11 +68,34 @@ def test_a_candidate_behind_a_surface_is_none():
     """The camera is one step in front of the wall at z = 5, which a second one sees from afar."""
     cameras = [camera_at(-2.0, z=4.2), camera_at(-2.0, z=1.0)]
     far = NextBestViewConfig(max_step=1.0)
-    found = propose_candidates(cameras, [seen_by(c) for c in cameras], 0.79, far)
+    found = propose_candidates(cameras, [seen_by(c) for c in cameras], 0.74, far)
     centers = torch.stack([c.camera.center for c in found])
     assert (centers[:, 2] < 4.9).all()
     assert len(found) < 28
     assert sum(c.base == 1 for c in found) == 14
+
+
+def test_no_camera_moves_near_to_the_ground_or_below_it():
+    """The floor is 1.5 below the cameras, and what is right below them is in no photograph."""
+    cameras = [camera_at(-0.3), camera_at(0.3)]
+    renders = [seen_by(camera) for camera in cameras]
+    far = NextBestViewConfig(max_step=1.0)
+    for step, is_kept in ((0.7, True), (0.8, False), (2.0, False)):
+        centers = [c.camera.center for c in propose_candidates(cameras, renders, step, far)]
+        assert (max(center[1].item() for center in centers) > 0.6) is is_kept
+    # A wall that fills the images tells of no ground.
+    wall = Room((((-30.0, -30.0, -1.0), (30.0, 30.0, 5.0)),))
+    renders = [seen_by(camera, wall) for camera in cameras]
+    assert find_ground_height(cameras[0], renders[0], UP) is None
+    centers = [c.camera.center for c in propose_candidates(cameras, renders, 2.0, far)]
+    assert max(center[1].item() for center in centers) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_the_height_of_the_ground_is_in_scene_units(unit):
+    camera = camera_at(unit=unit)
+    height = find_ground_height(camera, seen_by(camera, Room(unit=unit)), UP)
+    assert height == pytest.approx(-1.5 * unit, rel=0.02)
 
 
 def test_a_step_is_as_long_as_cameras_stand_apart_and_short_of_the_scene():

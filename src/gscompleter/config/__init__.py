@@ -249,7 +249,8 @@ class NextBestViewConfig(Settings):
     border_radius: Share = 0.25
     """Largest distance of a counted hole pixel to observed pixels, relative to that side."""
     clearance: Share = 0.5
-    """Depth below which a surface is too close, relative to the nearest 5 % of a photograph."""
+    """Depth below which a surface is too close, relative to the nearest 5 % of a photograph, and
+    height above the ground below which a candidate is too low, relative to that of a photograph."""
     max_close: Share = 0.1
     """Largest share of the image that surfaces that are too close may fill."""
     min_gain: Share = 0.01

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
+from torch.nn.functional import normalize
 
 from gscompleter.config import NextBestViewConfig
 from gscompleter.numerics.geometry import (
@@ -24,6 +25,7 @@ from gscompleter.numerics.geometry import (
     project,
     resize_camera,
     slerp_rotation,
+    unproject,
 )
 from gscompleter.types import Camera, Render
 
@@ -35,6 +37,13 @@ TURNS_UP_AND_DOWN = (8, 9)
 """Moves of `make_moves` that stand still and look at the floor or the ceiling."""
 MIN_SHOWN_SCENE = 0.05
 """Fraction of its image that must show the scene for a camera to have a known depth."""
+
+MIN_LEVEL = 0.9
+"""Least cosine of the angle between a level surface and the upward direction: 25 degrees."""
+MIN_GROUND = 0.02
+"""Least share of an image with level surfaces below the camera that tells where the ground is."""
+LOWEST = 0.05
+"""Share of these surfaces that may lie deeper than the ground, as shards do."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +68,7 @@ def propose_candidates(
     config: NextBestViewConfig = NextBestViewConfig(),
     stays_beside: bool = False,
 ) -> list[Candidate]:
-    """Propose the moves of each base camera that end in free space.
+    """Propose the moves of each base camera that end in free space, above the ground.
 
     `renders` show the scene at `bases`, at a small size. `step` is the longest move in scene units,
     0 if unknown. With `stays_beside`, cameras move aside or halfway to the most similar base only.
@@ -95,10 +104,19 @@ def propose_candidates(
         resize_camera(base, *render.alpha.T.shape)
         for base, render in zip(bases, renders, strict=True)
     ]
+    # Photographs see no ground below themselves, so that it is no surface before a move down.
+    grounds = [
+        find_ground_height(camera, render, up)
+        for camera, render in zip(small, renders, strict=True)
+    ]
+    lowest = [
+        -torch.inf if ground is None else (1 - config.clearance) * ground for ground in grounds
+    ]
     return [
         candidate
         for candidate in candidates
         if is_in_free_space(candidate.camera.center, small, renders)
+        and (candidate.camera.center - bases[candidate.base].center) @ up >= lowest[candidate.base]
     ]
 
 
@@ -181,6 +199,27 @@ def is_in_free_space(
             return True
         is_hidden = True
     return not is_hidden
+
+
+def find_ground_height(camera: Camera, render: Render, up: Float[Tensor, "3"]) -> float | None:
+    """Find the height of the ground that a camera sees, relative to the camera, in scene units.
+
+    It is negative, and that of the lowest level surfaces below the camera. `up` is a unit vector.
+    Returns None if the image shows too little of any.
+    """
+    seen = render.depth_map()
+    points = unproject(seen.depth, camera)
+    corner = points[:-1, :-1]
+    normals = normalize(
+        torch.linalg.cross(points[:-1, 1:] - corner, points[1:, :-1] - corner), dim=-1
+    )
+    heights = (corner - camera.center) @ up
+    is_level = (normals @ up).abs() >= MIN_LEVEL
+    has_depth = seen.valid[:-1, :-1] & seen.valid[:-1, 1:] & seen.valid[1:, :-1]
+    is_ground = is_level & has_depth & (heights < 0)
+    if is_ground.float().mean().item() < MIN_GROUND:
+        return None
+    return heights[is_ground].quantile(LOWEST).item()
 
 
 def is_close(render: Render, nearest: float, config: NextBestViewConfig) -> bool:
