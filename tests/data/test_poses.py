@@ -172,6 +172,20 @@ def test_masks_of_what_to_ignore_may_lie_beside_photographs_without_cameras(tmp_
     assert [path.name for path in opened.photographs.list_masks()] == [f"{n}.png" for n in names]
 
 
+def test_masks_of_what_to_ignore_may_lie_below_those_of_what_is_removed(tmp_path, monkeypatch):
+    given, out = blank(tmp_path / "photos", 4), tmp_path / "out"
+    ignored = given / "masks"
+    ignored.mkdir()
+    mask = Image.new("L", (64, 48))
+    mask.putpixel((2, 1), 255)
+    for number in range(4):
+        mask.save(given / f"{number}_mask.png")
+        mask.save(ignored / f"{number}.png")
+    stand_in(monkeypatch, tmp_path, model_script([f"{number}.png" for number in range(4)]))
+    request = SceneRequest(given, masks=MaskReading(folder=ignored), removal_masks=given)
+    assert find_poses(given, out, reading=request.search_masks).masked == 4
+
+
 def test_photographs_are_no_masks_of_what_to_ignore(tmp_path):
     """Their own folder without any mask holds what the search takes for photographs."""
     given = blank(tmp_path / "photos", 4)

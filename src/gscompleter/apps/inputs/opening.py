@@ -63,7 +63,7 @@ def open_scene(
     check_planes(request.near, request.far)
     check_resolution(request.resolution)
     if request.format is None and find_format(folder) is None and has_photographs(folder):
-        # All that can be refused at once, because the search takes minutes.
+        # The search takes minutes: whatever would be refused after it is refused now.
         check_before_search(request, search, console)
         check()
         return find_cameras(request, search, console)
@@ -201,7 +201,8 @@ def refuse_masks_among_photographs(
 def choose_working_size(opened: Opened, splat: Path, console: Console) -> Opened:
     """Choose the working size for a splat: that of its training, if smaller than the default one.
 
-    A larger one is only reported: details beyond the default size cost much time, and no harm is
+    It is for scenes whose user named no size, and returns them with the one that is chosen; if the
+    size of the training cannot be told, as they were. A larger one is only reported: details beyond the default size cost much time, and no harm is
     done where a splat is rendered smaller than it was trained.
     """
     photographs = opened.photographs
@@ -224,7 +225,7 @@ def choose_working_size(opened: Opened, splat: Path, console: Console) -> Opened
 
 def describe_cameras_above(folder: Path) -> list[str]:
     """Say that the folder above one of photographs has their cameras, which are not used."""
-    # The working folder is named as `.`, which is no name.
+    # Its own name has to be known, which `.` for the working folder does not tell.
     whole = Path(os.path.abspath(folder))
     if whole.name.casefold() not in FOLDERS:
         return []

@@ -168,7 +168,8 @@ def choose_denoising(pipeline: Any, steps: int | None) -> dict[str, Any]:
     # of 1 would turn the guidance off.
     if getattr(pipeline.config, "is_distilled", False):
         chosen["guidance_scale"] = 1.0
-    # Z-Image adds the scaled difference to the guided answer, so that only a scale of 0 is none.
+    # Z-Image adds to the answer for the prompt its difference from the unguided one, times the
+    # scale, so that only a scale of 0 is no guidance.
     if type(pipeline).__name__ in Z_IMAGE and pipeline.scheduler.config.get("shift") == TURBO_SHIFT:
         chosen["guidance_scale"] = 0.0
     # A scale of true guidance has no effect without a negative prompt. By default it is above 1 for
