@@ -201,9 +201,9 @@ def refuse_masks_among_photographs(
 def choose_working_size(opened: Opened, splat: Path, console: Console) -> Opened:
     """Choose the working size for a splat: that of its training, if smaller than the default one.
 
-    It is for scenes whose user named no size, and returns them with the one that is chosen; if the
-    size of the training cannot be told, as they were. A larger one is only reported: details beyond the default size cost much time, and no harm is
-    done where a splat is rendered smaller than it was trained.
+    It is for scenes whose user named no size. Where the size of the training cannot be told, the
+    scene is returned as it was. A larger one is only reported: details beyond the default size cost
+    much time, and no harm is done where a splat is rendered smaller than it was trained.
     """
     photographs = opened.photographs
     numbers = photographs.posed[:NUM_SIZE_PHOTOGRAPHS]
