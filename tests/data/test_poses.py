@@ -155,6 +155,46 @@ def test_masks_of_what_is_removed_that_lie_among_the_photographs_are_no_photogra
     assert told.value.argument == "mask"
 
 
+def test_masks_of_what_to_ignore_may_lie_beside_photographs_without_cameras(tmp_path, monkeypatch):
+    """The search takes them for no photographs, so that nothing has to be moved."""
+    given = blank(tmp_path / "photos", 4)
+    mask = Image.new("L", (64, 48))
+    mask.putpixel((2, 1), 255)
+    for number in range(4):
+        mask.save(given / f"{number}_mask.png")
+    names = [f"{number}.png" for number in range(4)]
+    stand_in(monkeypatch, tmp_path, model_script(names))
+    request = SceneRequest(given, masks=MaskReading(folder=given))
+    # What COLMAP would have found is put where the search keeps it.
+    find_poses(given, tmp_path / "out" / "colmap", reading=request.search_masks)
+    write_colmap_text(tmp_path / "out" / "colmap" / "sparse" / "0", names)
+    opened = open_scene(request, PosesRequest(tmp_path / "out"), Console(quiet=True))
+    assert [path.name for path in opened.photographs.list_masks()] == [f"{n}.png" for n in names]
+
+
+def test_masks_of_what_to_ignore_may_lie_below_those_of_what_is_removed(tmp_path, monkeypatch):
+    given, out = blank(tmp_path / "photos", 4), tmp_path / "out"
+    ignored = given / "masks"
+    ignored.mkdir()
+    mask = Image.new("L", (64, 48))
+    mask.putpixel((2, 1), 255)
+    for number in range(4):
+        mask.save(given / f"{number}_mask.png")
+        mask.save(ignored / f"{number}.png")
+    stand_in(monkeypatch, tmp_path, model_script([f"{number}.png" for number in range(4)]))
+    request = SceneRequest(given, masks=MaskReading(folder=ignored), removal_masks=given)
+    assert find_poses(given, out, reading=request.search_masks).masked == 4
+
+
+def test_photographs_are_no_masks_of_what_to_ignore(tmp_path):
+    """Their own folder without any mask holds what the search takes for photographs."""
+    given = blank(tmp_path / "photos", 4)
+    request = SceneRequest(given, masks=MaskReading(folder=given))
+    with pytest.raises(InputError, match="photos lies among the photographs") as told:
+        open_scene(request, PosesRequest(tmp_path / "out"), Console(quiet=True))
+    assert told.value.argument == "ignore"
+
+
 def test_masks_of_what_is_removed_may_lie_beside_their_photographs(tmp_path, monkeypatch):
     """The copies for COLMAP are called as the photographs are, which are no masks of them."""
     given, out = blank(tmp_path / "photos", 4), tmp_path / "out"

@@ -6,6 +6,7 @@ generators with the protocol.
 
 from __future__ import annotations
 
+import inspect
 import json
 import shutil
 from dataclasses import replace
@@ -32,7 +33,9 @@ from gscompleter.models.diffusion.inpaint import (
     DiffusersInpaint,
     Editor,
     Painter,
+    choose_denoising,
     complete_warp,
+    get_size_rules,
     load_painter,
 )
 from gscompleter.models.diffusion.kontext import SIZES, find_nearest_size, resize_antialiased
@@ -336,6 +339,53 @@ def test_a_base_model_of_flux2_klein_is_guided_as_its_pipeline_does(tmp_path):
     answer(DiffusersInpaint(painter, steps=1), context.views[1], TARGET, context)
     assert painter.pipeline.guidance_scale == 4.0
     assert painter.pipeline.do_classifier_free_guidance
+
+
+@pytest.mark.parametrize(("shift", "scale"), [(3.0, 0.0), (6.0, 5.0)], ids=["turbo", "base"])
+def test_only_z_image_turbo_paints_without_guidance(shift, scale, tmp_path):
+    """Its distillation leaves no use for guidance, which the pipeline has by default."""
+    pipeline = tiny_diffusion.z_image()
+    pipeline.scheduler.register_to_config(shift=shift)
+    folder = tiny_diffusion.saved(pipeline, tmp_path)
+    painter = replace(load_painter(str(folder)), side=64)
+    context = known_room()
+    answer(DiffusersInpaint(painter, steps=1), context.views[1], TARGET, context)
+    assert painter.pipeline.guidance_scale == scale
+    assert painter.pipeline.do_classifier_free_guidance == (scale > 0)
+
+
+def make_without_parts(name: str):
+    """Make a pipeline of diffusers whose networks are missing."""
+    import diffusers
+
+    kind = getattr(diffusers, name)
+    required = [
+        parameter.name
+        for parameter in inspect.signature(kind).parameters.values()
+        if parameter.default is inspect.Parameter.empty
+    ]
+    return kind(**dict.fromkeys(required))
+
+
+def test_qwen_image_is_guided_as_its_authors_do_and_flux_by_its_network():
+    """Without a negative prompt the pipeline of Qwen-Image leaves its guidance out."""
+    qwen, flux = map(make_without_parts, ("QwenImageInpaintPipeline", "FluxInpaintPipeline"))
+    assert choose_denoising(qwen, 20) == {"num_inference_steps": 20, "negative_prompt": " "}
+    assert choose_denoising(flux, None) == {}
+
+
+@pytest.mark.parametrize(
+    "name", ["FluxFillPipeline", "FluxInpaintPipeline", "QwenImageInpaintPipeline"]
+)
+def test_a_transformer_paints_at_the_size_that_its_pipeline_records(name):
+    assert get_size_rules(make_without_parts(name)) == (1024, 16)
+
+
+def test_z_image_paints_at_its_own_size_though_its_pipeline_records_none(tmp_path):
+    painter = load_painter(str(tiny_diffusion.saved(tiny_diffusion.z_image(), tmp_path)))
+    assert not hasattr(painter.pipeline, "default_sample_size")
+    assert painter.side == 1024
+    assert painter.compute_size(300, 300) == (1024, 1024)
 
 
 def test_the_size_follows_the_pipeline_and_the_aspect(inpaint_folder):

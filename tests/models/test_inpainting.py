@@ -163,13 +163,30 @@ def test_large_holes_are_filled_from_what_is_known_inwards():
 
     def fill(part, missing):
         calls.append(missing.float().mean().item())
-        return torch.full_like(part, float(len(calls)))
+        return torch.full_like(part, len(calls) / 100)
 
     filled = fill_windows(image, hole, fill)
     assert (filled[~hole] == 0).all()
     assert (filled[hole] > 0).all()
     assert all(0 < share < 1 for share in calls)
     assert (filled[0, 200:, 0].diff() >= 0).all()
+
+
+def test_colours_out_of_range_do_not_reach_the_next_window():
+    """A network that overshoots is given what the image can show of it."""
+    image, hole = torch.full((512, 900, 3), 0.5), torch.zeros(512, 900, dtype=torch.bool)
+    hole[:, 300:700] = True
+    seen = []
+
+    def fill(part, missing):
+        seen.append(part.aminmax())
+        return torch.linspace(-3, 3, part.shape[0])[:, None, None].expand(part.shape)
+
+    filled = fill_windows(image, hole, fill)
+    assert len(seen) > 1
+    assert all(least >= 0 and most <= 1 for least, most in seen)
+    assert filled.aminmax() == (0, 1)
+    assert torch.equal(filled[~hole], image[~hole])
 
 
 def test_a_fill_takes_the_tone_of_what_is_beside_it():
@@ -192,9 +209,10 @@ def test_what_photographs_show_is_kept():
     assert ((image >= 0) & (image <= 1)).all()
 
 
-def test_an_image_that_is_not_finite_is_refused():
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+def test_an_image_that_is_not_finite_is_refused(value):
     context = known_room()
-    generator = InpaintingGenerator(lambda image, hole: image / 0)
+    generator = InpaintingGenerator(lambda image, hole: torch.full_like(image, value))
     with pytest.raises(InputError, match="no finite image"):
         generator(context.views[1], TARGET, context)
 

@@ -128,6 +128,27 @@ def test_a_corner_of_another_primitive_is_refused(tmp_path):
         load_geometry(path)
 
 
+def test_primitives_that_share_a_few_vertices_cannot_make_triangles_without_end(tmp_path):
+    """A bomb of 124 KB: 2,000 primitives whose 10,000 triangles are the same bytes."""
+    corners = np.eye(3, dtype="<f4").tobytes()
+    indices = bytes(range(3)) * 10_000
+    view = {"buffer": 0}
+    primitive = {"attributes": {"POSITION": 0}, "indices": 1}
+    table = {
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive] * 2_000}],
+        "bufferViews": [view | {"byteLength": 36}, view | {"byteOffset": 36, "byteLength": 30_000}],
+        "accessors": [
+            {"bufferView": 0, "componentType": 5126, "count": 3, "type": "VEC3"},
+            {"bufferView": 1, "componentType": 5121, "count": 30_000, "type": "SCALAR"},
+        ],
+    }
+    path = write_glb(tmp_path / "room.glb", table, corners + indices)
+    assert path.stat().st_size < 150_000
+    with pytest.raises(InputError, match="bytes claim to hold 4,230,000 triangles"):
+        load_geometry(path)
+
+
 @pytest.mark.parametrize("mode", [4, 5, 6])
 def test_a_primitive_of_one_vertex_has_no_triangle(tmp_path, mode):
     path = write_glb_mesh(tmp_path / "room.glb", mesh_of())

@@ -22,7 +22,7 @@ class MaskReading:
     """Folder of masks in place of those that lie beside photographs; white there is ignored."""
     left_out: Path | None = None
     """Folder of masks that mean something else, such as what to remove. It may lie where masks are
-    looked for."""
+    looked for, unless `folder` says where that is."""
 
     @property
     def ignores_white(self) -> bool:

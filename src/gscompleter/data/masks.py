@@ -79,7 +79,8 @@ def find_given(
         masks = [find_mask(path, name, listings) for path, name in zip(paths, names, strict=True)]
     else:
         masks = find_masks_in(reading.folder, names, paths)
-    if reading.left_out is not None:
+    # A folder that is named for masks counts, though it be below the one that is left out.
+    if reading.left_out is not None and reading.folder is None:
         masks = [None if mask and lies_in(mask, reading.left_out) else mask for mask in masks]
     return [
         GivenPhotograph(name, StoredPhotograph(path), path, mask)

@@ -88,7 +88,8 @@ NUM_COMPONENTS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 MAX_FILE_BYTES = 2**32 - 1
 """Largest size that the header of a .glb can state."""
 MAX_PRIMITIVES = 10_000
-"""Most primitives of a scene; nodes that share meshes could name any number of them."""
+"""Most primitives of a scene; nodes that share meshes could name any number of them, and primitives
+that share accessors any number of Gaussians, vertices and triangles (`check_count`)."""
 
 
 class GlbDocument(NamedTuple):
@@ -104,15 +105,13 @@ def read_glb(path: Path, leaves_out_band_4: bool = False) -> Gaussians:
     A .spz in it may have harmonics of degree 4, which are refused or read without the fourth band.
     """
     document = _parse_document(read_bytes(path))
-    # Nodes and primitives may share bytes, so that a small file can claim any number.
     placed = []
     count = 0
+    # All are counted before any is decoded.
     for primitive, place in _find_primitives(document):
         placed.append((primitive, place))
         count += int(_get_accessor(document, primitive, "POSITION")["count"])
         check_count(count, len(document.binary))
-        if len(placed) > MAX_PRIMITIVES:
-            raise DamagedError(f"it claims to hold more than {MAX_PRIMITIVES:,} primitives")
     if not placed:
         raise UnsupportedError(_describe_other_content(document.table))
     parts = [
@@ -171,19 +170,29 @@ def _find_primitives(
     Of others, such as a mesh beside them, the transform may be any. Gaussians can only follow a
     similarity: an UnsupportedError is raised if their nodes, taken together, are none.
     """
+    for primitive, place in _walk_primitives(document):
+        if EXTENSION in primitive.get("extensions", {}):
+            require_similarity(place, "node")
+            yield primitive, place
+
+
+def _walk_primitives(
+    document: GlbDocument,
+) -> Iterator[tuple[dict[str, Any], Float[Tensor, "4 4"]]]:
+    """Walk through the primitives of the scene, of any kind, each with its transform to the scene.
+
+    A primitive comes once for each node that has its mesh. Raises DamagedError if there are more
+    than `MAX_PRIMITIVES`.
+    """
+    count = 0
     for node, place in _walk_nodes(document):
-        for primitive in _list_primitives(document, node):
-            if EXTENSION in primitive.get("extensions", {}):
-                require_similarity(place, "node")
-                yield primitive, place
-
-
-def _list_primitives(document: GlbDocument, node: dict[str, Any]) -> list[dict[str, Any]]:
-    """List the primitives of a node's mesh; none if it has none."""
-    if "mesh" not in node:
-        return []
-    primitives: list[dict[str, Any]] = document.table["meshes"][node["mesh"]]["primitives"]
-    return primitives
+        if "mesh" not in node:
+            continue
+        for primitive in document.table["meshes"][node["mesh"]]["primitives"]:
+            count += 1
+            if count > MAX_PRIMITIVES:
+                raise DamagedError(f"it claims to hold more than {MAX_PRIMITIVES:,} primitives")
+            yield primitive, place
 
 
 def _walk_nodes(
@@ -239,27 +248,31 @@ def _read_vector(numbers: Any, length: int) -> Float[Tensor, "k"]:
 def read_glb_meshes(path: Path) -> tuple[Float[ndarray, "n 3"], Int[ndarray, "m 3"]]:
     """Read the vertices and triangles of a .glb that holds a mesh, or the points of one.
 
-    Coordinates are those of the file: they are not turned to the axes of a .ply.
+    Coordinates are those of the scene of the file: they are not turned to the axes of a .ply.
     """
     document = _parse_document(read_bytes(path))
-    vertices, faces = [np.empty((0, 3))], [np.empty((0, 3), np.int64)]
-    count = num_primitives = 0
-    for node, place in _walk_nodes(document):
-        for primitive in _list_primitives(document, node):
-            num_primitives += 1
-            if num_primitives > MAX_PRIMITIVES:
-                raise DamagedError(f"it claims to hold more than {MAX_PRIMITIVES:,} primitives")
-            if EXTENSION in primitive.get("extensions", {}):
-                raise UnsupportedError("holds Gaussians; name a mesh or points as geometry")
-            if primitive.get("extensions", {}).get("KHR_draco_mesh_compression"):
-                raise UnsupportedError("holds a mesh compressed by Draco; export it without that")
-            accessor = _get_accessor(document, primitive, "POSITION")
-            points = _read_accessor(document, accessor, "vertices")
-            linear, shift = place[:3, :3].numpy(), place[:3, 3].numpy()
-            vertices.append(points.astype(np.float64) @ linear.T + shift)
-            faces.append(count + _read_triangles(document, primitive, len(points)))
-            count += len(points)
-            check_count(count, len(document.binary), "vertices")
+    vertices = [np.empty((0, 3))]
+    faces = [np.empty((0, 3), np.int64)]
+    count = 0
+    num_triangles = 0
+    for primitive, place in _walk_primitives(document):
+        if EXTENSION in primitive.get("extensions", {}):
+            raise UnsupportedError("holds Gaussians; name a mesh or points as geometry")
+        if primitive.get("extensions", {}).get("KHR_draco_mesh_compression"):
+            raise UnsupportedError("holds a mesh compressed by Draco; export it without that")
+        accessor = _get_accessor(document, primitive, "POSITION")
+        points = _read_accessor(document, accessor, "vertices")
+        linear, shift = place[:3, :3].numpy(), place[:3, 3].numpy()
+        vertices.append(points.astype(np.float64) @ linear.T + shift)
+        # Corners are counted through the vertices of all primitives.
+        triangles = count + _read_triangles(document, primitive, len(points))
+        faces.append(triangles)
+        # Either may be shared where the other is not: primitives of few vertices may have as many
+        # triangles as they have indices.
+        count += len(points)
+        check_count(count, len(document.binary), "vertices")
+        num_triangles += len(triangles)
+        check_count(num_triangles, len(document.binary), "triangles")
     if count == 0:
         raise UnsupportedError("holds neither a mesh nor points")
     return np.concatenate(vertices), np.concatenate(faces)
@@ -286,9 +299,9 @@ def _read_triangles(
         return np.stack([order[:-2], order[1:-1], order[2:]], axis=1)
     if mode == TRIANGLE_FAN:
         # All share the first corner.
-        first = np.full(max(len(order) - 2, 0), order[:1])
+        first = np.repeat(order[:1], max(len(order) - 2, 0))
         return np.stack([first, order[1:-1], order[2:]], axis=1)
-    # Points; lines are drawn by nobody who measures a surface.
+    # Points and lines have no surface; their vertices count as points.
     return np.empty((0, 3), np.int64)
 
 

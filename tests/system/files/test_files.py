@@ -86,6 +86,18 @@ def test_a_folder_is_no_place_for_a_file(tmp_path):
 
 
 @pytest.mark.linux
+def test_links_that_lead_back_to_themselves_are_told_as_such(tmp_path):
+    (tmp_path / "a.ply").symlink_to("b.ply")
+    (tmp_path / "b.ply").symlink_to("a.ply")
+    with (
+        pytest.raises(InputError, match="is a loop of symbolic links"),
+        replace_file(tmp_path / "a.ply"),
+    ):
+        pass
+    assert sorted(os.listdir(tmp_path)) == ["a.ply", "b.ply"]
+
+
+@pytest.mark.linux
 def test_a_pipe_and_a_device_are_never_replaced(tmp_path):
     os.mkfifo(tmp_path / "pipe.ply")
     (tmp_path / "null.ply").symlink_to("/dev/null")

@@ -29,12 +29,7 @@ from gscompleter.data.masks import (
 )
 from gscompleter.data.photographs import Photographs, check_resolution
 from gscompleter.data.sfm import NUM_VIDEO_FRAMES
-from gscompleter.data.sfm.poses import (
-    find_poses,
-    has_photographs,
-    list_all_photographs,
-    list_given_masks,
-)
+from gscompleter.data.sfm.poses import find_poses, has_photographs, list_all_photographs
 from gscompleter.data.unused_files import list_unused
 from gscompleter.data.video import is_video
 from gscompleter.splats.alignment.training_size import find_training_size
@@ -68,7 +63,7 @@ def open_scene(
     check_planes(request.near, request.far)
     check_resolution(request.resolution)
     if request.format is None and find_format(folder) is None and has_photographs(folder):
-        # All that can be refused at once, because the search takes minutes.
+        # The search takes minutes: whatever would be refused after it is refused now.
         check_before_search(request, search, console)
         check()
         return find_cameras(request, search, console)
@@ -98,14 +93,11 @@ def check_before_search(request: SceneRequest, search: PosesRequest, console: Co
     refuse_scenes_below(folder)
     print_lines(console, *describe_cameras_above(folder))
     refuse_missing_photographs(folder, search.named, search.num_frames)
-    # Frames of a video have no names before they are taken.
+    # Masks of a video's frames, which have no names before they are taken, are checked after that.
     if request.removal_masks is not None and not is_video(folder):
         names = list_all_photographs(folder)
         files = [folder / name for name in names]
-        # No photograph is taken for a mask, so that masks among photographs are not found.
-        found = find_masks_in(request.removal_masks, names, files, "mask")
-        if not any(found) and holds_photographs(request.removal_masks, files):
-            raise make_among_photographs_error(request.removal_masks, "mask")
+        refuse_masks_among_photographs(request.removal_masks, names, files, "mask")
         check_removal_masks(request.removal_masks, names, files, request.removal_reading)
     if request.masks.folder is not None:
         print_lines(console, *check_ignoring_masks(request.masks.folder, folder))
@@ -124,7 +116,8 @@ def find_cameras(request: SceneRequest, search: PosesRequest, console: Console) 
     print_lines(console, *poses.notes)
 
     photographs = open_photographs(kept, None, request.near, request.far)
-    # The masks of the copies are black where something is hidden, and their masks were checked.
+    # The masks of the copies are black where something is hidden, however those of the originals
+    # are read. Whether they hide too much was checked on the originals, before the search.
     photographs = read_masks(photographs, request, MaskReading(may_be_large=True))
     print_lines(console, *photographs.notes)
     # What lies beside the user's photographs, not beside the copies.
@@ -160,7 +153,7 @@ def read_masks(
 def check_ignoring_masks(masks: Path, folder: Path) -> list[str]:
     """Refuse a folder of masks to ignore, unless it has masks of photographs in `folder`.
 
-    Returns a line on masks that are named as none.
+    Returns a line on masks that are named as no photograph, or none.
     """
     if is_video(folder):
         raise InputError(
@@ -170,33 +163,47 @@ def check_ignoring_masks(masks: Path, folder: Path) -> list[str]:
         )
     names = list_all_photographs(folder)
     files = [folder / name for name in names]
-    if holds_photographs(masks, files):
-        raise make_among_photographs_error(masks, "ignore")
-    found = list_given_masks(folder, names, MaskReading(folder=masks))
-    if not found:
+    refuse_masks_among_photographs(masks, names, files, "ignore")
+    found = find_masks_in(masks, names, files)
+    if not any(found):
         raise make_no_mask_error(masks, names)
     return describe_unnamed_masks(masks, found, files)
 
 
-def holds_photographs(masks: Path, photographs: Sequence[Path]) -> bool:
-    """Check whether images in a folder of masks are among the photographs that are found."""
-    return any(lies_in(photograph, masks) for photograph in photographs)
+def refuse_masks_among_photographs(
+    masks: Path, names: Sequence[str], files: Sequence[Path], option: str
+) -> None:
+    """Refuse a folder of masks that the search for cameras would take for photographs.
 
+    Such a folder lies among the photographs, and its masks are called as these are. The search
+    takes every image for a photograph but the mask beside one (`x_mask.png` beside `x.jpg`), and no
+    photograph is taken for a mask, so that no mask is found. Where one is found, the photographs in
+    the folder are what they seem: the masks lie beside them.
 
-def make_among_photographs_error(masks: Path, option: str) -> InputError:
-    """Make the error for masks that the search for cameras would take for photographs."""
-    return InputError(
-        f"{quote_value(masks)} lies among the photographs, and would be taken for some; move it "
-        "out of their folder.",
-        option,
-    )
+    Args:
+        masks: Folder of masks, as the user named it.
+        names: The photographs without cameras, relative to their folder.
+        files: Their files.
+        option: Option that names the masks, for the error.
+
+    Raises:
+        InputError: The folder holds photographs and no masks, or a mask may be of several.
+    """
+    holds_photographs = any(lies_in(file, masks) for file in files)
+    if holds_photographs and not any(find_masks_in(masks, names, files, option)):
+        raise InputError(
+            f"{quote_value(masks)} lies among the photographs, and would be taken for some; move "
+            "it out of their folder.",
+            option,
+        )
 
 
 def choose_working_size(opened: Opened, splat: Path, console: Console) -> Opened:
     """Choose the working size for a splat: that of its training, if smaller than the default one.
 
-    A larger one is only reported: details beyond the default size cost much time, and no harm is
-    done where a splat is rendered smaller than it was trained.
+    It is for scenes whose user named no size. Where the size of the training cannot be told, the
+    scene is returned as it was. A larger one is only reported: details beyond the default size cost
+    much time, and no harm is done where a splat is rendered smaller than it was trained.
     """
     photographs = opened.photographs
     numbers = photographs.posed[:NUM_SIZE_PHOTOGRAPHS]
@@ -218,7 +225,7 @@ def choose_working_size(opened: Opened, splat: Path, console: Console) -> Opened
 
 def describe_cameras_above(folder: Path) -> list[str]:
     """Say that the folder above one of photographs has their cameras, which are not used."""
-    # The working folder is named as `.`, which is no name.
+    # Its own name has to be known, which `.` for the working folder does not tell.
     whole = Path(os.path.abspath(folder))
     if whole.name.casefold() not in FOLDERS:
         return []

@@ -31,8 +31,20 @@ from gscompleter.numerics.image_ops import dilate
 from gscompleter.system.errors import InputError
 from gscompleter.system.files.image import convert_to_pixels
 
-DEFAULT_SIDE = 512
-"""Default side length of the square image, in pixels."""
+UNET_SIDE = 512
+"""Side in pixels of the square training images of a U-Net whose configuration tells none: that of
+Stable Diffusion 1. The published ones tell theirs (512 to 1024)."""
+TRANSFORMER_SIDE = 1024
+"""The same for transformers, of which only the pipelines of Z-Image record none: the default size
+of its text-to-image pipeline, which its authors use. For Stable Diffusion 3, Flux, FLUX.2 [klein],
+Chroma and Qwen-Image diffusers 0.42 records this size, too."""
+Z_IMAGE = ("ZImageInpaintPipeline", "ZImageControlNetInpaintPipeline")
+"""Pipelines of Z-Image and of Z-Image-Turbo, which was distilled to few steps without guidance."""
+TURBO_SHIFT = 3.0
+"""Shift of the noise levels in the published scheduler of Z-Image-Turbo. That of Z-Image is 6, by
+which the two are told apart: their pipelines and networks have the same classes."""
+NO_NEGATIVE_PROMPT = " "
+"""Negative prompt that asks for nothing, as the authors of Qwen-Image write it."""
 EDITORS = ("Flux2KleinPipeline",)
 """Pipelines of models that edit images by a prompt and were trained without masks."""
 PAINTED_OVER = (0.0, 1.0, 0.0)
@@ -46,16 +58,20 @@ INSTRUCTION = (
 
 @dataclass(frozen=True)
 class Painter:
-    """A loaded inpainting pipeline with its image sizes."""
+    """A loaded inpainting pipeline, with the rules for the sizes of its images."""
 
     pipeline: Any
     side: int
     """Side length of the square training images, in pixels."""
     multiple: int
-    """Divisor of the side lengths of all images, in pixels."""
+    """Number that divides the side lengths of all images, in pixels."""
 
     def compute_size(self, height: int, width: int) -> tuple[int, int]:
-        """Compute a size of about `side`² pixels with the aspect ratio of the image."""
+        """Compute a size (height, width) of about `side`² pixels with the image's aspect ratio.
+
+        It may be larger than the image, which is then enlarged: networks paint best at the number
+        of pixels that they were trained with.
+        """
         scale = self.side / (height * width) ** 0.5
         rows = max(1, round(scale * height / self.multiple))
         columns = max(1, round(scale * width / self.multiple))
@@ -72,10 +88,16 @@ class Painter:
     ) -> Float[Tensor, "h w 3"]:
         """Inpaint the hole of an image in [0, 1]; other pixels may change too.
 
-        A pipeline that takes a reference image sees one, the nearest photograph.
+        Args:
+            image: Warped photographs, continued into the hole.
+            hole: True where the image is painted.
+            reference: The nearest photograph, for pipelines that take a reference image.
+            prompt: Text that describes the image.
+            seed: Seed of the noise.
+            steps: Number of denoising steps, or None for the pipeline's default.
         """
         size = self.compute_size(*hole.shape)
-        # A small pixel that covers any part of the hole is painted.
+        # A pixel of the other size that covers any part of the hole is painted.
         mask = (resize_antialiased(hole[..., None].float(), size) > 0).float()
         wanted: dict[str, Any] = {
             "prompt": prompt,
@@ -114,7 +136,11 @@ class Editor(Painter):
         seed: int,
         steps: int | None,
     ) -> Float[Tensor, "h w 3"]:
-        """Edit the painted-over image, beside the nearest photograph; all pixels may change."""
+        """Edit an image whose hole is painted over; arguments and result as those of `Painter`.
+
+        The pipeline sees two images, which the prompt calls the first and the second: this one and
+        the nearest photograph.
+        """
         size = self.compute_size(*hole.shape)
         color = image.new_tensor(PAINTED_OVER)
         over = resize_antialiased(torch.where(hole[..., None], color, image), size)
@@ -132,12 +158,25 @@ class Editor(Painter):
 
 
 def choose_denoising(pipeline: Any, steps: int | None) -> dict[str, Any]:
-    """Choose the arguments of denoising that differ from the defaults of the pipeline."""
+    """Choose the arguments of denoising that differ from the defaults of the pipeline.
+
+    Models are guided as their authors do. The defaults of a pipeline are those of one model, and
+    others that it runs were distilled to few steps, in which guidance spoils the image.
+    """
     chosen: dict[str, Any] = {} if steps is None else {"num_inference_steps": steps}
-    # Distilled models use no guidance, and warn of a scale above 1. For others, such as the base
-    # models of FLUX.2 [klein], a scale of 1 would turn the guidance off.
+    # FLUX.2 [klein] warns of a scale above 1. For its base models, which are not distilled, a scale
+    # of 1 would turn the guidance off.
     if getattr(pipeline.config, "is_distilled", False):
         chosen["guidance_scale"] = 1.0
+    # Z-Image adds to the answer for the prompt its difference from the unguided one, times the
+    # scale, so that only a scale of 0 is no guidance.
+    if type(pipeline).__name__ in Z_IMAGE and pipeline.scheduler.config.get("shift") == TURBO_SHIFT:
+        chosen["guidance_scale"] = 0.0
+    # A scale of true guidance has no effect without a negative prompt. By default it is above 1 for
+    # Qwen-Image, and 1, which is none, for Flux, whose guidance is an input of its network.
+    known = inspect.signature(pipeline.__call__).parameters
+    if "true_cfg_scale" in known and known["true_cfg_scale"].default > 1:
+        chosen["negative_prompt"] = NO_NEGATIVE_PROMPT
     return chosen
 
 
@@ -249,14 +288,24 @@ def load_inpainting_pipeline(source: Source, dtype: torch.dtype) -> Any:
 
 
 def get_size_rules(pipeline: Any) -> tuple[int, int]:
-    """Return the side length of training images and the divisor of side lengths, in pixels."""
+    """Return the side length of training images and the divisor of side lengths, in pixels.
+
+    Sizes that pipelines and configurations record are in latent pixels.
+    """
+    # Pixels of the image along the side of a latent pixel.
     latent = int(getattr(pipeline, "vae_scale_factor", 8))
     unet = getattr(pipeline, "unet", None)
-    # A transformer joins 2 × 2 latent pixels to a token.
     if unet is None:
-        side = int(getattr(pipeline, "default_sample_size", DEFAULT_SIDE // latent))
-        return side * latent, 2 * latent
+        recorded = getattr(pipeline, "default_sample_size", None)
+        if recorded is None:
+            recorded = pipeline.transformer.config.get("sample_size")
+        side = TRANSFORMER_SIDE if recorded is None else int(recorded) * latent
+        # A transformer joins 2 × 2 latent pixels to a token.
+        return side, 2 * latent
+    recorded = unet.config.get("sample_size")
+    # One number, or height and width.
+    if isinstance(recorded, (list, tuple)):
+        recorded = max(recorded)
+    side = UNET_SIDE if recorded is None else int(recorded) * latent
     # A U-Net halves the latent image between its blocks.
-    side = unet.config.get("sample_size") or DEFAULT_SIDE // latent
-    side = max(side) if isinstance(side, (list, tuple)) else int(side)
-    return side * latent, latent * 2 ** (len(unet.config.block_out_channels) - 1)
+    return side, latent * 2 ** (len(unet.config.block_out_channels) - 1)

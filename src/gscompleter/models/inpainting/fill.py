@@ -21,8 +21,8 @@ WINDOW = 512
 """Side in pixels of the windows in which larger images are filled; networks are trained at it."""
 
 Fill = Callable[[Float[Tensor, "h w 3"], Bool[Tensor, "h w"]], Float[Tensor, "h w 3"]]
-"""Network: image in [0, 1] and hole, True where it is filled -> image, of the same size; pixels
-outside the hole may change, and colours may leave [0, 1]."""
+"""Network: image in [0, 1] and hole, True where it is filled -> image, of the same size. Of the
+answer, `fill_windows` takes only the hole, and limits its colours to [0, 1]."""
 
 
 @dataclass(frozen=True)
@@ -39,11 +39,6 @@ class InpaintingGenerator:
         # The rim of the hole is filled too: there, both colours are known and are compared.
         hole = dilate(~warped.known, BORDER_WIDTH)
         filled = fill_windows(warped.image, hole, self.fill)
-        if not filled.isfinite().all():
-            raise InputError(
-                "The generator painted no finite image; check that its weights are correct, or "
-                "choose another generator."
-            )
         # Outside the hole the photographs stay; on its rim the filling is fitted to them.
         toned = match_tone(filled, warped.image, warped.known & hole)
         image = torch.where(warped.known[..., None], warped.image, toned)
@@ -55,9 +50,14 @@ def fill_windows(
 ) -> Float[Tensor, "h w 3"]:
     """Fill a hole window by window, those with the smallest share of it first.
 
-    What a window filled is known to the next, so that large images are not reduced.
+    An image that is larger than the network's own size needs not be reduced: what was filled in one
+    window is known in the next, which continues it. All colours that the network sees, and those
+    that are returned, are in [0, 1].
+
+    Raises InputError if the network fills the hole with a number that is not finite.
     """
-    image = image.clone()
+    # A copy, which the windows change.
+    image = image.clamp(0, 1)
     unfilled = hole.clone()
     # Windows that know most of their surroundings first: they continue it inwards.
     waiting = sorted(place_windows(*hole.shape), key=lambda at: hole[at].float().mean().item())
@@ -66,8 +66,14 @@ def fill_windows(
         at = next((at for at in waiting if not unfilled[at].all()), waiting[0])
         waiting.remove(at)
         if unfilled[at].any():
-            filled = fill(image[at], unfilled[at])
-            image[at] = torch.where(unfilled[at][..., None], filled, image[at])
+            painted = fill(image[at], unfilled[at])[unfilled[at]]
+            # Before colours are limited, which would turn infinity into white.
+            if not painted.isfinite().all():
+                raise InputError(
+                    "The generator painted no finite image; check that its weights are correct, or "
+                    "choose another generator."
+                )
+            image[at][unfilled[at]] = painted.clamp(0, 1)
             unfilled[at] = False
     return image
 
@@ -92,7 +98,11 @@ def place_windows(height: int, width: int) -> Iterator[tuple[slice, slice]]:
 def match_tone(
     filled: Float[Tensor, "h w 3"], observed: Float[Tensor, "h w 3"], ring: Bool[Tensor, "h w"]
 ) -> Float[Tensor, "h w 3"]:
-    """Add a smooth difference of colours, so that `filled` continues `observed` in the ring."""
+    """Add a smooth difference of colours, so that `filled` continues `observed` in the ring.
+
+    The difference goes on from the ring over the whole image, as a membrane. Results may leave
+    [0, 1].
+    """
     if not ring.any():
         return filled
     return filled + fit_membrane(observed - filled, ring.float())

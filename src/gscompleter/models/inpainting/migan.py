@@ -23,7 +23,7 @@ class MIGAN:
         self, image: Float[Tensor, "h w 3"], hole: Bool[Tensor, "h w"]
     ) -> Float[Tensor, "h w 3"]:
         """Fill the hole of an image in [0, 1]."""
-        pixels = (255 * image.clamp(0, 1)).round().byte().permute(2, 0, 1)[None]
+        pixels = (255 * image).round().byte().permute(2, 0, 1)[None]
         known = 255 * (~hole).byte()[None, None]
         result = run_inpainting_network(
             self.network, image=pixels.contiguous().numpy(), mask=known.numpy()

@@ -307,8 +307,9 @@ def project_splats(begin, end, gaussians, pinhole, splats, boxes, factors):
             if not opacity >= MIN_ALPHA:
                 continue
 
-        # Alpha is opacity exp(-r² / 2) at r standard deviations; it reaches MIN_ALPHA at `sigmas`.
-        # The box of an ellipse is as wide as the deviations along x and y.
+        # Alpha is opacity exp(-r² / 2) at r standard deviations; it reaches MIN_ALPHA at `sigmas`,
+        # to which a margin for rounding is added, so that no pixel of that alpha is left out. The
+        # box of an ellipse is as wide as the deviations along x and y.
         center_x, center_y = fx * tan_x + cx, fy * tan_y + cy
         sigmas = math.sqrt(np.float32(2) * math.log(opacity / MIN_ALPHA)) + np.float32(1e-3)
         radius_x, radius_y = sigmas * deviation_x, sigmas * deviation_y

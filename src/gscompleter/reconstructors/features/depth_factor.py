@@ -147,7 +147,9 @@ def fit_depth_factor(samples: DepthSamples) -> DepthFactor | None:
     log_factor = find_densest(ratios)
 
     # A factor within the noise of the poses, or of the ratios themselves, counts as 1, unless the
-    # samples do not agree with that.
+    # samples do not agree with that. The noise is the spread of single ratios, though the factor is
+    # a median of many: the errors of a pair's pose are common to all its depths, so that more of
+    # them do not average out.
     sigma = MAD_TO_SIGMA * float(np.median(np.abs(ratios - log_factor)))
     is_within_noise = abs(log_factor) <= max(POSE_NOISE, sigma)
     if is_within_noise and compute_agreement(ratios, 0.0) >= MIN_AGREEMENT:

@@ -93,7 +93,10 @@ def keep_access_list(old: Path, new: Path) -> None:
 
 
 def refuse_special_file(path: Path) -> None:
-    """Raise an OSError if there is something other than a regular file at the path."""
+    """Raise an OSError if there is something other than a regular file at a path without links."""
+    # What is still a link after `os.path.realpath` leads back to itself.
+    if os.path.islink(path):
+        raise OSError(errno.ELOOP, "it is a loop of symbolic links")
     if os.path.isdir(path):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
     if os.path.lexists(path) and not os.path.isfile(path):
