@@ -40,9 +40,9 @@ MIN_SHOWN_SCENE = 0.05
 
 MIN_LEVEL = 0.9
 """Least cosine of the angle between a level surface and the upward direction: 25 degrees."""
-MIN_GROUND = 0.02
+MIN_LEVEL_SHARE = 0.02
 """Least share of an image with level surfaces below the camera that tells where the ground is."""
-LOWEST = 0.05
+DEEPER_SHARE = 0.05
 """Share of these surfaces that may lie deeper than the ground, as shards do."""
 
 
@@ -217,9 +217,9 @@ def find_ground_height(camera: Camera, render: Render, up: Float[Tensor, "3"]) -
     is_level = (normals @ up).abs() >= MIN_LEVEL
     has_depth = seen.valid[:-1, :-1] & seen.valid[:-1, 1:] & seen.valid[1:, :-1]
     is_ground = is_level & has_depth & (heights < 0)
-    if is_ground.float().mean().item() < MIN_GROUND:
+    if is_ground.float().mean().item() < MIN_LEVEL_SHARE:
         return None
-    return heights[is_ground].quantile(LOWEST).item()
+    return heights[is_ground].quantile(DEEPER_SHARE).item()
 
 
 def is_close(render: Render, nearest: float, config: NextBestViewConfig) -> bool:
