@@ -208,6 +208,15 @@ def test_a_scene_of_an_unpacked_sog_is_that_of_its_folder(completion, saved, tmp
     assert find_splat_file(folder, scene).path == folder
 
 
+def test_a_scene_of_a_model_folder_is_its_newest_splat(completion, saved, tmp_path):
+    newest = tmp_path / "point_cloud" / "iteration_30000" / "point_cloud.ply"
+    newest.parent.mkdir(parents=True)
+    newest.write_bytes((saved / "context.ply").read_bytes())
+    (tmp_path / "cfg_args").write_text("Namespace()")
+    scene = replace(completion, source=ContextScene.whole(gsc.load_splat(tmp_path)))
+    assert find_splat_file(tmp_path, scene).path == newest
+
+
 def test_a_scene_of_which_gaussians_were_dropped_is_that_of_its_file(completion, saved, tmp_path):
     scene = gsc.load_splat(saved / "context.ply")
     path = tmp_path / "broken.ply"

@@ -106,6 +106,20 @@ def test_the_near_road_lies_on_the_ground(drive):
         np.testing.assert_array_equal(after.weight[~near], before.weight[~near])
 
 
+def test_ground_nearer_than_all_that_was_searched_lies_on_the_ground(drive):
+    """The rearmost photograph sees nearer road than the others, where the sweep ends."""
+    rig, measured, inverses = drive
+    planes = PLANES[:40]
+    assert planes[-1] < 0.5 * inverses[0].max()
+    index = measured[0].index.clip(max=len(planes) - 0.5)
+    measured[0] = replace(measured[0], planes=planes, index=index)
+    held = hold_to_ground(rig, measured, skies_of(inverses))[0]
+    near = np.s_[NEAR_ROAD:]
+    np.testing.assert_allclose(held.inverse[near], inverses[0][near], rtol=0.02)
+    far = np.s_[:NEAR_ROAD]
+    np.testing.assert_array_equal(held.inverse[far], measured[0].inverse[far])
+
+
 def test_what_stands_on_the_road_stays(drive):
     rig, measured, inverses = drive
     block = np.s_[75:85, 30:60]

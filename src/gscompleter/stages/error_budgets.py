@@ -23,6 +23,8 @@ from gscompleter.types import ErrorBudget, Gaussians, View
 
 NUM_HALVINGS = 16
 """Rounds of halving opacities before Gaussians at the worst pixels are removed."""
+NUM_QUARTERINGS = NUM_HALVINGS // 2
+"""Rounds of quartering in their place, after which as little is left of an opacity."""
 NUM_REMOVALS = 12
 """Rounds of removal before a photograph loses all generated Gaussians that it sees."""
 MIN_PSNR_LOSS = 1e-4
@@ -146,6 +148,7 @@ def meet_error_budgets(
     plans: Sequence[OpacityRender],
     config: PsnrGuardConfig = PsnrGuardConfig(),
     regions: Int64[Tensor, "n"] | None = None,
+    is_quick: bool = False,
 ) -> Gaussians:
     """Fade added Gaussians until every photograph is within its error budgets.
 
@@ -153,7 +156,8 @@ def meet_error_budgets(
     first and no more than needed. If that fails, Gaussians at the worst pixels are removed, finally
     all that the photograph sees. Only a photograph that is over budget with none stays so.
     `regions` are numbers from 0 of parts that stand or fall alone, by default one for all: a region
-    that loses more than `max_opacity_loss` of its opacity is dropped.
+    that loses more than `max_opacity_loss` of its opacity is dropped. If `is_quick`, opacities are
+    quartered, in half as many rounds.
     """
     if len(added) == 0:
         return added
@@ -165,9 +169,11 @@ def meet_error_budgets(
     checks = make_checks(budgets, frozen_views, plans)
     opacities = added.opacities
     active = checks
+    num_fadings = NUM_QUARTERINGS if is_quick else NUM_HALVINGS
+    faded = 0.25 if is_quick else 0.5
     for trial in count():
         worse = find_over_budget(active, opacities)
-        # While opacities are halved, only photographs that were over budget are rendered. A
+        # While opacities fade, only photographs that were over budget are rendered. A
         # Gaussian that faded may have occluded another one in the rest, so that all of them have
         # to be within budget at the end.
         if not worse and len(active) < len(checks):
@@ -176,13 +182,13 @@ def meet_error_budgets(
             break
 
         # A Gaussian that one photograph objects to gives way, whatever it improves in others.
-        objections = [render.choose_fading(trial, added) for render in worse]
+        objections = [render.choose_fading(added, num_fadings - trial) for render in worse]
         is_lowered = torch.stack(objections).any(dim=0)
         # Whatever one photograph loses may have hidden something in another, so this goes on as
         # long as there is something to lose.
-        if trial >= NUM_HALVINGS + NUM_REMOVALS and not (is_lowered & (opacities > 0)).any():
+        if trial >= num_fadings + NUM_REMOVALS and not (is_lowered & (opacities > 0)).any():
             break
-        factor = 0.5 if trial < NUM_HALVINGS else 0.0
+        factor = faded if trial < num_fadings else 0.0
         opacities = torch.where(is_lowered, factor * opacities, opacities)
         # What is left of a region that faded for the most part would be fog.
         opacity_lost = opacity_before - torch.bincount(regions, weights=opacities)
@@ -190,7 +196,7 @@ def meet_error_budgets(
         if is_dropped[regions].all():
             return added[:0]
         opacities = opacities.where(~is_dropped[regions], 0.0)
-        active = [render.check for render in worse] if trial + 1 < NUM_HALVINGS else checks
+        active = [render.check for render in worse] if trial + 1 < num_fadings else checks
     return replace(added, opacities=opacities, encoded=None)[~is_dropped[regions]]
 
 
@@ -240,22 +246,24 @@ class CheckedRender:
     excess: float
     """Error above the limit of that budget."""
 
-    def choose_fading(self, trial: int, added: Gaussians) -> Bool[Tensor, "n"]:
-        """Choose the Gaussians that lose opacity in round `trial`.
+    def choose_fading(self, added: Gaussians, num_left: int) -> Bool[Tensor, "n"]:
+        """Choose the Gaussians that lose opacity in a round.
 
-        In rounds of halving, the gradient chooses those whose fading lowers the squared error. SSIM
-        is not linear in opacities, so for it Gaussians at the worst pixels are chosen from the
-        first round on.
+        `num_left` is the number of rounds of fading with this one; 0 in the first round of removal,
+        and negative after it. In rounds of fading, the gradient chooses those whose fading lowers
+        the squared error. SSIM is not linear in opacities, so for it Gaussians at the worst pixels
+        are chosen from the first round on.
         """
-        uses_gradient = self.worst_budget.metric == "mse" and trial < NUM_HALVINGS
-        # Two Gaussians that occlude each other both have a helpful gradient, so halving never
+        uses_gradient = self.worst_budget.metric == "mse" and num_left > 0
+        # Two Gaussians that occlude each other both have a helpful gradient, so fading never
         # reaches the budget. Those at the worst pixels go before everything does, or else a hole
         # loses its whole rim (decision 011).
-        if not uses_gradient and trial < NUM_HALVINGS + NUM_REMOVALS:
+        if not uses_gradient and num_left > -NUM_REMOVALS:
             return self.find_at_worst_pixels(added)
 
         gradient = compute_gradient(self.image, self.worst_budget, self.opacities)
-        # To first order, an error falls by gradient * o / 2 if the opacity o is halved.
+        # To first order, an error falls by gradient * o / 2 if the opacity o is halved, and by more
+        # if it is quartered, which leaves a margin.
         if uses_gradient:
             return select_fewest(gradient * self.opacities.detach() / 2, self.excess)
         # What the photograph does not see has no gradient.

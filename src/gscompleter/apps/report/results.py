@@ -41,6 +41,7 @@ from gscompleter.render.loading import load_renderer
 from gscompleter.render.protocols import Renderer
 from gscompleter.splats.alignment.trainer_files import TRAINER_FILES
 from gscompleter.splats.edits import EDITS, EditDraft
+from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.formats import load_splat
 from gscompleter.splats.layout import has_same_values
 from gscompleter.state import Completion
@@ -231,8 +232,10 @@ def describe_judged(judged: Judged, splat_file: InputSplatFile | None) -> Mappin
     """Describe the input and the settings for `summary.json`, as `describe_run_values` does.
 
     What only a command is told is missing: format, frames and context of a folder, the use of
-    masks, of given depth and of refined poses, and the change of these. `near` and `far`, in scene
-    units, are those that were used, which the command has in `depth_range` alone if it found them.
+    masks, of given depth and of refined poses, and the change of these. So is the number of
+    photographs to which the scene was fitted, which a completion does not keep. `near` and `far`,
+    in scene units, are those that were used, which the command has in `depth_range` alone if it
+    found them.
     """
     completion = judged.completion
     camera = completion.views[0].camera
@@ -277,6 +280,8 @@ def find_splat_file(path: Path, completion: Completion) -> InputSplatFile:
     """
     if not os.path.exists(path):
         raise InputError(f"There is no splat {quote_value(path)}; name the file of the scene.")
+    # Of a trainer's model folder it is the newest iteration, as for `load_splat`.
+    path = resolve_splat(path)
     context = completion.context
     # Whoever completed it has accepted what a file is refused for otherwise, and may have moved its
     # origin.

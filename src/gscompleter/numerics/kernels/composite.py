@@ -259,8 +259,7 @@ def backproject_residual(begin, end, tiles, context, new, photograph, slots, sum
         n_end = n_start[tile + 1]
         c_depth = _get_depth(c_splats, c_entries, c, c_begin, c_end, infinity)
         n_depth = _get_depth(n_splats, n_entries, n, n_begin, n_end, infinity)
-        # Row of `kept` at which the weights of the next splat begin. Started from a plain 0, it
-        # would have the functions that take it compiled twice.
+        # Row of `kept` at which the weights of the next splat begin.
         kept_row = np.int64(0)
         while open_rows > 0 and (c < c_end or n < n_end):
             if c_depth <= n_depth:

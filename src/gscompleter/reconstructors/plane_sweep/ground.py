@@ -12,6 +12,7 @@ directions are in world axes.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -22,6 +23,7 @@ from jaxtyping import Bool, Float, Float32
 
 from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.reconstructors.features.stereo_image import StereoImage
+from gscompleter.reconstructors.plane_sweep.matching import Planes
 from gscompleter.reconstructors.plane_sweep.rig import Rig, Transform
 from gscompleter.reconstructors.plane_sweep.sweep import (
     BACKGROUND_WEIGHT,
@@ -331,10 +333,27 @@ def hold_view(
     confidence = np.where(is_compared, BACKGROUND_WEIGHT, np.float32(0))
     return replace(
         measured,
+        planes=extend_planes(measured.planes, index[held]),
         index=np.where(held, index, measured.index),
         weight=np.where(held, BACKGROUND_WEIGHT, measured.weight),
         confidence=np.where(held, confidence, measured.confidence),
     )
+
+
+def extend_planes(
+    planes: Planes, index: Float32[np.ndarray, "n"]
+) -> Float32[np.ndarray, "extended"]:
+    """Extend planes in their steps, so that each plane `index` is one of them.
+
+    The sweep ends at the nearest depth that another photograph sees. That which stands rearmost on
+    a drive sees nearer ground than any of them.
+    """
+    if index.size == 0 or index.max() < len(planes) - 0.5:
+        return planes
+    count = math.ceil(float(index.max())) + 1
+    step = float(planes[1]) - float(planes[0])
+    further = planes[0] + step * np.arange(len(planes), count)
+    return np.concatenate([planes, further.astype(planes.dtype)])
 
 
 def confirm_ground(rig: Rig, number: int, inverse: Map, is_ground: Mask) -> tuple[Mask, Mask]:
