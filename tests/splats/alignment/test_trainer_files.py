@@ -6,10 +6,11 @@ import json
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from command import run
 from gscompleter import save_ply
-from gscompleter.apps.inputs.captures import find_cameras_beside
+from gscompleter.apps.inputs.captures import find_cameras_beside, select_listed_cameras
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.splats.alignment.trainer_files import (
     find_trainer_files,
@@ -116,3 +117,22 @@ def test_a_scene_of_photographs_is_completed_further_without_them(
     # Its photographs are found to be where they were.
     listed = json.loads((completed_room / "trainer" / "cameras.json").read_text())
     assert [entry["img_name"] for entry in listed] == [row["file"] for row in summary["context"]]
+
+
+def test_cameras_of_the_list_that_see_what_is_removed_join_those_around_it(tmp_path):
+    place = torch.tensor([[0.0, 0.0, 3.0], [0.1, 0.1, 3.1]])
+    sides = {f"{x}.jpg": camera_at(x=x, size=128) for x in (-0.5, -0.4, -0.3, 0.3, 0.4, 0.5)}
+    away = {"away.jpg": camera_at(yaw=90, size=128)}
+    write_trainer_cameras(tmp_path, {**away, **sides})
+    path = tmp_path / "trainer" / "cameras.json"
+    listed = select_listed_cameras(path, place, np.zeros(3), 64)
+    assert len(listed) == 4
+    # Far from each other, and no larger than the others.
+    assert {round(camera.center[0].item(), 1) for camera in listed} >= {-0.5, 0.5}
+    assert {camera.width for camera in listed} == {64}
+
+    write_trainer_cameras(tmp_path, away)
+    assert select_listed_cameras(path, place, np.zeros(3), 64) == []
+    # Nobody named the list.
+    path.write_text("[{}]")
+    assert select_listed_cameras(path, place, np.zeros(3), 64) == []

@@ -20,7 +20,14 @@ from gscompleter.data.mask_reading import MaskReading
 from gscompleter.data.photograph_names import name_render
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.scene import load_cameras
-from gscompleter.numerics.geometry import add_near_plane, is_same_camera
+from gscompleter.numerics.geometry import (
+    add_near_plane,
+    is_inside,
+    is_same_camera,
+    project,
+    select_spread_cameras,
+    shrink_camera,
+)
 from gscompleter.render.protocols import Renderer
 from gscompleter.splats.alignment.trainer_frames import find_camera_lists, list_model_folders
 from gscompleter.system.errors import InputError, quote_value
@@ -38,6 +45,10 @@ MIN_FOUND_COVERED = 0.9
 """Least share of its image in which a camera that was found sees the splat."""
 NUM_STANDPOINTS = 6
 """Most cameras from which a trained splat looks well, at which it is rendered."""
+MAX_LISTED = 4
+"""Most cameras of the list beside a splat that join those around a place."""
+MIN_SEEN_PLACE = 0.5
+"""Least share of the place that such a camera has in its image."""
 MIN_FOUND_SIDE = 64
 """Least width and height of the camera of a pixel-aligned splat, in pixels, however few its
 Gaussians are."""
@@ -202,12 +213,42 @@ def search_around_place(
     upward = request.find_up(scene, renderer)
     side = choose_side(request.reading.resolution)
     cameras = choose_cameras_around_place(scene, chosen, upward.direction, side, renderer)
+    where = "around what is removed"
+    # They look at the place alone. What stands behind it, and is hidden from all of them, may be
+    # what photographs of the scene show.
+    beside = find_cameras_beside(request.reading.folder)
+    if beside is not None:
+        listed = select_listed_cameras(beside, scene.means[chosen], origin, side)
+        where += f", and {len(listed)} of {quote_value(beside)}," if listed else ""
+        cameras = [*cameras, *listed]
     if not cameras:
         raise InputError(
             "No camera around what is to be removed sees it unhidden; name cameras with --cameras, "
             "or which way is up with --up."
         )
-    return name_capture(cameras, "place", "around what is removed", request, upward)
+    return name_capture(cameras, "place", where, request, upward)
+
+
+def select_listed_cameras(
+    path: Path, place: Float[Tensor, "n 3"], origin: Float[np.ndarray, "3"], side: int
+) -> list[Camera]:
+    """Select cameras of a list that see a place, far from each other.
+
+    `place` are points relative to `origin`, and `side` is the longer side of an image at most.
+    Nobody named the list, so that there are none if it cannot be read.
+    """
+    try:
+        known = load_cameras(path, origin=origin.tolist())
+    except InputError:
+        return []
+    seeing = []
+    for camera in known:
+        pixels, z = project(place, camera.to(place.device))
+        if is_inside(pixels, z, camera).float().mean().item() >= MIN_SEEN_PLACE:
+            seeing.append(shrink_camera(camera, side))
+    if not seeing:
+        return []
+    return [seeing[index] for index in select_spread_cameras(seeing, MAX_LISTED)]
 
 
 def choose_side(resolution: tuple[int, int] | int | None) -> int:
