@@ -45,7 +45,7 @@ MIN_FOUND_COVERED = 0.9
 """Least share of its image in which a camera that was found sees the splat."""
 NUM_STANDPOINTS = 6
 """Most cameras from which a trained splat looks well, at which it is rendered."""
-MAX_LISTED = 4
+MAX_LISTED_CAMERAS = 4
 """Most cameras of the list beside a splat that join those around a place."""
 MIN_SEEN_PLACE = 0.5
 """Least share of the place that such a camera has in its image."""
@@ -248,7 +248,7 @@ def select_listed_cameras(
             seeing.append(shrink_camera(camera, side))
     if not seeing:
         return []
-    return [seeing[index] for index in select_spread_cameras(seeing, MAX_LISTED)]
+    return [seeing[index] for index in select_spread_cameras(seeing, MAX_LISTED_CAMERAS)]
 
 
 def choose_side(resolution: tuple[int, int] | int | None) -> int:
