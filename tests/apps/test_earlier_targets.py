@@ -73,6 +73,21 @@ def test_a_camera_in_another_frame_or_without_its_holes_is_no_earlier_target(tmp
     assert read(record(tmp_path / "first", settings)) == ()
 
 
+@pytest.mark.parametrize(
+    "changed",
+    [
+        {"cameras": None},
+        {"empty": 0.1},
+        {"cameras": [{"fl_x": 1}]},
+        {"cameras": ["a"]},
+        {"empty": ["much"]},
+    ],
+)
+def test_a_record_that_somebody_changed_ends_no_completion(tmp_path, changed):
+    settings = {**make_settings(CAMERAS[0], 0.1), **changed}
+    assert read(record(tmp_path / "first", settings)) == ()
+
+
 def test_a_splat_that_another_program_changed_has_no_earlier_targets(tmp_path):
     path = record(tmp_path / "first", make_settings(CAMERAS[0], 0.1))
     scene = load_ply(path)

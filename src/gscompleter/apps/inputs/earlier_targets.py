@@ -6,7 +6,8 @@ shows is another after it is made anew. Both open holes where an earlier command
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,6 +19,7 @@ from gscompleter.data.photographs import Resolution
 from gscompleter.data.scene import parse_camera
 from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.splats.edits import Edit, Edits
+from gscompleter.system.errors import InputError
 from gscompleter.types import Camera
 
 EMPTY_SHARES = "empty"
@@ -68,13 +70,22 @@ def read_earlier_targets(
 
 def read_targets_of(
     edit: Edit, resolution: Resolution, origin: Float[np.ndarray, "3"]
-) -> Iterator[EarlierTarget]:
-    """Read the targets of an edit; none if an earlier version did not tell what it left empty."""
-    cameras = edit.settings.get("cameras", ())
-    shares = edit.settings.get(EMPTY_SHARES, ())
-    if len(cameras) != len(shares):
-        return
+) -> list[EarlierTarget]:
+    """Read the targets of an edit; none if an earlier version did not tell what it left empty.
+
+    A record that somebody changed may hold anything. It is read when a completion is done, which is
+    not lost for it.
+    """
+    cameras = edit.settings.get("cameras")
+    shares = edit.settings.get(EMPTY_SHARES)
+    if not isinstance(cameras, list) or not isinstance(shares, list):
+        return []
     title = "a camera in the record of edits"
-    for described, share in zip(cameras, shares, strict=True):
-        camera = parse_camera(described, title, resolution, origin.tolist())
-        yield EarlierTarget(camera, float(share))
+    targets = []
+    for described, share in zip(cameras, shares, strict=False):
+        if not isinstance(described, dict) or not isinstance(share, (int, float)):
+            continue
+        with suppress(InputError):
+            camera = parse_camera(described, title, resolution, origin.tolist())
+            targets.append(EarlierTarget(camera, float(share)))
+    return targets
