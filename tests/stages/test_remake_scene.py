@@ -10,6 +10,7 @@ from gscompleter import GSCompleter, load_renderer
 from gscompleter.config import CompleterConfig
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.parts import NOT_INVENTED, EarlierWork
+from gscompleter.stages.remake_scene import find_overlying
 from gscompleter.state import Completion
 from gscompleter.types import (
     SH_C0,
@@ -87,6 +88,26 @@ def test_all_photographs_gain_and_what_nobody_sees_stays():
     assert (made.scene.generated == 1).sum() == 1
     assert (made.scene.generated == NOT_INVENTED).sum() == len(made.scene) - 1
     assert made.num_observed == len(made.scene) - 1
+
+
+def test_what_was_invented_gives_way_where_the_new_scene_shows_its_place():
+    # Before the wall, behind it, and beside all photographs.
+    before, behind = (
+        make_invented(0.2),
+        replace(make_invented(0.2), means=torch.tensor([[0, 0, 9.0]])),
+    )
+    # It hides another one until it goes.
+    hidden = replace(before, means=1.02 * before.means)
+    context = merge([before, hidden, behind, ASIDE, SHARDS])
+    invented = context.generated == 1
+    gone = ~invented
+
+    def find(new: Gaussians) -> list[bool]:
+        return find_overlying(context, invented, gone, new, PHOTOS, RENDERER)[:4].tolist()
+
+    assert find(WHOLE) == [True, True, False, False]
+    # Where the new scene is empty, they fill it.
+    assert find(WHOLE[WHOLE.means[:, 0] < -1]) == [False, False, False, False]
 
 
 def test_the_new_scene_keeps_the_exposure_of_what_stays():

@@ -3,7 +3,7 @@
 Ψ fits a scene to its photographs, and what looks right from them may be shards from elsewhere. What
 further photographs show cannot be added around shards, nor do they give way: the photographs that
 they were made of would lose. So Ψ makes the scene of all photographs together. What Φ invented
-stays, but where photographs show the place.
+stays, but where photographs show the place: where it lies before what Ψ made of them.
 """
 
 from __future__ import annotations
@@ -30,7 +30,12 @@ from gscompleter.stages.replace_contested import (
     render_at_views,
 )
 from gscompleter.state import Completion, Photo
-from gscompleter.types import SH_C0, ContextScene, Render, View, merge
+from gscompleter.types import SH_C0, ContextScene, Gaussians, Render, View, merge
+
+MAX_OVERLYING_LAYERS = 8
+"""Layers of invented Gaussians that give way behind each other."""
+MIN_OVERLYING = 0.1
+"""Least area in pixels, in all photographs together, that such a Gaussian covers."""
 
 
 def remake_scene(
@@ -46,9 +51,9 @@ def remake_scene(
 
     `views` are those of the context as they were given, and `has_scene_range` is that of
     `reconstruct_context`. What shows where photographs are ignored, as around what a person took
-    out, stays. The `contested` Gaussians, which Φ invented, go as well. Returns None if
-    nothing is to be made anew, or if the photographs are not nearer to the new scene than to the
-    given one, in the mean of their PSNR apart from their exposures.
+    out, stays. The `contested` Gaussians, which Φ invented, go as well, and so do those before the
+    new scene. Returns None if nothing is to be made anew, or if the photographs are not nearer to
+    the new scene than to the given one, in the mean of their PSNR apart from their exposures.
     """
     if earlier.remade is None:
         return None
@@ -59,10 +64,13 @@ def remake_scene(
     gone = gone & ~find_ignored(state, views, given, renderer)
     if contested is not None:
         gone = gone | contested.rows
+    invented = mark_rendered(state.source, earlier.invented)
+    new = made.source.gaussians
+    gone = gone | find_overlying(state.rendered_context, invented, gone, new, views, renderer)
     if not gone.all():
         # What was invented and stays has the exposure of the given scene. Else the new one keeps
         # its own, in which no photograph is brightened until it is clipped.
-        shown = list(render_at_views(made.source.gaussians, views, renderer))
+        shown = list(render_at_views(new, views, renderer))
         made = multiply_exposure(made, views, measure_exposure(given, shown, views))
     part = make_part(PartOrigin("photographs"), made.source.gaussians)
     # The scene has one exposure, which photographs of the context share from here on.
@@ -75,9 +83,44 @@ def remake_scene(
         context_notes=(*state.context_notes, *made.notes),
         is_remade=True,
     )
-    new = list(render_at_views(merge(begun.parts), made.views, renderer))
-    is_nearer = compute_psnrs(new, made.views).mean() > compute_psnrs(given, made.views).mean()
+    after = list(render_at_views(merge(begun.parts), made.views, renderer))
+    is_nearer = compute_psnrs(after, made.views).mean() > compute_psnrs(given, made.views).mean()
     return begun if is_nearer else None
+
+
+def find_overlying(
+    context: Gaussians,
+    invented: Bool[Tensor, "m"],
+    gone: Bool[Tensor, "m"],
+    new: Gaussians,
+    views: Sequence[View],
+    renderer: Renderer,
+) -> Bool[Tensor, "m"]:
+    """Find the invented Gaussians that photographs see before the `new` scene (decision 154).
+
+    They fitted the given scene, and the new one shows that place itself. Those that show mostly
+    where it is empty stay, and so do those that no photograph sees. `context` is the given scene,
+    of which `gone` goes in any case.
+    """
+    covered = [
+        (render.alpha >= COVERED) & view.valid_mask
+        for render, view in zip(render_at_views(new, views, renderer), views, strict=True)
+    ]
+    overlying = torch.zeros_like(gone)
+    # What goes may have hidden others.
+    for _ in range(MAX_OVERLYING_LAYERS):
+        stays = ~(gone | overlying)
+        kept = context.hide(~stays)
+        sums = torch.zeros_like(context.means)
+        for view, mask in zip(views, covered, strict=True):
+            frozen = renderer.freeze(merge([kept, new]), view.camera)
+            sums += sum_in_mask(frozen, mask.to(sums))[: len(context)]
+        on_scene, on_holes, _ = sums.unbind(dim=1)
+        found = invented & stays & (on_scene > on_holes) & (on_scene > MIN_OVERLYING)
+        if not found.any():
+            break
+        overlying = overlying | found
+    return overlying
 
 
 def find_ignored(

@@ -13,7 +13,7 @@ import pytest
 
 from gscompleter import InputError
 from gscompleter.system.errors import FullDiskError, OutputError
-from gscompleter.system.files import unfinished
+from gscompleter.system.files import unfinished, writing
 from gscompleter.system.files.downloads import get_download_folder
 from gscompleter.system.files.output_file import reserve_file
 from gscompleter.system.files.output_folder import open_output_folder
@@ -178,6 +178,26 @@ def test_a_file_that_replaces_another_keeps_its_mode_from_the_first_byte_on(tmp_
         file.write(b"new")
     assert path.read_bytes() == b"new"
     assert stat.S_IMODE(path.stat().st_mode) == mode
+
+
+@pytest.mark.linux
+def test_what_replaces_a_private_file_is_private_when_it_is_made(tmp_path, monkeypatch):
+    path = tmp_path / "scene.ply"
+    path.write_bytes(b"old")
+    path.chmod(0o600)
+    modes = []
+
+    def note_mode(old: Path, new: Path) -> None:
+        modes.append(stat.S_IMODE(new.stat().st_mode))
+
+    monkeypatch.setattr(writing, "keep_permissions", note_mode)
+    with replace_file(path) as file:
+        file.write(b"new")
+    with replace_file(tmp_path / "new.ply") as file:
+        file.write(b"new")
+    umask = os.umask(0)
+    os.umask(umask)
+    assert modes == [0o600, 0o666 & ~umask]
 
 
 @pytest.mark.linux

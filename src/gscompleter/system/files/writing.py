@@ -7,6 +7,7 @@ import os
 import stat
 from collections.abc import Container, Iterator
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import BinaryIO
 
@@ -35,8 +36,11 @@ def replace_file(path: Path | str, keep_existing: bool = False) -> Iterator[Bina
         refuse_special_file(target)
         temporary = target.with_name(make_unfinished_name(target.name))
         try:
-            with temporary.open("xb") as file, give_signs(temporary):
-                # Before anything is written: a private file has no moment at which others read it.
+            # A private file has no moment at which others may open it, and what takes the place of
+            # a file begins as private as any.
+            mode = 0o600 if target.exists() else 0o666
+            opener = partial(os.open, mode=mode)
+            with open(temporary, "xb", opener=opener) as file, give_signs(temporary):
                 keep_permissions(target, temporary)
                 yield file
                 file.flush()
