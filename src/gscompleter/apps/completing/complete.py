@@ -341,7 +341,8 @@ def list_sources(ready: Prepared, completion: Completion) -> dict[str, Camera]:
     for view in completion.views:
         if view.frame is None:
             continue
-        c2w = view.camera.c2w.detach().cpu().double()
+        # A copy, or a camera in float64 would be moved itself.
+        c2w = view.camera.c2w.detach().cpu().double().clone()
         c2w[:3, 3] += origin
         own = photographs.camera(view.frame)
         cameras[photographs.frame(view.frame).file_name] = replace(own, c2w=c2w, K=own.K.double())
