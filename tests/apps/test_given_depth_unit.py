@@ -167,7 +167,7 @@ def test_noise_of_the_measurement_is_no_factor():
 
 
 def test_a_factor_among_noise_is_used_where_1_would_be_refused():
-    """Of poses that are as noisy as the factor is large, most samples agree with the factor."""
+    """Scatter samples by noisy poses as far as the factor is large: most agree with the factor."""
     noise = np.random.default_rng(0).normal(0.27, 0.3, 400)
     fit = fit_depth_factor(sample(TRUE, TRUE * np.exp(noise)))
     assert fit is not None

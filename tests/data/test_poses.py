@@ -14,6 +14,7 @@ from rich.console import Console
 from command import run
 from gscompleter.apps.inputs.opening import open_scene
 from gscompleter.apps.inputs.removal import find_masks_of
+from gscompleter.apps.inputs.task import Opened
 from gscompleter.apps.requests.scene import PosesRequest, SceneRequest
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.mask_reading import MaskReading
@@ -195,6 +196,13 @@ def test_photographs_are_no_masks_of_what_to_ignore(tmp_path):
     assert told.value.argument == "ignore"
 
 
+def search_and_open(request: SceneRequest, out: Path, names: list[str]) -> Opened:
+    """Search for the cameras of copies with `names`, and open the photographs with them."""
+    find_poses(request.folder, out / "colmap", reading=request.search_masks)
+    write_colmap_text(out / "colmap" / "sparse" / "0", names)
+    return open_scene(request, PosesRequest(out), Console(quiet=True))
+
+
 def test_masks_of_what_is_removed_may_lie_beside_their_photographs(tmp_path, monkeypatch):
     """The copies for COLMAP are called as the photographs are, which are no masks of them."""
     given, out = blank(tmp_path / "photos", 4), tmp_path / "out"
@@ -205,9 +213,7 @@ def test_masks_of_what_is_removed_may_lie_beside_their_photographs(tmp_path, mon
     for number in range(4):
         mask.save(given / f"{number}_mask.png")
     request = SceneRequest(given, removal_masks=given)
-    find_poses(given, out / "colmap", reading=request.search_masks)
-    write_colmap_text(out / "colmap" / "sparse" / "0", names)
-    opened = open_scene(request, PosesRequest(out), Console(quiet=True))
+    opened = search_and_open(request, out, names)
     found = find_masks_of(opened.photographs, given)
     assert found == {number: given / f"{number}_mask.png" for number in range(4)}
 
@@ -225,9 +231,7 @@ def test_a_copy_in_another_format_is_known_by_the_name_of_its_photograph(tmp_pat
     copies = [f"{number}a.webp.png" for number in range(4)]
     stand_in(monkeypatch, tmp_path, model_script(copies))
     request = SceneRequest(given, removal_masks=goes)
-    find_poses(given, out / "colmap", reading=request.search_masks)
-    write_colmap_text(out / "colmap" / "sparse" / "0", copies)
-    opened = open_scene(request, PosesRequest(out), Console(quiet=True))
+    opened = search_and_open(request, out, copies)
     found = find_masks_of(opened.photographs, goes)
     assert found == {number: goes / f"{number}a.png" for number in range(4)}
     for word in ("2a", "2a.webp", "2a.webp.png"):

@@ -103,7 +103,8 @@ def test_what_was_invented_gives_way_where_the_new_scene_shows_its_place():
     gone = ~invented
 
     def find(new: Gaussians) -> list[bool]:
-        return find_overlying(context, invented, gone, new, PHOTOS, RENDERER)[:4].tolist()
+        shown = [RENDERER.render(new, view.camera) for view in PHOTOS]
+        return find_overlying(context, invented, gone, new, PHOTOS, shown, RENDERER)[:4].tolist()
 
     assert find(WHOLE) == [True, True, False, False]
     # Where the new scene is empty, they fill it.

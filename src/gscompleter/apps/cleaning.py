@@ -65,7 +65,10 @@ from gscompleter.types import Camera, Gaussians, View
 
 CLEAN_COMMAND = "clean"
 CLEANING_FILES = (
-    *(COMPLETED_FILE, REMOVED_FILE, REMOVED_PICTURE_FILE, SUMMARY_FILE),
+    COMPLETED_FILE,
+    REMOVED_FILE,
+    REMOVED_PICTURE_FILE,
+    SUMMARY_FILE,
     *EDITS,
     *TRAINER_FILES,
 )

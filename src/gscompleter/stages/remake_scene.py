@@ -65,12 +65,15 @@ def remake_scene(
     if contested is not None:
         gone = gone | contested.rows
     invented = mark_rendered(state.source, earlier.invented)
-    new = made.source.gaussians
-    gone = gone | find_overlying(state.rendered_context, invented, gone, new, views, renderer)
+    if not gone.all():
+        shown = list(render_at_views(made.source.gaussians, views, renderer))
+        overlying = find_overlying(
+            state.rendered_context, invented, gone, made.source.gaussians, views, shown, renderer
+        )
+        gone = gone | overlying
     if not gone.all():
         # What was invented and stays has the exposure of the given scene. Else the new one keeps
         # its own, in which no photograph is brightened until it is clipped.
-        shown = list(render_at_views(new, views, renderer))
         made = multiply_exposure(made, views, measure_exposure(given, shown, views))
     part = make_part(PartOrigin("photographs"), made.source.gaussians)
     # The scene has one exposure, which photographs of the context share from here on.
@@ -94,29 +97,27 @@ def find_overlying(
     gone: Bool[Tensor, "m"],
     new: Gaussians,
     views: Sequence[View],
+    shown: Sequence[Render],
     renderer: Renderer,
 ) -> Bool[Tensor, "m"]:
     """Find the invented Gaussians that photographs see before the `new` scene (decision 154).
 
     They fitted the given scene, and the new one shows that place itself. Those that show mostly
     where it is empty stay, and so do those that no photograph sees. `context` is the given scene,
-    of which `gone` goes in any case.
+    of which `gone` goes in any case, and `shown` are the renders of the new one at the photographs.
     """
     covered = [
         (render.alpha >= COVERED) & view.valid_mask
-        for render, view in zip(render_at_views(new, views, renderer), views, strict=True)
+        for render, view in zip(shown, views, strict=True)
     ]
     overlying = torch.zeros_like(gone)
     # What goes may have hidden others.
     for _ in range(MAX_OVERLYING_LAYERS):
-        stays = ~(gone | overlying)
-        kept = context.hide(~stays)
-        sums = torch.zeros_like(context.means)
-        for view, mask in zip(views, covered, strict=True):
-            frozen = renderer.freeze(merge([kept, new]), view.camera)
-            sums += sum_in_mask(frozen, mask.to(sums))[: len(context)]
+        candidates = invented & ~gone & ~overlying
+        scene = merge([context.hide(gone | overlying), new])
+        sums = sum_in_masks(scene, views, covered, renderer)[: len(context)]
         on_scene, on_holes, _ = sums.unbind(dim=1)
-        found = invented & stays & (on_scene > on_holes) & (on_scene > MIN_OVERLYING)
+        found = candidates & (on_scene > on_holes) & (on_scene > MIN_OVERLYING)
         if not found.any():
             break
         overlying = overlying | found
@@ -135,14 +136,27 @@ def find_ignored(
     right_views = [views[index] for index in choose_right_views(given, views)]
     if all(view.ignore_mask is None for view in right_views):
         return torch.zeros_like(context.opacities, dtype=torch.bool)
-    scene = merge(state.parts)
-    sums = torch.zeros_like(context.means)
-    for view in right_views:
-        frozen = renderer.freeze(scene, view.camera)
-        # The context comes first in the scene.
-        sums += sum_in_mask(frozen, view.valid_mask.to(sums))[: len(context)]
+    masks = [view.valid_mask for view in right_views]
+    # The context comes first in the scene.
+    sums = sum_in_masks(merge(state.parts), right_views, masks, renderer)[: len(context)]
     valid, ignored, _ = sums.unbind(dim=1)
     return ignored > valid
+
+
+def sum_in_masks(
+    scene: Gaussians,
+    views: Sequence[View],
+    masks: Sequence[Bool[Tensor, "_ _"]],
+    renderer: Renderer,
+) -> Float[Tensor, "n 3"]:
+    """Sum how much of each Gaussian photographs show inside and outside of masks, in pixels.
+
+    The third sum is 0, as in `sum_in_mask`.
+    """
+    sums = torch.zeros_like(scene.means)
+    for view, mask in zip(views, masks, strict=True):
+        sums += sum_in_mask(renderer.freeze(scene, view.camera), mask.to(sums))
+    return sums
 
 
 def choose_right_views(given: Sequence[Render], views: Sequence[View]) -> list[int]:

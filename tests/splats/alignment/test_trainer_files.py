@@ -10,13 +10,14 @@ import torch
 
 from command import run
 from gscompleter import save_ply
-from gscompleter.apps.inputs.captures import find_cameras_beside, select_listed_cameras
+from gscompleter.apps.inputs.captures import select_listed_cameras
 from gscompleter.data.camera_files import read_cameras
 from gscompleter.splats.alignment.trainer_files import (
     find_trainer_files,
     keep_trainer_files,
     write_trainer_cameras,
 )
+from gscompleter.splats.alignment.trainer_frames import find_cameras_beside
 from scenes import camera_at, random_gaussians
 
 LIST = '[{"img_name": "a"}]'

@@ -9,7 +9,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import torch
 from rich.console import Console
 
 from gscompleter.apps.command_line.exit_codes import DONE, ERROR
@@ -29,7 +28,7 @@ from gscompleter.apps.completing.remove import prepare_removal
 from gscompleter.apps.completing.run_info import describe_run_values, read_held_out
 from gscompleter.apps.completing.update import prepare_update
 from gscompleter.apps.inputs.describing import describe_task, print_lines
-from gscompleter.apps.inputs.earlier_targets import EMPTY_SHARES, measure_empty_share
+from gscompleter.apps.inputs.earlier_targets import EMPTY_SHARES
 from gscompleter.apps.inputs.refined_poses import write_refined_poses
 from gscompleter.apps.inputs.task import CompletionTask, Opened
 from gscompleter.apps.report.completion import write_report
@@ -51,9 +50,14 @@ from gscompleter.apps.requests.completion import (
 )
 from gscompleter.completer import check_target_ids
 from gscompleter.config.generators import PaintedSettings
+from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.scene import describe_camera, write_cameras
 from gscompleter.editing.removal import restore_surroundings
-from gscompleter.evaluation.metrics.coverage import render_pairs, sample_held_out_cameras
+from gscompleter.evaluation.metrics.coverage import (
+    compute_covered_share,
+    render_pairs,
+    sample_held_out_cameras,
+)
 from gscompleter.numerics.kernels.parallel import run_in_background
 from gscompleter.splats.alignment.similarity import transform_camera_exactly
 from gscompleter.splats.alignment.trainer_files import write_trainer_cameras
@@ -336,16 +340,15 @@ def list_sources(ready: Prepared, completion: Completion) -> dict[str, Camera]:
     takes the size of the list for that which the scene is sharp at.
     """
     photographs = ready.opened.photographs
-    origin = torch.from_numpy(ready.task.splat_origin)
+    to_file = compute_frame_from_photographs(-ready.task.splat_origin)
     cameras = {}
     for view in completion.views:
         if view.frame is None:
             continue
-        # A copy, or a camera in float64 would be moved itself.
-        c2w = view.camera.c2w.detach().cpu().double().clone()
-        c2w[:3, 3] += origin
-        own = photographs.camera(view.frame)
-        cameras[photographs.frame(view.frame).file_name] = replace(own, c2w=c2w, K=own.K.double())
+        # Its pose may have been refined, and is that of the scene.
+        own = replace(photographs.camera(view.frame), c2w=view.camera.on_cpu.c2w)
+        name = photographs.frame(view.frame).file_name
+        cameras[name] = transform_camera_exactly(own, to_file)
     return cameras
 
 
@@ -366,7 +369,7 @@ def describe_edit(ready: Prepared, completion: Completion) -> dict[str, Any]:
         describe_camera(transform_camera_exactly(target.camera, back))
         for target in ready.task.targets
     ]
-    empty = [round(measure_empty_share(result.after.alpha), 5) for result in completion.targets]
+    empty = [round(1 - compute_covered_share([result.after]), 5) for result in completion.targets]
     return {
         **place,
         **{name: strip_folders(value) for name, value in named.items()},

@@ -6,10 +6,11 @@ from dataclasses import replace
 
 from gscompleter.apps.completing.preparation import compute_view_transform
 from gscompleter.apps.completing.prepared import Prepared
-from gscompleter.apps.inputs.earlier_targets import measure_empty_share, read_earlier_targets
+from gscompleter.apps.inputs.earlier_targets import read_earlier_targets
 from gscompleter.apps.inputs.named_photographs import add_photograph
 from gscompleter.apps.inputs.taken_out import hide_in_target
 from gscompleter.apps.inputs.task import Target
+from gscompleter.evaluation.metrics.coverage import compute_covered_share
 from gscompleter.evaluation.verdict.numbers import format_percent
 from gscompleter.numerics.geometry import is_same_camera
 from gscompleter.splats.alignment.similarity import transform_camera
@@ -54,7 +55,7 @@ def find_reopened(ready: Prepared, completion: Completion) -> tuple[Target, ...]
         if any(is_same_camera(camera, known) for known in task.cameras):
             continue
         render = ready.completer.scenes.freeze(completion.parts, camera).render
-        share = measure_empty_share(render.alpha)
+        share = 1 - compute_covered_share([render])
         if share >= target.empty_share + MIN_REOPENED:
             found.append(make_reopened(ready, camera, share))
     return tuple(found)
@@ -75,7 +76,5 @@ def make_reopened(ready: Prepared, camera: Camera, share: float) -> Target:
 
 def find_frame_taken_by(ready: Prepared, camera: Camera) -> int | None:
     """Find the frame of the photograph that was taken by a camera; None if there is none."""
-    for frame, known in ready.cameras.items():
-        if is_same_camera(known, camera):
-            return frame
-    return None
+    taken = (frame for frame, known in ready.cameras.items() if is_same_camera(known, camera))
+    return next(taken, None)

@@ -29,7 +29,7 @@ from gscompleter.numerics.geometry import (
     shrink_camera,
 )
 from gscompleter.render.protocols import Renderer
-from gscompleter.splats.alignment.trainer_frames import find_camera_lists, list_model_folders
+from gscompleter.splats.alignment.trainer_frames import find_cameras_beside
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.types import Camera, Gaussians
 from gscompleter.virtual_capture.around_target import MAX_CHOSEN_CAMERAS, choose_cameras_around
@@ -119,14 +119,6 @@ class Capture:
     """What is up for them; None for cameras that are not placed by it."""
     others: Sequence[Camera] = ()
     """Further cameras from which the splat looks well, and at which it is not rendered."""
-
-
-def find_cameras_beside(splat: Path) -> Path | None:
-    """Find the list of cameras beside a splat, or in the folder of its trainer; None without one.
-
-    Of several it is the one whose name matches the splat, as `find_camera_lists` tells.
-    """
-    return next(iter(find_camera_lists(splat, list_model_folders(splat))), None)
 
 
 def take_from_file(path: Path, known: Photographs, request: RenderRequest) -> Capture:

@@ -12,9 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
-from torch import Tensor
 
-from gscompleter.config.settings import COVERED
 from gscompleter.data.photographs import Resolution
 from gscompleter.data.scene import parse_camera
 from gscompleter.numerics.geometry import is_same_camera
@@ -34,11 +32,6 @@ class EarlierTarget:
     """The camera, in the frame of the photographs as they are read."""
     empty_share: float
     """Share of its image that this command left empty."""
-
-
-def measure_empty_share(alpha: Float[Tensor, "h w"]) -> float:
-    """Measure the share of an image that a scene does not cover."""
-    return (alpha < COVERED).float().mean().item()
 
 
 def read_earlier_targets(

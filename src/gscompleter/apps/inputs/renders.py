@@ -17,7 +17,6 @@ from gscompleter.apps.inputs.captures import (
     RenderRequest,
     describe_capture,
     find_cameras_alone,
-    find_cameras_beside,
     search_around,
     search_around_place,
     take_from_file,
@@ -57,6 +56,7 @@ from gscompleter.data.photographs import (
     check_resolution,
 )
 from gscompleter.render.protocols import Renderer
+from gscompleter.splats.alignment.trainer_frames import find_cameras_beside
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.memory import check_memory
 from gscompleter.trust.lifted import find_pixel_center

@@ -11,7 +11,6 @@ from http.server import ThreadingHTTPServer
 from pathlib import Path
 
 from gscompleter.apps.command_line.answers import print_answer, print_json
-from gscompleter.apps.inputs.captures import find_cameras_beside
 from gscompleter.apps.report.schema import find_completed
 from gscompleter.apps.requests.viewing import ViewRequest
 from gscompleter.apps.viewer import packages
@@ -25,6 +24,7 @@ from gscompleter.apps.viewer.http import HTML, PageHandler, PageServer
 from gscompleter.apps.viewer.page import make_page_parts
 from gscompleter.data.scene import load_cameras
 from gscompleter.render.loading import load_renderer
+from gscompleter.splats.alignment.trainer_frames import find_cameras_beside
 from gscompleter.splats.foreign import resolve_splat
 from gscompleter.splats.sog import META
 from gscompleter.splats.upward import Direction

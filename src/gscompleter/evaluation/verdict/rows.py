@@ -53,7 +53,7 @@ class HeldOutRow(ScoreRow):
 
     @property
     def use(self) -> str:
-        """What the completion used it for, in words."""
+        """Say in words what the completion used it for."""
         return CHECK_USE if self.is_check else NO_USE
 
 

@@ -17,7 +17,7 @@ from gscompleter.data.camera_files import INRIA_CAMERAS_FILE, write_camera_list
 from gscompleter.data.transforms import DATAPARSER_FILE
 from gscompleter.splats.alignment.trainer_frames import (
     TRAINER_FOLDER,
-    find_camera_lists,
+    find_cameras_beside,
     list_model_folders,
 )
 from gscompleter.splats.alignment.training_size import (
@@ -51,8 +51,9 @@ def find_trainer_files(splat: Path) -> Iterator[tuple[Path, str]]:
     """
     folders = list_model_folders(splat)
     # `cameras_2.json` belongs to `splat_2.ply`; the result has another name.
-    for file in find_camera_lists(splat, folders)[:1]:
-        yield file, INRIA_CAMERAS_FILE
+    cameras = find_cameras_beside(splat)
+    if cameras is not None:
+        yield cameras, INRIA_CAMERAS_FILE
     places = {DATAPARSER_FILE: folders}
     places |= dict.fromkeys((INRIA_FILE, GSPLAT_FILE), list_settings_folders(splat, folders))
     for name, among in places.items():

@@ -130,6 +130,14 @@ def find_camera_lists(splat: Path, folders: Sequence[Path]) -> list[Path]:
     ]
 
 
+def find_cameras_beside(splat: Path) -> Path | None:
+    """Find the list of cameras beside a splat, or in the folder of its trainer; None without one.
+
+    Of several it is the one whose name matches the splat, as `find_camera_lists` tells.
+    """
+    return next(iter(find_camera_lists(splat, list_model_folders(splat))), None)
+
+
 def fit_named_cameras(ours: Mapping[str, Matrix], theirs: Mapping[str, Matrix]) -> Matrix | None:
     """Fit the similarity from `ours` to `theirs` by name; None without two matched positions."""
     pairs = match_names(list(ours), list(theirs))

@@ -19,7 +19,7 @@ COMPLETED_FILES = (COMPLETED_FILE, "completed.spz", "completed.sog")
 REMOVED_FILE = "removed.ply"
 """Originals of changed and removed Gaussians of a given scene, beside the completed one."""
 EDITS_FILE = "edits.json"
-"""What commands did to the scene, in their order."""
+"""Record of what commands did to the scene, in their order."""
 EDITS_FOLDER = "edits"
 """Folder beside it with what earlier commands removed or changed."""
 STROKES_FILE = "strokes.json"
