@@ -46,21 +46,22 @@ class Completion(Displayed):
     config: CompleterConfig
     source: ContextScene
     rendered_context: Gaussians
-    """The context as stages see it: recoloured in part, and of a large scene a proxy."""
+    """The context as stages see it: without what is gone, recoloured in part, and of a large scene
+    a proxy."""
     photos: tuple[Photo, ...]
     """Context photographs, then check photographs."""
     num_context: int
     trust: Trust
-    """Trust in `rendered_context`; added Gaussians have full trust, as those at its end have that
-    returned after a removal."""
+    """Trust in `rendered_context`, full after a removal. Additions have full trust, and so have
+    Gaussians that returned after a removal: they are the last rows, for which it has no values."""
     added_parts: tuple[Part, ...] = ()
     """What was added, part by part, in the order of addition."""
     targets: tuple[TargetResult, ...] = ()
     filled_target: Camera | None = None
     """Target whose holes are filled and whose gaps are being closed; None in between targets."""
     free_space_cameras: tuple[Camera, ...] = ()
-    """Further cameras whose free space stays empty, such as the witnesses of a splat; their images
-    are not read."""
+    """Further cameras whose free space stays empty, such as the witnesses of a splat; they need no
+    photographs."""
     seconds: Mapping[str, float] = field(default_factory=dict)
     """Wall time of context, generate, lift, register, integrate and total."""
     exposure_gains: Float[Tensor, "v 3"] | None = None
@@ -81,8 +82,8 @@ class Completion(Displayed):
     """How far photographs confirm what a removal left, although all of it has full trust; None if
     they do not decide what stays (`forces_removed` and `keeps_confirmed`)."""
     trust_elsewhere: Trust | None = None
-    """Trust in `rendered_context` where nothing was removed: that from before a removal, of which
-    the rest has full trust; None before one."""
+    """Trust in `rendered_context` from before a removal, for holes where nothing was removed; None
+    without a removal."""
     is_restored: bool = False
     """True if photographs look as before around what was removed (`restore_surroundings`); a target
     or removal after it makes it False."""
@@ -116,9 +117,10 @@ class Completion(Displayed):
         return self.score()
 
     def score(self, unused_views: Sequence[View] = ()) -> dict[str, Any]:
-        """Score as `scores`, with photographs that were not used, in the frame of the cameras.
+        """Score as `scores`, with photographs that were not used.
 
-        One at the camera of a target scores that target; the others count as held out.
+        Their cameras are in the coordinates of the scene. A photograph at the camera of a target
+        scores that target; the others count as held out.
         """
         scores: dict[str, Any] = load_function(RESULTS_MODULE, "score_result")(self, unused_views)
         return scores
@@ -135,13 +137,13 @@ class Completion(Displayed):
         Args:
             out: New or empty folder; with `overwrite`, also one of an earlier run.
             unused_views: As in `score`.
-            splat: File that the scene was loaded from, and that still has its values. In its layout
-                and order `completed.ply` is then written, so that `strip` takes back recolouring
-                and removal, too.
+            splat: File or folder that the scene was loaded from (`load_splat`), and that still has
+                its values. In its layout and order `completed.ply` is then written, so that `strip`
+                takes back recolouring and removal, too.
             overwrite: True to replace the files of an earlier run.
 
         Raises:
-            InputError: The folder is not empty, or the file holds another scene.
+            InputError: `out` is not empty, or `splat` holds another scene.
         """
         folder: Path = load_function(RESULTS_MODULE, "save_result")(
             self, out, unused_views, splat, overwrite
@@ -170,7 +172,7 @@ class Completion(Displayed):
 
     @property
     def context(self) -> Gaussians:
-        """The scene before its first target, bit for bit."""
+        """The scene as it was given or reconstructed, bit for bit, with what was removed since."""
         return self.source.gaussians
 
     @cached_property
@@ -205,8 +207,7 @@ class Completion(Displayed):
     @cached_property
     def scene(self) -> Gaussians:
         """The rest of the context, bit for bit unless recoloured, then all added Gaussians."""
-        parts = [self.kept_context, *self.parts[1:]]
-        return merge(parts) if len(parts) > 1 else parts[0]
+        return merge([self.kept_context, *self.parts[1:]])
 
     @cached_property
     def recolored(self) -> Gaussians:

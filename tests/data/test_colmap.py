@@ -133,6 +133,15 @@ def test_names_with_spaces_and_of_any_encoding_are_found(tmp_path):
         check_room(open_photographs(tmp_path), [4, 2, 0, 3, 1])
 
 
+def test_names_without_endings_may_look_like_features(tmp_path):
+    """Lines of features are triples, too, and end in a whole number."""
+    names = ["IMG 0 0", "IMG 1 2", "a b c 3 4 5", "d -1 6", "e"]
+    write_photographs(tmp_path / "images", [f"{name}.png" for name in names])
+    for features in ("1 2 -1", "1.5 2 -1 " * 4):
+        write_colmap_text(tmp_path / "sparse", names, features)
+        check_room(open_photographs(tmp_path))
+
+
 def test_intrinsics_follow_the_size_on_the_disk(tmp_path):
     """The camera file has twice or half the size, and the view does not change."""
     for factor in (2.0, 0.5):
@@ -176,6 +185,17 @@ def test_of_several_models_the_largest_is_opened(tmp_path):
     (note,) = photographs.notes
     assert "3 models lie in" in note
     assert "1 with 5 images is used" in note
+
+
+@pytest.mark.linux
+def test_names_of_folders_split_no_sentence(tmp_path):
+    scene = tmp_path / "a\nroom"
+    write_photographs(scene / "images", NAMES[:1], VIEWS[:1])
+    for model in "01":
+        write_colmap_binary(scene / "sparse" / model)
+    notes = open_photographs(scene).notes
+    assert len(notes) == 2
+    assert not any("\n" in note for note in notes)
 
 
 def test_photographs_are_used_as_they_are_stored_and_that_is_said(tmp_path):
@@ -387,7 +407,8 @@ def test_truncated_and_empty_files_are_refused(tmp_path, name):
     write_photographs(tmp_path / "images")
     model = write_colmap_binary(tmp_path / "sparse")
     whole = (model / name).read_bytes()
-    for length in (0, 3, 20, len(whole) // 2, len(whole) - 1):
+    # The last ones end within and before the pairs of the last track.
+    for length in (0, 3, 20, len(whole) // 2, *(len(whole) - cut for cut in (16, 8, 1))):
         (model / name).write_bytes(whole[:length])
         with pytest.raises(InputError, match=f"{name} is empty, truncated"):
             open_photographs(tmp_path).points()

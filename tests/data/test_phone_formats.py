@@ -7,6 +7,7 @@ from importlib import import_module
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 from types import ModuleType
+from zipfile import ZipFile, ZipInfo
 
 import numpy as np
 import pytest
@@ -96,6 +97,27 @@ def test_folders_and_archives_show_the_room_from_where_they_say(tmp_path, name):
         check_room(open_photographs(path, format=name), size)
 
 
+@pytest.mark.parametrize("form", ["./{}", "Aug 5/./{}", "Aug 5//{}", "{}", "Aug 5/{}"])
+@pytest.mark.parametrize("separator", ["/", "\\"])
+def test_archives_of_any_program_are_read(tmp_path, form, separator):
+    """Some write "./" in front of names, and Windows PowerShell backslashes."""
+    files = {form.format(name): content for name, content in polycam().items()}
+    path = tmp_path / "room.zip"
+    with ZipFile(path, "w") as archive:
+        for name, content in files.items():
+            entry = ZipInfo()
+            entry.filename = name.replace("/", separator)
+            archive.writestr(entry, content)
+    check_room(open_photographs(path), WIDE)
+
+
+def test_a_dot_in_the_name_of_a_folder_begins_no_ending(tmp_path):
+    for day in ("2024.05.01", "2024.05.02"):
+        check_room(open_photographs(write_folder(tmp_path / day, polycam())), WIDE, day)
+        archive = write_archive(tmp_path / f"{day}.zip", polycam())
+        check_room(open_photographs(archive), WIDE, day)
+
+
 def test_small_copies_keep_depth_and_confidence(tmp_path):
     photographs = open_photographs(write_folder(tmp_path / "room", polycam()))
     view = photographs.views([1], WIDE[0] // 3)[0]
@@ -143,6 +165,7 @@ def changed(files: Files, name: str, **values: object) -> Files:
 
 
 CAMERA = "keyframes/corrected_cameras/1660000000002.json"
+PHOTOGRAPH = "keyframes/corrected_images/1660000000002.jpg"
 DEPTH, CONFIDENCE = (f"keyframes/{kind}/1660000000002.png" for kind in ("depth", "confidence"))
 FRAME = "frame_00002.json"
 BROKEN = {
@@ -155,7 +178,12 @@ BROKEN = {
         {**record3d(), "rgbd/1.depth": b"bvxn" + struct.pack("<II", 2**31, 0) + b"bvx$"},
         "larger than the photograph",
     ),
-    "depth": ({**polycam(), DEPTH: b"PNG"}, "frame 1660000000002 .* is not an image"),
+    "photograph": ({**polycam(), PHOTOGRAPH: b"JPG"}, "Frame 1660000000002 .* is not an image"),
+    "depth": ({**polycam(), DEPTH: b"PNG"}, "The depth of frame 1660000000002 .* is not an image"),
+    "cut confidence": (
+        {**polycam(), CONFIDENCE: b"PNG"},
+        "The confidence of frame 1660000000002 .* is not an image",
+    ),
     "8-bit depth": ({**polycam(), DEPTH: encode(np.zeros((3, 4), np.uint8))}, "uint8 of shape"),
     "confidence": ({**polycam(), CONFIDENCE: encode(np.zeros((3, 4), np.uint8))}, r"\(3, 4\)"),
     "scanner": (changed(scanner_app(), FRAME, intrinsics=[1, 2]), "`intrinsics` of frame 00002"),
@@ -299,11 +327,12 @@ RECORDINGS = {
     "short": (changed(record3d(), "metadata", poses=[[0] * 6] * 4), "`poses` of .* 4 × 7"),
     "lenses": (changed(record3d(), "metadata", perFrameIntrinsicCoeffs=[1]), "4 × 4 numbers"),
     "K": (changed(record3d(own_lenses=False), "metadata", K=[1]), "`K` of .* 9 numbers"),
-    "depth": ({**record3d(), "rgbd/1.depth": b"bvx2" + b"\xff" * 40}, "depth of frame 1"),
+    "depth": ({**record3d(), "rgbd/1.depth": b"bvx2" + b"\xff" * 40}, "The depth of frame 1"),
     "odd depth": ({**record3d(), "rgbd/1.depth": pack(b"\0" * 28)}, "depth of frame 1"),
     "no depth": ({**record3d(), "rgbd/1.depth": pack(b"")}, "depth of frame 1"),
     "huge": ({**record3d(), "rgbd/1.depth": b"\0" * 99_999}, "larger than the photograph"),
     "confidence": ({**record3d(), "rgbd/1.conf": pack(b"\0" * 12)}, "its confidence"),
+    "cut confidence": ({**record3d(), "rgbd/1.conf": b"bvx-"}, "The confidence of frame 1"),
 }
 
 

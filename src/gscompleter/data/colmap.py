@@ -47,8 +47,6 @@ MAX_NAME = 1024
 """Longest image name in a binary file, in bytes."""
 FEATURE_SIZE = 24
 """Bytes of a feature: x, y and the number of its point."""
-SIGHTING_SIZE = 8
-"""Bytes of a point's sighting: the numbers of the image and of the feature."""
 MAX_FEATURES_LINE = 1 << 22
 """Longest line of a text file, in characters: the features of an image."""
 MAX_MODEL_BYTES = 1 << 34
@@ -69,8 +67,8 @@ class PosedImage(NamedTuple):
     """Path below the folder of photographs, with forward slashes."""
     camera: int
     c2w: Float[np.ndarray, "4 4"]
-    """Camera-to-world in OpenCV axes. A pose that cannot be inverted stays world-to-camera, and
-    leaves the photograph out later with its defect as the reason."""
+    """Camera-to-world in OpenCV axes. An invalid pose stays world-to-camera: all that is asked of
+    it later is its defect."""
 
 
 def build_posed_image(number: int, name: str, camera: int, numbers: Sequence[float]) -> PosedImage:
@@ -237,7 +235,7 @@ def _read_binary_images(path: Path) -> Iterator[PosedImage]:
     with _open_binary(path) as content:
         for _ in range(_read_count(content)):
             number, *pose, camera = _unpack_struct(content, "<I4d3dI")
-            # A name of any length, which ends with a zero byte.
+            # The name ends with a zero byte.
             start = content.tell()
             end = content.find(b"\0", start, start + MAX_NAME)
             if end < 0:
@@ -253,8 +251,9 @@ def _read_binary_points(path: Path) -> Iterator[Track]:
         for _ in range(_read_count(content)):
             # Between the position and the length of its track, a point has a colour and an error.
             xyz = _unpack_struct(content, "<Q3d3Bd")[1:4]
-            track = content.read(_read_count(content) * SIGHTING_SIZE)
-            yield xyz, [image for image, _ in struct.iter_unpack("<II", track)]
+            # A track is pairs of the numbers of an image and of a feature in it.
+            track = _unpack_struct(content, f"<{2 * _read_count(content)}I")
+            yield xyz, list(track[::2])
 
 
 @contextmanager
@@ -307,15 +306,27 @@ def _parse_camera_line(line: str) -> CameraEntry:
 
 
 def _parse_image(line: str) -> PosedImage | None:
-    """Parse a pose and a name; None for the features X Y POINT3D_ID of an image."""
-    words = line.split()
-    # Features are triples that end in the number of a point, or -1; a pose has ten words.
-    if len(words) % 3 == 0 and words[-1].lstrip("-").isdecimal():
+    """Parse a pose and a name; None for the features of an image."""
+    if _holds_features(line.split()):
         return None
     # A name may hold spaces.
     number, qw, qx, qy, qz, x, y, z, camera, name = line.split(maxsplit=9)
     pose = [float(word) for word in (qw, qx, qy, qz, x, y, z)]
     return build_posed_image(int(number), name, int(camera), pose)
+
+
+def _holds_features(words: Sequence[str]) -> bool:
+    """Check whether a line of images.txt holds features, triples X Y POINT3D_ID, and no pose."""
+    # The number of a point is whole, and -1 for none.
+    if len(words) % 3 != 0 or not words[-1].lstrip("-").isdecimal():
+        return False
+    # A pose has nine numbers and a name. Words of a name such as "IMG 1 2" are no feature.
+    try:
+        for word in words[9:12]:
+            float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def _parse_point(line: str) -> Track:
@@ -330,14 +341,14 @@ def has_colmap(path: Path) -> bool:
 
 
 def open_colmap(path: Path) -> Iterator[Photographs]:
-    """Open the photographs of a scene, model or images file, which are one scene.
+    """Open the photographs of a scene, of one model, or of its images file, as a single scene.
 
     The model with most images is used, and the topmost folder of the scene gives the name. Frames
     are numbered by the sorted names of the photographs that exist.
     """
     model, frames, notes = _select_largest(path)
     roots = _list_roots(path.parent if is_image_file(path) else path, model)
-    existing, missing_notes = keep_existing(locate_images(frames, roots), str(model))
+    existing, missing_notes = keep_existing(locate_images(frames, roots), quote_value(model))
     existing, depth_notes = attach_depth_maps(existing, roots, model)
     notes += (*missing_notes, *depth_notes, *_describe_orientation(existing[0]))
     photographs = build_photographs(roots[-1].name, quote_value(model), existing)
@@ -375,8 +386,8 @@ def _select_largest(path: Path) -> tuple[Path, list[Frame], tuple[str, ...]]:
     if len(models) == 1:
         return model, frames, ()
     note = (
-        f"{len(models)} models lie in {model.parent}: {model.name} with {len(frames)} images is "
-        "used; the others are ignored."
+        f"{len(models)} models lie in {quote_value(model.parent)}: {quote_value(model.name)} with "
+        f"{len(frames)} images is used; the others are ignored."
     )
     return model, frames, (note,)
 
@@ -417,8 +428,8 @@ def _find_model_file(folder: Path, name: str) -> Path | None:
 def read_image_file(path: Path) -> list[Frame]:
     """Read the frames of an images.txt or images.bin in its order, with the cameras file beside it.
 
-    They have cameras, but no photographs yet.
-    `rigs` and `frames` (COLMAP 3.12) beside it add nothing to the poses.
+    They have cameras, but no photographs yet. `rigs` and `frames` (COLMAP 3.12) beside it add
+    nothing to the poses.
     """
     cameras_file = _find_model_file(path.parent, "cameras")
     if cameras_file is None:

@@ -22,6 +22,7 @@ import numpy as np
 from jaxtyping import Shaped
 
 from gscompleter.data.cameras import Intrinsics, compute_rotation
+from gscompleter.data.frame import capitalize
 from gscompleter.data.json_fields import get_array, get_intrinsics, get_number, get_part, get_size
 from gscompleter.data.limits import require
 from gscompleter.data.phones.export import (
@@ -174,6 +175,5 @@ def _unpack_map(
         return values.reshape(round(math.sqrt(len(values) * size[1] / size[0])), -1)
     except Exception as error:  # damaged bytes raise anything
         raise InputError(
-            f"The depth of {title} cannot be read ({describe_damage(error)}); "
-            f"{PHONE_EXPORT_ADVICE}."
+            f"{capitalize(title)} cannot be read ({describe_damage(error)}); {PHONE_EXPORT_ADVICE}."
         ) from error

@@ -1,7 +1,7 @@
 """Files of a phone's export, in a folder or a zip archive, and the photographs that they make.
 
-Poses are ARKit's: camera-to-world in metres, x right, y up and z back in the stored photograph. So
-is confidence: 0 where depth is unreliable.
+Poses are ARKit's: camera-to-world in metres, x right, y up and z back in the stored photograph.
+Confidence is ARKit's as well: 0 where depth is unreliable.
 """
 
 from __future__ import annotations
@@ -11,8 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache, partial
-from pathlib import Path, PurePosixPath
-from typing import Any
+from pathlib import Path, PurePath, PurePosixPath
 from zipfile import ZipFile
 
 import numpy as np
@@ -38,7 +37,10 @@ Reader = Callable[[], bytes]
 Files = dict[str, Reader]
 """Functions that read files, by the names of frames."""
 Decoder = Callable[[bytes, str], Shaped[np.ndarray, "..."]]
-"""Function from the bytes of a map of depth or confidence, and its title, to its values."""
+"""Function from the bytes of a map of depth or confidence, and its title, to its values.
+
+The title is for errors, such as "the depth of frame 3 of room.zip".
+"""
 PoseAndLens = tuple[Float[np.ndarray, "4 4"], Intrinsics]
 
 
@@ -48,25 +50,32 @@ def find_files(export: Path, pattern: str) -> Files:
     The name of a frame is what follows the last underscore of the file's name. In an archive the
     export may lie in a folder of its own.
     """
-    paths: list[Any] = list(export.glob(pattern))
-    read: Callable[[Any], bytes] = read_bytes
+    readers: dict[PurePath, Reader] = {
+        path: partial(read_bytes, path) for path in export.glob(pattern)
+    }
     if os.path.isfile(export) and export.suffix.lower() in (".zip", ".r3d"):
         with _open_archive(export) as archive:
-            entries = [PurePosixPath(name) for name in archive.namelist()]
-            # `match` compares from the right, so that a folder around the export does not matter.
-            paths = [entry for entry in entries if entry.match(pattern)]
-        read = partial(_read_archive_entry, export)
-    paths = sorted(path for path in paths if not is_hidden_name(path.name))
+            names = archive.namelist()
+        # Programs write "./" in front of names, and Windows PowerShell separates folders by a
+        # backslash. An entry is still read by its name as it is written.
+        entries = {PurePosixPath(name.replace("\\", "/")): name for name in names}
+        # `match` compares from the right, so that a folder around the export does not matter.
+        readers = {
+            path: partial(_read_archive_entry, export, name)
+            for path, name in entries.items()
+            if path.match(pattern)
+        }
+    paths = sorted(path for path in readers if not is_hidden_name(path.name))
     require(
         len({path.parent for path in paths}) <= 1,
         f"{quote_value(export)} holds several recordings; unpack it, and name one of them.",
     )
-    return {path.stem.rpartition("_")[2]: partial(read, path) for path in paths}
+    return {path.stem.rpartition("_")[2]: readers[path] for path in paths}
 
 
-def _read_archive_entry(export: Path, path: PurePosixPath) -> bytes:
+def _read_archive_entry(export: Path, name: str) -> bytes:
     with _open_archive(export) as archive:
-        return read_zip_entry(archive, str(path), MAX_ENTRY)
+        return read_zip_entry(archive, name, MAX_ENTRY)
 
 
 @contextmanager
@@ -82,13 +91,16 @@ def _open_archive(path: Path) -> Iterator[ZipFile]:
 
 @lru_cache(maxsize=1)
 def _keep_open(path: Path, _written: int) -> ZipFile:
-    """Open an archive; the last one stays open, because its list of files is long."""
+    """Open an archive; the last one stays open, because its list of files is long.
+
+    One that was `_written` since, by its time of modification, is opened anew.
+    """
     return ZipFile(path)
 
 
 def decode_png(data: bytes, title: str) -> Shaped[np.ndarray, "..."]:
     """Decode the values of a PNG file."""
-    with open_image(data, title) as image:
+    with open_image(data, capitalize(title)) as image:
         return np.array(image)
 
 
@@ -100,9 +112,9 @@ def build_recording(
 ) -> Photographs:
     """Build photographs from cameras by frame name, and the files of images, depth and confidence.
 
-    `decoders` are those of depth and of confidence, either of which a frame may lack. A camera
-    without a photograph is usual: 3d Scanner App keeps poses of every frame. The other way round, a
-    note tells it.
+    `decoders` are those of depth and of confidence, either of which a frame may lack. Cameras
+    without a photograph are usual, and are left out; photographs without a camera are left out with
+    a note.
     """
     frames = []
     images, depths, confidences = files
@@ -117,7 +129,10 @@ def build_recording(
         frame = Frame(name, title, c2w @ OPENCV_FROM_OPENGL, lens, stored, depth)
         frames.append(frame.with_rigid_pose())
     require(frames, f"No photograph of {quote_value(path)} has a camera; {PHONE_EXPORT_ADVICE}.")
-    photographs = build_photographs(path.resolve().stem, quote_value(path), frames)
+    place = path.resolve()
+    # A dot in the name of a folder begins no ending.
+    scene = place.stem if os.path.isfile(place) else place.name
+    photographs = build_photographs(scene, quote_value(path), frames)
     lost = sorted(images.keys() - cameras.keys())
     if not lost:
         return photographs
@@ -131,9 +146,12 @@ def _read_depth(
     depth: Reader, confidence: Reader | None, decoders: tuple[Decoder, Decoder], title: str
 ) -> Float[np.ndarray, "h w"]:
     """Read z-depth in metres, 0 where it is unknown or unreliable."""
-    stored = decoders[0](depth(), title)
+    stored = decoders[0](depth(), f"the depth of {title}")
     # Confidence is optional; depth without it is taken as it is.
-    sure = stored if confidence is None else decoders[1](confidence(), title)
+    sure = stored
+    if confidence is not None:
+        sure = decoders[1](confidence(), f"the confidence of {title}")
+    # Values of one byte are a picture of depth, and no distances.
     require(
         stored.ndim == 2 and stored.dtype.itemsize > 1 and stored.shape == sure.shape,
         f"The depth of {title} and its confidence are {stored.dtype} of shape {stored.shape} and "

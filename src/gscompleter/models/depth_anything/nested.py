@@ -34,11 +34,11 @@ class NestedPrediction:
     any_view: Prediction
     metric: MetricDepth
     scale: float
-    """Metres per unit of `any_view`."""
+    """Metres per unit of `any_view`; 1 if too few pixels tell it."""
 
     @property
     def depth(self) -> Float[Tensor, "1 v h w"]:
-        """The z-depth in metres; the sky lies behind the foreground, at most at 200 m."""
+        """The z-depth in metres, in the sky that of the far foreground (`set_sky_depth`)."""
         return set_sky_depth(
             self.any_view.depth * self.scale, self.metric.solid_mask, MAX_SKY_DEPTH
         )
@@ -69,10 +69,14 @@ class NestedDepthAnything(nn.Module):
 
 
 def fit_metres_per_unit(prediction: Prediction, metric: MetricDepth) -> float:
-    """Fit the scale from any-view to metric depth on the more confident half of the foreground."""
+    """Fit the scale from any-view to metric depth on the more confident half of the foreground.
+
+    It is 1 if hardly any pixels are left.
+    """
     solid = metric.solid_mask
     if not solid.any():
         return 1.0
+    # By the predicted cameras, even if poses were given, as the authors do.
     metres = metric.convert_to_metres(prediction.poses.K)
     middle = interpolate_quantile(prediction.confidence[solid], 0.5)
     deep = (metres > MIN_METRES) & (prediction.depth > MIN_DEPTH)

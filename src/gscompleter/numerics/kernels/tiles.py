@@ -1,4 +1,8 @@
-"""Splat lists of the tiles, front to back, and sums of gradients over their entries."""
+"""Splat lists of the tiles, front to back, and sums of gradients over their entries.
+
+`splats` and `boxes` are those of `project.project_splats`, and `tiles_x` is the number of tiles in
+a row. The list of tile t is entries[tile_start[t]:tile_start[t + 1]], numbers of splats.
+"""
 
 import numpy as np
 
@@ -12,8 +16,9 @@ TILE_SHIFT = 4
 
 @njit(nogil=True)
 def count_entries(begin, end, splats, boxes, depth_limits, tiles_x, counts):
-    """Add to `counts` [tiles] int32 how many of the splats begin..end touch each tile.
+    """Add to `counts` [tiles] int32 how many of the splats begin..end are in the list of each tile.
 
+    They are those whose boxes touch it, but for splats behind its depth limit.
     depth_limits [tiles] float32: depth behind which nothing is visible in a tile.
     """
     for i in range(begin, end):
@@ -25,7 +30,7 @@ def count_entries(begin, end, splats, boxes, depth_limits, tiles_x, counts):
 
 
 def counts_to_offsets(counts):
-    """Turn counts [chunks, tiles] into offsets in place, and return the starts of the lists."""
+    """Turn counts [chunks, tiles] into offsets in place, and return `tile_start` [tiles + 1]."""
     # Tile by tile and, within a tile, chunk by chunk: so a list keeps the order of the Gaussians.
     ends = np.cumsum(counts.T, dtype=np.int64).reshape(counts.T.shape)
     starts = ends - counts.T
@@ -35,9 +40,9 @@ def counts_to_offsets(counts):
 
 @njit(nogil=True)
 def fill_entries(begin, end, splats, boxes, depth_limits, tiles_x, places, entries, keys):
-    """Enter the splats begin..end into the lists of the tiles they touch; see `count_entries`.
+    """Enter the splats begin..end into the lists of the tiles; see `count_entries`.
 
-    places [tiles] int32: next free entry of each tile; counted up.
+    places [tiles] int32: next free entry of each tile for these splats, counted up.
     entries, keys [e]: receive the index of the splat, int32, and the bits of its depth, uint32.
     """
     for i in range(begin, end):
@@ -94,7 +99,8 @@ def sort_lists(begin, end, tile_start, entries, keys):
 def number_slots(entries, count):
     """Assign slots to the entries [e] so that the gradients of a splat are adjacent.
 
-    Returns the slot of each entry [e] int32, and the first slot of each splat [count + 1] int64.
+    Returns the slot of each entry [e] int32, and the first slot of each of the `count` splats, with
+    the end of the last one [count + 1] int64.
     """
     slot_start = np.zeros(count + 1, np.int64)
     for place in range(len(entries)):
@@ -115,7 +121,10 @@ def number_slots(entries, count):
 
 @njit(nogil=True)
 def number_by_use(entries, count):
-    """Renumber `entries` by the first use of splats; return the used splats in order, and them."""
+    """Renumber the splats of `entries` by their first use.
+
+    Returns the used splats in their new order, and the entries with the new numbers.
+    """
     numbers = np.full(count, -1, np.int32)
     order = np.empty(count, np.int32)
     renamed = np.empty_like(entries)
@@ -132,9 +141,10 @@ def number_by_use(entries, count):
 
 @njit(nogil=True, fastmath={"contract"}, error_model="numpy")
 def sum_entries(begin, end, slot_start, gradients, written, totals):
-    """Sum the gradients of the entries of each of the Gaussians begin..end into `totals` [n, c].
+    """Sum the gradients of all entries of each of the splats begin..end into `totals` [n, c].
 
-    gradients [slots, c] float32 count if written [slots], from slot_start[i] to slot_start[i + 1].
+    gradients [slots, c] float32: those of splat i are in the slots from slot_start[i] to
+    slot_start[i + 1], and count where written [slots] is True.
     """
     for i in range(begin, end):
         for column in range(gradients.shape[1]):

@@ -11,7 +11,7 @@ from pathlib import Path
 from PIL import Image, features
 
 from gscompleter.system.damage import describe_damage
-from gscompleter.system.errors import InputError, quote_value, refuse_pointer
+from gscompleter.system.errors import MAX_PATH_LENGTH, InputError, quote_value, refuse_pointer
 from gscompleter.system.files.reading import check_file, make_read_error, read_head
 
 IMAGE_FORMATS = ("PNG", "JPEG", "TIFF", "WEBP", "BMP", "PPM", "GIF", "JPEG2000")
@@ -32,8 +32,10 @@ def open_image(stored: Path | str | bytes, name: str = "") -> Iterator[Image.Ima
     `name` stands for bytes in errors.
     """
     file = io.BytesIO(stored) if isinstance(stored, bytes) else Path(stored)
-    shown = quote_value(name) if isinstance(file, io.BytesIO) else f"The image {quote_value(file)}"
+    # A name may hold the path of a container.
+    shown = quote_value(name, MAX_PATH_LENGTH)
     if isinstance(file, Path):
+        shown = f"The image {quote_value(file)}"
         check_file(file)
         refuse_pointer(file)
     head = stored[:64] if isinstance(stored, bytes) else read_head(Path(stored), 64)
