@@ -315,6 +315,7 @@ def test_wrong_frames_are_refused(scene, tmp_path, monkeypatch, capsys, more, se
         (("--seed", 2**64), "seed must be less than 4611686018427387904"),
         (("--seed", 1.5), "--seed takes a whole number, and was given '1.5' (see gscompleter "),
         (("--sed", 1), "nearest is --seed INT (see gscompleter complete --help)."),
+        (("a", "--sed"), "options: a, --sed; the nearest is --seed INT (see gscompleter complete"),
         (("--drop_nonfinit",), "options: --drop_nonfinit; the nearest is --drop-nonfinite (see"),
         (("--qwertz", 1), "Unrecognized options: --qwertz, 1 (see gscompleter complete --help)."),
         (("--depth", "none", "moge-2"), "moge-2 belongs to no option of complete, and"),
@@ -432,6 +433,20 @@ def test_a_wrong_number_of_targets_is_told_as_that_of_its_option(
 def test_wrong_values_of_an_option_are_told_without_types(monkeypatch, capsys, words, sentence):
     assert run(monkeypatch, *words.split()) == 2
     assert sentence in capsys.readouterr().err
+
+
+LONG_PATH = "/".join(["reconstructions"] * 8)
+
+
+@pytest.mark.parametrize(
+    ("word", "sentence"),
+    [(LONG_PATH, LONG_PATH), ("--renderer-device", "takes cpu or cuda, and none was given")],
+)
+def test_an_error_is_whole_however_narrow_the_terminal_is(monkeypatch, capsys, word, sentence):
+    monkeypatch.setenv("COLUMNS", "40")
+    assert run(monkeypatch, "complete", "a", "--out", "b", word) == 2
+    assert sentence in capsys.readouterr().err
+    assert os.environ["COLUMNS"] == "40"
 
 
 @pytest.mark.parametrize("word", ["compleat", "--verson"])

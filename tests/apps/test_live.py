@@ -17,6 +17,7 @@ from functools import partial, partialmethod
 from pathlib import Path
 from socketserver import BaseServer
 from types import SimpleNamespace
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -672,6 +673,35 @@ def test_a_step_that_is_not_kept_is_done_and_says_so(page, monkeypatch):
     assert said["steps"] == 1
     assert "are removed" in said["text"]
     assert said["text"].endswith("This step is not kept on the disk: The disk is full.")
+
+
+@pytest.mark.parametrize(("message", "state"), [("OUT is complete", "Saved"), ("", "Not saved")])
+def test_what_was_saved_before_an_interrupt_counts_as_saved(page, monkeypatch, message, state):
+    """Ctrl-C waits while results are renamed, and then says that they are complete."""
+
+    def stop(_: Session) -> str:
+        raise KeyboardInterrupt(*filter(None, [message]))
+
+    do(page, request_for("remove", box=CRATE))
+    monkeypatch.setattr(page, "_save", stop)
+    with pytest.raises(KeyboardInterrupt):
+        do(page, request_for("save"))
+    assert serving.describe_end(page.session, page._journal)[0].startswith(state)
+
+
+def test_ctrl_c_ends_the_page_also_while_the_browser_is_opened(page, room, monkeypatch, capsys):
+    addresses = []
+
+    def stop(address: str) -> None:
+        addresses.append(urlsplit(address))
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("webbrowser.open", stop)
+    serving.serve(decide_live(options_for(room, Path("out"))), page)
+    (address,) = addresses
+    assert f"{address.netloc}/?token=" in capsys.readouterr().out
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection((address.hostname, address.port))
 
 
 def test_an_error_is_a_sentence_and_ends_nothing(page, monkeypatch, capsys):

@@ -6,7 +6,7 @@ import torch
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.generators.lines import continue_lines
 from gscompleter.generators.warp import WarpedImage, continue_image, fill_background_first
-from gscompleter.numerics.smooth import fit_membrane
+from gscompleter.numerics.smooth import average_trusted, fit_membrane
 from gscompleter.types import GeneratorInput, Render, View
 from scenes import camera_at
 
@@ -101,3 +101,12 @@ def test_a_membrane_runs_straight_between_two_borders_and_follows_the_weights():
             torch.where(middle[..., None] > 0, 1.0, values), known + weight * middle
         )
         assert abs(pulled[W // 2, W // 2, 0].item() - nearest) < 0.2
+
+
+@pytest.mark.parametrize("trust", [0.0, 1.0])
+def test_trusted_colours_reach_over_all_of_the_image(trust):
+    """A strip at the border has a colour; at the other side it has a tiny weight."""
+    alpha = (torch.arange(W) < 4).float().expand(W, W)
+    render = Render(0.8 * alpha[..., None].expand(W, W, 3), torch.ones(W, W), alpha)
+    mean = average_trusted(render, torch.full((W, W), trust))
+    assert (mean - 0.8).abs().max() < 1e-4

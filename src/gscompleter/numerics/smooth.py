@@ -48,7 +48,9 @@ def continue_smoothly(
 ) -> Float[Tensor, "h w c"]:
     """Fill pixels of zero `weight` with weighted means over a radius that grows inwards.
 
-    Weights are not negative, in any unit; without a positive one all values are 0.
+    Weights are not negative, and the largest is about 1: a radius with a mean weight of at most
+    `MIN_LEVEL_WEIGHT` counts as empty, and the next wider one is taken, or at last the image.
+    Without a positive weight all values are 0. Values are finite, also where they have none.
     """
     known = weight > 0
     if not known.any():
@@ -73,7 +75,7 @@ def build_sum_pyramid(weighted: Float32[ndarray, "h w c"]) -> list[Float32[ndarr
     sums = []
     while True:
         blurred = cv2.GaussianBlur(weighted, (0, 0), BLUR_SIGMA)
-        sums.append(blurred.reshape(weighted.shape))
+        sums.append(blurred)
         if min(weighted.shape[:2]) <= 8:
             return sums
         half = ((weighted.shape[1] + 1) // 2, (weighted.shape[0] + 1) // 2)
@@ -145,5 +147,6 @@ def average_trusted(render: Render, trust: Float[Tensor, "h w"]) -> Float[Tensor
     for level in range(NUM_SCALES):
         mean = cv2.GaussianBlur(small, (0, 0), FIRST_SIGMA * 2**level)
         total += np.float32(COARSER_WEIGHT**level) * mean.astype(np.float32)
-    means = cv2.resize(total[..., :3] / np.maximum(total[..., 3:], 1e-6), (width, height))
+    # Far from all colours only the coarsest scales have a weight, which is tiny.
+    means = cv2.resize(total[..., :3] / np.maximum(total[..., 3:], 1e-12), (width, height))
     return torch.from_numpy(means).to(render.image).clamp(0, 1)

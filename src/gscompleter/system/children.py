@@ -14,6 +14,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
+from gscompleter.system.environment import set_variables
+
 SAFE_PATH = {"PYTHONSAFEPATH": "1"}
 """Environment in which Python 3.11 and later keep the working folder off the path."""
 BEGINNING = """\
@@ -78,17 +80,11 @@ def hide_working_folder() -> Iterator[None]:
     They begin in the folder of Python's own modules, so each has to change to its folder itself.
     No other thread may rely on the working folder meanwhile.
     """
-    before = {name: os.environ.get(name) for name in SAFE_PATH}
     here = os.getcwd()
-    os.environ.update(SAFE_PATH)
-    # Python 3.10 does not know the variable, and Ray names the working folder to its workers.
-    os.chdir(Path(os.__file__).parent)
-    try:
-        yield
-    finally:
-        os.chdir(here)
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+    with set_variables(SAFE_PATH):
+        # Python 3.10 does not know the variable, and Ray names the working folder to its workers.
+        os.chdir(Path(os.__file__).parent)
+        try:
+            yield
+        finally:
+            os.chdir(here)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import redirect_stderr
+from contextlib import nullcontext, redirect_stderr
 from dataclasses import is_dataclass
 from functools import cache
 from io import StringIO
+from itertools import pairwise
 from typing import Any, get_args, get_type_hints
 
 import tyro
@@ -25,6 +26,7 @@ from gscompleter.apps.command_line.old_spellings import refuse_old_spellings
 from gscompleter.apps.command_line.wrong_values import explain_values
 from gscompleter.apps.requests.completion import DEFAULT_NUM_TARGETS
 from gscompleter.config import CompleterConfig, load_config
+from gscompleter.system.environment import set_variables
 from gscompleter.system.errors import InputError, join_names, quote_value
 
 CONTINUING = ("batch", "evaluate")
@@ -43,8 +45,12 @@ NUMBER = re.compile(r"[+-]?\d+(\.\d*)?")
 NEAREST_WORD = "the nearest is"
 SURPLUS = "Unrecognized options: "
 """Beginning of tyro's message on words that nothing takes."""
+OPTION_AMONG = re.compile(r"(^|, )-")
+"""Option in the list of these words."""
 HINTS = {"Argument helptext:": "give", "Perhaps you meant:": NEAREST_WORD}
-"""Titles in tyro's messages before the option that is meant."""
+"""Titles in tyro's messages before the option that is meant, and words for it in a sentence."""
+WIDE_TERMINAL = {"COLUMNS": "1000000"}
+"""Environment in which tyro breaks no line of an error."""
 
 
 def format_error(error: InputError) -> str:
@@ -70,17 +76,19 @@ def parse_words(words: Sequence[str], kinds: Mapping[str, type]) -> Any:
     refuse_empty_words(words)
     check_once(words)
 
-    # Settings of the method are options as well, five times as many as a command has of its own. To
-    # prepare them takes tyro a tenth of a second, 3 % of a small completion. Without them it knows
+    # Settings of the method are options as well, more than a command has of its own. To prepare
+    # them takes tyro up to a tenth of a second, 3 % of a small completion. Without them it knows
     # the words of most command lines, but not always the option that is meant by a wrong one.
     has_setting = any(word.startswith(f"--{CONFIG_OPTION}.") for word in words)
     box = ""
     for knows_settings in (True,) if has_setting else (False, True):
         # tyro prints an error in a box and ends the process. The box is caught, and one sentence of
-        # it becomes that of an InputError.
+        # it becomes that of an InputError. In a box as wide as the terminal long paths are broken;
+        # help pages have that width.
         printed = StringIO()
+        wide = nullcontext() if asks_for_help(words) else set_variables(WIDE_TERMINAL)
         try:
-            with redirect_stderr(printed):
+            with redirect_stderr(printed), wide:
                 return parse_known_words(words, kinds, knows_settings)
         except SystemExit as stop:
             # Code 0: the help was printed.
@@ -98,7 +106,7 @@ def parse_known_words(words: Sequence[str], kinds: Mapping[str, type], knows_set
     rules: list[Rule] = [make_parsing_rule(knows_settings)]
     # To find help texts tyro parses source code, also where it shows none.
     marks: tuple[Any, ...] = (tyro.conf.HelptextFromCommentsOff,)
-    if any(word in (*HELP, HELP_ALL) for word in words):
+    if asks_for_help(words):
         # Rules for help pages change the fields, so that no option could be parsed by them.
         words, rules = prepare_help(words)
         marks = ()
@@ -110,6 +118,11 @@ def parse_known_words(words: Sequence[str], kinds: Mapping[str, type], knows_set
     parsed = call_tyro(kinds[words[0]], prog, about, words[1:], registry, marks)
     check_config(parsed)
     return parsed
+
+
+def asks_for_help(words: Sequence[str]) -> bool:
+    """Return True if a command line asks for a help page of its command."""
+    return any(word in (*HELP, HELP_ALL) for word in words)
 
 
 def check_config(options: Any) -> None:
@@ -148,9 +161,9 @@ def explain_words(words: Sequence[str], kinds: Mapping[str, type], box: str) -> 
         or explain_values(words, own, "\n".join(list_box_lines(box)))
         or extract_sentence(box, own)
     )
-    # Of words that are no options, tyro says so as well.
+    # tyro calls all words options that nothing takes, also where none of them is one.
     surplus = sentence.removeprefix(SURPLUS)
-    if surplus != sentence and not surplus.startswith("-"):
+    if surplus != sentence and not OPTION_AMONG.search(surplus):
         return (
             f"{surplus} belongs to no option of {words[0]}, and an option takes one value unless "
             "its help shows several"
@@ -163,8 +176,8 @@ def list_options(kind: Any, prefix: str = "") -> Mapping[str, Any]:
     """List the options of a command by name, without dashes before it, with their types."""
     options: dict[str, Any] = {}
     for field, hint in get_type_hints(kind, include_extras=True).items():
-        # `Annotated[inner, *marks]`. Of a plain union the first member is `inner`, and the others
-        # count as marks, none of which is searched for.
+        # `Annotated[inner, *marks]`. Of a plain union, tuple or Literal the first argument is
+        # `inner`, and the others count as marks; none of them is searched for.
         marks = get_args(hint)[1:]
         inner: Any = get_args(hint)[0] if marks else hint
         name = f"{prefix}{field.replace('_', '-')}"
@@ -199,7 +212,7 @@ def describe_foreign_option(
 
 def refuse_empty_words(words: Sequence[str]) -> None:
     """Refuse an empty word, which as a path would mean the working folder."""
-    for before, word in zip(["gscompleter", *words], words, strict=False):
+    for before, word in pairwise(words):
         name, sign, value = word.partition("=")
         # Empty is the word itself, or what follows the sign in `--out=`.
         if word and not (name.startswith("--") and sign and not value):
@@ -265,7 +278,8 @@ def show_config(words: Sequence[str]) -> tuple[CompleterConfig, list[str]]:
 
 def list_box_lines(box: str) -> list[str]:
     """List the lines of tyro's boxed error message, without the border."""
-    # The first line is its top, and each other one begins with `│ `.
+    # The first line is its top. The others begin with `│ `, or with two spaces where the output has
+    # no such characters. The bottom stays, as a rule.
     return [line[2:].rstrip("│ ") for line in box.splitlines()[1:]]
 
 

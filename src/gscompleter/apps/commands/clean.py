@@ -36,9 +36,10 @@ OPTIONS_OF_PHOTOGRAPHS = (
     "ignore",
     "forget_edits",
 )
-"""Options that only photographs can follow: without them no renders take their place here."""
+"""Options that only photographs can follow. Some are those of renders as well, which take the place
+of photographs in `complete`, but not here."""
 NEEDS_PHOTOGRAPHS = "There are no photographs to apply this to; name their SCENE."
-"""Sentence about such an option where there are none."""
+"""Sentence about such an option, or a setting, where there are none."""
 
 Strength = Annotated[float, Interval(ge=0.1, le=10)]
 

@@ -170,7 +170,13 @@ class LivePage:
         """Write the completed scene."""
         if not self.session.steps and self._journal.has_saved:
             raise InputError(ALL_UNDONE)
-        text = self._save(self.session)
+        try:
+            text = self._save(self.session)
+        except KeyboardInterrupt as stop:
+            # With a message it came after the result was complete (`defer_interrupts`).
+            if stop.args:
+                self._journal.set_saved(self.session)
+            raise
         self._journal.set_saved(self.session)
         return Outcome(text)
 

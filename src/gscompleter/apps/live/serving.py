@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shlex
 import webbrowser
-from contextlib import suppress
+from contextlib import closing, suppress
 from pathlib import Path
 
 from PIL import Image
@@ -138,24 +138,26 @@ def name_session(ready: Prepared) -> str:
 def serve(request: LiveRequest, page: LivePage) -> None:
     """Serve a page until Ctrl-C."""
     server = LiveServer(resolve_host(request.host), request.host, request.port, page)
-    # Printed once the server listens.
-    if request.session.completion.results.answer.json:
-        print_json({"url": server.url})
-    else:
-        print(f"{server.url} (Ctrl-C ends it)", flush=True)
-    if request.opens_browser:
-        webbrowser.open(server.opening_url)
-    with suppress(KeyboardInterrupt):
+    with closing(server), suppress(KeyboardInterrupt):
+        # Printed once the server listens.
+        if request.session.completion.results.answer.json:
+            print_json({"url": server.url})
+        else:
+            print(f"{server.url} (Ctrl-C ends it)", flush=True)
+        if request.opens_browser:
+            webbrowser.open(server.opening_url)
         page.handle_requests()
-    server.close()
 
 
 def find_next_target(ready: Prepared, session: Session) -> Camera | None:
-    """Find the next-best target camera: first for what was removed, then for other holes."""
-    # The settings of a removal know no other holes.
-    removal = session.latest
-    elsewhere = set_apart(session.first_config, removal)
-    for state in (removal,) if elsewhere is removal else (removal, elsewhere):
+    """Find the next-best target camera: first for what was removed, then for other holes.
+
+    None if no hole is worth a target.
+    """
+    # The settings of a removal know no other holes; where nothing was removed both are the same.
+    latest = session.latest
+    elsewhere = set_apart(session.first_config, latest)
+    for state in (latest,) if elsewhere is latest else (latest, elsewhere):
         choices = ready.explorer.plan(state, list(ready.cameras.values()), 1)
         if choices:
             return choices[0].camera

@@ -1,4 +1,4 @@
-"""Scores a splat against photographs: it is rendered at their cameras and compared."""
+"""Fit of a splat to photographs: it is rendered at their cameras and compared."""
 
 from __future__ import annotations
 
@@ -26,7 +26,8 @@ MIN_COVERED_SHARE = 0.05
 MIN_MARGIN = 3.0
 """Smallest margin in dB of a match: half of the photograph's variance is explained."""
 MIN_PSNR = 30.0
-"""PSNR in dB above which a flat photograph counts as a match, if half of it is covered."""
+"""PSNR in dB of a match whatever its margin, if half of the photograph is covered: a flat one has
+no margin."""
 MAX_DRIFT = 0.25
 """Largest displacement of an exact alignment, in pixels; a scale error of 0.5 % causes 0.5."""
 MIN_TRACKED_CORNERS = 15
@@ -55,8 +56,8 @@ class ImageFit(NamedTuple):
     @property
     def is_match(self) -> bool:
         """True if the splat shows the content of the photograph."""
-        flat = self.psnr >= MIN_PSNR and self.coverage >= 0.5
-        return self.coverage >= MIN_COVERED_SHARE and (self.margin >= MIN_MARGIN or flat)
+        is_alike = self.psnr >= MIN_PSNR and self.coverage >= 0.5
+        return self.coverage >= MIN_COVERED_SHARE and (self.margin >= MIN_MARGIN or is_alike)
 
 
 class SplatFit(NamedTuple):
