@@ -93,8 +93,8 @@ class LivePage:
         self._journal = journal
         self._requests: SimpleQueue[PageRequest] = SimpleQueue()
         self._busy = Lock()
-        # Revision 0 is the scene as it was given, which a page holds. What a session begins with may
-        # be another one, also without steps: photographs add to a splat and recolour it.
+        # Revision 0 is the scene as it was given, which a page holds. What a session begins with
+        # may be another one, also without steps: photographs add to a splat and recolour it.
         self._revision = 1
         self._actions: dict[str, Callable[[PageRequest], Outcome]] = {
             **dict.fromkeys(PERFORM, self.do_step),
