@@ -1,5 +1,6 @@
 """COLMAP models: every layout, both encodings, every lens, and damaged files."""
 
+import re
 import shutil
 import struct
 from dataclasses import dataclass
@@ -14,7 +15,13 @@ from PIL import Image
 from command import run
 from gscompleter import InputError, load_cameras
 from gscompleter.data.cameras import Distortion, distort
-from gscompleter.data.colmap import CAMERA_MODELS, _list_roots, build_intrinsics
+from gscompleter.data.colmap import (
+    CAMERA_MODELS,
+    MAX_NAME,
+    _list_roots,
+    build_intrinsics,
+    read_images,
+)
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.points import add_depth_range
 from gscompleter.system.files.image import write_image
@@ -142,6 +149,29 @@ def test_names_without_endings_may_look_like_features(tmp_path):
         check_room(open_photographs(tmp_path))
 
 
+def test_names_of_three_numbers_are_no_features(tmp_path):
+    names = ["1 2 3", "2024 05 01", "2024 05 02", "2024 05 03", "7 8 9 10 11 12"]
+    write_photographs(tmp_path / "images", [f"{name}.png" for name in names])
+    for features in ("", "1 2 -1", "1.5 2 -1 " * 4, "0 0 -1 " * 4, "0 0 0 " * 4):
+        write_colmap_text(tmp_path / "sparse", names, features)
+        check_room(open_photographs(tmp_path))
+    # The first camera is that of the scene's axes, whose pose COLMAP writes in whole numbers.
+    path = tmp_path / "sparse" / "images.txt"
+    text, count = re.subn(r"\n1 .* 7 1 2 3\n", "\n1 1 0 0 0 0 0 0 7 1 2 3\n", path.read_text())
+    assert count == 1
+    path.write_text(text)
+    check_room(open_photographs(tmp_path))
+
+
+def test_the_longest_name_of_a_binary_file_is_read(tmp_path):
+    for length in (MAX_NAME - 1, MAX_NAME):
+        path = write_colmap_binary(tmp_path, ["a" * length, "b"]) / "images.bin"
+        assert [len(image.name) for image in read_images(path)] == [length, 1]
+    write_colmap_binary(tmp_path, ["a" * (MAX_NAME + 1), "b"])
+    with pytest.raises(InputError, match="is empty, truncated"):
+        read_images(path)
+
+
 def test_intrinsics_follow_the_size_on_the_disk(tmp_path):
     """The camera file has twice or half the size, and the view does not change."""
     for factor in (2.0, 0.5):
@@ -184,7 +214,19 @@ def test_of_several_models_the_largest_is_opened(tmp_path):
     check_room(photographs)
     (note,) = photographs.notes
     assert "3 models lie in" in note
-    assert "1 with 5 images is used" in note
+    assert "sparse: 1 with 5 images is used" in note
+
+
+def test_of_a_model_and_others_in_its_folder_the_largest_is_opened(tmp_path):
+    write_photographs(tmp_path / "images")
+    home = write_colmap_text(tmp_path / "sparse")
+    write_colmap_binary(home / "0", NAMES[:2])
+    photographs = open_photographs(tmp_path)
+    check_room(photographs)
+    (note,) = photographs.notes
+    assert note.startswith(
+        f"2 models lie in {home}: the one in the folder itself with 5 images is used;"
+    )
 
 
 @pytest.mark.linux

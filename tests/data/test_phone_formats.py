@@ -3,6 +3,7 @@
 import json
 import struct
 import sys
+from dataclasses import replace
 from importlib import import_module
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
@@ -184,8 +185,18 @@ BROKEN = {
         {**polycam(), CONFIDENCE: b"PNG"},
         "The confidence of frame 1660000000002 .* is not an image",
     ),
-    "8-bit depth": ({**polycam(), DEPTH: encode(np.zeros((3, 4), np.uint8))}, "uint8 of shape"),
-    "confidence": ({**polycam(), CONFIDENCE: encode(np.zeros((3, 4), np.uint8))}, r"\(3, 4\)"),
+    "8-bit depth": (
+        {**without(polycam(), CONFIDENCE), DEPTH: encode(np.zeros((3, 4), np.uint8))},
+        r"The depth of frame 1660000000002 .*zip is uint8 of shape \(3, 4\); one channel is needed",
+    ),
+    "confidence": (
+        {**polycam(), CONFIDENCE: encode(np.zeros((3, 4), np.uint8))},
+        r"The depth of frame 1660000000002 .* its confidence \(3, 4\);",
+    ),
+    "two photographs": (
+        {**polycam(), PHOTOGRAPH.replace("jpg", "png"): photograph(0, WIDE, "PNG")},
+        "Frame 1660000000002 of .* has several files, 1660000000002.jpg, 1660000000002.png; keep",
+    ),
     "scanner": (changed(scanner_app(), FRAME, intrinsics=[1, 2]), "`intrinsics` of frame 00002"),
 }
 
@@ -216,6 +227,15 @@ def test_photographs_without_a_camera_are_told(tmp_path):
         assert len(photographs) == 3
         told = f"Left out of {tmp_path / name}: 1 photograph without a camera ({lost})."
         assert told in photographs.notes
+
+
+def test_a_photograph_with_a_longer_name_takes_the_place_of_none(tmp_path):
+    files = {**scanner_app(), "frame_x_00002.jpg": photograph(3, WIDE)}
+    scene = write_folder(tmp_path / "room", files)
+    photographs = open_photographs(scene)
+    told = f"Left out of {scene}: 1 photograph without a camera (x_00002)."
+    assert photographs.notes == (told,)
+    check_room(replace(photographs, notes=()), WIDE)
 
 
 def test_other_files_beside_photographs_are_no_cameras(tmp_path):

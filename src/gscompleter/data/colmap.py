@@ -7,6 +7,7 @@ the feature lines of text files or add empty ones, so lines are classified by co
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
 import struct
@@ -45,6 +46,8 @@ MODEL_ENDINGS = (".bin", ".txt")
 
 MAX_NAME = 1024
 """Longest image name in a binary file, in bytes."""
+UNIT_TOLERANCE = 1e-3
+"""Largest deviation of the length of a quaternion from 1, by which it is known as one."""
 FEATURE_SIZE = 24
 """Bytes of a feature: x, y and the number of its point."""
 MAX_FEATURES_LINE = 1 << 22
@@ -237,7 +240,7 @@ def _read_binary_images(path: Path) -> Iterator[PosedImage]:
             number, *pose, camera = _unpack_struct(content, "<I4d3dI")
             # The name ends with a zero byte.
             start = content.tell()
-            end = content.find(b"\0", start, start + MAX_NAME)
+            end = content.find(b"\0", start, start + MAX_NAME + 1)
             if end < 0:
                 raise ValueError("a name without an end")
             name = os.fsdecode(content.read(end + 1 - start)[:-1])
@@ -317,16 +320,20 @@ def _parse_image(line: str) -> PosedImage | None:
 
 def _holds_features(words: Sequence[str]) -> bool:
     """Check whether a line of images.txt holds features, triples X Y POINT3D_ID, and no pose."""
-    # The number of a point is whole, and -1 for none.
-    if len(words) % 3 != 0 or not words[-1].lstrip("-").isdecimal():
+    # The number of a point is whole, and -1 for none. In a pose qx and tx stand at such places.
+    places = (*words[2:12:3], words[-1])
+    if len(words) % 3 != 0 or not all(word.lstrip("-").isdecimal() for word in places):
         return False
     # A pose has nine numbers and a name. Words of a name such as "IMG 1 2" are no feature.
     try:
-        for word in words[9:12]:
-            float(word)
+        numbers = [float(word) for word in words[:12]]
     except ValueError:
         return False
-    return True
+    # What is left may still be a pose of whole numbers, as that of a first image often is, and a
+    # name of three numbers, such as "2024 05 01". Its quaternion has the length 1. Between two
+    # features, in pixels, the same four numbers do not.
+    is_posed = len(numbers) == 12 and abs(math.hypot(*numbers[1:5]) - 1) < UNIT_TOLERANCE
+    return not (is_posed and numbers[0] >= 0 and numbers[8] >= 0)
 
 
 def _parse_point(line: str) -> Track:
@@ -385,9 +392,12 @@ def _select_largest(path: Path) -> tuple[Path, list[Frame], tuple[str, ...]]:
     model, frames = max(models, key=lambda one: len(one[1]))
     if len(models) == 1:
         return model, frames, ()
+    # Only the first one may be the home of the others itself.
+    home = models[-1][0].parent
+    used = "the one in the folder itself" if model == home else quote_value(model.name)
     note = (
-        f"{len(models)} models lie in {quote_value(model.parent)}: {quote_value(model.name)} with "
-        f"{len(frames)} images is used; the others are ignored."
+        f"{len(models)} models lie in {quote_value(home)}: {used} with {len(frames)} images is "
+        "used; the others are ignored."
     )
     return model, frames, (note,)
 

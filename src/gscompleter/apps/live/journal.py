@@ -61,7 +61,7 @@ class Journal:
         self._saved = digest_steps(session.steps)
 
     def is_saved(self, session: Session) -> bool:
-        """Return True if the folder has what a session shows, or nothing was done."""
+        """Return True if the folder has what a session shows, or no step is left to be saved."""
         if self._saved is None:
             return not session.steps
         return digest_steps(session.steps) == self._saved

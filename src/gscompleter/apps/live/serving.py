@@ -84,10 +84,12 @@ def describe_end(session: Session, journal: Journal) -> list[str]:
     if not list_steps(session) and not journal.has_saved:
         return []
     out = quote_value(journal.folder)
-    is_saved = journal.is_saved(session)
-    state = f"Saved in {out}." if is_saved else f"Not saved: {out} has the steps, and no result."
-    if journal.has_saved and not is_saved:
+    # Where all steps are undone, nothing is left to be saved: this alone is no result.
+    state = f"Not saved: {out} has the steps, and no result."
+    if journal.has_saved:
         state = f"Not saved: {out} has the steps, and the result of an earlier Save."
+        if journal.is_saved(session):
+            state = f"Saved in {out}."
     command = shlex.join(["gscompleter", "live", str(journal.folder)])
     return [state, f"To go on: {command}"]
 
@@ -101,7 +103,8 @@ def build_page(
 ) -> LivePage:
     """Build the page of a session, and print notes on what it cannot show."""
     ready = prepared.scene
-    # Without what was added or changed: the page gets the steps as differences.
+    # The page holds the scene as it was given. What was added or changed since, by steps or as the
+    # session began, is a difference to it.
     scene = session.latest.context
     kind = "Photograph" if ready.opened.renders_from is None else "View"
     shots = [
@@ -113,7 +116,7 @@ def build_page(
         )
         for view in session.latest.views
     ]
-    # At first the states before and after are the same.
+    # The page itself has the same states before and after; the difference changes the latter.
     content = ViewerContent(name_session(ready), scene, scene, tuple(shots))
     page, notes = make_page(content, libraries, is_live=True)
     print_lines(console, *notes)
