@@ -204,7 +204,12 @@ def test_the_sky_has_one_tone_where_photographs_meet():
     views = [View(blue, cameras[0]), View(torch.ones(64, 64, 3), cameras[1])]
     sky = torch.zeros(64, 64, dtype=torch.bool)
     sky[:40] = True
-    first, second = blend_skies(views, [sky, sky])
+    # Of two photographs each keeps its own colours.
+    for image, view in zip(blend_skies(views, [sky, sky]), views, strict=True):
+        torch.testing.assert_close(image[sky], view.image[sky], atol=1e-5, rtol=0)
+    # A third one shows no sky.
+    third = View(blue, replace(camera_at(yaw=90.0, size=64), near=1.0, far=10.0))
+    first, second, _ = blend_skies([*views, third], [sky, sky, torch.zeros_like(sky)])
     # At the border of the second image, which the first shows, and as far from its own.
     pixels, _ = project(cameras[1].center + 80 * cameras[1].z_rays()[10, [6, 30, 50]], cameras[0])
     x, y = pixels.long().unbind(-1)
@@ -226,16 +231,17 @@ def test_behind_a_surface_the_sky_is_that_of_other_photographs():
     views = [
         View(torch.full((64, 64, 3), 0.1), camera),
         View(torch.tensor(BLUE).repeat(64, 64, 1), camera),
+        View(torch.ones(64, 64, 3), camera),
     ]
     whole = torch.ones(64, 64, dtype=torch.bool)
     part = whole.clone()
     part[:, 20:] = False
-    tree, _ = blend_skies(views, [part, whole])
+    none = torch.zeros_like(whole)
+    tree, *_ = blend_skies(views, [part, whole, none])
     torch.testing.assert_close(tree[30, 40], torch.tensor(BLUE), atol=1e-3, rtol=0)
     # A view without a sky is left as it is, and tells nothing.
-    none = torch.zeros_like(whole)
-    assert torch.equal(blend_skies(views, [none, whole])[0], views[0].image)
-    alone = blend_skies(views, [none, part])[1]
+    assert torch.equal(blend_skies(views, [none, whole, none])[0], views[0].image)
+    alone = blend_skies(views, [none, part, none])[1]
     torch.testing.assert_close(alone, views[1].image, atol=1e-5, rtol=0)
 
 

@@ -290,6 +290,12 @@ def test_large_images_are_matched_at_half_their_size_first(monkeypatch, count, s
     assert {tuple(depth.depth.shape) for depth in depths} == {(size, size)}
 
 
+def no_occluders(layers: list[DepthLayer]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Occluders and skies of views that have neither."""
+    labels = [np.zeros(layer.inverse.shape, int) for layer in layers]
+    return labels, [label > 0 for label in labels]
+
+
 def test_what_stands_before_the_surfaces_of_others_moves_behind_them():
     layers, transforms = true_layers(row_of_views(3))
     block = (slice(20, 40), slice(24, 40))
@@ -303,8 +309,7 @@ def test_what_stands_before_the_surfaces_of_others_moves_behind_them():
     open_pixels[0][22] = False
 
     layers = [changed, *layers[1:]]
-    nothing = [np.zeros_like(mask) for mask in open_pixels]
-    first, *others = leave_free_space(layers, open_pixels, nothing, transforms)
+    first, *others = leave_free_space(layers, open_pixels, *no_occluders(layers), transforms)
     assert all(after is before for after, before in zip(others, layers[1:], strict=True))
     surfaces = [Surfaces.measured_in(layer) for layer in layers]
     was_before = find_seen_through(0, wrong, surfaces, transforms) & open_pixels[0]
@@ -323,32 +328,44 @@ def test_what_is_measured_or_has_no_place_behind_stays():
     layers, transforms = true_layers(row_of_views(3))
     near = replace(layers[0], inverse=1.5 * layers[0].inverse)
     everywhere = [np.ones_like(near.inverse, dtype=bool) for _ in layers]
-    nothing = [np.zeros_like(mask) for mask in everywhere]
-    (first, *_) = leave_free_space([near, *layers[1:]], everywhere, everywhere, transforms)
+    _, no_sky = no_occluders(layers)
+    whole = [mask.astype(int) for mask in everywhere]
+    (first, *_) = leave_free_space([near, *layers[1:]], everywhere, whole, no_sky, transforms)
     assert first is near
     # Even twice its farthest depth is before what the others see.
     flat = np.full_like(near.inverse, 4 * near.inverse.max())
     unknown = replace(near, inverse=flat, confidence=np.zeros_like(flat))
-    (first, *_) = leave_free_space([unknown, *layers[1:]], everywhere, nothing, transforms)
+    occluders = no_occluders(layers)
+    (first, *_) = leave_free_space([unknown, *layers[1:]], everywhere, *occluders, transforms)
     assert first is unknown
 
 
-def test_what_looks_otherwise_at_the_border_comes_before_the_surfaces_of_others():
-    """As a branch before the first camera, behind which the others see the wall."""
+@pytest.mark.parametrize("share", [1.0, 0.5, 0.1])
+def test_a_branch_before_the_sky_of_others_comes_nearer(share):
+    """The others see the sky behind a share of it, and the wall behind the rest."""
     views = [view_of(Room(), camera_at(x, size=SIZE)) for x in (-0.5, 0.0, 0.5)]
     layers, transforms = true_layers(views)
     branch = np.zeros_like(layers[0].measured_mask)
-    branch[10:40, :8] = True
+    branch[:30, :8] = True
+    skies = [np.zeros_like(branch) for _ in layers]
+    for number, sky in enumerate(skies):
+        sky[: round(30 * share)] = True
+        layer = layers[number]
+        layers[number] = replace(layer, inverse=np.where(sky, np.float32(1e-3), layer.inverse))
+    skies[0] &= ~branch
     confidence = np.where(branch, 0.0, layers[0].confidence)
     # Surfaces that go on to there stand a little before the wall.
-    inverse = np.where(branch, np.float32(1.3) * layers[0].inverse, layers[0].inverse)
+    inverse = np.where(branch, np.float32(1.3) * layers[0].inverse[-34], layers[0].inverse)
     layers[0] = replace(layers[0], inverse=inverse, confidence=confidence)
-    nothing = np.zeros_like(branch)
-    occluders = [branch, nothing, nothing]
-    first, *_ = leave_free_space(layers, occluders, occluders, transforms)
+    no_branch = [np.zeros_like(branch, dtype=int) for _ in skies]
+    labels = [3 * branch.astype(int), *no_branch[1:]]
+    first, *_ = leave_free_space(layers, no_occluders(layers)[1], labels, skies, transforms)
     moved = first.inverse != inverse
-    assert moved[branch].mean() > 0.5
     assert not moved[~branch].any()
+    if share == 0.1:
+        assert not moved.any()
+        return
+    assert moved[branch].mean() > 0.5
     assert (first.inverse > inverse)[moved].all()
     surfaces = [Surfaces.measured_in(layer) for layer in layers]
     assert not find_seen_through(0, first.inverse, surfaces, transforms)[moved].any()
@@ -364,7 +381,8 @@ def test_an_occluder_is_large_and_reaches_out_of_the_image():
     photograph[45:75, 90:] = 0.55
     ignored = torch.zeros(100, 100, dtype=torch.bool)
     ignored[:, 10:12] = True
-    found = find_occluders(image, View(photograph, camera_at(size=100), ignore_mask=ignored))
+    view = View(photograph, camera_at(size=100), ignore_mask=ignored)
+    found = find_occluders(image, view) > 0
     assert found[:25, :9].all()
     assert not found[:, 10:12].any()
     found[:36, :36] = False

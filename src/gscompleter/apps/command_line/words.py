@@ -304,8 +304,8 @@ def extract_sentence(box: str, own: Collection[str]) -> str:
     """
     lines = list_box_lines(box)
 
-    # The message is the first paragraph, up to an empty line or a rule. Its deeply indented lines
-    # are lists of arguments, no part of a sentence.
+    # The message is the first paragraph, up to an empty line or a rule. It may list arguments. The
+    # help of each stands below it, indented once more, and is no part of a sentence.
     paragraph: list[str] = []
     for line in lines:
         if line.strip("─- "):
@@ -313,7 +313,7 @@ def extract_sentence(box: str, own: Collection[str]) -> str:
         elif paragraph:
             break
     sentence = " ".join(line.strip() for line in paragraph if not line.startswith(" " * 5))
-    # What settings refuse themselves comes with tyro's name of the class around them.
+    # A value that cannot be read comes with tyro's words on where.
     sentence = re.sub(r"^Error parsing [\w.-]+: ", "", sentence)
 
     # Below a title tyro lists the option that is meant, in the next line; the last title counts.

@@ -133,7 +133,7 @@ class Splatter:
 
         fitted_views = [view.to(self.fit_device) for view in views]
         gains = gains.to(self.fit_device)
-        candidates, kept, depths = self.fuse(normalized, depths, layers, transforms)
+        candidates, kept, depths = self.fuse(normalized, depths, layers, skies, transforms)
         # Nothing is reconstructed from masked pixels.
         kept &= flatten_masks([view.valid_mask for view in fitted_views])
         if masks is not None:
@@ -212,6 +212,7 @@ class Splatter:
         views: Sequence[View],
         depths: Sequence[DepthMap],
         layers: Sequence[DepthLayer],
+        skies: Sequence[Bool[Tensor, "_ _"]],
         transforms: Transforms,
     ) -> tuple[Gaussians, Bool[Tensor, "n"], Sequence[DepthMap]]:
         """Create a disc for every pixel of every view, and mark those that form the scene.
@@ -233,7 +234,8 @@ class Splatter:
             find_occluders(render.image, view)
             for render, view in zip(renders, fitted_views, strict=True)
         ]
-        moved = leave_free_space(layers, open_pixels, occluders, transforms)
+        no_surfaces = [sky.cpu().numpy() for sky in skies]
+        moved = leave_free_space(layers, open_pixels, occluders, no_surfaces, transforms)
         if all(after is before for after, before in zip(moved, layers, strict=True)):
             return candidates, kept, depths
         depths = [

@@ -36,7 +36,8 @@ def blend_skies(
 
     `skies` mark the sky of each view. There a view keeps its own detail, in the mean tone of all
     that show the direction. Behind its surfaces it gets what others show, or else a continuation.
-    The images are those of a view without a sky.
+    The image of a view without a sky is returned as it is. Of one or two views each keeps its own
+    colours, as on surfaces (decision 043).
     """
     weights = [weigh_sky(sky) for sky in skies]
     blended = []
@@ -49,7 +50,7 @@ def blend_skies(
         total = weights[number]
         colors = total[..., None] * view.image
         for other, (shown, weight) in enumerate(zip(views, weights, strict=True)):
-            if other == number or not weight.any():
+            if other == number or len(views) <= 2 or not weight.any():
                 continue
             pixels, z = project(points, shown.camera)
             sampled = sample(torch.cat([shown.image, weight[..., None]], dim=-1), pixels)
