@@ -37,7 +37,7 @@ from gscompleter.reconstructors.plane_sweep.fit import (
     shuffle_views,
 )
 from gscompleter.reconstructors.plane_sweep.free_space import (
-    NEAREST,
+    NEAREST_OCCLUDER,
     Surfaces,
     find_occluders,
     find_seen_through,
@@ -369,7 +369,7 @@ def test_a_branch_before_the_sky_of_others_comes_nearer(share):
     assert (first.inverse > inverse)[moved].all()
     surfaces = [Surfaces.measured_in(layer) for layer in layers]
     assert not find_seen_through(0, first.inverse, surfaces, transforms)[moved].any()
-    assert first.inverse.max() <= NEAREST * inverse.max()
+    assert first.inverse.max() <= NEAREST_OCCLUDER * inverse.max()
 
 
 def test_an_occluder_is_large_and_reaches_out_of_the_image():

@@ -29,7 +29,7 @@ STEP = np.float32(1.05)
 """Factor of the depth by which pixels are moved at a time."""
 FARTHEST = np.float32(2)
 """Depth up to which pixels are moved, relative to the farthest one of their view."""
-NEAREST = np.float32(3)
+NEAREST_OCCLUDER = np.float32(3)
 """Inverse depth up to which pixels are moved, relative to the nearest one of their view."""
 MAX_COLOR_ERROR = 0.15
 """Error of a colour in [0, 1], averaged over a window, from which on something else is shown."""
@@ -123,7 +123,7 @@ def leave_free_space(
         if not len(of_surfaces):
             return layer
         lowest = of_surfaces.min() / FARTHEST
-        highest = of_surfaces.max() * NEAREST
+        highest = of_surfaces.max() * NEAREST_OCCLUDER
         labels = np.where(layer.measured_mask, 0, occluders[number])
         waiting = (open_pixels[number] & ~layer.measured_mask) | (labels > 0)
         back = move_pixels(start, waiting, 1 / STEP, lowest, highest, sees_through)

@@ -22,7 +22,7 @@ from gscompleter.types import View
 FEATHER = 0.25
 """Distance from the border of a sky within which its weight rises to 1, as a share of the shorter
 image side."""
-MIN_WEIGHT = 0.02
+MIN_SKY_WEIGHT = 0.02
 """Least weight, in all views together, of a direction in which the sky counts as shown."""
 TONE_SHARE = 1 / 16
 """Radius within which the tone of a sky changes alike, as a share of the shorter image side: clouds
@@ -61,7 +61,7 @@ def blend_skies(
         radius = max(1, round(TONE_SHARE * min(sky.shape)))
         tone = smooth_masked((mean - view.image).where(sky[..., None], 0.0), sky, radius)
         image = (view.image + tone).clamp(0, 1).where(sky[..., None], mean)
-        is_shown = sky | (total > MIN_WEIGHT)
+        is_shown = sky | (total > MIN_SKY_WEIGHT)
         blended.append(push_pull(image, is_shown.to(image.dtype)))
     return blended
 
