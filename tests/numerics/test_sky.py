@@ -15,6 +15,7 @@ from gscompleter.numerics.sky import SKY_DEPTH, extend_sky, is_sky, mask_out_sky
 from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.reconstructors.features.stereo_image import make_stereo_images
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
+from gscompleter.reconstructors.plane_sweep.emphasis import Emphasis
 from gscompleter.reconstructors.plane_sweep.sky_colors import blend_skies, weigh_sky
 from gscompleter.reconstructors.plane_sweep.sky_mask import find_even_region
 from gscompleter.reconstructors.plane_sweep.sweep import find_hidden_pixels
@@ -243,6 +244,17 @@ def test_behind_a_surface_the_sky_is_that_of_other_photographs():
     assert torch.equal(blend_skies(views, [none, whole, none])[0], views[0].image)
     alone = blend_skies(views, [none, part, none])[1]
     torch.testing.assert_close(alone, views[1].image, atol=1e-5, rtol=0)
+
+
+def test_a_part_that_is_nothing_but_sky_is_not_fitted():
+    camera = replace(camera_at(size=32), near=1.0, far=10.0)
+    view = View(torch.tensor(BLUE).repeat(32, 32, 1), camera)
+    scene = gaussians_of(view, torch.full((32, 32), SKY_DEPTH * 10.0))
+    whole = torch.ones(32, 32, dtype=torch.bool)
+    fitted = PlaneSweep().fit_before_sky(
+        scene, [view] * 3, torch.ones(3, 3), [whole] * 3, Emphasis()
+    )
+    assert fitted is scene
 
 
 def test_the_weight_of_a_sky_rises_from_all_its_borders():

@@ -30,7 +30,7 @@ STEP = np.float32(1.05)
 FARTHEST = np.float32(2)
 """Depth up to which pixels are moved, relative to the farthest one of their view."""
 NEAREST_OCCLUDER = np.float32(3)
-"""Inverse depth up to which pixels are moved, relative to the nearest one of their view."""
+"""Inverse depth up to which occluders come nearer, relative to the nearest pixel of their view."""
 MAX_COLOR_ERROR = 0.15
 """Error of a colour in [0, 1], averaged over a window, from which on something else is shown."""
 WINDOW_SIDE = 9
@@ -45,8 +45,8 @@ MARGIN = 0.25
 """Margin around the images of others, as a share of their sides, into which their surfaces go on.
 The first place beside an image would be wrong before a camera that turns a little from there."""
 
-
 Labels = Int[np.ndarray, "h w"]
+"""Number of the occluder that each pixel shows; 0 where it shows none."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ def leave_free_space(
         has_no_place = (back == start) & sees_through(start)
         nearer = find_components(labels, has_no_place, MIN_WITHOUT_PLACE)
         inverse = move_pixels(start, nearer, STEP, lowest, highest, sees_through)
-        inverse = np.where(open_pixels[number] & ~nearer, back, inverse)
+        inverse = np.where(open_pixels[number] & (inverse == start), back, inverse)
         return layer if np.array_equal(inverse, start) else replace(layer, inverse=inverse)
 
     return map_in_parallel(move, range(len(layers)))

@@ -316,6 +316,9 @@ class Splatter:
         """
         in_sky = find_sky_gaussians(scene, views[0].camera)
         surfaces = scene[~in_sky]
+        # A part of a scene may be nothing but sky.
+        if not len(surfaces):
+            return scene
         photographs = self.replace_all_ignored(surfaces, views, gains)
         checks = [
             self.prepare_check(surfaces, view.to(self.fit_device), gains)
