@@ -400,7 +400,10 @@ def test_an_option_of_another_command_is_told_as_such(monkeypatch, capsys, words
     ("number", "sentence"),
     [
         ("-3", "auto must be greater than or equal to 1, got -3 (--auto)."),
-        ("2.5", "--auto takes a whole number, and was given '2.5' (see gscompleter"),
+        *(
+            (number, f"--auto takes a whole number, and was given '{number}' (see gscompleter")
+            for number in ("2.5", ".5", "5.", "1e1", "-.5", "-1e1")
+        ),
     ],
 )
 def test_a_wrong_number_of_targets_is_told_as_that_of_its_option(

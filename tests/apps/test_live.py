@@ -690,6 +690,49 @@ def test_a_step_that_is_not_kept_is_done_and_says_so(page, monkeypatch):
     assert said["text"].endswith("This step is not kept on the disk: The disk is full.")
 
 
+def test_the_last_line_tells_steps_that_could_not_be_written(page):
+    folder = page._journal.folder
+    folder.touch()  # a file in the place of the folder
+    said = do(page, request_for("remove", box=CRATE))
+    assert "This step is not kept on the disk" in said["text"]
+    lost = f"Not saved: {folder} has neither the steps nor a result."
+    assert serving.describe_end(page.session, page._journal) == [lost]
+
+    folder.unlink()
+    do(page, request_for("undo"))
+    state, command = serving.describe_end(page.session, page._journal)
+    assert state == f"Not saved: {folder} has the steps, and no result."
+
+    folder.rename(folder.with_name("aside"))
+    folder.touch()
+    do(page, request_for("redo"))
+    lacking = f"Not saved: {folder} lacks what was done last, and has "
+    assert serving.describe_end(page.session, page._journal) == [f"{lacking}no result.", command]
+    do(page, request_for("save"))
+    assert serving.describe_end(page.session, page._journal) == [f"Saved in {folder}.", command]
+    do(page, request_for("undo"))
+    state, _ = serving.describe_end(page.session, page._journal)
+    assert state == f"{lacking}the result of an earlier Save."
+
+
+def test_photographs_are_shown_as_taken_also_where_a_removal_goes_on(
+    splat_ready, splat_begun, without_crate, journal, monkeypatch
+):
+    """A removal paints them over, for the session itself."""
+    removed, _ = without_crate
+    shown = []
+    monkeypatch.setattr(
+        serving, "make_page", lambda content, *_, **__: (shown.append(content) or b"", ())
+    )
+    for session in (splat_begun, removed):
+        serving.build_page(splat_ready, session, Libraries({}, {}), QUIET, journal)
+    first, later = shown
+    pairs = zip(splat_begun.latest.views, removed.latest.views, strict=True)
+    assert any(not torch.equal(one.image, other.image) for one, other in pairs)
+    assert [shot.thumbnail for shot in later.cameras] == [shot.thumbnail for shot in first.cameras]
+    assert later.before is first.before
+
+
 @pytest.mark.parametrize(("message", "state"), [("OUT is complete", "Saved"), ("", "Not saved")])
 def test_what_was_saved_before_an_interrupt_counts_as_saved(page, monkeypatch, message, state):
     """Ctrl-C waits while results are renamed, and then says that they are complete."""

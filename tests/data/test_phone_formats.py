@@ -270,10 +270,35 @@ def test_files_that_were_cut_are_told_in_plain_words(tmp_path, kind):
 # Archives.
 
 
-def test_several_recordings_in_an_archive_are_refused(tmp_path):
-    files = {f"{home}/{name}": data for home in "ab" for name, data in polycam().items()}
-    with pytest.raises(InputError, match="holds several recordings; unpack it"):
-        open_photographs(write_archive(tmp_path / "both.zip", files))
+@pytest.mark.parametrize("name", FOLDERS)
+def test_several_recordings_in_an_archive_are_refused(tmp_path, name):
+    """Also where the second one lacks a part."""
+    files = FOLDERS[name][0]()
+    for number, lacking in enumerate((None, ".jpg", ".json", "metadata")):
+        second = files if lacking is None else without(files, lacking)
+        both = {
+            **{f"a/{n}": data for n, data in files.items()},
+            **{f"b/{n}": d for n, d in second.items()},
+        }
+        with pytest.raises(InputError, match="holds several recordings; unpack it"):
+            open_photographs(write_archive(tmp_path / f"{number}.zip", both)).views(range(4))
+
+
+@pytest.mark.parametrize("cameras", [(), ("a",), ("a", "b")])
+@pytest.mark.parametrize("folder", ["", "keyframes/images/", "keyframes/corrected_images/"])
+def test_photographs_of_something_else_in_two_folders_are_no_recordings(tmp_path, folder, cameras):
+    """Also with JSON files of the names that those of an export have, and of other content."""
+    beside = folder.replace("images", "cameras")
+    files = {f"{home}/{folder}frame_{n}.jpg": b"x" for home in "ab" for n in range(2)}
+    files |= {f"{home}/{beside}frame_{n}.json": b"{}" for home in cameras for n in range(2)}
+    with pytest.raises(InputError, match="There are no posed photographs in"):
+        open_photographs(write_archive(tmp_path / "other.zip", files))
+
+
+def test_pictures_beside_a_recording_are_none_of_it(tmp_path):
+    pictures = {f"{home}/frame_0.jpg": b"x" for home in ("a", "b")}
+    path = write_archive(tmp_path / "room.r3d", {**record3d(), **pictures})
+    check_room(open_photographs(path), UPRIGHT)
 
 
 @pytest.mark.parametrize("name", ["room.zip", "room.r3d"])

@@ -45,11 +45,9 @@ The title is for errors, such as "the depth of frame 3 of room.zip".
 PoseAndLens = tuple[Float[np.ndarray, "4 4"], Intrinsics]
 
 
-def find_files(export: Path, pattern: str) -> Files:
-    """Map frame names to readers of the files that match a pattern, sorted by path.
+def find_matches(export: Path, pattern: str) -> dict[PurePath, Reader]:
+    """Map the paths of the files that match a pattern to their readers, sorted, of any recording.
 
-    The name of a frame is that of the file without its ending and without what the pattern has
-    before its asterisk, such as `frame_`. Where two files have one, it is refused when it is read.
     In an archive the export may lie in a folder of its own.
     """
     readers: dict[PurePath, Reader] = {
@@ -67,17 +65,26 @@ def find_files(export: Path, pattern: str) -> Files:
             for path, name in entries.items()
             if path.match(pattern)
         }
-    paths = sorted(path for path in readers if not is_hidden_name(path.name))
+    return {path: readers[path] for path in sorted(readers) if not is_hidden_name(path.name)}
+
+
+def find_files(export: Path, pattern: str) -> Files:
+    """Map frame names to readers of the files that match a pattern, sorted by path.
+
+    The name of a frame is that of the file without its ending and without what the pattern has
+    before its asterisk, such as `frame_`. Where two files have one, it is refused when it is read.
+    Raises InputError for several recordings, so that formats are detected by `find_matches`.
+    """
+    readers = find_matches(export, pattern)
     require(
-        len({path.parent for path in paths}) <= 1,
+        len({path.parent for path in readers}) <= 1,
         f"{quote_value(export)} holds several recordings; unpack it, and name one of them.",
     )
     prefix, asterisk, _ = PurePosixPath(pattern).name.partition("*")
     found: dict[str, list[PurePath]] = {}
-    for path in paths:
+    for path in readers:
         name = path.stem.removeprefix(prefix) if asterisk else path.stem
         found.setdefault(name, []).append(path)
-    # Formats are detected by these files, so that those of another format must not be refused here.
     return {
         name: readers[same[0]] if len(same) == 1 else partial(_refuse_files, export, name, same)
         for name, same in found.items()
