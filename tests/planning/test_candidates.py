@@ -1,5 +1,7 @@
 """Candidate cameras: moves of cameras whose surroundings are known."""
 
+from dataclasses import replace
+
 import pytest
 import torch
 
@@ -96,6 +98,17 @@ def test_the_height_of_the_ground_is_in_scene_units(unit):
     camera = camera_at(unit=unit)
     height = find_ground_height(camera, seen_by(camera, Room(unit=unit)), UP)
     assert height == pytest.approx(-1.5 * unit, rel=0.02)
+
+
+def test_ground_at_the_depth_of_wrong_matches_does_not_count():
+    camera = camera_at()
+    seen = seen_by(camera)
+    # A fifth of the floor, to the left, is twice as deep.
+    depth = seen.depth.clone()
+    floor = depth.shape[0] // 2 + 10
+    depth[floor:, : depth.shape[1] // 5] *= 2
+    height = find_ground_height(camera, replace(seen, depth=depth), UP)
+    assert height == pytest.approx(-1.5, rel=0.05)
 
 
 def test_a_step_is_as_long_as_cameras_stand_apart_and_short_of_the_scene():
