@@ -103,10 +103,10 @@ def test_the_height_of_the_ground_is_in_scene_units(unit):
 def test_ground_at_the_depth_of_wrong_matches_does_not_count():
     camera = camera_at()
     seen = seen_by(camera)
-    # A fifth of the floor, to the left, is twice as deep.
+    # An eighth of the image, to the left, shows the floor twice as deep.
     depth = seen.depth.clone()
     floor = depth.shape[0] // 2 + 10
-    depth[floor:, : depth.shape[1] // 5] *= 2
+    depth[floor:, : depth.shape[1] // 8] *= 2
     height = find_ground_height(camera, replace(seen, depth=depth), UP)
     assert height == pytest.approx(-1.5, rel=0.05)
 
