@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Collection, Mapping, Sequence
 from contextlib import nullcontext, redirect_stderr
-from dataclasses import is_dataclass
+from dataclasses import fields, is_dataclass
 from functools import cache
 from io import StringIO
 from itertools import pairwise
@@ -175,12 +175,14 @@ def explain_words(words: Sequence[str], kinds: Mapping[str, type], box: str) -> 
 def list_options(kind: Any, prefix: str = "") -> Mapping[str, Any]:
     """List the options of a command by name, without dashes before it, with their types."""
     options: dict[str, Any] = {}
-    for field, hint in get_type_hints(kind, include_extras=True).items():
+    hints = get_type_hints(kind, include_extras=True)
+    for field in fields(kind):
+        hint = hints[field.name]
         # `Annotated[inner, *marks]`. Of a plain union, tuple or Literal the first argument is
         # `inner`, and the others count as marks; none of them is searched for.
         marks = get_args(hint)[1:]
         inner: Any = get_args(hint)[0] if marks else hint
-        name = f"{prefix}{field.replace('_', '-')}"
+        name = f"{prefix}{field.name.replace('_', '-')}"
         if inner is ChosenConfig:
             options[CONFIG_OPTION] = str
             options |= list_options(CompleterConfig, f"{CONFIG_OPTION}.")
