@@ -9,10 +9,15 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 
+from annotated_types import Interval as Interval
 from annotated_types import Len
 from typing_extensions import Doc
 
+# What is imported `as` itself is at hand for the settings of further rows.
+from gscompleter.config.settings import Count as Count
 from gscompleter.config.settings import Settings, validate
+from gscompleter.config.settings import Share as Share
+from gscompleter.config.settings import Weight as Weight
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.plugins import is_in_file, load_plugins
 
