@@ -10,6 +10,7 @@ import torch
 from annotated_types import Interval
 
 from gscompleter import InputError, load_generator
+from gscompleter.apps.command_line.field_texts import read_field_texts
 from gscompleter.apps.command_line.words import format_error
 from gscompleter.cli import parse_command
 from gscompleter.config import generators
@@ -145,7 +146,7 @@ class HazeSettings(GeneratorSettings):
     """Settings of a generator that is not in the table."""
 
     density: Annotated[float, Interval(ge=0, le=1)] = 0.5
-    color: tuple[Share, Share, Share] = (1.0, 1.0, 1.0)
+    tint: tuple[Share, Share, Share] = (1.0, 1.0, 1.0)
     unexplained: int = 3
 
 
@@ -154,7 +155,7 @@ HAZE = GeneratorEntry(
     load="a:b",
     line=GeneratorLine(input="nothing", output="haze"),
     settings=HazeSettings,
-    help={"density": "Density of the haze (0.5).", "color": "Its colour (1 1 1)."},
+    help={"density": "Density of the haze (0.5).", "tint": "Its colour (1 1 1)."},
     is_own=False,
 )
 
@@ -178,14 +179,14 @@ def haze_options(monkeypatch) -> type[GeneratorOptions]:
 def test_what_a_row_explains_is_an_option(haze_options):
     assert {f.name for f in fields(haze_options)} - {f.name for f in fields(GeneratorOptions)} == {
         "generator_density",
-        "generator_color",
+        "generator_tint",
         "more",
     }
     default = asdict(haze_options().make_settings())
-    assert default == {"density": 0.5, "color": (1, 1, 1), "unexplained": 3}
-    thick = replace(haze_options(), generator_density=0.9, generator_color=(0.5, 0.25, 1.0))
+    assert default == {"density": 0.5, "tint": (1, 1, 1), "unexplained": 3}
+    thick = replace(haze_options(), generator_density=0.9, generator_tint=(0.5, 0.25, 1.0))
     assert thick.make_settings() == HazeSettings(0.9, (0.5, 0.25, 1.0))
-    for name, value in (("density", 1.5), ("color", (0.0, 0.0, 1.5))):
+    for name, value in (("density", 1.5), ("tint", (0.0, 0.0, 1.5))):
         with pytest.raises(InputError, match=f"^{name} must be less than") as error:
             replace(haze_options(), **{f"generator_{name}": value}).make_settings()
         assert error.value.argument == f"generator_{name}"
@@ -198,12 +199,19 @@ def test_a_wrong_setting_of_a_generator_is_told_by_the_name_of_its_option(haze_o
 
         synthesis: haze_options
 
-    options = haze_options(generator_color=(float("nan"), 0.0, 0.0))
-    with pytest.raises(InputError, match="^generator_color must be a finite number, got") as error:
+    options = haze_options(generator_tint=(float("nan"), 0.0, 0.0))
+    with pytest.raises(InputError, match="^generator_tint must be a finite number, got") as error:
         validate(CommandOptions(options))
-    assert error.value.argument == "generator_color"
+    assert error.value.argument == "generator_tint"
     told = format_error(error.value)
-    assert told == "generator_color must be a finite number, got nan (--generator-color)."
+    assert told == "generator_tint must be a finite number, got nan (--generator-tint)."
+
+
+def test_an_option_is_of_one_row():
+    """Rows with the same name would share its sentence, and its type."""
+    names = [PREFIX + name for row in GENERATORS.values() for name in row.help]
+    names += read_field_texts(generators.__name__)["GeneratorOptions"]
+    assert sorted(set(names)) == sorted(names)
 
 
 def test_only_a_generator_of_given_images_leaves_cameras_without_one(haze_options):
