@@ -22,14 +22,9 @@ from typing_extensions import Doc
 
 from gscompleter.apps.command_line.old_spellings import OLD_SPELLINGS
 from gscompleter.cli import COMMANDS, OptionClasses
-from gscompleter.config.generators import (
-    GENERATORS,
-    PREFIX,
-    GeneratorLine,
-    GeneratorOptions,
-    GeneratorSettings,
-)
+from gscompleter.config.generators import GENERATORS, PREFIX, GeneratorEntry, GeneratorOptions
 from gscompleter.models.tables import GENERATORS as LEARNED_GENERATORS
+from gscompleter.models.tables import GeneratorLoader
 from gscompleter.splats.splat_format import SplatFormat
 from gscompleter.splats.table import SPLAT_FORMATS
 
@@ -169,33 +164,33 @@ def format_table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 # ---- generators ---------------------------------------------------------------------------------
 
 
-def list_lines() -> dict[str, GeneratorLine]:
-    """List what the page says of each generator: built-in ones, then those with weights."""
-    rows = {**GENERATORS, **LEARNED_GENERATORS}
-    return {name: row.line for name, row in rows.items()}
+ALL_GENERATORS: Mapping[str, GeneratorEntry | GeneratorLoader] = {
+    **GENERATORS,
+    **LEARNED_GENERATORS,
+}
+"""Rows by name: built-in generators, then those with weights."""
 
 
 def make_generators() -> str:
     """Make the table of generators."""
     default = GeneratorOptions().generator
-    rows = [
-        [f"`{name}`{' (default)' * (name == default)}", line.input, line.output, line.needs]
-        for name, line in list_lines().items()
-    ]
+    rows = []
+    for name, row in ALL_GENERATORS.items():
+        title = f"`{name}` (default)" if name == default else f"`{name}`"
+        rows.append([title, row.line.input, row.line.output, row.line.needs])
     return format_table(["name", "input", "output", "needs"], rows)
 
 
 def make_generator_options() -> str:
     """Make the table of their options, with the generators that have each."""
-    kinds: dict[str, type[GeneratorSettings]] = {
-        name: row.settings for name, row in {**GENERATORS, **LEARNED_GENERATORS}.items()
-    }
     rows = []
     for name, _, text in walk_fields(GeneratorOptions):
         if not name.startswith(PREFIX):
             continue
         setting = name.removeprefix(PREFIX)
-        owners = [f"`{owner}`" for owner, kind in kinds.items() if hasattr(kind, setting)]
+        owners = [
+            f"`{owner}`" for owner, row in ALL_GENERATORS.items() if hasattr(row.settings, setting)
+        ]
         rows.append([f"`--{name.replace('_', '-')}`", ", ".join(owners), text])
     return format_table(["option", "for", "meaning"], rows)
 
