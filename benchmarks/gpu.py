@@ -26,6 +26,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
+from unittest.mock import patch
 
 import torch
 from torch.autograd import DeviceType
@@ -40,6 +41,14 @@ from gscompleter.evaluation.baselines.optimization import OptimizationConfig, op
 from gscompleter.evaluation.baselines.reggs import RegGSConfig, register_by_similarity
 from gscompleter.evaluation.metrics.image import psnr
 from gscompleter.generators import GeneratorRequest, load_generator
+from gscompleter.generators.patch_devices import PATCH_DEVICES
+from gscompleter.generators.patch_rounds import (
+    PatchRounds,
+    RunRounds,
+    run_with_kernels,
+    run_with_tensors,
+)
+from gscompleter.generators.warp_inpaint import WarpInpaint
 from gscompleter.models.diffusion.inpaint import DiffusersInpaint, Editor, get_size_rules
 from gscompleter.models.diffusion.pe_field import PEField
 from gscompleter.models.diffusion.placing import select_dtype
@@ -213,7 +222,10 @@ def measure_stages(bench: Bench) -> Iterator[Row]:
     """
     for name, config in CONFIGS.items():
         complete = GSCompleter(
-            PlaneSweep(device=bench.device), renderer=bench.renderer, config=config
+            PlaneSweep(device=bench.device),
+            WarpInpaint(device=bench.device),
+            renderer=bench.renderer,
+            config=config,
         )
         for size in bench.sizes:
             views = bench.make_views(size)
@@ -235,7 +247,10 @@ def measure_profile(bench: Bench) -> Iterator[Row]:
         activities.append(torch.profiler.ProfilerActivity.CUDA)
     for name, config in CONFIGS.items():
         complete = GSCompleter(
-            PlaneSweep(device=bench.device), renderer=bench.renderer, config=config
+            PlaneSweep(device=bench.device),
+            WarpInpaint(device=bench.device),
+            renderer=bench.renderer,
+            config=config,
         )
         complete(views, target)
         with torch.profiler.profile(activities=activities) as profile:
@@ -318,6 +333,70 @@ def compare_reconstructions(
         )
         what = f"{shown}: photograph {number}, better on the device by"
         yield Row(what, after - before, "dB", f"kernels: {before:.2f} dB")
+
+
+@dataclass(frozen=True)
+class KeptLevels:
+    """Fills with the kernels, and keeps what there was to do."""
+
+    levels: list[PatchRounds]
+
+    def choose_rounds(self, num_patches: int) -> RunRounds:
+        """Choose a function that keeps the rounds."""
+
+        def run(rounds: PatchRounds) -> tuple[Any, Any]:
+            self.levels.append(rounds)
+            return run_with_kernels(rounds)
+
+        return run
+
+
+def measure_patches(bench: Bench) -> Iterator[Row]:
+    """Measure the search for patches with its kernels and on the device, and how far both agree.
+
+    Each level alone, whatever its number of patches: `MIN_DEVICE_PATCHES` should be that from which
+    the device is faster. Then images, with the levels where they belong. The last size is four
+    times the usual one, about that of a photograph.
+    """
+    height, width = bench.sizes[-1]
+    for size in (*bench.sizes, (4 * height, 4 * width)):
+        shown = f"{size[0]}x{size[1]}"
+        views, target = bench.make_views(size), bench.make_target(size)
+        scene = bench.make_scene(views)
+        seen = tuple(bench.renderer.render(scene, view.camera) for view in views)
+        context = GeneratorInput(tuple(views), seen, bench.renderer.render(scene, target))
+        levels: list[PatchRounds] = []
+        with patch.dict(PATCH_DEVICES, {"cpu": lambda _, kept=levels: KeptLevels(kept)}):
+            WarpInpaint()(views[1], target, context)
+        for rounds in levels:
+            yield from compare_rounds(bench, f"{shown}, {len(rounds.matches):,} patches", rounds)
+        images = []
+        for device in ("cpu", bench.device):
+            fill = partial(WarpInpaint(device=device), views[1], target, context)
+            seconds = measure_median_seconds(fill, bench.repetitions)
+            kind = "kernels" if device == "cpu" else device
+            yield Row(f"{shown}: image, {kind}", seconds, "s")
+            images.append(fill())
+        difference = (images[1] - images[0]).abs().amax(dim=-1)
+        share = (difference > 1e-3).float().mean().item()
+        note = f"largest {difference.max().item():.2g}"
+        yield Row(f"{shown}: pixels that differ by more than 1e-3", share, "", note)
+
+
+def compare_rounds(bench: Bench, shown: str, rounds: PatchRounds) -> Iterator[Row]:
+    """Fill a level with the kernels and on the device."""
+    filled = []
+    for name, run in (
+        ("kernels", run_with_kernels),
+        (bench.device, partial(run_with_tensors, device=bench.device)),
+    ):
+        seconds = measure_median_seconds(partial(run, rounds), bench.repetitions)
+        yield Row(f"{shown}: {rounds.num_rounds} rounds, {name}", 1e3 * seconds, "ms")
+        filled.append(run(rounds))
+    (expected, field), (image, matches) = filled
+    moved = (field != matches).any(axis=1).mean().item()
+    note = f"largest difference of colours {abs(image - expected).max():.2g}"
+    yield Row(f"{shown}: matches that differ", moved, "", note)
 
 
 def measure_completions(bench: Bench) -> Iterator[Row]:
@@ -576,6 +655,9 @@ PARTS = {
     "profile": Part("Profile of a completion", 90, lambda: measure_profile(BENCH), needs="build"),
     "plane-sweep": Part(
         "Plane-sweep, kernels and device", 120, lambda: measure_plane_sweep(BENCH), needs="build"
+    ),
+    "patches": Part(
+        "Patches of Φ, kernels and device", 60, lambda: measure_patches(BENCH), needs="build"
     ),
     "tests": Part("Tests", 90, lambda: run_tests(GPU_TESTS, "-m", "gpu"), needs="build"),
     "completions": Part(

@@ -55,7 +55,8 @@ class Completion(Displayed):
     """Trust in `rendered_context`, full after a removal. Additions have full trust, and so have
     Gaussians that returned after a removal: they are the last rows, for which it has no values."""
     added_parts: tuple[Part, ...] = ()
-    """What was added, part by part, in the order of addition."""
+    """What was added, part by part in the order of addition. The end of a removal puts what was not
+    invented first."""
     targets: tuple[TargetResult, ...] = ()
     filled_target: Camera | None = None
     """Target whose holes are filled and whose gaps are being closed; None in between targets."""

@@ -179,4 +179,13 @@ def test_a_number_may_follow_auto_or_not():
     assert parse_command([*words, "--auto", "7"]).auto == 7
     assert parse_command([*words, "--auto"]).auto == 4
     assert parse_command(["complete", "SCENE", "--auto", "--out", "OUT"]).auto == 4
-    assert insert_auto_count(["complete", "--auto", "x"]) == ["complete", "--auto", "4", "x"]
+    for word in ("x", "room.5", "e3", "1e", ".", "3d", "1e1.5"):
+        assert insert_auto_count(["complete", "--auto", word]) == ["complete", "--auto", "4", word]
+
+
+@pytest.mark.parametrize(
+    "number", ["5", "+5", "-5", "2.5", "5.", ".5", "-.5", "1e1", "1E+3", ".5e-2"]
+)
+def test_a_number_after_auto_is_its_own_however_it_is_written(number):
+    words = ["complete", "--out", "OUT", "--auto", number]
+    assert insert_auto_count(words) == words

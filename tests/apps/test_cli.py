@@ -22,7 +22,7 @@ import plyfile
 import pytest
 import torch
 
-from command import run
+from command import run, run_on_terminal
 from gscompleter import load_ply
 from gscompleter.cli import COMMANDS, OptionClasses, parse_command
 from gscompleter.config import CompleterConfig, load_config
@@ -400,7 +400,10 @@ def test_an_option_of_another_command_is_told_as_such(monkeypatch, capsys, words
     ("number", "sentence"),
     [
         ("-3", "auto must be greater than or equal to 1, got -3 (--auto)."),
-        ("2.5", "--auto takes a whole number, and was given '2.5' (see gscompleter"),
+        *(
+            (number, f"--auto takes a whole number, and was given '{number}' (see gscompleter")
+            for number in ("2.5", ".5", "5.", "1e1", "-.5", "-1e1")
+        ),
     ],
 )
 def test_a_wrong_number_of_targets_is_told_as_that_of_its_option(
@@ -447,6 +450,26 @@ def test_an_error_is_whole_however_narrow_the_terminal_is(monkeypatch, capsys, w
     assert run(monkeypatch, "complete", "a", "--out", "b", word) == 2
     assert sentence in capsys.readouterr().err
     assert os.environ["COLUMNS"] == "40"
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        ("complete a --resolutoin 256", "Missing from gscompleter complete: --out PATH"),
+        ("complete a --out b --frames x", "--frames takes a whole number, and was given 'x'"),
+        ("complete --frames --help", "--frames takes a whole number, and none was given"),
+    ],
+)
+def test_an_error_on_a_terminal_is_a_plain_sentence(words, sentence):
+    code, shown = run_on_terminal(*words.split())
+    assert code == 2
+    assert shown.split() == f"gscompleter: {sentence} (see gscompleter complete --help).".split()
+
+
+def test_a_help_page_on_a_terminal_has_its_colours():
+    code, shown = run_on_terminal("doctor", "--help")
+    assert code == 0
+    assert shown.startswith("\x1b[1musage:")
 
 
 @pytest.mark.parametrize("word", ["compleat", "--verson"])
@@ -579,6 +602,14 @@ def test_the_page_of_all_commands_is_plain_where_the_output_has_no_boxes(monkeyp
     assert page.isascii()
     assert "+- options ---" in page
     assert "  * complete  Fill the parts" in page
+
+
+@pytest.mark.parametrize("word", ["--help", "-h", "--help-all"])
+def test_help_is_no_name_of_a_config(monkeypatch, capsys, word):
+    assert run(monkeypatch, "complete", word) == 0
+    page = capsys.readouterr().out
+    assert run(monkeypatch, "complete", "--config", word) == 0
+    assert capsys.readouterr().out == page
 
 
 def test_help_all_knows_every_setting(monkeypatch, capsys):

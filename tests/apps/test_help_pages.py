@@ -152,6 +152,13 @@ def test_a_page_names_options_that_there_are(command):
             assert word.rstrip(".") in own, (name, word)
 
 
+@pytest.mark.parametrize("command", COMMANDS)
+def test_what_settings_hold_in_common_is_no_option(command):
+    """Variables of their classes, such as `__pydantic_config__`."""
+    for name in list_options(OptionClasses()[command]):
+        assert re.fullmatch(r"[a-z][a-z0-9-]*(\.[a-z][a-z0-9-]*)*", name)
+
+
 def options_of(command: str) -> set[str]:
     return {f"--{name}" for name in list_options(OptionClasses()[command])} | OF_OTHERS
 

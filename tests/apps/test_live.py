@@ -48,6 +48,7 @@ from gscompleter.apps.live.session import (
 )
 from gscompleter.apps.viewer import http as served
 from gscompleter.apps.viewer.packages import Libraries
+from gscompleter.apps.viewer.page import read_asset
 from gscompleter.cli import parse_command
 from gscompleter.config import CompleterConfig
 from gscompleter.data.scene import describe_camera
@@ -616,15 +617,15 @@ def test_a_step_is_asked_for_shown_undone_and_done_again(server, page):
     mask = base64.b64encode(SPOT).decode()
     said = do(page, request_for("repair", mask=mask))
     assert "are removed" in said["text"]
-    assert (said["busy"], said["revision"], said["steps"]) == (False, 1, 1)
+    assert (said["busy"], said["revision"], said["steps"]) == (False, 2, 1)
     assert said["saved"] is False
     told = json.loads(ask(server, "GET", "/difference")[1])
-    assert told["revision"] == 1
+    assert told["revision"] == 2
     name = told["chunks"][-1]["name"]
     status, chunk = ask(server, "GET", f"/chunks/{name}")
     assert (status, read_count(chunk)) == (200, len(page.session.latest.added))
     said = do(page, request_for("undo"))
-    assert (said["steps"], said["undone"], said["revision"]) == (0, 1, 2)
+    assert (said["steps"], said["undone"], said["revision"]) == (0, 1, 3)
     assert json.loads(page.difference)["chunks"][-1]["hidden"] is None
     said = do(page, request_for("redo"))
     assert (said["steps"], said["undone"]) == (1, 0)
@@ -633,6 +634,20 @@ def test_a_step_is_asked_for_shown_undone_and_done_again(server, page):
     # The page's box is where the page has it.
     said = do(page, request_for("remove", box=CRATE, box_rotation=(1.0, 0.0, 0.0, 0.0)))
     assert "--box -0.6 0.2 2.1 0.4 1.47 3.1" in said["text"]
+
+
+def test_what_a_session_begins_with_is_shown_at_once(room, tmp_path):
+    """Before any step photographs add to a splat, which the page holds as it was given."""
+    save_ply(tmp_path / "splat.ply", gaussians_of(view_of(Room(), CAMERAS[0])))
+    ready = prepare(options_for(room, tmp_path / "out", scene=tmp_path / "splat.ply"))
+    begun = serving.begin_session(ready)
+    assert len(begun.latest.added) > 50
+    journal = Journal(tmp_path / "out", ready.start)
+    page = serving.build_page(ready, begun, Libraries({}, {}), QUIET, journal)
+    told = json.loads(page.difference)
+    assert "added-1" in [chunk["name"] for chunk in told["chunks"]]
+    held = re.search(r"let shownRevision = (\d+);", read_asset("connection.js"))
+    assert page.channel.latest["revision"] == told["revision"] > int(held[1])
 
 
 def test_messages_arrive_as_they_are_sent(server, page):
@@ -675,6 +690,49 @@ def test_a_step_that_is_not_kept_is_done_and_says_so(page, monkeypatch):
     assert said["text"].endswith("This step is not kept on the disk: The disk is full.")
 
 
+def test_the_last_line_tells_steps_that_could_not_be_written(page):
+    folder = page._journal.folder
+    folder.touch()  # a file in the place of the folder
+    said = do(page, request_for("remove", box=CRATE))
+    assert "This step is not kept on the disk" in said["text"]
+    lost = f"Not saved: {folder} has neither the steps nor a result."
+    assert serving.describe_end(page.session, page._journal) == [lost]
+
+    folder.unlink()
+    do(page, request_for("undo"))
+    state, command = serving.describe_end(page.session, page._journal)
+    assert state == f"Not saved: {folder} has the steps, and no result."
+
+    folder.rename(folder.with_name("aside"))
+    folder.touch()
+    do(page, request_for("redo"))
+    lacking = f"Not saved: {folder} lacks what was done last, and has "
+    assert serving.describe_end(page.session, page._journal) == [f"{lacking}no result.", command]
+    do(page, request_for("save"))
+    assert serving.describe_end(page.session, page._journal) == [f"Saved in {folder}.", command]
+    do(page, request_for("undo"))
+    state, _ = serving.describe_end(page.session, page._journal)
+    assert state == f"{lacking}the result of an earlier Save."
+
+
+def test_photographs_are_shown_as_taken_also_where_a_removal_goes_on(
+    splat_ready, splat_begun, without_crate, journal, monkeypatch
+):
+    """A removal paints them over, for the session itself."""
+    removed, _ = without_crate
+    shown = []
+    monkeypatch.setattr(
+        serving, "make_page", lambda content, *_, **__: (shown.append(content) or b"", ())
+    )
+    for session in (splat_begun, removed):
+        serving.build_page(splat_ready, session, Libraries({}, {}), QUIET, journal)
+    first, later = shown
+    pairs = zip(splat_begun.latest.views, removed.latest.views, strict=True)
+    assert any(not torch.equal(one.image, other.image) for one, other in pairs)
+    assert [shot.thumbnail for shot in later.cameras] == [shot.thumbnail for shot in first.cameras]
+    assert later.before is first.before
+
+
 @pytest.mark.parametrize(("message", "state"), [("OUT is complete", "Saved"), ("", "Not saved")])
 def test_what_was_saved_before_an_interrupt_counts_as_saved(page, monkeypatch, message, state):
     """Ctrl-C waits while results are renamed, and then says that they are complete."""
@@ -687,6 +745,14 @@ def test_what_was_saved_before_an_interrupt_counts_as_saved(page, monkeypatch, m
     with pytest.raises(KeyboardInterrupt):
         do(page, request_for("save"))
     assert serving.describe_end(page.session, page._journal)[0].startswith(state)
+
+
+def test_where_all_steps_are_undone_nothing_is_said_to_be_saved(page):
+    do(page, request_for("remove", box=CRATE))
+    assert do(page, request_for("undo"))["saved"] is True  # nothing is left that could be
+    state, command = serving.describe_end(page.session, page._journal)
+    assert state == f"Not saved: {page._journal.folder} has the steps, and no result."
+    assert command.startswith("To go on: ")
 
 
 def test_ctrl_c_ends_the_page_also_while_the_browser_is_opened(page, room, monkeypatch, capsys):

@@ -181,6 +181,21 @@ def test_a_hole_that_is_flown_to_closes_opens_again_and_is_saved(tmp_path, monke
 
 
 @pytest.mark.slow
+def test_what_photographs_add_to_a_splat_is_shown_before_any_step(tmp_path):
+    cameras = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in PLACES]
+    room, splat = photographed(tmp_path / "room", cameras), tmp_path / "s.ply"
+    save_ply(splat, gaussians_of(view_of(Room(), cameras[0])))
+    words = (room, "--scene", splat, "--context", 0, 1, "--out", tmp_path / "out", *SMALL[:-1])
+    with served(*words) as address, launched(SWITCHES) as browser:
+        tab = LiveTab(browser, address)
+        stats = tab.stats()
+        assert stats["live"]["steps"] == 0
+        assert sum(stats["counts"].values()) - stats["counts"]["before"] > SIZE**2 + 50
+        assert "Fly to a hole" in tab.page.inner_text("#message")
+        tab.check_quiet()
+
+
+@pytest.mark.slow
 def test_a_killed_program_shows_its_steps_again(tmp_path):
     """SIGKILL after each of three steps; then undo three times gives the input."""
     cameras = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in PLACES]

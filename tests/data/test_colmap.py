@@ -1,5 +1,6 @@
 """COLMAP models: every layout, both encodings, every lens, and damaged files."""
 
+import re
 import shutil
 import struct
 from dataclasses import dataclass
@@ -14,7 +15,14 @@ from PIL import Image
 from command import run
 from gscompleter import InputError, load_cameras
 from gscompleter.data.cameras import Distortion, distort
-from gscompleter.data.colmap import CAMERA_MODELS, _list_roots, build_intrinsics
+from gscompleter.data.colmap import (
+    CAMERA_MODEL_NAMES,
+    CAMERA_MODELS,
+    MAX_NAME,
+    _list_roots,
+    build_intrinsics,
+    read_images,
+)
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.points import add_depth_range
 from gscompleter.system.files.image import write_image
@@ -66,16 +74,25 @@ def test_the_folder_of_a_model_and_its_images_file_open_too(tmp_path):
         check_room(photographs)
 
 
-def test_a_scene_may_be_called_by_a_number(tmp_path):
+@pytest.mark.parametrize("parent", ["scenes", "colmap", "Sparse"])
+@pytest.mark.parametrize("images", ["images", ""])
+@pytest.mark.parametrize("model", ["", "sparse/0", "0"])
+def test_a_scene_may_be_called_by_a_number(tmp_path, parent, images, model):
     """The model of scene 360 does not reach for the photographs beside the folder 360."""
     write_photographs(tmp_path / "images", views=VIEWS[::-1])
-    for model in ("", "sparse/0", "0"):
-        scene = tmp_path / f"36{len(model)}"
-        write_photographs(scene / "images")
-        write_colmap_binary(scene / model)
-        photographs = open_photographs(scene)
-        assert photographs.name == scene.name
+    write_photographs(tmp_path / parent / "images", views=VIEWS[::-1])
+    scene = tmp_path / parent / "360"
+    write_photographs(scene / images)
+    write_colmap_binary(scene / model)
+    given = [scene, *([scene / model] if model == "sparse/0" else [])]
+    for path in given:
+        photographs = open_photographs(path)
+        assert photographs.name == "360"
         check_room(photographs)
+    # One that is missing is left out.
+    (scene / images / NAMES[-1]).unlink()
+    for path in given:
+        check_room(open_photographs(path), range(len(NAMES) - 1))
 
 
 def test_the_images_file_that_is_named_is_read(tmp_path):
@@ -142,6 +159,29 @@ def test_names_without_endings_may_look_like_features(tmp_path):
         check_room(open_photographs(tmp_path))
 
 
+def test_names_of_three_numbers_are_no_features(tmp_path):
+    names = ["1 2 3", "2024 05 01", "2024 05 02", "2024 05 03", "7 8 9 10 11 12"]
+    write_photographs(tmp_path / "images", [f"{name}.png" for name in names])
+    for features in ("", "1 2 -1", "1.5 2 -1 " * 4, "0 0 -1 " * 4, "0 0 0 " * 4):
+        write_colmap_text(tmp_path / "sparse", names, features)
+        check_room(open_photographs(tmp_path))
+    # The first camera is that of the scene's axes, whose pose COLMAP writes in whole numbers.
+    path = tmp_path / "sparse" / "images.txt"
+    text, count = re.subn(r"\n1 .* 7 1 2 3\n", "\n1 1 0 0 0 0 0 0 7 1 2 3\n", path.read_text())
+    assert count == 1
+    path.write_text(text)
+    check_room(open_photographs(tmp_path))
+
+
+def test_the_longest_name_of_a_binary_file_is_read(tmp_path):
+    for length in (MAX_NAME - 1, MAX_NAME):
+        path = write_colmap_binary(tmp_path, ["a" * length, "b"]) / "images.bin"
+        assert [len(image.name) for image in read_images(path)] == [length, 1]
+    write_colmap_binary(tmp_path, ["a" * (MAX_NAME + 1), "b"])
+    with pytest.raises(InputError, match="is empty, truncated"):
+        read_images(path)
+
+
 def test_intrinsics_follow_the_size_on_the_disk(tmp_path):
     """The camera file has twice or half the size, and the view does not change."""
     for factor in (2.0, 0.5):
@@ -184,7 +224,19 @@ def test_of_several_models_the_largest_is_opened(tmp_path):
     check_room(photographs)
     (note,) = photographs.notes
     assert "3 models lie in" in note
-    assert "1 with 5 images is used" in note
+    assert "sparse: 1 with 5 images is used" in note
+
+
+def test_of_a_model_and_others_in_its_folder_the_largest_is_opened(tmp_path):
+    write_photographs(tmp_path / "images")
+    home = write_colmap_text(tmp_path / "sparse")
+    write_colmap_binary(home / "0", NAMES[:2])
+    photographs = open_photographs(tmp_path)
+    check_room(photographs)
+    (note,) = photographs.notes
+    assert note.startswith(
+        f"2 models lie in {home}: the one in the folder itself with 5 images is used;"
+    )
 
 
 @pytest.mark.linux
@@ -344,14 +396,38 @@ def test_photographs_of_every_lens_show_the_room_without_it(tmp_path, model):
         assert (photograph - seen).abs().mean() > 3 * error
 
 
-def test_a_lens_that_is_not_known_is_refused_with_what_to_do(tmp_path):
+@pytest.mark.parametrize(
+    ("number", "name", "advice"),
+    [
+        (11, "RAD_TAN_THIN_PRISM_FISHEYE", "`colmap image_undistorter`"),
+        (17, "EQUIRECTANGULAR", "split the panoramas into perspective images"),
+        (99, "99", "`colmap image_undistorter`"),
+    ],
+)
+def test_a_lens_that_is_not_known_is_refused_with_what_to_do(tmp_path, number, name, advice):
     write_photographs(tmp_path / "images")
     model = write_colmap_binary(tmp_path / "sparse")
     content = bytearray((model / "cameras.bin").read_bytes())
-    struct.pack_into("<i", content, 12, 17)
+    struct.pack_into("<i", content, 12, number)
     (model / "cameras.bin").write_bytes(content)
-    with pytest.raises(InputError, match="camera model 17 of camera 7 .* image_undistorter"):
+    with pytest.raises(InputError, match=f"camera model {name} of camera 7 .* {advice}") as binary:
         open_photographs(tmp_path)
+    if name != str(number):
+        for file in model.iterdir():
+            file.unlink()
+        write_colmap_text(model)
+        (model / "cameras.txt").write_text(f"7 {name} 64 32 64 32")
+        with pytest.raises(InputError) as text:
+            open_photographs(tmp_path)
+        assert str(text.value) == str(binary.value).replace("cameras.bin", "cameras.txt")
+
+
+def test_all_camera_models_of_colmap_are_known_by_name():
+    """Also those that are not read."""
+    pycolmap = pytest.importorskip("pycolmap", reason="needs gscompleter[poses]")
+    names = {int(model): name for name, model in pycolmap.CameraModelId.__members__.items()}
+    assert names.pop(-1) == "INVALID"
+    assert names.items() <= CAMERA_MODEL_NAMES.items()
 
 
 # Damage.

@@ -3,6 +3,7 @@
 import json
 import struct
 import sys
+from dataclasses import replace
 from importlib import import_module
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
@@ -184,8 +185,18 @@ BROKEN = {
         {**polycam(), CONFIDENCE: b"PNG"},
         "The confidence of frame 1660000000002 .* is not an image",
     ),
-    "8-bit depth": ({**polycam(), DEPTH: encode(np.zeros((3, 4), np.uint8))}, "uint8 of shape"),
-    "confidence": ({**polycam(), CONFIDENCE: encode(np.zeros((3, 4), np.uint8))}, r"\(3, 4\)"),
+    "8-bit depth": (
+        {**without(polycam(), CONFIDENCE), DEPTH: encode(np.zeros((3, 4), np.uint8))},
+        r"The depth of frame 1660000000002 .*zip is uint8 of shape \(3, 4\); one channel is needed",
+    ),
+    "confidence": (
+        {**polycam(), CONFIDENCE: encode(np.zeros((3, 4), np.uint8))},
+        r"The depth of frame 1660000000002 .* its confidence \(3, 4\);",
+    ),
+    "two photographs": (
+        {**polycam(), PHOTOGRAPH.replace("jpg", "png"): photograph(0, WIDE, "PNG")},
+        "Frame 1660000000002 of .* has several files, 1660000000002.jpg, 1660000000002.png; keep",
+    ),
     "scanner": (changed(scanner_app(), FRAME, intrinsics=[1, 2]), "`intrinsics` of frame 00002"),
 }
 
@@ -216,6 +227,15 @@ def test_photographs_without_a_camera_are_told(tmp_path):
         assert len(photographs) == 3
         told = f"Left out of {tmp_path / name}: 1 photograph without a camera ({lost})."
         assert told in photographs.notes
+
+
+def test_a_photograph_with_a_longer_name_takes_the_place_of_none(tmp_path):
+    files = {**scanner_app(), "frame_x_00002.jpg": photograph(3, WIDE)}
+    scene = write_folder(tmp_path / "room", files)
+    photographs = open_photographs(scene)
+    told = f"Left out of {scene}: 1 photograph without a camera (x_00002)."
+    assert photographs.notes == (told,)
+    check_room(replace(photographs, notes=()), WIDE)
 
 
 def test_other_files_beside_photographs_are_no_cameras(tmp_path):
@@ -250,10 +270,35 @@ def test_files_that_were_cut_are_told_in_plain_words(tmp_path, kind):
 # Archives.
 
 
-def test_several_recordings_in_an_archive_are_refused(tmp_path):
-    files = {f"{home}/{name}": data for home in "ab" for name, data in polycam().items()}
-    with pytest.raises(InputError, match="holds several recordings; unpack it"):
-        open_photographs(write_archive(tmp_path / "both.zip", files))
+@pytest.mark.parametrize("name", FOLDERS)
+def test_several_recordings_in_an_archive_are_refused(tmp_path, name):
+    """Also where the second one lacks a part."""
+    files = FOLDERS[name][0]()
+    for number, lacking in enumerate((None, ".jpg", ".json", "metadata")):
+        second = files if lacking is None else without(files, lacking)
+        both = {
+            **{f"a/{n}": data for n, data in files.items()},
+            **{f"b/{n}": d for n, d in second.items()},
+        }
+        with pytest.raises(InputError, match="holds several recordings; unpack it"):
+            open_photographs(write_archive(tmp_path / f"{number}.zip", both)).views(range(4))
+
+
+@pytest.mark.parametrize("cameras", [(), ("a",), ("a", "b")])
+@pytest.mark.parametrize("folder", ["", "keyframes/images/", "keyframes/corrected_images/"])
+def test_photographs_of_something_else_in_two_folders_are_no_recordings(tmp_path, folder, cameras):
+    """Also with JSON files of the names that those of an export have, and of other content."""
+    beside = folder.replace("images", "cameras")
+    files = {f"{home}/{folder}frame_{n}.jpg": b"x" for home in "ab" for n in range(2)}
+    files |= {f"{home}/{beside}frame_{n}.json": b"{}" for home in cameras for n in range(2)}
+    with pytest.raises(InputError, match="There are no posed photographs in"):
+        open_photographs(write_archive(tmp_path / "other.zip", files))
+
+
+def test_pictures_beside_a_recording_are_none_of_it(tmp_path):
+    pictures = {f"{home}/frame_0.jpg": b"x" for home in ("a", "b")}
+    path = write_archive(tmp_path / "room.r3d", {**record3d(), **pictures})
+    check_room(open_photographs(path), UPRIGHT)
 
 
 @pytest.mark.parametrize("name", ["room.zip", "room.r3d"])

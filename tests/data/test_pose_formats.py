@@ -451,6 +451,21 @@ def test_a_damaged_sequence_of_kitti_is_refused(tmp_path, file, text, sentence):
         open_photographs(scene)
 
 
+@pytest.mark.parametrize(
+    ("lens", "advice"),
+    [("fisheye", "undistort the images"), ("equirectangular", "split the panoramas into persp")],
+)
+def test_lenses_of_dgp_that_are_not_read_are_refused_with_what_to_do(tmp_path, lens, advice):
+    scene = dgp(tmp_path / "room")
+    path = scene / "calibration" / "abc.json"
+    content = json.loads(path.read_text())
+    for entry in content["intrinsics"]:
+        entry[lens] = 1
+    path.write_text(json.dumps(content))
+    with pytest.raises(InputError, match=f"`{lens}`, which is not read; {advice}"):
+        open_photographs(scene)
+
+
 def test_dgp_says_what_is_missing(tmp_path):
     scene = dgp(tmp_path / "room")
     path = scene / "scene_1.json"

@@ -144,7 +144,11 @@ def changed(scene: Path, change) -> Path:
         (lambda c: c["frames"][0].update(transform_matrix=[[1, 2], [3, 4]]), "transform_matrix"),
         (lambda c: c.update(w=0), "w"),
         (lambda c: c.update(fl_x="wide"), "fl_x"),
-        (lambda c: c.update(camera_model="EQUIRECTANGULAR"), "EQUIRECTANGULAR"),
+        (lambda c: c.update(camera_model="FISHEYE624"), "'FISHEYE624' .* undistort the images"),
+        (
+            lambda c: c.update(camera_model="EQUIRECTANGULAR"),
+            "'EQUIRECTANGULAR' .* split the panoramas into perspective images",
+        ),
     ],
 )
 def test_a_wrong_transforms_json_is_refused(tmp_path, change, sentence):

@@ -13,7 +13,11 @@ from gscompleter.guards.free_space import respect_free_space
 from gscompleter.numerics.geometry import project
 from gscompleter.numerics.sky import SKY_DEPTH, extend_sky, is_sky, mask_out_sky
 from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
+from gscompleter.reconstructors.features.stereo_image import make_stereo_images
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
+from gscompleter.reconstructors.plane_sweep.emphasis import Emphasis
+from gscompleter.reconstructors.plane_sweep.sky_colors import blend_skies, weigh_sky
+from gscompleter.reconstructors.plane_sweep.sky_mask import find_even_region
 from gscompleter.reconstructors.plane_sweep.sweep import find_hidden_pixels
 from gscompleter.render.loading import load_renderer
 from gscompleter.stages.extrapolate_registration import extrapolate_sky
@@ -137,6 +141,132 @@ def test_a_photographed_street_has_a_sky(frames, shared):
     assert has_sky(given.views(frames, (256, 256)))
 
 
+HOUSE = (
+    ((-90.0, -90.0, -1.0), (90.0, 1.5, 90.0)),
+    ((-6.0, -0.7, 5.0), (6.0, 1.5, 7.0)),
+    ((-1.6, -1.4, 3.6), (-0.6, 1.5, 5.0)),
+    ((0.6, -1.1, 4.2), (1.8, 1.5, 5.0)),
+)
+"""The ground, and a house with two towers. Nothing stands behind them."""
+BLUE, HAZE, WHITE = (0.45, 0.7, 0.95), (0.7, 0.8, 0.9), (1.0, 1.0, 1.0)
+
+
+def house(x: float, sky: tuple[float, float, float], towers: int) -> View:
+    camera = replace(camera_at(x, size=96), near=2.0, far=8.0)
+    image, depth = cast(Room(boxes=HOUSE[: 2 + towers]), camera)
+    is_open = depth > 9
+    image = torch.where(is_open[..., None], torch.tensor(sky), 0.6 * image)
+    return View(image, camera, depth=depth.masked_fill(is_open, torch.inf))
+
+
+def find_sky_shares(skies: list[tuple[float, float, float]], towers: int = 2) -> list[float]:
+    """Find which share of the true sky each photograph of the house gets."""
+    views = [house(0.6 * number, sky, towers) for number, sky in enumerate(skies)]
+    depths = PlaneSweep().estimate_depths(views)
+    shares = []
+    for view, depth in zip(views, depths, strict=True):
+        found = is_sky(depth.depth, view.camera)
+        truth = torch.isinf(view.depth)
+        assert (found & ~truth).sum() < 0.03 * (~truth).sum()
+        shares.append(float((found & truth).sum() / truth.sum()))
+    return shares
+
+
+def test_a_blue_sky_needs_nothing_far_away_below_it():
+    assert min(find_sky_shares([BLUE, BLUE, BLUE])) > 0.85
+
+
+def test_a_white_sky_needs_a_photograph_that_shows_it_blue():
+    """Against the light the sky is clipped to white, as ceilings are."""
+    assert find_sky_shares([WHITE, WHITE, WHITE]) == [0, 0, 0]
+    assert min(find_sky_shares([WHITE, BLUE, WHITE])) > 0.85
+
+
+def test_a_light_blue_wall_behind_one_plane_is_no_sky():
+    assert find_sky_shares([HAZE, HAZE, HAZE], towers=0) == [0, 0, 0]
+    assert min(find_sky_shares([BLUE, BLUE, BLUE], towers=0)) > 0.85
+
+
+def test_what_is_dark_at_the_top_is_no_sky():
+    image = torch.tensor(BLUE).repeat(60, 80, 1)
+    image[30:] = torch.rand(30, 80, 3, generator=torch.Generator().manual_seed(0))
+    image[:20, :25] = 0.02
+    view = View(image, replace(camera_at(size=80), height=60))
+    aside = replace(view, camera=replace(camera_at(0.1, size=80), height=60))
+    region = find_even_region(make_stereo_images([view, aside])[0][0])
+    assert region[:25, 30:].all()
+    assert not region[:18, :22].any()
+
+
+def test_the_sky_has_one_tone_where_photographs_meet():
+    cameras = [replace(camera_at(yaw=yaw, size=64), near=1.0, far=10.0) for yaw in (0.0, 20.0)]
+    blue = torch.tensor(BLUE).repeat(64, 64, 1)
+    blue[20:22, 40:42] = 0.8  # a cloud
+    views = [View(blue, cameras[0]), View(torch.ones(64, 64, 3), cameras[1])]
+    sky = torch.zeros(64, 64, dtype=torch.bool)
+    sky[:40] = True
+    # Of two photographs each keeps its own colours.
+    for image, view in zip(blend_skies(views, [sky, sky]), views, strict=True):
+        torch.testing.assert_close(image[sky], view.image[sky], atol=1e-5, rtol=0)
+    # A third one shows no sky.
+    third = View(blue, replace(camera_at(yaw=90.0, size=64), near=1.0, far=10.0))
+    first, second, _ = blend_skies([*views, third], [sky, sky, torch.zeros_like(sky)])
+    # At the border of the second image, which the first shows, and as far from its own.
+    pixels, _ = project(cameras[1].center + 80 * cameras[1].z_rays()[10, [6, 30, 50]], cameras[0])
+    x, y = pixels.long().unbind(-1)
+    assert x[0] < 60
+    apart = (second[10, 6] - first[y[0], x[0]]).abs().max()
+    assert apart < 0.05 < (views[1].image[10, 6] - blue[y[0], x[0]]).abs().max()
+    # Where only one of them shows it, it stays.
+    torch.testing.assert_close(first[10, 2], blue[10, 2], atol=0.02, rtol=0)
+    assert x[2] > 70
+    torch.testing.assert_close(second[10, 60], torch.ones(3), atol=0.02, rtol=0)
+    # The cloud keeps its contrast.
+    contrast = first[20:22, 40:42].mean() - first[16:26, 36:38].mean()
+    wanted = blue[20:22, 40:42].mean() - blue[16:26, 36:38].mean()
+    assert contrast == pytest.approx(float(wanted), rel=0.25)
+
+
+def test_behind_a_surface_the_sky_is_that_of_other_photographs():
+    camera = replace(camera_at(size=64), near=1.0, far=10.0)
+    views = [
+        View(torch.full((64, 64, 3), 0.1), camera),
+        View(torch.tensor(BLUE).repeat(64, 64, 1), camera),
+        View(torch.ones(64, 64, 3), camera),
+    ]
+    whole = torch.ones(64, 64, dtype=torch.bool)
+    part = whole.clone()
+    part[:, 20:] = False
+    none = torch.zeros_like(whole)
+    tree, *_ = blend_skies(views, [part, whole, none])
+    torch.testing.assert_close(tree[30, 40], torch.tensor(BLUE), atol=1e-3, rtol=0)
+    # A view without a sky is left as it is, and tells nothing.
+    assert torch.equal(blend_skies(views, [none, whole, none])[0], views[0].image)
+    alone = blend_skies(views, [none, part, none])[1]
+    torch.testing.assert_close(alone, views[1].image, atol=1e-5, rtol=0)
+
+
+def test_a_part_that_is_nothing_but_sky_is_not_fitted():
+    camera = replace(camera_at(size=32), near=1.0, far=10.0)
+    view = View(torch.tensor(BLUE).repeat(32, 32, 1), camera)
+    scene = gaussians_of(view, torch.full((32, 32), SKY_DEPTH * 10.0))
+    whole = torch.ones(32, 32, dtype=torch.bool)
+    fitted = PlaneSweep().fit_before_sky(
+        scene, [view] * 3, torch.ones(3, 3), [whole] * 3, Emphasis()
+    )
+    assert fitted is scene
+
+
+def test_the_weight_of_a_sky_rises_from_all_its_borders():
+    sky = torch.zeros(40, 40, dtype=torch.bool)
+    sky[:30] = True
+    weight = weigh_sky(sky)
+    assert not weight[30:].any()
+    assert weight[0].max() <= 0.11
+    assert weight[29].max() <= 0.11
+    assert weight[15, 20] == 1
+
+
 def test_a_hole_beside_the_sky_is_sky_if_it_shows_its_colour():
     camera = replace(camera_at(size=16), near=0.5, far=10.0)
     image = torch.full((16, 16, 3), 0.8)
@@ -167,7 +297,8 @@ def test_the_sky_goes_on_behind_what_stands_before_it():
     sky = torch.ones(32, 32, dtype=torch.bool)
     sky[:, 4:28] = False
     image[~sky] = 0.1
-    gaussians, pixels = extend_sky(View(image, camera), sky, 0.6)
+    sky_image = torch.full((32, 32, 3), 0.8)
+    gaussians, pixels = extend_sky(View(image, camera), sky, sky_image, 0.6)
     where = torch.zeros(32 * 32, dtype=torch.bool)
     where[pixels] = True
     assert where.reshape(32, 32)[:, 4:8].all()

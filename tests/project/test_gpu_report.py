@@ -169,7 +169,7 @@ def test_limits_leave_time_for_what_comes_after_the_build():
         # Up to minutes on a CPU.
         *(
             pytest.param(part, marks=pytest.mark.slow)
-            for part in ("stages", "profile", "plane_sweep", "commands", "baselines")
+            for part in ("stages", "profile", "plane_sweep", "patches", "commands", "baselines")
         ),
     ],
 )

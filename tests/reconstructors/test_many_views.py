@@ -37,7 +37,9 @@ from gscompleter.reconstructors.plane_sweep.fit import (
     shuffle_views,
 )
 from gscompleter.reconstructors.plane_sweep.free_space import (
+    NEAREST_OCCLUDER,
     Surfaces,
+    find_occluders,
     find_seen_through,
     leave_free_space,
 )
@@ -288,6 +290,12 @@ def test_large_images_are_matched_at_half_their_size_first(monkeypatch, count, s
     assert {tuple(depth.depth.shape) for depth in depths} == {(size, size)}
 
 
+def no_occluders(layers: list[DepthLayer]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Occluders and skies of views that have neither."""
+    labels = [np.zeros(layer.inverse.shape, int) for layer in layers]
+    return labels, [label > 0 for label in labels]
+
+
 def test_what_stands_before_the_surfaces_of_others_moves_behind_them():
     layers, transforms = true_layers(row_of_views(3))
     block = (slice(20, 40), slice(24, 40))
@@ -301,7 +309,7 @@ def test_what_stands_before_the_surfaces_of_others_moves_behind_them():
     open_pixels[0][22] = False
 
     layers = [changed, *layers[1:]]
-    first, *others = leave_free_space(layers, open_pixels, transforms)
+    first, *others = leave_free_space(layers, open_pixels, *no_occluders(layers), transforms)
     assert all(after is before for after, before in zip(others, layers[1:], strict=True))
     surfaces = [Surfaces.measured_in(layer) for layer in layers]
     was_before = find_seen_through(0, wrong, surfaces, transforms) & open_pixels[0]
@@ -320,13 +328,89 @@ def test_what_is_measured_or_has_no_place_behind_stays():
     layers, transforms = true_layers(row_of_views(3))
     near = replace(layers[0], inverse=1.5 * layers[0].inverse)
     everywhere = [np.ones_like(near.inverse, dtype=bool) for _ in layers]
-    (first, *_) = leave_free_space([near, *layers[1:]], everywhere, transforms)
+    _, no_sky = no_occluders(layers)
+    whole = [mask.astype(int) for mask in everywhere]
+    (first, *_) = leave_free_space([near, *layers[1:]], everywhere, whole, no_sky, transforms)
     assert first is near
     # Even twice its farthest depth is before what the others see.
     flat = np.full_like(near.inverse, 4 * near.inverse.max())
     unknown = replace(near, inverse=flat, confidence=np.zeros_like(flat))
-    (first, *_) = leave_free_space([unknown, *layers[1:]], everywhere, transforms)
+    occluders = no_occluders(layers)
+    (first, *_) = leave_free_space([unknown, *layers[1:]], everywhere, *occluders, transforms)
     assert first is unknown
+
+
+@pytest.mark.parametrize("share", [1.0, 0.5, 0.1])
+def test_a_branch_before_the_sky_of_others_comes_nearer(share):
+    """The others see the sky behind a share of it, and the wall behind the rest."""
+    views = [view_of(Room(), camera_at(x, size=SIZE)) for x in (-0.5, 0.0, 0.5)]
+    layers, transforms = true_layers(views)
+    branch = np.zeros_like(layers[0].measured_mask)
+    branch[:30, :8] = True
+    skies = [np.zeros_like(branch) for _ in layers]
+    for number, sky in enumerate(skies):
+        sky[: round(30 * share)] = True
+        layer = layers[number]
+        layers[number] = replace(layer, inverse=np.where(sky, np.float32(1e-3), layer.inverse))
+    skies[0] &= ~branch
+    confidence = np.where(branch, 0.0, layers[0].confidence)
+    # Surfaces that go on to there stand a little before the wall.
+    inverse = np.where(branch, np.float32(1.3) * layers[0].inverse[-34], layers[0].inverse)
+    layers[0] = replace(layers[0], inverse=inverse, confidence=confidence)
+    no_branch = [np.zeros_like(branch, dtype=int) for _ in skies]
+    labels = [3 * branch.astype(int), *no_branch[1:]]
+    first, *_ = leave_free_space(layers, no_occluders(layers)[1], labels, skies, transforms)
+    moved = first.inverse != inverse
+    assert not moved[~branch].any()
+    if share == 0.1:
+        assert not moved.any()
+        return
+    assert moved[branch].mean() > 0.5
+    assert (first.inverse > inverse)[moved].all()
+    surfaces = [Surfaces.measured_in(layer) for layer in layers]
+    assert not find_seen_through(0, first.inverse, surfaces, transforms)[moved].any()
+    assert first.inverse.max() <= NEAREST_OCCLUDER * inverse.max()
+
+
+def test_an_occluder_is_large_and_reaches_out_of_the_image():
+    image = torch.full((100, 100, 3), 0.5)
+    photograph = image.clone()
+    photograph[:30, :30] = 0.1
+    photograph[40:70, 40:70] = 0.1
+    photograph[95:, 95:] = 0.1
+    photograph[45:75, 90:] = 0.55
+    ignored = torch.zeros(100, 100, dtype=torch.bool)
+    ignored[:, 10:12] = True
+    view = View(photograph, camera_at(size=100), ignore_mask=ignored)
+    found = find_occluders(image, view) > 0
+    assert found[:25, :9].all()
+    assert not found[:, 10:12].any()
+    found[:36, :36] = False
+    assert not found.any()
+
+
+def test_surfaces_do_not_grow_over_a_sky_that_photographs_show_unlike():
+    """Fitted to a sky that is blue in some and white in others, they would cover it."""
+    start = gaussians_of(view_of(Room(), camera_at(size=SIZE)))
+    cameras = [camera_at(x, size=SIZE) for x in (-0.1, 0.0, 0.1)]
+    renders = [RENDERER.render(start, camera) for camera in cameras]
+    # What lies in the upper half is sky, of which the surfaces are to hold nothing.
+    surfaces = start[start.means[:, 1] > -0.2]
+    views = []
+    skies = []
+    for camera, render, light in zip(cameras, renders, (0.2, 0.6, 1.0), strict=True):
+        sky = RENDERER.render(surfaces, camera).alpha < 0.05
+        views.append(View(torch.where(sky[..., None], light, render.image), camera))
+        skies.append(sky)
+    gains = torch.ones(3, 3)
+    covered = []
+    for given in (skies, ()):
+        fitted = fit_jointly(surfaces, views, gains, RENDERER, skies=given)
+        renders = [RENDERER.render(fitted, camera) for camera in cameras]
+        pairs = zip(renders, skies, strict=True)
+        covered.append(torch.cat([render.alpha[sky] for render, sky in pairs]).mean())
+    assert skies[1].float().mean() > 0.2
+    assert covered[0] < 0.5 * covered[1]
 
 
 def test_what_one_of_four_photographs_shows_is_no_fog_before_it(shared):

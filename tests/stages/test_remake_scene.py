@@ -129,6 +129,22 @@ def test_the_new_scene_keeps_the_exposure_of_what_stays():
         assert after > true
 
 
+def test_photographs_that_check_the_scene_get_the_depth_range_of_the_new_one():
+    """The range of the given scene was measured in it, and the photographs have none."""
+    bare = [replace(v, camera=replace(v.camera, near=None, far=None)) for v in PHOTOS]
+    remade = torch.ones(len(SHARDS), dtype=torch.bool)
+    ranges = []
+    for earlier in (EarlierWork(remade=remade), EarlierWork()):
+        completer = GSCompleter(reconstruct_exactly, config=CompleterConfig.splat())
+        begun = completer.begin(bare[:3], SHARDS, bare[3:], earlier=earlier)
+        assert begun.is_remade == (earlier.remade is not None)
+        assert len(begun.photos) == len(PHOTOS)
+        found = {(photo.view.camera.near, photo.view.camera.far) for photo in begun.photos}
+        assert len(found) == 1
+        ranges.append(found)
+    assert ranges[0] != ranges[1]
+
+
 def test_what_shows_where_photographs_are_ignored_stays():
     """Ψ makes nothing there: around what a person took out, the given scene is all that is left."""
     middle = torch.zeros(48, 48, dtype=torch.bool)

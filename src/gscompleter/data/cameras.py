@@ -27,6 +27,14 @@ MAX_ZOOM_IN = 4.0
 FRACTIONS = (1, 1)
 """`Intrinsics.size` of values in image widths and heights."""
 
+PANORAMA_MODEL = "EQUIRECTANGULAR"
+"""Name of the camera model of panoramas, for COLMAP and for nerfstudio."""
+PANORAMA_ADVICE = (
+    "split the panoramas into perspective images with cameras, or name the folder of the panoramas "
+    "alone, and cameras are found anew"
+)
+"""What to do about that model: no program undistorts a panorama into one image."""
+
 FLOAT_NOISE = 1e-6
 """Largest deviation from a rotation that is kept as it is."""
 SAME_ASPECT = 0.02

@@ -7,6 +7,7 @@ the feature lines of text files or add empty ones, so lines are classified by co
 
 from __future__ import annotations
 
+import math
 import mmap
 import os
 import struct
@@ -22,6 +23,8 @@ import numpy as np
 from jaxtyping import Float
 
 from gscompleter.data.cameras import (
+    PANORAMA_ADVICE,
+    PANORAMA_MODEL,
     Distortion,
     Intrinsics,
     Projection,
@@ -29,12 +32,20 @@ from gscompleter.data.cameras import (
     invert_viewmat,
 )
 from gscompleter.data.depth_beside_colmap import attach_depth_maps
-from gscompleter.data.frame import Frame, find_file, find_path, keep_existing, locate_images
+from gscompleter.data.file_names import is_photograph_name
+from gscompleter.data.frame import (
+    Frame,
+    find_file,
+    find_path,
+    keep_existing,
+    list_image_folders,
+    locate_images,
+)
 from gscompleter.data.limits import MAX_COEFFICIENT, MAX_NUMBER
 from gscompleter.data.photographs import Photographs, build_photographs
 from gscompleter.data.points import read_point_cloud
 from gscompleter.system.errors import InputError, quote_value, refuse_pointer
-from gscompleter.system.files.reading import open_file, read_lines
+from gscompleter.system.files.reading import list_entries, open_file, read_lines
 from gscompleter.types import MAX_IMAGE_SIDE
 
 MODEL_HOMES = ("sparse", "colmap/sparse", "distorted/sparse", "")
@@ -45,6 +56,8 @@ MODEL_ENDINGS = (".bin", ".txt")
 
 MAX_NAME = 1024
 """Longest image name in a binary file, in bytes."""
+UNIT_TOLERANCE = 1e-3
+"""Largest deviation of the length of a quaternion from 1, by which it is known as one."""
 FEATURE_SIZE = 24
 """Bytes of a feature: x, y and the number of its point."""
 MAX_FEATURES_LINE = 1 << 22
@@ -107,10 +120,15 @@ CAMERA_MODELS = {
     "FISHEYE": CameraModel(15, "fx fy cx cy", "equidistant"),
     "EUCM": CameraModel(16, "fx fy cx cy alpha beta", "unified"),
 }
-"""Camera models by COLMAP's names, without RAD_TAN_THIN_PRISM_FISHEYE (11). k4 to k6 of FULL_OPENCV
+"""Camera models by COLMAP's names, without those of `UNREAD_CAMERA_MODELS`. k4 to k6 of FULL_OPENCV
 are d1 to d3, and sx1 and sy1 are s1 and s3."""
 
-CAMERA_MODEL_NAMES = {model.number: name for name, model in CAMERA_MODELS.items()}
+UNREAD_CAMERA_MODELS = {11: "RAD_TAN_THIN_PRISM_FISHEYE", 17: PANORAMA_MODEL}
+"""Names of COLMAP's other camera models, by number."""
+
+CAMERA_MODEL_NAMES = UNREAD_CAMERA_MODELS | {
+    model.number: name for name, model in CAMERA_MODELS.items()
+}
 
 _IN_PIXELS = ("f", "fx", "fy", "cx", "cy")
 """Parameters in pixels; the others have no unit."""
@@ -118,13 +136,18 @@ _IN_PIXELS = ("f", "fx", "fy", "cx", "cy")
 
 def get_camera_model(name: str | int, title: str) -> CameraModel:
     """Return the camera model of a name or number; `title` names the camera in errors."""
-    known = CAMERA_MODEL_NAMES.get(name) if isinstance(name, int) else name
-    if known not in CAMERA_MODELS:
-        raise InputError(
-            f"The camera model {quote_value(str(name))} of {title} is not supported; undistort the "
-            "photographs with `colmap image_undistorter`, which writes a PINHOLE model."
-        )
-    return CAMERA_MODELS[known]
+    known = CAMERA_MODEL_NAMES.get(name, str(name)) if isinstance(name, int) else name
+    if known in CAMERA_MODELS:
+        return CAMERA_MODELS[known]
+    advice = (
+        "undistort the photographs with `colmap image_undistorter`, which writes a PINHOLE model"
+    )
+    if known == PANORAMA_MODEL:
+        # That command refuses panoramas.
+        advice = PANORAMA_ADVICE
+    raise InputError(
+        f"The camera model {quote_value(known)} of {title} is not supported; {advice}."
+    )
 
 
 def build_intrinsics(
@@ -237,7 +260,7 @@ def _read_binary_images(path: Path) -> Iterator[PosedImage]:
             number, *pose, camera = _unpack_struct(content, "<I4d3dI")
             # The name ends with a zero byte.
             start = content.tell()
-            end = content.find(b"\0", start, start + MAX_NAME)
+            end = content.find(b"\0", start, start + MAX_NAME + 1)
             if end < 0:
                 raise ValueError("a name without an end")
             name = os.fsdecode(content.read(end + 1 - start)[:-1])
@@ -317,16 +340,20 @@ def _parse_image(line: str) -> PosedImage | None:
 
 def _holds_features(words: Sequence[str]) -> bool:
     """Check whether a line of images.txt holds features, triples X Y POINT3D_ID, and no pose."""
-    # The number of a point is whole, and -1 for none.
-    if len(words) % 3 != 0 or not words[-1].lstrip("-").isdecimal():
+    # The number of a point is whole, and -1 for none. In a pose qx and tx stand at such places.
+    places = (*words[2:12:3], words[-1])
+    if len(words) % 3 != 0 or not all(word.lstrip("-").isdecimal() for word in places):
         return False
     # A pose has nine numbers and a name. Words of a name such as "IMG 1 2" are no feature.
     try:
-        for word in words[9:12]:
-            float(word)
+        numbers = [float(word) for word in words[:12]]
     except ValueError:
         return False
-    return True
+    # What is left may still be a pose of whole numbers, as that of a first image often is, and a
+    # name of three numbers, such as "2024 05 01". Its quaternion has the length 1. Between two
+    # features, in pixels, the same four numbers do not.
+    is_posed = len(numbers) == 12 and abs(math.hypot(*numbers[1:5]) - 1) < UNIT_TOLERANCE
+    return not (is_posed and numbers[0] >= 0 and numbers[8] >= 0)
 
 
 def _parse_point(line: str) -> Track:
@@ -385,9 +412,12 @@ def _select_largest(path: Path) -> tuple[Path, list[Frame], tuple[str, ...]]:
     model, frames = max(models, key=lambda one: len(one[1]))
     if len(models) == 1:
         return model, frames, ()
+    # Only the first one may be the home of the others itself.
+    home = models[-1][0].parent
+    used = "the one in the folder itself" if model == home else quote_value(model.name)
     note = (
-        f"{len(models)} models lie in {quote_value(model.parent)}: {quote_value(model.name)} with "
-        f"{len(frames)} images is used; the others are ignored."
+        f"{len(models)} models lie in {quote_value(home)}: {used} with {len(frames)} images is "
+        "used; the others are ignored."
     )
     return model, frames, (note,)
 
@@ -475,14 +505,24 @@ def _list_roots(scene: Path, model: Path) -> list[Path]:
     given = Path(os.path.abspath(scene))
     roots = [Path(os.path.abspath(model))]
     home_names = {part for home in MODEL_HOMES if home for part in home.split("/")}
+    # A numbered model, 0, lies in a home of models. Scene 360 may lie in a folder of that name, but
+    # has photographs, or its model is below it.
+    is_numbered = roots[0].name.isdecimal() and not _holds_photographs(roots[0])
     while True:
         folder = roots[-1]
         is_below_given = given in folder.parents
-        # A numbered model, 0, lies in a home of models.
-        home = folder.parent if folder.name.isdecimal() else folder
+        home = folder.parent if is_numbered and len(roots) == 1 else folder
         if not is_below_given and home.name.casefold() not in home_names:
             return roots
         roots.append(folder.parent)
+
+
+def _holds_photographs(folder: Path) -> bool:
+    """Check whether photographs lie in a folder, or in one of the usual folders below it."""
+    *image_folders, _ = list_image_folders([folder])
+    return bool(image_folders) or any(
+        is_photograph_name(path.name) for path in list_entries(folder)
+    )
 
 
 def _make_model_point_reader(model: Path) -> partial[Float[np.ndarray, "n 3"]] | None:

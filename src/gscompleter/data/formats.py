@@ -27,7 +27,7 @@ from gscompleter.data.llff import has_llff, open_llff
 from gscompleter.data.masks import attach_masks
 from gscompleter.data.multi_view_stereo import has_idr, has_mvsnet, open_idr, open_mvsnet
 from gscompleter.data.one_photograph import find_photograph, open_photograph
-from gscompleter.data.phones.apps import POLYCAM, SCANNER_APP, find_recording, open_recording
+from gscompleter.data.phones.apps import POLYCAM, SCANNER_APP, find_recordings, open_recording
 from gscompleter.data.photographs import Photographs
 from gscompleter.data.real_estate import (
     has_chunks,
@@ -83,7 +83,7 @@ SCENE_FORMATS = {
     "waymo": SceneFormat(list_segments, open_waymo, "m"),
     "real-estate-10k": SceneFormat(list_camera_files, open_camera_files),
     "polycam": SceneFormat(POLYCAM.find_frames, POLYCAM.open, "m"),
-    "record3d": SceneFormat(find_recording, open_recording, "m"),
+    "record3d": SceneFormat(find_recordings, open_recording, "m"),
     "3d-scanner-app": SceneFormat(SCANNER_APP.find_frames, SCANNER_APP.open, "m"),
     "scannet": SceneFormat(has_scannet, open_scannet, "m"),
     "replica": SceneFormat(has_replica, open_replica, "m"),

@@ -16,7 +16,13 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.cameras import Distortion, Intrinsics, find_pose_defect
+from gscompleter.data.cameras import (
+    PANORAMA_ADVICE,
+    PANORAMA_MODEL,
+    Distortion,
+    Intrinsics,
+    find_pose_defect,
+)
 from gscompleter.data.file_names import FolderListings, list_endings, locate
 from gscompleter.data.frame import Frame, find_file, find_image
 from gscompleter.data.json_fields import (
@@ -211,10 +217,13 @@ def _parse_intrinsics(entry: Mapping[str, Any], title: str) -> Intrinsics:
 def _parse_distortion(entry: Mapping[str, Any], title: str) -> Distortion:
     default = "OPENCV_FISHEYE" if entry.get("is_fisheye") else "OPENCV"
     model = default if entry.get("camera_model") is None else entry["camera_model"]
+    known = PERSPECTIVE_MODELS + FISHEYE_MODELS
+    advice = f"undistort the images first, or use one of {', '.join(known)}"
+    if model == PANORAMA_MODEL:
+        advice = PANORAMA_ADVICE
     require(
-        model in PERSPECTIVE_MODELS + FISHEYE_MODELS,
-        f"The camera model '{quote_value(model)}' of {title} is not supported; undistort the "
-        f"images first, or use one of {', '.join(PERSPECTIVE_MODELS + FISHEYE_MODELS)}.",
+        model in known,
+        f"The camera model '{quote_value(model)}' of {title} is not supported; {advice}.",
     )
     # Not all six are listed: files omit those that are zero.
     k1, k2, k3, k4, p1, p2 = (

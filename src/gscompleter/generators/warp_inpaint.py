@@ -15,12 +15,14 @@ from typing import ClassVar
 import cv2
 import numpy as np
 import torch
-from jaxtyping import Bool, Float, Float32, Int64
+from jaxtyping import Bool, Float, Int64
 from numpy import ndarray
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, pad
 
 from gscompleter.config.generators import GeneratorSettings
+from gscompleter.generators.patch_devices import PatchDevice, get_patch_device
+from gscompleter.generators.patch_rounds import FINEST_SPACING, PatchRounds
 from gscompleter.generators.warp import (
     BORDER_WIDTH,
     WarpedImage,
@@ -51,14 +53,8 @@ MIN_VOTE_ROUNDS = 2
 """Iterations on the finest level."""
 MAX_VOTE_ROUNDS = 8
 """Iterations on the coarsest level, where sharp votes need more to agree."""
-VOTE_SHARPNESS = 8
-"""Decay of a vote with its cost; at 1, averaged patches lose a quarter of their detail."""
-MIN_VOTE = 1e-6
-"""Smallest vote: a pixel whose patches all fit badly gets their mean."""
 WEIGHT_DECAY = 0.85
 """Weight factor of an unknown pixel per pixel from the border of the hole."""
-FINEST_SPACING = 2
-"""Only every second patch is matched on the finest level, as the white squares of a chessboard."""
 MIN_SIZE = 80
 """Shorter side of the coarsest level, in pixels; coarser ones cost 0.3 dB."""
 FINE_REACH = 8
@@ -72,6 +68,13 @@ class WarpInpaint:
     name: ClassVar[str] = "warp-inpaint"
 
     seed: int = 0
+    device: str = "cpu"
+    """Device of the search for patches, whatever device the photographs are on: a GPU searches
+    large levels, `cpu` and `mps` none."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError for a device that the search for patches does not know."""
+        get_patch_device(self.device)
 
     def __call__(
         self, nearest: View, target: Camera, context: GeneratorInput
@@ -135,7 +138,8 @@ class WarpInpaint:
 
         # Patches add what is finer than the tone, and keep the tone itself (decision 033). Deep in
         # a hole they fade, and beyond `reach` and in cracks the tone counts as known to them.
-        patched = fill_by_patches(tone, ~undecided, warped.depth.log(), sources, self.seed)
+        expected = warped.depth.log()
+        patched = fill_by_patches(tone, ~undecided, expected, sources, self.seed, self.device)
         detail = patched - tone
         detail = detail - smooth_masked(detail, undecided, TONE_RADIUS)
         fading = (2 * (1 - distance / reach)).clamp(0, 1)
@@ -145,8 +149,8 @@ class WarpInpaint:
 def load_warp_inpaint(
     settings: GeneratorSettings, seed: int, photographs: Sequence[View], device: str
 ) -> WarpInpaint:
-    """Load the generator."""
-    return WarpInpaint(seed)
+    """Load the generator; patches of large levels are searched on the device of the networks."""
+    return WarpInpaint(seed, device)
 
 
 def remove_cracks(hole: Bool[Tensor, "h w"], width: int) -> Bool[Tensor, "h w"]:
@@ -217,12 +221,14 @@ def fill_by_patches(
     expected: Float[Tensor, "h w"],
     sources: Sources,
     seed: int,
+    device: str = "cpu",
 ) -> Float[Tensor, "h w 3"]:
     """Fill the unknown pixels of `image` with patches of `sources`.
 
     Unknown pixels of `image` hold a first guess of the tone. `expected` is the expected log-depth;
-    nearer sources cost more.
+    nearer sources cost more. Tensors lie on the CPU, whatever device large levels are filled on.
     """
+    patch_device = get_patch_device(device)
     # Coarse to fine (Wexler et al. 2007): the coarsest level decides what goes where, and each
     # finer one starts from its matches.
     levels = [InpaintLevel(image, known, expected, sources)]
@@ -243,7 +249,9 @@ def fill_by_patches(
             (rows + columns) % spacing == 0
         )
         # Each level and round draws other random numbers; the steps between seeds are primes.
-        filled, field = search_and_vote(level, field, centres, rounds, seed + 7919 * number)
+        filled, field = search_and_vote(
+            level, field, centres, rounds, seed + 7919 * number, patch_device
+        )
     return filled
 
 
@@ -253,6 +261,7 @@ def search_and_vote(
     centres: Bool[ndarray, "h w"],
     rounds: int,
     seed: int,
+    device: PatchDevice,
 ) -> tuple[Float[Tensor, "h w 3"], Field | None]:
     """Alternate between searching the best patches around `centres` and voting for the image.
 
@@ -274,8 +283,6 @@ def search_and_vote(
     weight_in_hole = np.maximum(WEIGHT_DECAY**distance, 0.05)
     weight = np.where(known, 1.0, weight_in_hole).astype(np.float32)
     matches = init_matches(queries, coarse_field, usable, seed)
-    images = patchmatch.pad_column(level.sources.images.numpy())
-    log_depth = np.ascontiguousarray(level.sources.log_depth.numpy())
     channel_weight = patchmatch.pad_border(np.repeat(weight[..., None], 3, axis=-1))
     # Beyond the image a patch has no weight.
     total_weight = cv2.boxFilter(
@@ -285,6 +292,17 @@ def search_and_vote(
         normalize=False,
         borderType=cv2.BORDER_CONSTANT,
     )
+    problem = patchmatch.PatchProblem(
+        image=patchmatch.pad_border(level.image.numpy()),
+        weight=channel_weight,
+        total=total_weight[centres],
+        queries=queries,
+        query_at=query_at,
+        expected_log_depth=level.expected.numpy()[centres],
+        sources=patchmatch.pad_column(level.sources.images.numpy()),
+        usable_mask=usable,
+        log_depth=np.ascontiguousarray(level.sources.log_depth.numpy()),
+    )
     costs = patchmatch.Costs(
         max_bias=np.float32(MAX_BIAS),
         bias_penalty=np.float32(BIAS_PENALTY),
@@ -292,49 +310,26 @@ def search_and_vote(
         distance_penalty=np.float32(DISTANCE_PENALTY),
         diagonal=np.float32(math.hypot(*usable.shape[1:])),
     )
-
-    # Every pixel of the hole is the mean of what the patches over it show there, each with its
-    # colour shift and weighted by its vote.
-    def vote_colors(
-        votes: Float32[ndarray, "q"], shift: Float32[ndarray, "q 3"]
-    ) -> Float32[ndarray, "p 3"]:
-        return patchmatch.vote(query_at, votes, images, matches, shift)[0][~known]
-
     # The matches of a coarser level are nearly right, so that they are searched around alone. The
     # coarsest level begins with the tone, and searches everywhere.
-    current = level.image.numpy().copy()
-    reach = max(usable.shape)
-    if coarse_field is not None:
-        # Before the first search all matches are equally likely.
-        no_shift = np.zeros((len(queries), 3), np.float32)
-        current[~known] = vote_colors(weight[centres], no_shift)
-        reach = FINE_REACH
-    for number in range(rounds):
-        problem = patchmatch.PatchProblem(
-            image=patchmatch.pad_border(current),
-            weight=channel_weight,
-            total=total_weight[centres],
-            queries=queries,
-            query_at=query_at,
-            expected_log_depth=level.expected.numpy()[centres],
-            sources=images,
-            usable_mask=usable,
-            log_depth=log_depth,
+    is_refined = coarse_field is not None
+    run_rounds = device.choose_rounds(len(queries))
+    image, matches = run_rounds(
+        PatchRounds(
+            problem=problem,
+            costs=costs,
+            known=known,
+            center_weight=weight[centres],
+            matches=matches,
+            is_refined=is_refined,
+            reach=FINE_REACH if is_refined else max(usable.shape),
+            num_rounds=rounds,
+            seed=seed,
         )
-        # Improves `matches` in place.
-        cost, shift = patchmatch.search(problem, costs, matches, reach, seed + 31 * number)
-        current[~known] = vote_colors(weight[centres] * compute_likelihood(cost), shift)
-
+    )
     field = np.full((h, w, 3), -1, np.int64)
     field[centres] = matches
-    return torch.from_numpy(current), field
-
-
-def compute_likelihood(cost: Float32[ndarray, "q"]) -> Float32[ndarray, "q"]:
-    """Convert costs to vote weights (Wexler et al. 2007, Sec. 3.2)."""
-    usual = max(float(np.percentile(cost, 75)), 1e-6)
-    likely = np.exp(-VOTE_SHARPNESS * cost / (2 * usual))
-    return np.maximum(likely, MIN_VOTE).astype(np.float32)
+    return torch.from_numpy(image), field
 
 
 def find_usable_centres(valid: Bool[Tensor, "s h w"]) -> Bool[ndarray, "s h w"]:

@@ -9,7 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
-from gscompleter.numerics.image_ops import dilate, push_pull
+from gscompleter.numerics.image_ops import dilate
 from gscompleter.types import Camera, DepthMap, Gaussians, Render, View, make_observed, sh_from_rgb
 
 SKY_DEPTH = 8.0
@@ -52,11 +52,13 @@ def mask_out_sky(render: Render, camera: Camera) -> DepthMap:
 
 
 def extend_sky(
-    view: View, sky: Bool[Tensor, "h w"], sigma: float
+    view: View, sky: Bool[Tensor, "h w"], sky_image: Float[Tensor, "h w 3"], sigma: float
 ) -> tuple[Gaussians, Int[Tensor, "n"]]:
-    """Extend the sky behind surfaces by Gaussians of `sigma` pixels; return their pixels, too."""
+    """Extend the sky behind surfaces by Gaussians of `sigma` pixels; return their pixels, too.
+
+    `sky_image` has the colours of the sky beside `sky`, as well.
+    """
     camera = view.camera
-    image = view.image
     # Only behind surfaces: where the sky is seen, the reconstruction has its Gaussians.
     reach = round(SKY_EXTENSION * min(camera.width, camera.height))
     where = dilate(sky, reach) & ~sky
@@ -66,12 +68,19 @@ def extend_sky(
     size = sigma * depth * 2 / (camera.K[0, 0] + camera.K[1, 1])
     gaussians = make_observed(
         means=camera.center + depth * camera.z_rays()[where],
-        quats=image.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(pixels), 1),
+        quats=sky_image.new_tensor([1.0, 0.0, 0.0, 0.0]).repeat(len(pixels), 1),
         scales=size.expand(len(pixels), 3).clone(),
-        opacities=image.new_full((len(pixels),), SKY_OPACITY),
-        sh=sh_from_rgb(push_pull(image, sky.to(image.dtype))[where]),
+        opacities=sky_image.new_full((len(pixels),), SKY_OPACITY),
+        sh=sh_from_rgb(sky_image[where]),
     )
     return gaussians, pixels
+
+
+def find_sky_gaussians(gaussians: Gaussians, camera: Camera) -> Bool[Tensor, "n"]:
+    """Find the Gaussians of the sky; `camera` is any of those that see them."""
+    # Distances and not z-depths, as a Gaussian may lie beside the view of this one camera. Surfaces
+    # end at the far plane, and the sky is so much farther away that both tell the same.
+    return is_sky((gaussians.means - camera.center).norm(dim=-1), camera)
 
 
 def restore_sky_colors(made: Gaussians, fitted: Gaussians, camera: Camera) -> Gaussians:
@@ -80,9 +89,7 @@ def restore_sky_colors(made: Gaussians, fitted: Gaussians, camera: Camera) -> Ga
     Fitting compensates for blur, which makes a bright line of sky along roofs; parallax would
     reveal it. `camera` is any of those that see the Gaussians.
     """
-    # Distances and not z-depths, as a Gaussian may lie beside the view of this one camera. Surfaces
-    # end at the far plane, and the sky is so much farther away that both tell the same.
-    in_sky = is_sky((made.means - camera.center).norm(dim=-1), camera)
+    in_sky = find_sky_gaussians(made, camera)
     if not in_sky.any():
         return fitted
     # The fit may have added harmonics, which the sky does not have.

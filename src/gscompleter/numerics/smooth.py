@@ -48,9 +48,10 @@ def continue_smoothly(
 ) -> Float[Tensor, "h w c"]:
     """Fill pixels of zero `weight` with weighted means over a radius that grows inwards.
 
-    Weights are not negative, and the largest is about 1: a radius with a mean weight of at most
-    `MIN_LEVEL_WEIGHT` counts as empty, and the next wider one is taken, or at last the image.
-    Without a positive weight all values are 0. Values are finite, also where they have none.
+    Weights are not negative. The largest is not far below 1, and may be far above: a radius with a
+    mean weight of at most `MIN_LEVEL_WEIGHT`, whatever the largest one is, counts as empty, and the
+    next wider one is taken, or at last the image. Without a positive weight all values are 0.
+    Values are finite, also where they have none.
     """
     known = weight > 0
     if not known.any():

@@ -175,7 +175,7 @@ def compute_cost_volume(
     return volume.reshape(rows * TILE_ROWS, columns * TILE_COLUMNS, -1)[:h, :w]
 
 
-def multiply_add(a: Tensor, b: Tensor, c: Tensor | float) -> Tensor:
+def multiply_add(a: Tensor, b: Tensor | float, c: Tensor | float) -> Tensor:
     """Compute a b + c with a single rounding to float32, as processors do for compiled loops.
 
     Not with `addcmul`, since it depends on the device whether that rounds once or twice. The

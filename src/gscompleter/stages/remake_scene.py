@@ -19,6 +19,7 @@ from gscompleter.config.settings import COVERED
 from gscompleter.generators.exposure import compute_median_ratio
 from gscompleter.parts import EarlierWork, PartOrigin, make_part
 from gscompleter.reconstructors import Reconstructor
+from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.render.mask_sums import sum_in_mask
 from gscompleter.render.protocols import Renderer
 from gscompleter.stages.context import InitialContext, reconstruct_context, sort_by_frame
@@ -78,9 +79,13 @@ def remake_scene(
     part = make_part(PartOrigin("photographs"), made.source.gaussians)
     # The scene has one exposure, which photographs of the context share from here on.
     context = tuple(Photo(view) for view in made.views)
+    # All photographs share one depth range: that of the scene as it is made anew.
+    others = state.photos[len(context) :]
+    ranged = set_depth_range([photo.view for photo in others], *get_depth_range(made.views))
+    checks = [replace(photo, view=view) for photo, view in zip(others, ranged, strict=True)]
     begun = replace(
         drop_rows(state, state, gone),
-        photos=(*context, *state.photos[len(context) :]),
+        photos=(*context, *checks),
         added_parts=(part,),
         exposure_gains=made.exposure_gains,
         context_notes=(*state.context_notes, *made.notes),

@@ -104,20 +104,20 @@ def estimate_scene_bytes(
 
 
 def estimate_gpu_bytes(
-    count: int, harmonics: int, shown: Sequence[int], pixels: int, matching: int = 0
+    count: int, harmonics: int, shown: Sequence[int], pixels: int, embedded: int = 0
 ) -> int:
     """Estimate the peak memory of a GPU for `count` Gaussians with so many harmonics of a channel.
 
     `shown` is the number that each photograph shows, and `pixels` are those of all together.
-    `matching` bytes are taken before stages that add and recolour, beside the frozen scene. What
-    will be added is not known before.
+    `embedded` bytes are those of the embedded Ψ or Φ, taken before stages that add and recolour,
+    beside the frozen scene. What will be added is not known before.
     """
     further = 4 * 3 * (harmonics - 1)
     scene = count * (GPU_BYTES_PER_GAUSSIAN + GPU_COPIES * further)
     stages = scene + GPU_BYTES_PER_SPLAT * sum(shown) + GPU_BYTES_PER_PIXEL * pixels
     frozen = count * (GPU_BYTES_OF_SCENE + further)
     frozen += GPU_BYTES_OF_VIEW * sum(shown) + GPU_BYTES_OF_RENDER * pixels
-    return max(stages, frozen + matching)
+    return max(stages, frozen + embedded)
 
 
 def check_gpu_bytes(needed: int, available: int, number: str) -> None:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from gscompleter.generators.warp_inpaint import compute_likelihood
+from gscompleter.generators.patch_rounds import compute_likelihood
 from gscompleter.numerics.kernels import patchmatch
 from gscompleter.numerics.kernels.patchmatch import PATCHMATCH_RADIUS, PATCHMATCH_SIDE
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Mapping, Sequence
-from contextlib import nullcontext, redirect_stderr
+from contextlib import redirect_stderr
 from dataclasses import fields, is_dataclass
 from functools import cache
 from io import StringIO
@@ -40,7 +40,7 @@ ADAPTED = {"remove": CompleterConfig.for_removal, "repair": CompleterConfig.for_
 MAX_NAMED_COMMANDS = 3
 """Most commands that a sentence names as those with an option."""
 
-NUMBER = re.compile(r"[+-]?\d+(\.\d*)?")
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.IGNORECASE)
 """A word that is meant as a number, of whatever range."""
 NEAREST_WORD = "the nearest is"
 SURPLUS = "Unrecognized options: "
@@ -49,8 +49,8 @@ OPTION_AMONG = re.compile(r"(^|, )-")
 """Option in the list of these words."""
 HINTS = {"Argument helptext:": "give", "Perhaps you meant:": NEAREST_WORD}
 """Titles in tyro's messages before the option that is meant, and words for it in a sentence."""
-WIDE_TERMINAL = {"COLUMNS": "1000000"}
-"""Environment in which tyro breaks no line of an error."""
+PLAIN_TERMINAL = {"COLUMNS": "1000000", "TERM": "dumb"}
+"""Environment in which tyro breaks no line of an error, and colours none."""
 
 
 def format_error(error: InputError) -> str:
@@ -76,19 +76,13 @@ def parse_words(words: Sequence[str], kinds: Mapping[str, type]) -> Any:
     refuse_empty_words(words)
     check_once(words)
 
-    # Settings of the method are options as well, more than a command has of its own. To prepare
-    # them takes tyro up to a tenth of a second, 3 % of a small completion. Without them it knows
-    # the words of most command lines, but not always the option that is meant by a wrong one.
-    has_setting = any(word.startswith(f"--{CONFIG_OPTION}.") for word in words)
+    # tyro prints an error in a box and ends the process. The box is caught, and one sentence of it
+    # becomes that of an InputError.
     box = ""
-    for knows_settings in (True,) if has_setting else (False, True):
-        # tyro prints an error in a box and ends the process. The box is caught, and one sentence of
-        # it becomes that of an InputError. In a box as wide as the terminal long paths are broken;
-        # help pages have that width.
+    for knows_settings, terminal in list_attempts(words):
         printed = StringIO()
-        wide = nullcontext() if asks_for_help(words) else set_variables(WIDE_TERMINAL)
         try:
-            with redirect_stderr(printed), wide:
+            with redirect_stderr(printed), set_variables(terminal):
                 return parse_known_words(words, kinds, knows_settings)
         except SystemExit as stop:
             # Code 0: the help was printed.
@@ -98,6 +92,23 @@ def parse_words(words: Sequence[str], kinds: Mapping[str, type]) -> Any:
     sentence = explain_words(words, kinds, box)
     see = " ".join(["gscompleter", *words[:1]])
     raise InputError(f"{sentence} (see {see} --help).")
+
+
+def list_attempts(words: Sequence[str]) -> list[tuple[bool, Mapping[str, str]]]:
+    """List the ways to parse a command line, each taken if the one before ends in an error.
+
+    A way is whether tyro knows the settings of the method, and variables of its environment. The
+    last one prints errors as `extract_sentence` needs them.
+    """
+    if asks_for_help(words):
+        # A help page has the width and the colours of the terminal. tyro asks for those of the
+        # standard output also where it prints an error, which goes elsewhere.
+        return [(True, {}), (True, PLAIN_TERMINAL)]
+    # Settings of the method are options as well, more than a command has of its own. To prepare
+    # them takes tyro up to a tenth of a second, 3 % of a small completion. Without them it knows
+    # the words of most command lines, but not always the option that is meant by a wrong one.
+    has_setting = any(word.startswith(f"--{CONFIG_OPTION}.") for word in words)
+    return [(known, PLAIN_TERMINAL) for known in ((True,) if has_setting else (False, True))]
 
 
 def parse_known_words(words: Sequence[str], kinds: Mapping[str, type], knows_settings: bool) -> Any:
@@ -264,13 +275,15 @@ def show_config(words: Sequence[str]) -> tuple[CompleterConfig, list[str]]:
     """Load the config that a help page shows, and return it with the words but `--config NAME`."""
     others: list[str] = []
     name = ChosenConfig.name
-    left = iter(words)
-    for word in left:
+    for before, word in pairwise(("", *words)):
         option, sign, value = word.partition("=")
-        if option != f"--{CONFIG_OPTION}":
+        # An option in the place of the name, such as --help, is no name.
+        if before == f"--{CONFIG_OPTION}" and not word.startswith("-"):
+            name = word
+        elif option != f"--{CONFIG_OPTION}":
             others.append(word)
-        else:
-            name = value if sign else next(left, name)
+        elif sign:
+            name = value
     if not words or words[0] not in CONFIGURED:
         return CompleterConfig(), others
     has_scene = any(word.partition("=")[0] == "--scene" for word in others)
@@ -280,8 +293,9 @@ def show_config(words: Sequence[str]) -> tuple[CompleterConfig, list[str]]:
 
 def list_box_lines(box: str) -> list[str]:
     """List the lines of tyro's boxed error message, without the border."""
-    # The first line is its top. The others begin with `│ `, or with two spaces where the output has
-    # no such characters. The bottom stays, as a rule.
+    # The first line is its top, or its title where the output has no such characters. The others
+    # begin with `│ `, or with two spaces there; `PLAIN_TERMINAL` leaves out the codes of colours
+    # that would stand around them. The bottom stays.
     return [line[2:].rstrip("│ ") for line in box.splitlines()[1:]]
 
 
@@ -292,8 +306,8 @@ def extract_sentence(box: str, own: Collection[str]) -> str:
     """
     lines = list_box_lines(box)
 
-    # The message is the first paragraph, up to an empty line or a rule. Its deeply indented lines
-    # are lists of arguments, no part of a sentence.
+    # The message is the first paragraph, up to an empty line or a rule. It may list arguments. The
+    # help of each stands below it, indented once more, and is no part of a sentence.
     paragraph: list[str] = []
     for line in lines:
         if line.strip("─- "):
@@ -301,7 +315,7 @@ def extract_sentence(box: str, own: Collection[str]) -> str:
         elif paragraph:
             break
     sentence = " ".join(line.strip() for line in paragraph if not line.startswith(" " * 5))
-    # What settings refuse themselves comes with tyro's name of the class around them.
+    # A value that cannot be read comes with tyro's words on where.
     sentence = re.sub(r"^Error parsing [\w.-]+: ", "", sentence)
 
     # Below a title tyro lists the option that is meant, in the next line; the last title counts.

@@ -71,6 +71,7 @@ from gscompleter.stages.context import prepare_single
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.progress import show_preparation
 from gscompleter.system.timing import record_seconds, timed_stage
+from gscompleter.trust.lifted import is_lifted
 from gscompleter.types import Camera, View
 
 
@@ -258,7 +259,8 @@ def read_inputs(
     with show_preparation("aligning the scene"):
         task = move_to_splat(task, given, splat_file, opened)
     if device == "cuda":
-        check_gpu(task, work.models)
+        margin = work.config.choose_margin(is_lifted(given)).margin
+        check_gpu(task, work.models, margin or 0.0)
     return task
 
 
@@ -438,11 +440,11 @@ def read_splat_alone(
     with show_preparation("choosing cameras"):
         renderer = load_renderer(device)
         alone = open_renders(request, splat_file, gaussians, renderer, device)
+        config = work.config.choose_margin(alone.kind.is_lifted).for_holes(alone.kind.holes)
         if device == "cpu":
             check_scene(alone.task, gaussians)
         else:
-            check_gpu(alone.task, work.models)
-    config = work.config.choose_margin(alone.kind.is_lifted).for_holes(alone.kind.holes)
+            check_gpu(alone.task, work.models, config.margin or 0.0)
     return alone.opened, add_paintings(alone.task, targets, alone.opened), config
 
 

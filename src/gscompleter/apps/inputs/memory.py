@@ -10,7 +10,8 @@ from torch import Tensor
 
 from gscompleter.apps.inputs.task import CompletionTask
 from gscompleter.apps.requests.models import ModelRequest
-from gscompleter.numerics.geometry import is_inside, project
+from gscompleter.generators.patch_devices import estimate_patch_bytes
+from gscompleter.numerics.geometry import is_inside, pad_camera, project
 from gscompleter.reconstructors.plane_sweep.device_memory import estimate_sweep_bytes
 from gscompleter.stages.add_observed import limit_part_photos
 from gscompleter.system.files.mapping import is_mapped
@@ -38,14 +39,23 @@ def check_scene(task: CompletionTask, scene: Gaussians) -> None:
     check_bytes(estimate_memory(task, scene), what, remedy)
 
 
-def check_gpu(task: CompletionTask, models: ModelRequest) -> None:
-    """Raise InputError if `task.scene` does not fit on the GPU together with its photographs."""
+def check_gpu(task: CompletionTask, models: ModelRequest, margin: float) -> None:
+    """Raise InputError if `task.scene` does not fit on the GPU together with its photographs.
+
+    Images of targets are padded by `margin` of their size on every side.
+    """
     assert task.scene is not None
     views = [*task.views, *(task.check_views or ())]
     cameras = [view.camera for view in views]
-    is_matched = models.reconstructor == "plane-sweep" and models.network_device == "cuda"
-    matching = estimate_matching_bytes(cameras) if is_matched else 0
-    needed = estimate_gpu_memory(task.scene, cameras, matching)
+    # The embedded models run there one after the other.
+    embedded = [0]
+    if models.network_device == "cuda" and models.reconstructor == "plane-sweep":
+        embedded.append(estimate_matching_bytes(cameras))
+    if models.network_device == "cuda" and models.generator == "warp-inpaint":
+        photographs = [view.camera for view in task.views]
+        targets = [target.camera for target in task.targets] or photographs
+        embedded.append(estimate_filling_bytes(photographs, targets, margin))
+    needed = estimate_gpu_memory(task.scene, cameras, max(embedded))
     free, _ = torch.cuda.mem_get_info()
     what = f"The {len(task.scene):,} Gaussians of the scene and {len(views)} photographs"
     check_gpu_bytes(needed, free, what)
@@ -61,18 +71,27 @@ def estimate_matching_bytes(cameras: Sequence[Camera]) -> int:
     return estimate_sweep_bytes(sizes[-number:])
 
 
-def estimate_gpu_memory(scene: Gaussians, cameras: Sequence[Camera], matching: int = 0) -> int:
+def estimate_filling_bytes(
+    photographs: Sequence[Camera], targets: Sequence[Camera], margin: float
+) -> int:
+    """Estimate the bytes that warp-inpaint takes on a GPU for the target for which it is most."""
+    sizes = [(camera.height, camera.width) for camera in photographs]
+    padded = [pad_camera(target, margin).padded for target in targets]
+    return max(estimate_patch_bytes(sizes, (camera.height, camera.width)) for camera in padded)
+
+
+def estimate_gpu_memory(scene: Gaussians, cameras: Sequence[Camera], embedded: int = 0) -> int:
     """Estimate the bytes that a completion of a placed splat needs on a GPU.
 
-    `cameras` are those of its photographs, at least one, and `matching` bytes are those of
-    plane-sweep there. The splat has Gaussians, as every file that is read does.
+    `cameras` are those of its photographs, at least one, and `embedded` bytes are those of the
+    embedded Ψ or Φ there. The splat has Gaussians, as every file that is read does.
     """
     # Views on a GPU hold the Gaussians in their image, whatever hides them.
     means = scene.means[:: max(1, len(scene) // NUM_SAMPLED)]
     inside = [is_inside(*project(means, camera), camera).float().mean() for camera in cameras]
     shown = [round(len(scene) * share) for share in torch.stack(inside).tolist()]
     pixels = sum(camera.width * camera.height for camera in cameras)
-    return estimate_gpu_bytes(len(scene), scene.sh.shape[1], shown, pixels, matching)
+    return estimate_gpu_bytes(len(scene), scene.sh.shape[1], shown, pixels, embedded)
 
 
 def estimate_memory(task: CompletionTask, scene: Gaussians | None) -> int:

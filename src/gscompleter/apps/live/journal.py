@@ -33,6 +33,7 @@ class Journal:
         self.folder = folder
         self._start = start
         self._saved = saved
+        self._kept: Session | None = None
 
     def write(self, session: Session) -> None:
         """Write the steps of a session, so that at any time the file has masks for all its steps.
@@ -55,16 +56,27 @@ class Journal:
             named = {name_mask(index) for index, step in enumerate(steps) if step.mask is not None}
             for name in list_session(self.folder) - {STROKES_FILE, *named}:
                 (self.folder / name).unlink(missing_ok=True)
+        self._kept = session
 
     def set_saved(self, session: Session) -> None:
         """Remember that the folder has a session as it was saved there, with its `strokes.json`."""
         self._saved = digest_steps(session.steps)
+        self._kept = session
 
     def is_saved(self, session: Session) -> bool:
-        """Return True if the folder has what a session shows, or nothing was done."""
+        """Return True if the folder has what a session shows, or no step is left to be saved."""
         if self._saved is None:
             return not session.steps
         return digest_steps(session.steps) == self._saved
+
+    def has_steps(self, session: Session) -> bool:
+        """Return True if the last change of a session is written, or there was none."""
+        return session is self._kept or not list_steps(session)
+
+    @property
+    def has_begun(self) -> bool:
+        """True if the folder has a state of the session with which another program goes on."""
+        return self.has_saved or self._kept is not None
 
     @property
     def has_saved(self) -> bool:

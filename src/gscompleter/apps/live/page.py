@@ -93,9 +93,9 @@ class LivePage:
         self._journal = journal
         self._requests: SimpleQueue[PageRequest] = SimpleQueue()
         self._busy = Lock()
-        # What was done before is a difference to the page, which has the scene as it was given.
-        count = len(session.steps)
-        self._revision = 0 if count == 0 else 1
+        # Revision 0 is the scene as it was given, which a page holds. What a session begins with
+        # may be another one, also without steps: photographs add to a splat and recolour it.
+        self._revision = 1
         self._actions: dict[str, Callable[[PageRequest], Outcome]] = {
             **dict.fromkeys(PERFORM, self.do_step),
             "undo": self.undo,
@@ -104,6 +104,7 @@ class LivePage:
             "save": self.save,
         }
         self._describe_scene()
+        count = len(session.steps)
         greetings = {0: WELCOME, 1: GOES_ON_ONE}
         self.tell(greetings.get(count, GOES_ON.format(count)), is_busy=False)
 

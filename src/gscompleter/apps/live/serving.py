@@ -84,10 +84,16 @@ def describe_end(session: Session, journal: Journal) -> list[str]:
     if not list_steps(session) and not journal.has_saved:
         return []
     out = quote_value(journal.folder)
-    is_saved = journal.is_saved(session)
-    state = f"Saved in {out}." if is_saved else f"Not saved: {out} has the steps, and no result."
-    if journal.has_saved and not is_saved:
-        state = f"Not saved: {out} has the steps, and the result of an earlier Save."
+    if not journal.has_begun:
+        return [f"Not saved: {out} has neither the steps nor a result."]
+    # Where all steps are undone, nothing is left to be saved: this alone is no result.
+    has_steps = journal.has_steps(session)
+    steps = "has the steps, and" if has_steps else "lacks what was done last, and has"
+    state = f"Not saved: {out} {steps} no result."
+    if journal.has_saved:
+        state = f"Not saved: {out} {steps} the result of an earlier Save."
+        if journal.is_saved(session):
+            state = f"Saved in {out}."
     command = shlex.join(["gscompleter", "live", str(journal.folder)])
     return [state, f"To go on: {command}"]
 
@@ -101,8 +107,10 @@ def build_page(
 ) -> LivePage:
     """Build the page of a session, and print notes on what it cannot show."""
     ready = prepared.scene
-    # Without what was added or changed: the page gets the steps as differences.
-    scene = session.latest.context
+    # The page holds the scene as it was given. What was added or changed since, by steps or as the
+    # session began, is a difference to it.
+    first = session.completions[0]
+    scene = first.context
     kind = "Photograph" if ready.opened.renders_from is None else "View"
     shots = [
         ViewerCamera(
@@ -111,9 +119,10 @@ def build_page(
             view.camera.on_cpu,
             shrink_image(Image.fromarray(convert_to_pixels(view.image))),
         )
-        for view in session.latest.views
+        # A removal paints photographs over where it was; they are shown as they were taken.
+        for view in first.views
     ]
-    # At first the states before and after are the same.
+    # The page itself has the same states before and after; the difference changes the latter.
     content = ViewerContent(name_session(ready), scene, scene, tuple(shots))
     page, notes = make_page(content, libraries, is_live=True)
     print_lines(console, *notes)

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from gscompleter.data.cameras import Distortion, Intrinsics
+from gscompleter.data.cameras import PANORAMA_ADVICE, Distortion, Intrinsics
 from gscompleter.data.driving.vehicle import transform_points
 from gscompleter.data.frame import Frame
 from gscompleter.data.json_fields import (
@@ -188,10 +188,8 @@ def _parse_lens(entry: Any, title: str) -> Intrinsics:
         return tuple(get_optional_number(entry, key, title, *bounds) or 0.0 for key in keys)
 
     other = next((key for key in OTHER_LENSES if entry.get(key)), None)
-    require(
-        other is None,
-        f"The lens of {title} has `{other}`, which is not read; undistort the images first.",
-    )
+    advice = PANORAMA_ADVICE if other == "equirectangular" else "undistort the images first"
+    require(other is None, f"The lens of {title} has `{other}`, which is not read; {advice}.")
     p1, p2 = get_coefficients("p1", "p2")
     distortion = Distortion(
         radial=get_coefficients("k1", "k2", "k3"),

@@ -11,11 +11,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
@@ -31,6 +31,7 @@ from gscompleter.data.phones.export import (
     PoseAndLens,
     build_recording,
     find_files,
+    find_matches,
 )
 from gscompleter.data.phones.lzfse import measure_unpacked
 from gscompleter.data.photographs import Photographs
@@ -41,6 +42,8 @@ from gscompleter.types import MAX_COORDINATE
 
 HOME = "keyframes"
 """Folder of all frames in an export of Polycam."""
+RECORDED = "rgbd/*.jpg"
+"""Pattern of the photographs in a recording of Record3D."""
 METADATA = "metadata"
 """File of the cameras in a recording of Record3D."""
 LENSES = "perFrameIntrinsicCoeffs"
@@ -60,17 +63,19 @@ class KeyframeFormat:
     """Patterns of cameras, photographs, depth maps and confidences, in order of preference."""
 
     def find_frames(self, path: Path) -> list[Files]:
-        """Find the files of the first patterns that have photographs and cameras; or none."""
+        """Find the files of the first patterns that have photographs and cameras; or none.
+
+        Raises InputError for several recordings of this app.
+        """
         root = path.parent if path.name == HOME else path
         for group in self.patterns:
-            files = [find_files(root, pattern) for pattern in group]
-            cameras, photographs, *_ = files
+            cameras, photographs = (find_matches(root, pattern) for pattern in group[:2])
             if not photographs or not cameras:
                 continue
             # Other exports have JSON files of these names, too.
             read_first_camera = next(iter(cameras.values()))
             if self.mark in read_first_camera():
-                return files
+                return [find_files(root, pattern) for pattern in group]
         return []
 
     def open(self, path: Path) -> Iterator[Photographs]:
@@ -110,9 +115,9 @@ SCANNED = ("frame_*.json", "frame_*.jpg", "depth_*.png", "conf_*.png")
 SCANNER_APP = KeyframeFormat(b'"cameraPoseARFrame"', parse_scanner_app, (SCANNED,))
 
 
-def find_recording(path: Path) -> Files:
-    """Find the photographs of a recording of Record3D, packed or not; none if there are none."""
-    return find_files(path, "rgbd/*.jpg")
+def find_recordings(path: Path) -> Collection[PurePath]:
+    """Find the photographs of recordings of Record3D, packed or not; none if there are none."""
+    return find_matches(path, RECORDED).keys()
 
 
 def open_recording(path: Path) -> Iterator[Photographs]:
@@ -125,7 +130,7 @@ def open_recording(path: Path) -> Iterator[Photographs]:
     depths = find_files(path, "rgbd/*.depth")
     confidences = find_files(path, "rgbd/*.conf")
     is_unread = bool(depths) and find_spec("liblzfse") is None
-    files = [find_recording(path), {} if is_unread else depths, confidences]
+    files = [find_files(path, RECORDED), {} if is_unread else depths, confidences]
     unpack_depth = partial(_unpack_map, "<f4", size)
     unpack_confidence = partial(_unpack_map, "u1", size)
     cameras = _parse_recorded(content, size, title)

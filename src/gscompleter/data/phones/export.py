@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import lru_cache, partial
 from pathlib import Path, PurePath, PurePosixPath
+from typing import NoReturn
 from zipfile import ZipFile
 
 import numpy as np
@@ -44,11 +45,10 @@ The title is for errors, such as "the depth of frame 3 of room.zip".
 PoseAndLens = tuple[Float[np.ndarray, "4 4"], Intrinsics]
 
 
-def find_files(export: Path, pattern: str) -> Files:
-    """Map frame names to readers of the files that match a pattern, sorted by path.
+def find_matches(export: Path, pattern: str) -> dict[PurePath, Reader]:
+    """Map the paths of the files that match a pattern to their readers, sorted, of any recording.
 
-    The name of a frame is what follows the last underscore of the file's name. In an archive the
-    export may lie in a folder of its own.
+    In an archive the export may lie in a folder of its own.
     """
     readers: dict[PurePath, Reader] = {
         path: partial(read_bytes, path) for path in export.glob(pattern)
@@ -65,12 +65,39 @@ def find_files(export: Path, pattern: str) -> Files:
             for path, name in entries.items()
             if path.match(pattern)
         }
-    paths = sorted(path for path in readers if not is_hidden_name(path.name))
+    return {path: readers[path] for path in sorted(readers) if not is_hidden_name(path.name)}
+
+
+def find_files(export: Path, pattern: str) -> Files:
+    """Map frame names to readers of the files that match a pattern, sorted by path.
+
+    The name of a frame is that of the file without its ending and without what the pattern has
+    before its asterisk, such as `frame_`. Where two files have one, it is refused when it is read.
+    Raises InputError for several recordings, so that formats are detected by `find_matches`.
+    """
+    readers = find_matches(export, pattern)
     require(
-        len({path.parent for path in paths}) <= 1,
+        len({path.parent for path in readers}) <= 1,
         f"{quote_value(export)} holds several recordings; unpack it, and name one of them.",
     )
-    return {path.stem.rpartition("_")[2]: readers[path] for path in paths}
+    prefix, asterisk, _ = PurePosixPath(pattern).name.partition("*")
+    found: dict[str, list[PurePath]] = {}
+    for path in readers:
+        name = path.stem.removeprefix(prefix) if asterisk else path.stem
+        found.setdefault(name, []).append(path)
+    return {
+        name: readers[same[0]] if len(same) == 1 else partial(_refuse_files, export, name, same)
+        for name, same in found.items()
+    }
+
+
+def _refuse_files(export: Path, name: str, paths: Sequence[PurePath]) -> NoReturn:
+    """Refuse several files of one frame."""
+    names = join_names([path.name for path in paths], MAX_MISSING_PHOTOGRAPHS)
+    raise InputError(
+        f"Frame {quote_value(name)} of {quote_value(export)} has several files, {names}; keep one "
+        "of them."
+    )
 
 
 def _read_archive_entry(export: Path, name: str) -> bytes:
@@ -147,16 +174,21 @@ def _read_depth(
 ) -> Float[np.ndarray, "h w"]:
     """Read z-depth in metres, 0 where it is unknown or unreliable."""
     stored = decoders[0](depth(), f"the depth of {title}")
+    # Values of one byte are a picture of depth, and no distances.
+    require(
+        stored.ndim == 2 and stored.dtype.itemsize > 1,
+        f"The depth of {title} is {stored.dtype} of shape {stored.shape}; one channel is needed, "
+        f"of whole millimetres in 16 bits, or of metres; {PHONE_EXPORT_ADVICE}.",
+    )
     # Confidence is optional; depth without it is taken as it is.
     sure = stored
     if confidence is not None:
         sure = decoders[1](confidence(), f"the confidence of {title}")
-    # Values of one byte are a picture of depth, and no distances.
-    require(
-        stored.ndim == 2 and stored.dtype.itemsize > 1 and stored.shape == sure.shape,
-        f"The depth of {title} and its confidence are {stored.dtype} of shape {stored.shape} and "
-        f"{sure.dtype} of shape {sure.shape}; {PHONE_EXPORT_ADVICE}.",
-    )
+        require(
+            sure.shape == stored.shape,
+            f"The depth of {title} has the shape {stored.shape}, and its confidence {sure.shape}; "
+            f"{PHONE_EXPORT_ADVICE}.",
+        )
     known = (sure > 0) & (stored > 0) & np.isfinite(stored)
     unit = 1.0 if stored.dtype.kind == "f" else 1e-3  # whole numbers are millimetres
     return np.where(known, stored * unit, 0).astype(np.float32)

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from gscompleter.config.settings import COVERED
@@ -80,6 +80,7 @@ def fit_jointly(
     gains: Float[Tensor, "views 3"],
     renderer: Renderer,
     emphasis: Emphasis = Emphasis(),
+    skies: Sequence[Bool[Tensor, "_ _"]] = (),
 ) -> Gaussians:
     """Minimize the squared image error, with renders scaled by each view's exposure gain.
 
@@ -90,11 +91,14 @@ def fit_jointly(
 
     Each step is drawn before a backdrop of a random colour, in the exposure of the scene, so that
     surfaces become opaque. Before black, one that lets 5 % through only gets brighter, and what is
-    added behind it shines through (decision 141).
+    added behind it shines through (decision 141). In the `skies` of the views, of which
+    `gaussians` hold nothing, the photograph itself is the backdrop (decision 156).
     """
     check_views = emphasis.check_views
     order = shuffle_views(len(views), len(check_views), emphasis.find_refined(views))
     backdrops = torch.rand(len(order), 3, generator=torch.Generator().manual_seed(0)).to(gains)
+    # Check views are fitted to where surfaces cover them.
+    skies = [*(skies or map(find_no_sky, views)), *map(find_no_sky, check_views)]
     views = [*views, *check_views]
     gains = torch.cat([gains, gains.new_ones(len(check_views), 3)])
     unknown = init_parameters(gaussians)
@@ -105,18 +109,30 @@ def fit_jointly(
         render = renderer.render(fitted, view.camera)
         # In ignored pixels the scene is wanted as it was, which may be open there.
         is_open = (1 - render.alpha) * view.valid_mask
-        image = render.image + is_open[..., None] * backdrops[step]
+        sky_image = view.image / gains[number]
+        backdrop = sky_image.where(skies[number][..., None], backdrops[step])
+        image = render.image + is_open[..., None] * backdrop
         rate_factor = 1 - (1 - FINAL_RATE) * step / len(order)
         optimizer.step((gains[number] * image - view.image).square().mean(), rate_factor)
         with torch.no_grad():
             unknown["grown"].clamp_(max=math.log(MAX_SIZE_GROWTH))
 
     fitted = apply_parameters(gaussians, {name: v.detach() for name, v in unknown.items()})
-    # The scene has one exposure, so that each photograph is divided by its own.
-    normalized = [replace(v, image=v.image / gain) for v, gain in zip(views, gains, strict=True)]
-    depths = [renderer.render(fitted, view.camera).depth_map() for view in views]
+    renders = [renderer.render(fitted, view.camera) for view in views]
+    shown = []
+    for view, gain, sky, render in zip(views, gains, skies, renders, strict=True):
+        # The scene has one exposure, so that each photograph is divided by its own. What surfaces
+        # leave open of the sky is not theirs.
+        share = render.alpha.where(sky & view.valid_mask, 1.0)
+        shown.append(replace(view, image=share[..., None] * view.image / gain))
+    depths = [render.depth_map() for render in renders]
     weights = emphasis.weigh_colors(views)
-    return fit_linear_colors(fitted, normalized, depths, renderer, weights)
+    return fit_linear_colors(fitted, shown, depths, renderer, weights)
+
+
+def find_no_sky(view: View) -> Bool[Tensor, "h w"]:
+    """Return an empty mask of the size of a view."""
+    return torch.zeros_like(view.image[..., 0], dtype=torch.bool)
 
 
 def init_parameters(gaussians: Gaussians) -> dict[str, Tensor]:

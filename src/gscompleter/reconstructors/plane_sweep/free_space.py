@@ -2,29 +2,51 @@
 
 Surfaces continue into what is not measured, and may come to stand where other photographs see
 farther. They are wrong there, and dropped. Where nothing else covers these pixels, the joint fit
-would inflate what is beside them to a fog before the photograph (decision 137).
+would inflate what is beside them to a fog before the photograph: they move back (decision 137).
+Where something covers them that looks otherwise, as the facade and the sky behind a branch before
+one of the cameras, they stand before it: they come nearer (decision 156).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
+import cv2
 import numpy as np
+from jaxtyping import Float, Int
+from torch import Tensor
 
 from gscompleter.numerics.kernels import stereo
 from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.reconstructors.plane_sweep.fusion import DepthLayer
 from gscompleter.reconstructors.plane_sweep.rig import Transform, Transforms
 from gscompleter.reconstructors.plane_sweep.sweep import MAX_RETURN_ERROR, UNKNOWN, Map, Mask
+from gscompleter.types import View
 
 STEP = np.float32(1.05)
 """Factor of the depth by which pixels are moved at a time."""
 FARTHEST = np.float32(2)
 """Depth up to which pixels are moved, relative to the farthest one of their view."""
+NEAREST_OCCLUDER = np.float32(3)
+"""Inverse depth up to which occluders come nearer, relative to the nearest pixel of their view."""
+MAX_COLOR_ERROR = 0.15
+"""Error of a colour in [0, 1], averaged over a window, from which on something else is shown."""
+WINDOW_SIDE = 9
+"""Side of that window in pixels: edges beside their place are no occluders."""
+MIN_OCCLUDER = 0.005
+"""Least share of the image that an occluder has. What looks otherwise in small spots, such as a
+reflection, would fly before the scene."""
+MIN_WITHOUT_PLACE = 0.3
+"""Least share of an occluder that has no place behind. What looks otherwise because the scene is
+wrong there has one: before the target of a fountain it cost 6 dB."""
 MARGIN = 0.25
 """Margin around the images of others, as a share of their sides, into which their surfaces go on.
 The first place beside an image would be wrong before a camera that turns a little from there."""
+
+Labels = Int[np.ndarray, "h w"]
+"""Number of the occluder that each pixel shows; 0 where it shows none."""
 
 
 @dataclass(frozen=True)
@@ -61,30 +83,89 @@ class Surfaces:
         return shifted
 
 
-def leave_free_space(
-    layers: Sequence[DepthLayer], open_pixels: Sequence[Mask], transforms: Transforms
-) -> list[DepthLayer]:
-    """Move the `open_pixels` of each view that are not measured back, until none sees through them.
+def find_occluders(shown: Float[Tensor, "h w 3"], view: View) -> Labels:
+    """Find what the photograph of a view may show before what the scene shows there.
 
-    They come to rest on or behind the surfaces of the other views, or beside these. Pixels without
-    such a place stay, and so does a layer of which none moves.
+    Return the number of the occluder of each pixel, 0 where there is none. `shown` is the render of
+    the scene. An occluder that no other camera saw, though they look at the place behind it, is
+    near this camera and reaches out of its image.
+    """
+    error = (shown.clamp(0, 1) - view.image).cpu().numpy()
+    smooth = cv2.blur(error, (WINDOW_SIDE, WINDOW_SIDE))
+    is_other = (np.abs(smooth).mean(axis=-1) > MAX_COLOR_ERROR) & view.valid_mask.cpu().numpy()
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(is_other.astype(np.uint8))
+    large = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] >= MIN_OCCLUDER * is_other.size)
+    at_border = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
+    return np.where(np.isin(labels, np.intersect1d(large, at_border)), labels, 0)
+
+
+def leave_free_space(
+    layers: Sequence[DepthLayer],
+    open_pixels: Sequence[Mask],
+    occluders: Sequence[Labels],
+    skies: Sequence[Mask],
+    transforms: Transforms,
+) -> list[DepthLayer]:
+    """Move pixels of each view that are not measured, until no other view sees through them.
+
+    The `open_pixels` move back, and come to rest on or behind the surfaces of the other views, or
+    beside these. `occluders` that have no such place, as where the others see the sky, come nearer
+    until the others do not see them. Pixels without a place stay, and so does a layer of which none
+    moves. `skies` mark the sky of each view.
     """
     surfaces = [Surfaces.measured_in(layer) for layer in layers]
 
     def move(number: int) -> DepthLayer:
         layer = layers[number]
-        inverse = layer.inverse
-        waiting = open_pixels[number] & ~layer.measured_mask
-        lowest = inverse.min() / FARTHEST
-        while waiting.any():
-            waiting = waiting & find_seen_through(number, inverse, surfaces, transforms)
-            inverse = np.where(waiting, inverse / STEP, inverse)
-            is_too_far = waiting & (inverse < lowest)
-            inverse = np.where(is_too_far, layer.inverse, inverse)
-            waiting = waiting & ~is_too_far
-        return layer if np.array_equal(inverse, layer.inverse) else replace(layer, inverse=inverse)
+        start = layer.inverse
+        sees_through = partial(find_seen_through, number, surfaces=surfaces, transforms=transforms)
+        of_surfaces = start[~skies[number]]
+        if not len(of_surfaces):
+            return layer
+        lowest = of_surfaces.min() / FARTHEST
+        highest = of_surfaces.max() * NEAREST_OCCLUDER
+        labels = np.where(layer.measured_mask, 0, occluders[number])
+        waiting = (open_pixels[number] & ~layer.measured_mask) | (labels > 0)
+        back = move_pixels(start, waiting, 1 / STEP, lowest, highest, sees_through)
+        # A part of it may have a place on a surface behind it, of another colour.
+        has_no_place = (back == start) & sees_through(start)
+        nearer = find_components(labels, has_no_place, MIN_WITHOUT_PLACE)
+        inverse = move_pixels(start, nearer, STEP, lowest, highest, sees_through)
+        inverse = np.where(open_pixels[number] & (inverse == start), back, inverse)
+        return layer if np.array_equal(inverse, start) else replace(layer, inverse=inverse)
 
     return map_in_parallel(move, range(len(layers)))
+
+
+def find_components(labels: Labels, mask: Mask, least: float) -> Mask:
+    """Find the components, 0 is none, of which `mask` covers at least a share."""
+    counts = np.bincount(labels.ravel())
+    covered = np.bincount(labels.ravel(), mask.ravel(), len(counts))
+    is_chosen = covered >= least * counts
+    is_chosen[0] = False
+    return is_chosen[labels]
+
+
+def move_pixels(
+    start: Map,
+    waiting: Mask,
+    factor: np.float32,
+    lowest: np.float32,
+    highest: np.float32,
+    sees_through: Callable[[Map], Mask],
+) -> Map:
+    """Multiply inverse depths by a factor, while other views see through them.
+
+    Pixels that reach the lowest or highest inverse depth go back to where they started.
+    """
+    inverse = start
+    while waiting.any():
+        waiting = waiting & sees_through(inverse)
+        inverse = np.where(waiting, inverse * factor, inverse)
+        is_lost = waiting & ((inverse < lowest) | (inverse > highest))
+        inverse = np.where(is_lost, start, inverse)
+        waiting = waiting & ~is_lost
+    return inverse
 
 
 def find_seen_through(

@@ -18,11 +18,19 @@ from gscompleter.numerics.geometry import (
     rotations_to_quats,
 )
 from gscompleter.numerics.image_ops import dilate
-from gscompleter.numerics.sky import extend_sky, is_sky, restore_sky_colors
+from gscompleter.numerics.sky import (
+    extend_sky,
+    find_sky_gaussians,
+    is_sky,
+    restore_sky_colors,
+)
 from gscompleter.reconstructors.plane_sweep.directional_colors import fit_directional_colors
 from gscompleter.reconstructors.plane_sweep.emphasis import Emphasis
 from gscompleter.reconstructors.plane_sweep.fit import fit_jointly, fit_opacities
-from gscompleter.reconstructors.plane_sweep.free_space import leave_free_space
+from gscompleter.reconstructors.plane_sweep.free_space import (
+    find_occluders,
+    leave_free_space,
+)
 from gscompleter.reconstructors.plane_sweep.fusion import (
     DepthLayer,
     estimate_gains,
@@ -31,6 +39,7 @@ from gscompleter.reconstructors.plane_sweep.fusion import (
     measure_ratio,
 )
 from gscompleter.reconstructors.plane_sweep.rig import Transforms
+from gscompleter.reconstructors.plane_sweep.sky_colors import blend_skies
 from gscompleter.reconstructors.plane_sweep.sweep import Mask
 from gscompleter.render.fit_colors import RELAXATION, fit_colors
 from gscompleter.render.loading import load_renderer
@@ -107,10 +116,15 @@ class Splatter:
         """
         gains = torch.from_numpy(estimate_gains(layers, transforms)).float()
         device = views[0].image.device
-        normalized = [
-            view.normalize_exposure(gain)
-            for view, gain in zip(views, gains.to(device), strict=True)
+        skies = [
+            is_sky(depth.depth, view.camera) for view, depth in zip(views, depths, strict=True)
         ]
+        sky_images = blend_skies(views, skies)
+        normalized = []
+        for view, gain, sky, image in zip(views, gains.to(device), skies, sky_images, strict=True):
+            of_surfaces = view.normalize_exposure(gain)
+            image = image.where(sky[..., None], of_surfaces.image)
+            normalized.append(replace(of_surfaces, image=image))
 
         if masks is not None and not any(bool(mask.any()) for mask in masks):
             empty = self.splat(normalized[0], depths[0])[:0]
@@ -119,7 +133,7 @@ class Splatter:
 
         fitted_views = [view.to(self.fit_device) for view in views]
         gains = gains.to(self.fit_device)
-        candidates, kept, depths = self.fuse(normalized, depths, layers, transforms)
+        candidates, kept, depths = self.fuse(normalized, depths, layers, skies, transforms)
         # Nothing is reconstructed from masked pixels.
         kept &= flatten_masks([view.valid_mask for view in fitted_views])
         if masks is not None:
@@ -128,34 +142,28 @@ class Splatter:
             kept = kept.masked_scatter(kept, find_in_valid(of_scene, fitted_views))
         # Those of a part, too, are behind all surfaces: few, and whoever asked for the part selects
         # by its masks once more.
-        skies = [
+        extensions = [
             (number, gaussians.to(self.fit_device), pixels.to(self.fit_device))
-            for number, gaussians, pixels in self.extend_skies(normalized, depths)
+            for number, gaussians, pixels in self.extend_skies(views, skies, sky_images)
         ]
-        scene = merge([candidates[kept], *(gaussians for _, gaussians, _ in skies)])
-
-        photographs = [
-            self.replace_ignored(scene, view, gain)
-            for view, gain in zip(fitted_views, gains, strict=True)
-        ]
-        # One or two views are not fitted jointly, and check views take no part in their fits.
-        used = emphasis.check_views if len(views) > 2 else ()
-        checks = [self.prepare_check(scene, view.to(self.fit_device), gains) for view in used]
-        emphasis = replace(emphasis, check_views=checks)
-        fitted = self.fit_gaussians(scene, photographs, gains, emphasis)
-        fitted = restore_sky_colors(scene, fitted, fitted_views[0].camera)
+        scene = merge([candidates[kept], *(gaussians for _, gaussians, _ in extensions)])
+        if len(views) > 2:
+            fitted = self.fit_before_sky(scene, fitted_views, gains, skies, emphasis)
+        else:
+            fitted = self.fit_gaussians(scene, self.replace_all_ignored(scene, fitted_views, gains))
+            fitted = restore_sky_colors(scene, fitted, fitted_views[0].camera)
 
         # View and pixel of each Gaussian, in the order of the scene.
         sizes = [view.valid_mask.numel() for view in views]
         pixels = torch.cat([torch.arange(size) for size in sizes]).to(kept.device)[kept]
         numbers = torch.cat([torch.full((size,), i) for i, size in enumerate(sizes)])
         numbers = numbers.to(kept.device)[kept]
-        sky_numbers = [torch.full_like(sky_pixels, i) for i, _, sky_pixels in skies]
+        sky_numbers = [torch.full_like(sky_pixels, i) for i, _, sky_pixels in extensions]
         return Reconstruction(
             fitted.to(device),
             tuple(depths),
             torch.cat([numbers, *sky_numbers]).to(device),
-            torch.cat([pixels, *(sky_pixels for _, _, sky_pixels in skies)]).to(device),
+            torch.cat([pixels, *(sky_pixels for _, _, sky_pixels in extensions)]).to(device),
             None if (gains == 1).all() else gains.to(device),
         )
 
@@ -204,6 +212,7 @@ class Splatter:
         views: Sequence[View],
         depths: Sequence[DepthMap],
         layers: Sequence[DepthLayer],
+        skies: Sequence[Bool[Tensor, "_ _"]],
         transforms: Transforms,
     ) -> tuple[Gaussians, Bool[Tensor, "n"], Sequence[DepthMap]]:
         """Create a disc for every pixel of every view, and mark those that form the scene.
@@ -216,8 +225,17 @@ class Splatter:
         kept = self.select_pixels(candidates, fitted_views, layers, transforms)
         if len(views) <= 2:
             return candidates, kept, depths
-        open_pixels = self.find_open_pixels(candidates[kept], fitted_views)
-        moved = leave_free_space(layers, open_pixels, transforms)
+        renders = [self.renderer.render(candidates[kept], view.camera) for view in fitted_views]
+        open_pixels = [
+            ((render.alpha < CLOSED_ALPHA) & view.valid_mask).cpu().numpy()
+            for render, view in zip(renders, fitted_views, strict=True)
+        ]
+        occluders = [
+            find_occluders(render.image, view)
+            for render, view in zip(renders, fitted_views, strict=True)
+        ]
+        no_surfaces = [sky.cpu().numpy() for sky in skies]
+        moved = leave_free_space(layers, open_pixels, occluders, no_surfaces, transforms)
         if all(after is before for after, before in zip(moved, layers, strict=True)):
             return candidates, kept, depths
         depths = [
@@ -229,15 +247,6 @@ class Splatter:
         candidates = self.splat_all(views, depths)
         return candidates, self.select_pixels(candidates, fitted_views, moved, transforms), depths
 
-    def find_open_pixels(self, gaussians: Gaussians, views: Sequence[View]) -> list[Mask]:
-        """Find the pixels of each view that Gaussians do not cover, apart from ignored ones."""
-        return [
-            ((self.renderer.render(gaussians, view.camera).alpha < CLOSED_ALPHA) & view.valid_mask)
-            .cpu()
-            .numpy()
-            for view in views
-        ]
-
     def splat_all(self, views: Sequence[View], depths: Sequence[DepthMap]) -> Gaussians:
         """Create the discs of all pixels of all views in turn, where they are fitted."""
         # From three views on the sizes are fitted, and other photographs see a road from nearer by.
@@ -247,6 +256,14 @@ class Splatter:
             self.splat(view, depth, stretch) for view, depth in zip(views, depths, strict=True)
         ]
         return merge(parts).to(self.fit_device)
+
+    def replace_all_ignored(
+        self, scene: Gaussians, views: Sequence[View], gains: Float[Tensor, "views 3"]
+    ) -> list[View]:
+        """Replace the ignored pixels of all views, as `replace_ignored` does."""
+        return [
+            self.replace_ignored(scene, view, gain) for view, gain in zip(views, gains, strict=True)
+        ]
 
     def replace_ignored(self, scene: Gaussians, view: View, gain: Float[Tensor, "3"]) -> View:
         """Replace ignored pixels by the render, so that nothing is fitted to them."""
@@ -271,25 +288,48 @@ class Splatter:
         )
 
     @use_one_torch_thread()
-    def fit_gaussians(
-        self,
-        gaussians: Gaussians,
-        views: Sequence[View],
-        gains: Float[Tensor, "views 3"],
-        emphasis: Emphasis = Emphasis(),
-    ) -> Gaussians:
-        """Fit the Gaussians to views whose colours are `gains` times those of the scene.
+    def fit_gaussians(self, gaussians: Gaussians, views: Sequence[View]) -> Gaussians:
+        """Fit the Gaussians to one or two views.
 
         Of one view only colours are fitted. Two views get colours by direction: plain ones, fitted
-        to both, would cancel other errors there and be wrong elsewhere (decision 043). Of more
-        views place, size, direction, opacity and colour are fitted together (decision 031).
+        to both, would cancel other errors there and be wrong elsewhere (decision 043).
         """
         if len(views) == 1:
             return self.fit_to_image(gaussians, views[0])
-        if len(views) == 2:
-            faded, depths = fit_opacities(gaussians, views, self.renderer)
-            return fit_directional_colors(faded, views, depths, self.renderer)
-        return fit_jointly(gaussians, views, gains, self.renderer, emphasis)
+        faded, depths = fit_opacities(gaussians, views, self.renderer)
+        return fit_directional_colors(faded, views, depths, self.renderer)
+
+    @use_one_torch_thread()
+    def fit_before_sky(
+        self,
+        scene: Gaussians,
+        views: Sequence[View],
+        gains: Float[Tensor, "views 3"],
+        skies: Sequence[Bool[Tensor, "_ _"]],
+        emphasis: Emphasis,
+    ) -> Gaussians:
+        """Fit the surfaces to three views or more, before the sky that each of them shows.
+
+        Place, size, direction, opacity and colour are fitted together (decision 031), to views
+        whose colours are `gains` times those of the scene. The sky stays as it is: what one
+        photograph shows white and another one blue would pull at the surfaces before it.
+        """
+        in_sky = find_sky_gaussians(scene, views[0].camera)
+        surfaces = scene[~in_sky]
+        # A part of a scene may be nothing but sky.
+        if not len(surfaces):
+            return scene
+        photographs = self.replace_all_ignored(surfaces, views, gains)
+        checks = [
+            self.prepare_check(surfaces, view.to(self.fit_device), gains)
+            for view in emphasis.check_views
+        ]
+        emphasis = replace(emphasis, check_views=checks)
+        backdrops = [sky.to(self.fit_device) for sky in skies]
+        fitted = fit_jointly(surfaces, photographs, gains, self.renderer, emphasis, backdrops)
+        # In the order of the scene again.
+        rows = torch.cat([torch.nonzero(~in_sky), torch.nonzero(in_sky)])[:, 0]
+        return merge([fitted, scene[in_sky]])[rows.argsort()]
 
     def splat(
         self, view: View, depth: DepthMap, plane_stretch: float = MAX_DISC_STRETCH
@@ -299,14 +339,16 @@ class Splatter:
         return make_discs(view, depth.depth, normals, self.disc_sigma, plane_stretch)
 
     def extend_skies(
-        self, views: Sequence[View], depths: Sequence[DepthMap]
+        self,
+        views: Sequence[View],
+        skies: Sequence[Bool[Tensor, "_ _"]],
+        sky_images: Sequence[Float[Tensor, "_ _ 3"]],
     ) -> list[tuple[int, Gaussians, Int[Tensor, "n"]]]:
         """List view number, Gaussians and pixels of the sky behind each view's objects."""
         extended = []
-        for number, (view, depth) in enumerate(zip(views, depths, strict=True)):
-            sky = is_sky(depth.depth, view.camera)
+        for number, (view, sky, image) in enumerate(zip(views, skies, sky_images, strict=True)):
             if sky.any():
-                gaussians, pixels = extend_sky(view, sky, self.disc_sigma)
+                gaussians, pixels = extend_sky(view, sky, image, self.disc_sigma)
                 extended.append((number, gaussians, pixels))
         return extended
 

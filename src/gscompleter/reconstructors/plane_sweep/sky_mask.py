@@ -2,8 +2,10 @@
 
 Stereo cannot measure a uniform sky. A ceiling or blank wall is uniform too, but its outline lies on
 one plane, not much farther than the rest. A sky therefore needs all of: no texture, no parallax, a
-wide and high region connected to the top of the image, and an outline of which a large part is far
-away. An undetected sky keeps the depth of its surroundings.
+wide and high region connected to the top of the image that is brighter than its outline, and an
+outline on no plane. Besides, something has to tell it from what is white indoors (decision 156):
+a large part of the outline is far away, or any photograph shows a blue sky. Nothing stands far
+behind a building. An undetected sky keeps the depth of its surroundings.
 """
 
 from __future__ import annotations
@@ -30,6 +32,8 @@ EDGE_RADIUS = 3
 """Distance in pixels at which an edge still raises the gradient of the sky."""
 SKY_OUTLINE_WIDTH = 3
 """Width of the outline of a sky, in pixels."""
+MIN_LIGHT = 0.5
+"""Least lightness of a part of the sky, relative to the median of all parts."""
 MIN_SKY_WIDTH = 0.4
 """Smallest fraction of the top image row that a sky covers."""
 MIN_HEIGHT = 0.1
@@ -66,13 +70,25 @@ SKY_FIT_ITERATIONS = 20
 """Iterations of reweighted least squares."""
 MIN_SKY_AGREEMENT = 0.5
 """Fraction of a sky that must also be sky in the other views."""
+MIN_BLUE = 0.12
+"""Least amount by which the median blue of a blue sky exceeds its red, for colours in [0, 1]."""
+DEEP_BLUE = 0.3
+"""The same amount from which on its outline may lie on one plane."""
+MIN_BLUE_LIGHT = 0.6
+"""Least median blue of such a sky. Walls in a shade of blue are darker."""
 
 
 def find_skies(rig: Rig, measurements: Sequence[Measurement]) -> list[Mask]:
     """Find the sky of each view that the other views confirm."""
-    skies = [
-        find_sky(image, measured) for image, measured in zip(rig.images, measurements, strict=True)
-    ]
+    pairs = list(zip(rig.images, measurements, strict=True))
+    skies = [find_candidate(image, measured) for image, measured in pairs]
+    # A sky that is clipped to white tells nothing by itself. Where any view shows a blue one, all
+    # candidates are skies.
+    if not any(is_blue(image, sky) for image, sky in zip(rig.images, skies, strict=True)):
+        skies = [
+            keep_distant(image, measured, sky)
+            for (image, measured), sky in zip(pairs, skies, strict=True)
+        ]
     return [
         sky if is_confirmed(number, sky, skies, rig) else np.zeros_like(sky)
         for number, sky in enumerate(skies)
@@ -86,32 +102,69 @@ def transfer_sky(rig: Rig, sky_of_second: Mask) -> Mask:
 
 
 def find_sky(image: StereoImage, measured: Measurement) -> Mask:
-    """Find the uniform region at the top of the image if its outline is that of a sky."""
+    """Find the uniform region at the top of the image if it is a sky by itself."""
+    region = find_candidate(image, measured)
+    return region if is_blue(image, region) else keep_distant(image, measured, region)
+
+
+def find_candidate(image: StereoImage, measured: Measurement) -> Mask:
+    """Find the uniform region at the top of the image if its outline may be that of a sky."""
     region = find_even_region(image)
-    return region if is_open(image, measured, region) else np.zeros_like(region)
-
-
-def is_open(image: StereoImage, measured: Measurement, region: Mask) -> bool:
-    """Test the outline of `region` for an open sky."""
-    full = measured.resize_to(image.size)
-    is_measured = full.confidence > 0
-    outline = dilate_square(region, SKY_OUTLINE_WIDTH) & ~region & is_measured
+    heights, is_measured, _ = measure_heights(measured, image.size)
+    outline = find_outline(region) & is_measured
+    nothing = np.zeros_like(region)
     if not is_overhead(region) or outline.sum() < MIN_OUTLINE:
-        return False
-
-    # Inverse depths from infinity on, in sweep planes; indices count from the far plane.
-    heights = full.index + full.planes[0] / (full.planes[1] - full.planes[0])
-    bright = bool(np.median(image.image[region]) > np.median(image.image[outline]))
-    far_plane = float(heights.min() - full.index.min())
-    if not bright or not is_distant(heights[outline], heights[is_measured & ~region], far_plane):
-        return False
-
+        return nothing
+    if np.median(image.image[region]) <= np.median(image.image[outline]):
+        return nothing
+    # No ceiling is so blue, which may be above a flat roof as well.
+    if is_blue(image, region, DEEP_BLUE):
+        return region
     # The outline of a ceiling or wall lies on one plane; its near part is tested alone, too.
     near = outline & (heights > max(NEAR_PLANES, 2 * np.quantile(heights[outline], END_SHARE)))
-    return (
-        measure_planarity(outline, heights) < MAX_ON_PLANE
-        and measure_planarity(near, heights) < MAX_NEAR_ON_PLANE
+    is_plane = (
+        measure_planarity(outline, heights) >= MAX_ON_PLANE
+        or measure_planarity(near, heights) >= MAX_NEAR_ON_PLANE
     )
+    return nothing if is_plane else region
+
+
+def is_blue(image: StereoImage, region: Mask, least: float = MIN_BLUE) -> bool:
+    """Test if a region, which may be empty, has the colour of a blue sky.
+
+    `least` is the least amount by which its median blue exceeds its red.
+    """
+    if not region.any():
+        return False
+    red, green, blue = np.median(image.image[region], axis=0)
+    return bool(red <= green <= blue and blue >= MIN_BLUE_LIGHT and blue - red >= least)
+
+
+def keep_distant(image: StereoImage, measured: Measurement, region: Mask) -> Mask:
+    """Keep a region, which may be empty, if its outline is near infinity."""
+    heights, is_measured, far_plane = measure_heights(measured, image.size)
+    outline = find_outline(region) & is_measured
+    if not region.any() or not is_distant(
+        heights[outline], heights[is_measured & ~region], far_plane
+    ):
+        return np.zeros_like(region)
+    return region
+
+
+def measure_heights(measured: Measurement, size: tuple[int, int]) -> tuple[Map, Mask, float]:
+    """Measure inverse depths in planes of the sweep, from infinity on.
+
+    Return them with the measured pixels and the height of the far plane.
+    """
+    full = measured.resize_to(size)
+    # Indices count from the far plane.
+    far_plane = full.planes[0] / (full.planes[1] - full.planes[0])
+    return full.index + far_plane, full.confidence > 0, float(far_plane)
+
+
+def find_outline(region: Mask) -> Mask:
+    """Find the pixels beside a region."""
+    return dilate_square(region, SKY_OUTLINE_WIDTH) & ~region
 
 
 def is_overhead(region: Mask) -> bool:
@@ -132,8 +185,15 @@ def find_even_region(image: StereoImage) -> Mask:
     # Erosion cuts narrow bridges between the sky and an even surface.
     even = cv2.erode(smooth.astype(np.uint8), np.ones((3, 3), np.uint8))
     _, labels = cv2.connectedComponents(even, connectivity=4)
-    top = labels[0][labels[0] > 0]
-    core = np.isin(labels, top)
+    core = np.isin(labels, labels[0][labels[0] > 0])
+    if core.any():
+        # What is dark is even, too, as a tree against the light.
+        light = image.image.max(axis=-1)
+        usual = np.median(light[core])
+        parts = np.unique(labels[core])
+        core &= np.isin(
+            labels, [n for n in parts if np.median(light[labels == n]) >= MIN_LIGHT * usual]
+        )
     # An edge raises the gradient around it, so that the core ends before the sky does. Pixels
     # beside it that have its colour are added.
     alike = compute_difference_from_core(core, image) < MAX_SKY_DIFFERENCE
@@ -186,17 +246,20 @@ def measure_planarity(outline: Mask, heights: Map) -> float:
 
 
 def is_confirmed(number: int, sky: Mask, others: Sequence[Mask], rig: Rig) -> bool:
-    """Test if most of `sky` is sky in the other views, if any, that show its direction."""
-    shown = [
+    """Test if most of `sky` is sky in another view, as far as others show its directions.
+
+    Where several show a direction one is enough: a tree may stand before the sky in the others.
+    """
+    answers = [
         sample_at_infinity(sky.shape, other, rig, number, i)[sky]
         for i, other in enumerate(others)
         if i != number
     ]
-    if not shown:
+    if not answers:
         return True
-    answers = np.concatenate(shown)
-    seen = answers >= 0
-    return bool(seen.any()) and float(answers[seen].mean()) > MIN_SKY_AGREEMENT
+    best = np.max(answers, axis=0)
+    is_shown = best >= 0
+    return bool(is_shown.any()) and float(best[is_shown].mean()) > MIN_SKY_AGREEMENT
 
 
 def sample_at_infinity(

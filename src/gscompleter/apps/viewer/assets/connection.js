@@ -9,7 +9,8 @@ const SILENT = "The program does not answer: it was ended, its machine sleeps, o
 const client = Math.random().toString(36).slice(2);
 /* The latest message of the program: text, busy, revision, steps, undone, saved, camera, client. */
 let latest = null;
-/* The revision of the scene that is shown, and what this page asked for last. */
+/* The revision of the scene that is shown, 0 of which is the scene as it was given and as the page
+   holds it, and what this page asked for last. */
 let shownRevision = 0;
 let asked = "";
 let answered = () => {};
