@@ -22,7 +22,7 @@ GPU_WHEELS := $(VENV)/wheels/fetched
 # Tests start hundreds of processes, which would compile all modules again. (Empty is not set.)
 export PYTHONDONTWRITEBYTECODE =
 
-.PHONY: demo set-up kernels test test-core test-slow golden check-golden lint format types docs dist release-check fuzz evaluate reproduce development held-out results-pages bench gpu clean
+.PHONY: demo set-up kernels test test-core test-slow pages check golden check-golden lint format types docs dist release-check fuzz evaluate reproduce development held-out results-pages bench gpu clean
 
 demo: $(VENV)/installed
 ifneq ($(NVIDIA),)
@@ -52,6 +52,17 @@ test-core: $(VENV)/installed-test kernels
 
 test-slow: $(VENV)/installed-test $(GPU_WHEELS)
 	$(BIN)/python -m pytest -m slow
+
+# What is written from the code: tables of pages, and help texts as they are recorded.
+pages: $(VENV)/installed
+	$(BIN)/python docs/make_tables.py
+	$(BIN)/python benchmarks/golden.py record --only texts
+
+# What a new generator, splat format or guard has to pass, in some minutes; .ci/run runs all tests.
+check: lint types $(VENV)/installed-test kernels
+	$(BIN)/python -m pytest -n auto --maxprocesses 4 --dist loadfile --no-loadscope-reorder tests/generators \
+		tests/splats tests/guards tests/config tests/project tests/apps/test_options.py \
+		tests/apps/test_cli.py tests/apps/test_help_pages.py
 
 # The net under a restructuring: `make golden` before it, `make check-golden` after it. ONLY=scenes|room|texts.
 golden: $(VENV)/installed

@@ -155,6 +155,12 @@ def test_a_file_without_anything_finite_is_refused(tmp_path, monkeypatch, capsys
     assert "no Gaussian that is finite" in capsys.readouterr().err
 
 
+def test_a_file_without_gaussians_is_refused_as_that(tmp_path, monkeypatch, capsys):
+    save_ply(tmp_path / "a.ply", walls([0], [0.0])[:0])
+    assert run(monkeypatch, "inspect", tmp_path / "a.ply") == 2
+    assert "holds no Gaussians; name another file" in capsys.readouterr().err
+
+
 def test_models_are_named_with_their_licences(tmp_path):
     (tmp_path / "weights").mkdir()
     assert record_model("mvsplat-re10k", None).licence is None

@@ -15,7 +15,7 @@ from gscompleter.apps.inputs.named_photographs import (
     read_targets,
     refuse_missing_photographs,
 )
-from gscompleter.apps.inputs.opening import describe_cameras_above
+from gscompleter.apps.inputs.opening import describe_cameras_above, refuse_splat_as_photographs
 from gscompleter.data.formats import open_photographs
 from gscompleter.data.sfm.poses import has_photographs, list_all_photographs
 from gscompleter.splats.formats import save_splat
@@ -161,6 +161,15 @@ def test_an_unpacked_sog_is_a_splat_and_no_folder_of_photographs(tmp_path, monke
     # Beside photographs, its tables are none of them.
     write_photographs(tmp_path, CAMERAS)
     assert list_all_photographs(tmp_path) == [f"photo_{number:03d}.png" for number in range(4)]
+
+
+def test_a_file_of_cameras_that_is_named_as_a_splat_is_none(tmp_path):
+    """The names of files of an unpacked .sog end in meta.json, and so may others."""
+    scene = write_transforms(tmp_path / "scene", CAMERAS)
+    file = (scene / "transforms.json").rename(scene / "my_meta.json")
+    assert not names_splat(file)
+    refuse_splat_as_photographs(file)
+    assert names_splat(write_packed(tmp_path / "packed") / "meta.json")
 
 
 def test_a_streamed_scene_is_named_where_photographs_are_expected(tmp_path, monkeypatch, capsys):

@@ -25,8 +25,8 @@ DOCS = TESTS.parent / "docs"
 
 @pytest.fixture(scope="module")
 def table() -> ModuleType:
-    """Return the script that makes the page of all options."""
-    spec = spec_from_file_location("make_option_table", DOCS / "make_option_table.py")
+    """Return the script that makes the tables of pages."""
+    spec = spec_from_file_location("make_tables", DOCS / "make_tables.py")
     assert spec is not None
     assert spec.loader is not None
     module = module_from_spec(spec)
@@ -49,9 +49,23 @@ def test_one_name_has_one_kind_of_value_and_one_sentence_in_every_command(table)
         assert all(option.kinds <= widest for option in same), (name, same)
 
 
-def test_the_page_of_options_is_that_of_the_commands(table):
-    said = (DOCS / "options.md").read_text(encoding="utf-8")
-    assert said == table.make_page(), "run `python docs/make_option_table.py`"
+@pytest.mark.parametrize("page", ["options.md", "formats.md", "generators.md", "provenance.md"])
+def test_pages_list_what_is_in_the_code(table, page):
+    pages = table.make_pages()
+    assert len(pages) == 4
+    said = (DOCS / page).read_text(encoding="utf-8")
+    assert said == pages[DOCS / page], "run `make pages`"
+
+
+def test_every_table_that_is_made_stands_in_one_page(table):
+    texts = [(DOCS / page).read_text(encoding="utf-8") for page in table.PAGES]
+    named = [found["name"] for text in texts for found in table.REGION.finditer(text)]
+    assert sorted(named) == sorted(table.TABLES)
+
+
+def test_an_option_of_several_numbers_says_so(table):
+    assert list(table.list_kinds(tuple[float, float, float] | None)) == ["3 numbers"]
+    assert list(table.list_kinds(tuple[Path, ...])) == ["path"]
 
 
 def test_the_help_of_a_format_names_all(table):

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from gscompleter import InputError
@@ -51,6 +52,28 @@ def test_masks_of_idr_are_read_and_the_object_stays(tmp_path):
     mask.save(tmp_path / "mask" / "000001.png")
     (view,) = open_photographs(tmp_path).views([1])
     assert view.ignore_mask.float().mean() == 0.25
+
+
+@pytest.mark.parametrize(("write", "name"), [(idr, "cameras_sphere.npz"), (replica, "traj.txt")])
+def test_the_file_of_all_poses_stands_for_its_folder(tmp_path, monkeypatch, write, name):
+    folder = write(tmp_path / "scene")
+    whole, named = open_photographs(folder), open_photographs(folder / name)
+    monkeypatch.chdir(folder)
+    beside = open_photographs(Path(name))
+    for photographs in (named, beside):
+        assert (photographs.name, photographs.format) == ("scene", whole.format)
+        assert [one.file_name for one in photographs.frames] == [
+            one.file_name for one in whole.frames
+        ]
+        assert torch.equal(photographs.camera(1).c2w, whole.camera(1).c2w)
+
+
+def test_one_of_two_files_of_cameras_is_opened_by_its_name(tmp_path):
+    idr(tmp_path)
+    (tmp_path / "cameras.npz").write_bytes(b"PK")
+    assert len(open_photographs(tmp_path / "cameras_sphere.npz")) == len(VIEWS)
+    with pytest.raises(InputError, match=r"cameras\.npz is no archive of matrices"):
+        open_photographs(tmp_path / "cameras.npz")
 
 
 def test_real_cameras_of_dtu_are_read(shared, tmp_path):

@@ -14,8 +14,7 @@ from damage import require_plain
 from fuzz import damage, replaced
 from gscompleter import InputError, load_splat, save_splat
 from splat_files import (
-    FORMATS_BUT_PLY,
-    WRITTEN,
+    SPLAT_FILES,
     glb_table,
     made,
     plausible,
@@ -152,7 +151,7 @@ def test_a_broken_header_of_a_ply_is_quoted_and_not_explained_by_python(tmp_path
     assert "broken header" in refuse(path) or b"vertex 9" in wrong
 
 
-KINDS = sorted({*FORMATS_BUT_PLY, *WRITTEN, "plain.spz"})
+KINDS = sorted({*SPLAT_FILES} - {"folder"})
 
 
 @pytest.mark.parametrize("name", KINDS)

@@ -14,8 +14,9 @@ from gsply import plyread
 
 from full_disk import limit_file_size
 from gscompleter import Gaussians, InputError, load_ply, merge, save_ply
+from gscompleter.splats.formats import describe_oddities
 from gscompleter.system.files.ply import read_ply_file
-from scenes import random_gaussians
+from scenes import random_gaussians, scaled
 
 FIELDS = ("means", "quats", "scales", "opacities", "sh", "generated", "encoded")
 
@@ -293,6 +294,20 @@ def test_infinite_logits_are_opacities_of_one_and_zero(tmp_path):
 def test_infinite_scales_are_damage(tmp_path, value):
     path = with_values(saved(tmp_path, random_gaussians(20)), ["scale_1"], slice(4, 5), value)
     refused(path, "1 of 20 Gaussians .* drop what is not finite")
+
+
+@pytest.mark.filterwarnings("error")
+def test_infinite_positions_print_no_warnings_of_numpy(tmp_path):
+    """Of scales that may be sizes the extent of the scene decides."""
+    path = saved(tmp_path, scaled(random_gaussians(400), 1e3))
+    scales = [f"scale_{axis}" for axis in range(3)]
+    with_values(path, scales, slice(None), 0.5)
+    with_values(path, ["x"], slice(0, 30, 2), float("inf"))
+    with_values(path, ["x"], slice(1, 30, 2), -float("inf"))
+    refused(path, "30 of 400 Gaussians .* drop what is not finite")
+    describe_oddities(path)
+    with_values(path, ["y"], slice(None), float("nan"))
+    refused(path, "400 of 400 Gaussians")
 
 
 def test_flat_gaussians_have_a_scale_of_zero(tmp_path):

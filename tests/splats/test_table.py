@@ -8,18 +8,22 @@ from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
 import pytest
 import torch
 
 from damage import require_plain
 from fuzz import damage, replaced
-from gscompleter import InputError, load_splat, save_splat
-from gscompleter.splats.formats import read_provenance
+from gscompleter import Gaussians, InputError, load_splat, save_splat
+from gscompleter.splats import table
+from gscompleter.splats.formats import describe_losses, read_provenance
+from gscompleter.splats.glb import write_glb
 from gscompleter.splats.labels_file import get_labels_path
-from gscompleter.splats.packing import ZIP_MAGIC
-from gscompleter.splats.provenance import Provenance, RunRecord
+from gscompleter.splats.packing import ZIP_MAGIC, build_gaussians
+from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, RunRecord
 from gscompleter.splats.splat_format import HEAD_BYTES, SplatFormat
-from gscompleter.splats.table import SPLAT_FORMATS, match_ending
+from gscompleter.splats.table import SPLAT_FORMATS, get_written_format, match_ending
+from gscompleter.system.damage import DamagedError
 from paths import ROOT
 from splat_files import BY_HAND, made, plausible, read_parts, write_parts
 
@@ -51,6 +55,7 @@ PROMISES = {
 
 
 def get_promise(name: str) -> Promise:
+    assert name in PROMISES, f"add to PROMISES a file and the largest errors of {name}"
     if SPLAT_FORMATS[name].extra:
         pytest.importorskip("pxr", reason="needs usd-core (the extra usd)")
     return PROMISES[name]
@@ -62,7 +67,7 @@ def test_every_format_has_a_promise():
     assert set(PROMISES) == set(SPLAT_FORMATS)
 
 
-@pytest.mark.parametrize("name", PROMISES)
+@pytest.mark.parametrize("name", SPLAT_FORMATS)
 def test_a_format_rounds_no_more_than_it_promises(tmp_path, name):
     promise = get_promise(name)
     gaussians = plausible(120, 1 if SPLAT_FORMATS[name].holds_harmonics else 0)
@@ -76,7 +81,7 @@ def test_a_format_rounds_no_more_than_it_promises(tmp_path, name):
     assert len(loaded.means.unique(dim=0)) == 120
 
 
-@pytest.mark.parametrize("name", PROMISES)
+@pytest.mark.parametrize("name", SPLAT_FORMATS)
 def test_a_format_is_recognised_by_itself_alone(tmp_path, name):
     """So the order of the rows decides nothing, and a renamed file is read as what it is."""
     path = made(tmp_path, get_promise(name).file, plausible(20, 1))
@@ -146,20 +151,51 @@ def test_a_row_says_what_its_files_hold(tmp_path, name):
     record = Provenance((RunRecord("a tool", "1", (1, 2), seed=3),))
     save_splat(path, gaussians, record)
     beside = get_labels_path(path)
-    assert beside.exists() != row.holds_labels
+    # What a file has no place for, labels or the record, lies beside it.
+    holds_both = row.holds_labels and row.read_record is not None
+    assert beside.exists() != holds_both, describe_row(row, "holds_labels", "read_record")
     # Without what lies beside it, a file has what its row says.
     beside.unlink(missing_ok=True)
     loaded = load_splat(path)
-    assert loaded.generated.any() == row.holds_labels
-    assert loaded.is_antialiased == row.marks_antialiased
-    assert (loaded.origin is not None) == row.holds_origin
-    assert (read_provenance(path) == record) == (row.read_record is not None)
+    assert loaded.generated.any() == row.holds_labels, describe_row(row, "holds_labels")
+    assert loaded.is_antialiased == row.marks_antialiased, describe_row(row, "marks_antialiased")
+    assert (loaded.origin is not None) == row.holds_origin, describe_row(row, "holds_origin")
+    has_record = read_provenance(path) == record
+    assert has_record == (row.read_record is not None), describe_row(row, "read_record")
+
+
+def describe_row(row: SplatFormat, *fields: str) -> str:
+    """Describe what a row says of its files, which its files do not hold."""
+    said = " and ".join(f"{field} = {getattr(row, field)!r}" for field in fields)
+    return f"a file of {row.name} does not hold what its row says: {said}"
+
+
+def test_labels_and_the_record_may_be_in_different_places(tmp_path, monkeypatch):
+    """As in a .compressed.ply, and the other way round."""
+    row = replace(SPLAT_FORMATS["glb"], read_record=None, write=write_without_record)
+    monkeypatch.setitem(SPLAT_FORMATS, "glb", row)
+    monkeypatch.setattr(table, "_ROWS", list(SPLAT_FORMATS.values()))
+    test_a_row_says_what_its_files_hold(tmp_path, "glb")
+
+
+def write_without_record(path: Path, gaussians: Gaussians) -> None:
+    write_glb(path, gaussians, NOTHING_KNOWN)
+
+
+@pytest.mark.parametrize("row", SPLAT_FORMATS.values(), ids=list(SPLAT_FORMATS))
+def test_texts_of_a_row_say_what_its_fields_say(row):
+    assert ("y up" in row.texts.axes) == row.is_y_up
+    assert row.texts.precision or row.write is None
+    # The properties of a .ply are those that its reader of rows finds.
+    claimed = set(row.texts.places) - ({"list_names"} if row.name == "ply" else set())
+    assert [field for field in claimed if not getattr(row, field)] == []
 
 
 @pytest.mark.parametrize("name", [name for name in SPLAT_FORMATS if name not in WRITTEN])
 def test_a_format_that_is_only_read_is_written_by_the_tests(name):
-    is_written = PROMISES[name].file in BY_HAND
-    assert is_written, f"add a writer of {PROMISES[name].file} to BY_HAND (splat_files.py)"
+    file = get_promise(name).file
+    is_written = file in BY_HAND
+    assert is_written, f"add a writer of {file} to BY_HAND (splat_files.py)"
 
 
 def read_endings(page: str, title: str) -> set[str]:
@@ -173,7 +209,7 @@ def read_endings(page: str, title: str) -> set[str]:
 def test_a_format_has_a_line_in_the_reference_page(row: SplatFormat):
     ending = row.endings[0]
     is_there = ending in read_endings("formats.md", "Splats")
-    assert is_there, f"add a line for {ending} to the table under Splats of docs/formats.md"
+    assert is_there, f"run `make pages`, which writes a line for {ending}"
     if row.write is not None and row.read_record is not None:
         assert row.endings[0] in read_endings("provenance.md", "Where it is")
 
@@ -182,3 +218,50 @@ def test_the_longest_ending_is_meant(tmp_path):
     assert match_ending(tmp_path / "A.COMPRESSED.PLY").name == "compressed-ply"
     assert match_ending(tmp_path / "a.ply").name == "ply"
     assert match_ending(tmp_path / "a.txt") is None
+
+
+def test_sentences_name_the_formats_of_the_table(tmp_path):
+    with pytest.raises(InputError, match=r"end it in \.ply, .*\.spz.* or \.usdz\.") as error:
+        get_written_format(tmp_path / "a.ksplat")
+    assert ".ksplat" not in str(error.value).partition("end it in ")[2]
+    far = replace(plausible(30, 0), origin=(500_000.0, 4_000_000.0, 0.0))
+    save_splat(tmp_path / "a.splat", far)
+    (loss,) = describe_losses(tmp_path / "a.splat", far)
+    assert loss.endswith("; write .ply, .glb, .usdc or .usdz.")
+
+
+ARRAYS = {
+    "positions": np.zeros((5, 3)),
+    "rotations": np.ones((5, 4)),
+    "sizes": np.ones((5, 3)),
+    "opacities": np.ones(5),
+    "colours": np.zeros((5, 4, 3)),
+}
+
+
+def test_numbers_of_any_type_are_gaussians():
+    arrays = {name: array.astype(np.int16) for name, array in ARRAYS.items()}
+    assert build_gaussians(*arrays.values()).sh.shape == (5, 4, 3)
+
+
+@pytest.mark.parametrize(
+    ("name", "array", "sentence"),
+    [
+        ("positions", np.zeros((5, 2)), "its positions are no 5 × 3 numbers but 5 × 2"),
+        ("positions", np.float32(1), "its positions are no 0 × 3 numbers but 1"),
+        ("rotations", np.ones((5, 3)), "its rotations are no 5 × 4 numbers but 5 × 3"),
+        ("sizes", np.ones((5, 1)), "its sizes are no 5 × 3 numbers but 5 × 1"),
+        ("sizes", np.ones((4, 3)), "its sizes are no 5 × 3 numbers but 4 × 3"),
+        ("opacities", np.ones((5, 1)), "its opacities are no 5 numbers but 5 × 1"),
+        ("opacities", np.array(["a"] * 5), "its opacities are no 5 numbers"),
+        ("colours", np.zeros((5, 4, 4)), "its colours are no 5 × 4 × 3 numbers but 5 × 4 × 4"),
+        ("colours", np.zeros((5, 3)), "its colours are no 5 × 0 × 3 numbers but 5 × 3"),
+        ("colours", np.zeros((5, 3, 3)), "its colours have 3 coefficients, which no degree has"),
+    ],
+)
+def test_arrays_that_are_no_gaussians_are_damage(name, array, sentence):
+    arrays = {**ARRAYS, name: np.asarray(array)}
+    with pytest.raises(DamagedError) as error:
+        build_gaussians(*arrays.values())
+    assert str(error.value) == sentence
+    require_plain(sentence)

@@ -30,6 +30,9 @@ from pathlib import Path
 from typing import Any
 
 os.environ |= {"OMP_WAIT_POLICY": "PASSIVE", "NUMBA_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+
+from splat_files import SPLAT_FILES, made, plausible  # after this, since it imports torch
+
 ADDRESS_SPACE = 8 << 30
 MAX_MEMORY = 2 << 20
 """Most memory of a run, in kilobytes."""
@@ -104,7 +107,6 @@ def build(folder: Path) -> None:
     from phone_files import polycam, record3d, scanner_app, write_archive, write_folder
     from pose_files import WRITERS, write_camera_list
     from scenes import Room, camera_at, gaussians_of, photographed, view_of
-    from splat_files import FORMATS_BUT_PLY, made, plausible
 
     cameras = [camera_at(x, yaw=yaw, size=SIZE) for x, yaw in ((-0.3, 0), (0.1, 0), (0.7, 12))]
     views = [view_of(Room(), camera) for camera in cameras]
@@ -143,7 +145,7 @@ def build(folder: Path) -> None:
         write(folder / kind)
     write_camera_list(folder / "target-list.json")
     (folder / "splats").mkdir()
-    for name in (*FORMATS_BUT_PLY, "plain.spz", "folder"):
+    for name in SPLAT_FILES:
         made(folder / "splats", name, plausible(40, 1))
     write_infos(folder / "infos")
     write_drive(folder / "kitti-raw")
@@ -455,10 +457,15 @@ def scene_words(kind: str) -> list[str]:
     return [*words, "--resolution", str(SIZE), str(SIZE)]
 
 
-def splat(name: str, pattern: str = "") -> Mutation:
+def splat(name: str) -> Mutation:
     """Return a file of Gaussians, or one of the files in its folder."""
     words = ["convert", f"splats/{name}", "out.ply", "--quiet"]
-    return in_bytes(f"splats/{name}{pattern}", words)
+    return in_bytes(name_splat(name), words)
+
+
+def name_splat(name: str) -> str:
+    """Name a file of Gaussians by a pattern, or the files in its folder."""
+    return f"splats/{name}" if "." in name else f"splats/{name}/*"
 
 
 RANGE = ["--near", "0.5", "--far", "20"]
@@ -509,15 +516,7 @@ KINDS: dict[str, Mutation] = {
     "targets-colmap": in_bytes(
         "colmap-text/sparse/images.txt", [*COMPLETE, "colmap-text/sparse/images.txt", *RANGE]
     ),
-    "compressed-ply": splat("scene.compressed.ply"),
-    "spz": splat("scene.spz"),
-    "spz-4": splat("four.spz"),
-    "spz-unpacked": splat("plain.spz"),
-    "splat": splat("scene.splat"),
-    "ksplat": splat("scene.ksplat"),
-    "sog": splat("scene.sog"),
-    "sog-folder": splat("folder", "/*"),
-    "glb": splat("scene.glb"),
+    **{f"splat-{name}": splat(name) for name in SPLAT_FILES},
     "polycam": in_bytes("polycam/keyframes/*/*2.*", scene_words("polycam")),
     "polycam-zip": in_bytes("polycam.zip", scene_words("polycam.zip")),
     "scanner-app": in_bytes("scanner-app/*_00002.*", scene_words("scanner-app")),
@@ -542,7 +541,9 @@ KINDS: dict[str, Mutation] = {
     "chunk-file": not_a_file("chunks/*", CHUNKS),
     "config-file": not_a_file("config.yaml", [*COMPLETE, "2", *RANGE, "--config", "config.yaml"]),
     "sog-file": not_a_file("splats/folder/*", ["convert", "splats/folder", "out.ply", "--quiet"]),
-    "splat-file": not_a_file("splats/scene.s*", ["convert", "splats/scene.splat", "out.ply"]),
+    "splat-file": not_a_file(
+        "splats/scene.s*", ["convert", "splats/scene.splat", "out.ply", "--quiet"]
+    ),
     "ply-file": not_a_file("small.ply", ["convert", "small.ply", "out.ply", "--quiet"]),
     "yaml": in_yaml,
     "words": in_words,

@@ -42,6 +42,7 @@ from gscompleter.generators import GeneratorOutput
 from gscompleter.numerics.value_checks import check_gaussians, check_views
 from gscompleter.types import DepthMap, Reconstruction, View
 from scenes import Room, camera_at, gaussians_of, random_gaussians, view_of
+from splat_files import SPLAT_FILES, WRITTEN
 
 jaxtyping_config.update("jaxtyping_disable", True)  # users run without it
 
@@ -322,13 +323,14 @@ def call_generator(chance: random.Random, folder: Path) -> None:
     check_completion(done)
 
 
-ENDINGS = ("ply", "compressed.ply", "spz", "splat", "sog", "glb", "txt", "ksplat")
+WRITTEN_ENDINGS = tuple(name.partition(".")[2] for name in WRITTEN)
+OTHER_ENDINGS = ("txt", "ksplat")
 
 
 def call_files(chance: random.Random, folder: Path) -> None:
     """Write Gaussians with odd numbers in every format, and read them again."""
     scene = random_gaussians(60, sh_degree=chance.randrange(4))
-    path = folder / f"scene.{chance.choice(ENDINGS)}"
+    path = folder / f"scene.{chance.choice([*WRITTEN_ENDINGS, *OTHER_ENDINGS])}"
     odd = chance.choice([spoil_numbers, spoil_numbers, spoil])(scene, chance)
     write = chance.choice([gsc.save_splat, gsc.save_splat, gsc.save_ply])
     write(chance.choice([path, str(path)]), odd)
@@ -393,7 +395,7 @@ def read_splat(name: str) -> Callable[[Path, random.Random], None]:
     def read(folder: Path, chance: random.Random) -> None:
         loaded = gsc.load_splat(folder / name, drop_nonfinite=chance.random() < 0.3)
         check_scene(loaded)
-        out = folder / f"converted.{chance.choice(ENDINGS[:6])}"
+        out = folder / f"converted.{chance.choice(WRITTEN_ENDINGS)}"
         gsc.save_splat(out, loaded)
         check_scene(gsc.load_splat(out))
 
@@ -423,15 +425,10 @@ Reader = tuple[str, Callable[[Path, random.Random], None]]
 FILES: dict[str, Reader] = {
     "ply": ("small.ply", read_splat("small.ply")),
     "ascii-ply": ("ascii.ply", read_splat("ascii.ply")),
-    "compressed-ply": ("splats/scene.compressed.ply", read_splat("splats/scene.compressed.ply")),
-    "spz": ("splats/scene.spz", read_splat("splats/scene.spz")),
-    "spz-4": ("splats/four.spz", read_splat("splats/four.spz")),
-    "spz-unpacked": ("splats/plain.spz", read_splat("splats/plain.spz")),
-    "splat": ("splats/scene.splat", read_splat("splats/scene.splat")),
-    "ksplat": ("splats/scene.ksplat", read_splat("splats/scene.ksplat")),
-    "sog": ("splats/scene.sog", read_splat("splats/scene.sog")),
-    "sog-folder": ("splats/folder/*", read_splat("splats/folder")),
-    "glb": ("splats/scene.glb", read_splat("splats/scene.glb")),
+    **{
+        f"splat-{name}": (commands.name_splat(name), read_splat(f"splats/{name}"))
+        for name in SPLAT_FILES
+    },
     "filtered-ply": ("filtered.ply", read_splat("filtered.ply")),
     "surfels": ("surfels.ply", read_splat("surfels.ply")),
     "transforms": ("scene/transforms.json", read_scene("scene")),

@@ -39,7 +39,7 @@ from gscompleter.splats.formats import (
     read_provenance,
 )
 from gscompleter.splats.origin import count_digits
-from gscompleter.splats.ply import MIDDLE_QUANTILES
+from gscompleter.splats.ply import MIDDLE_QUANTILES, check_finite
 from gscompleter.splats.provenance import ModelRecord, RunRecord
 from gscompleter.splats.row_kinds import count_row_kinds
 from gscompleter.system.console import make_console
@@ -122,8 +122,7 @@ def inspect_splat(request: InspectionRequest) -> Inspection:
     # Other readers refuse a file with NaN; here those Gaussians are counted, and left out.
     decoded = decode_splat(path)
     finite = find_finite(decoded)
-    if not finite.any():
-        raise InputError(f"{quote_value(path)} holds no Gaussian that is finite; write it anew.")
+    check_finite(int(finite.sum()), len(decoded), path, drop_nonfinite=True)
     gaussians = decoded[finite]
     # A damaged record is told beside the Gaussians, which can be read without it.
     defect = None

@@ -7,12 +7,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Annotated, Any, TypeVar, get_type_hints
+from typing import Annotated, Any, ClassVar, TypeVar, get_type_hints
 
+from annotated_types import Interval as Interval
 from annotated_types import Len
 from typing_extensions import Doc
 
+# What is imported `as` itself is at hand for the settings of further rows.
+from gscompleter.config.settings import Count as Count
 from gscompleter.config.settings import Settings, validate
+from gscompleter.config.settings import Share as Share
+from gscompleter.config.settings import Weight as Weight
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.plugins import is_in_file, load_plugins
 
@@ -22,48 +27,81 @@ class GeneratorSettings(Settings):
     """Settings of a generator."""
 
 
-@dataclass(frozen=True)
-class PaintedSettings(GeneratorSettings):
-    """Images that were painted elsewhere."""
+@dataclass(frozen=True, kw_only=True)
+class GeneratorLine:
+    """What the table of `docs/generators.md` says of a generator."""
 
-    painter: Annotated[str, Len(1, 100)] = "an unnamed painter"
-    """Name of the program, model or person."""
+    input: str
+    """What it makes its image of."""
+    output: str
+    """What the image shows, in the hole and beside it."""
+    needs: str = "nothing"
+    """What has to be installed, fetched or given."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class GeneratorEntry:
-    """All that is known of a built-in generator."""
+    """All that is known of a built-in generator: a row of the table."""
 
     what: str
     """What its image is, as a clause for help pages."""
     load: str
     """Loader as `module:function`: settings, seed, images of the targets, device -> Φ."""
+    line: GeneratorLine
     settings: type[GeneratorSettings] = GeneratorSettings
     help: Mapping[str, str] = field(default_factory=dict)
-    """Sentence about each setting that is the option `--generator-NAME`, by its name."""
+    """Sentence about each setting that is the option `--generator-NAME`, by its name. A setting of
+    several numbers is a tuple of them."""
     is_own: bool = True
-    """True if the image is made here, and not a photograph or somebody's painting."""
+    """True if the image is made here, for any camera; False if it is one of the target that is
+    given, a photograph or somebody's painting, of which the record states no licence of ours."""
 
 
-GENERATORS = {
-    "warp-inpaint": GeneratorEntry(
-        "warped photographs, holes filled by patches",
-        "gscompleter.generators.warp_inpaint:load_warp_inpaint",
+GENERATORS: dict[str, GeneratorEntry] = {}
+"""Built-in generators by name: the rows that follow, each below the class of its settings if it has
+one."""
+
+GENERATORS["warp-inpaint"] = GeneratorEntry(
+    what="warped photographs, holes filled by patches",
+    load="gscompleter.generators.warp_inpaint:load_warp_inpaint",
+    line=GeneratorLine(
+        input="all photographs, the scene at all cameras",
+        output="photographs warped through the scene's depth; tone and lines of the border go on "
+        "into holes, patches where no line leads",
     ),
-    "oracle": GeneratorEntry(
-        "the real photograph",
-        "gscompleter.generators.oracle:load_oracle",
-        is_own=False,
+)
+
+GENERATORS["oracle"] = GeneratorEntry(
+    what="the real photograph",
+    load="gscompleter.generators.oracle:load_oracle",
+    line=GeneratorLine(
+        input="the photograph of the target",
+        output="that photograph",
+        needs="the true image: for measuring geometry alone",
     ),
-    "painted": GeneratorEntry(
-        # The painter is an option of its own, beside that of the images.
-        "by `complete --images`",
-        "gscompleter.generators.painted:load_painted",
-        PaintedSettings,
-        is_own=False,
+    is_own=False,
+)
+
+
+@dataclass(frozen=True)
+class PaintedSettings(GeneratorSettings):
+    """Images that were painted elsewhere."""
+
+    painter: Annotated[str, Len(1, 100)] = "an unnamed painter"
+    """Name of the program, model or person; an option of its own, beside that of the images."""
+
+
+GENERATORS["painted"] = GeneratorEntry(
+    what="by `complete --images`",
+    load="gscompleter.generators.painted:load_painted",
+    line=GeneratorLine(
+        input="images that were painted elsewhere (`--images`)",
+        output="the painting in the hole, in the exposure of the scene; the scene elsewhere",
+        needs="[your own painter](guide/painting.md)",
     ),
-}
-"""Built-in generators by name."""
+    settings=PaintedSettings,
+    is_own=False,
+)
 
 PREFIX = "generator_"
 """Start of the names of their settings as options."""
@@ -102,6 +140,11 @@ def get_settings_class(name: str) -> type[GeneratorSettings]:
     )
 
 
+def makes_any_image(name: str) -> bool:
+    """Return True if a generator makes an image for any camera, and not only shows given ones."""
+    return name not in GENERATORS or GENERATORS[name].is_own
+
+
 def add_options(kind: type[SettingsClass]) -> type[SettingsClass]:
     """Add to a class of options a field for each setting that a row of the table explains.
 
@@ -122,6 +165,7 @@ def add_options(kind: type[SettingsClass]) -> type[SettingsClass]:
 class GeneratorOptions(Settings):
     """Model that synthesizes images, and its settings."""
 
+    has_plain_options: ClassVar[bool] = True
     generator: Annotated[str, Doc(CHOICE)] = "warp-inpaint"
     generator_weights: str | None = None
     """Weights, by default those published: a folder saved by diffusers, USER/NAME or
@@ -132,16 +176,16 @@ class GeneratorOptions(Settings):
     generator_offload: bool = False
     """Keep only the active part of the model on the GPU, to need less GPU memory."""
     generator_steps: int | None = None
-    """Denoising steps: for pe-field 4, as in the paper (its authors' demo has 28), for
-    diffusers-inpaint the pipeline's own number."""
+    """Denoising steps: for pe-field 4, as in the paper (its authors' demo has 28), for flux2-klein
+    4, for diffusers-inpaint the pipeline's own number."""
     generator_depth: str | None = None
     """Depth of the photograph for pe-field: context (rendered; the default), moge-2-large (that of
-    its authors; with the config `paper`), monocular (a small network), or the folder or hub id of
-    another one."""
+    its authors; with the config `paper`), moge-2, monocular (a small network), or the folder or hub
+    id of another one."""
     generator_batch_size: int | None = None
     """Most target images that pe-field denoises together (4). Fewer need less memory."""
     generator_prompt: str | None = None
-    """Text prompt of diffusers-inpaint (a photograph)."""
+    """Text prompt of diffusers-inpaint and flux2-klein (a photograph)."""
 
     def make_settings(self) -> GeneratorSettings:
         """Return the settings; raise InputError if one is unknown to the generator or wrong."""

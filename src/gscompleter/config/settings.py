@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, TypeVar
@@ -41,6 +41,8 @@ class Settings:
         "allow_inf_nan": False,
         "revalidate_instances": "always",
     }
+    has_plain_options: ClassVar[bool] = False
+    """True if its settings are options without the name of their group before them."""
 
 
 def validate(settings: S, prefix: str = "") -> S:
@@ -85,12 +87,24 @@ def translate_errors(settings: object, where: str = "", prefix: str = "") -> Ite
         refusal = wrong.get("ctx", {}).get("error")
         if isinstance(refusal, InputError):
             raise refusal from None
-        # Parts of its place that are numbers are indices in a list. Those with a bracket are kinds
-        # of a value that may be of several.
-        parts = [part for part in wrong["loc"] if isinstance(part, str) and "[" not in part]
-        name = ".".join(parts)
+        name = ".".join(list_names(settings, wrong["loc"]))
         argument = prefix + name if name else None
         raise InputError(where + describe_invalid(wrong, name, settings), argument) from None
+
+
+def list_names(settings: object, place: Sequence[int | str]) -> list[str]:
+    """List the names, from the outermost group on, by which options call the value at a place."""
+    names = []
+    group = settings
+    for part in place:
+        # Numbers are indices in a list. What has a bracket is a kind of a value that may be of
+        # several.
+        if not isinstance(part, str) or "[" in part:
+            continue
+        group = getattr(group, part, None)
+        if not (isinstance(group, Settings) and group.has_plain_options):
+            names.append(part)
+    return names
 
 
 def merge_nested(values: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

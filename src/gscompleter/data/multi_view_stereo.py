@@ -129,20 +129,23 @@ def _split_pfm(data: bytes) -> tuple[bytes, int, int, float, bytes]:
 
 
 def _find_matrices(path: Path) -> Path | None:
-    files = [path / name for name in IDR_FILES]
+    """Find the file of cameras in a folder, or return the path if it is one by its name."""
+    files = [path] if path.name in IDR_FILES else []
+    files += [path / name for name in IDR_FILES]
     return next((file for file in files if os.path.isfile(file)), None)
 
 
 def has_idr(path: Path) -> bool:
-    """Check whether a folder has cameras of IDR or NeuS, and its photographs."""
-    has_images = any((path / name).is_dir() for name in IDR_FOLDERS)
-    return has_images and _find_matrices(path) is not None
+    """Check whether `path` is a folder with cameras of IDR or NeuS, or their file."""
+    file = _find_matrices(path)
+    return file is not None and any((file.parent / name).is_dir() for name in IDR_FOLDERS)
 
 
 def open_idr(path: Path) -> Iterator[Photographs]:
     """Open a scene of IDR or NeuS; frames are numbered by the sorted names of its photographs."""
     file = _find_matrices(path)
     assert file is not None
+    path = file.parent
     home = next(path / name for name in IDR_FOLDERS if (path / name).is_dir())
     images = [one for one in list_entries(home) if one.suffix.lower() in MVS_ENDINGS]
     matrices = read_matrices(file)

@@ -76,9 +76,15 @@ def open_scannet(path: Path) -> Iterator[Photographs]:
 
 
 def has_replica(path: Path) -> bool:
-    """Check whether a folder is a scene of Replica that was rendered for SLAM."""
-    has_results = (path / RESULTS_FOLDER).is_dir() and (path / TRAJECTORY).is_file()
-    return has_results and _find_parameters(path) is not None
+    """Check whether `path` is a scene of Replica that was rendered for SLAM, or its trajectory."""
+    folder = _find_replica_folder(path)
+    has_results = (folder / RESULTS_FOLDER).is_dir() and (folder / TRAJECTORY).is_file()
+    return has_results and _find_parameters(folder) is not None
+
+
+def _find_replica_folder(path: Path) -> Path:
+    is_file = path.name == TRAJECTORY and os.path.isfile(path)
+    return path.parent if is_file else path
 
 
 def _find_parameters(path: Path) -> Path | None:
@@ -88,6 +94,7 @@ def _find_parameters(path: Path) -> Path | None:
 
 def open_replica(path: Path) -> Iterator[Photographs]:
     """Open a scene of Replica; frames are numbered by their order."""
+    path = _find_replica_folder(path)
     file = _find_parameters(path)
     assert file is not None
     content = read_json(file, RGBD_ADVICE)

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from gscompleter.config.generators import GeneratorSettings
+from gscompleter.config.generators import GeneratorLine, GeneratorSettings
 from gscompleter.generators import Generator, as_generator
 
 # The third table, which an entry point finds in this module, too.
@@ -56,6 +56,7 @@ class GeneratorLoader:
     load: Callable[[Any, int, str], Any]
     """Called with settings, seed and device: a learned generator needs no true image."""
     settings: type[GeneratorSettings]
+    line: GeneratorLine
 
     def __call__(
         self, settings: Any, seed: int, photographs: Sequence[View], device: str
@@ -99,11 +100,55 @@ RECONSTRUCTORS: dict[str, Callable[[Path | None, str], Reconstructor]] = {
 } | {"mapanything": _load_map_anything, f"ffgs:{FFGS_VARIANT}": _load_ffgs}
 """Loaders of the learned reconstructors, called with the path of the weights and a device."""
 
+WARPED_INPUT = "the warped photographs and the mask of unseen pixels"
+WARPED_OUTPUT = "the warped photographs exactly; {} in the mask"
+
 GENERATORS = {
-    "pe-field": GeneratorLoader(_load_pe_field, PEFieldSettings),
-    "diffusers-inpaint": GeneratorLoader(_load_diffusers_inpaint, DiffusersInpaintSettings),
-    "flux2-klein": GeneratorLoader(_load_diffusers_inpaint, Flux2KleinSettings),
-    "migan": GeneratorLoader(_load_migan, FileSettings),
-    "lama": GeneratorLoader(_load_lama, FileSettings),
+    "pe-field": GeneratorLoader(
+        _load_pe_field,
+        PEFieldSettings,
+        GeneratorLine(
+            input="the nearest photograph, its depth, both cameras",
+            output="a newly painted image, colour-matched to the photographs",
+            needs="`pip install 'gscompleter[diffusion]'`, weights, in practice a GPU",
+        ),
+    ),
+    "diffusers-inpaint": GeneratorLoader(
+        _load_diffusers_inpaint,
+        DiffusersInpaintSettings,
+        GeneratorLine(
+            input=WARPED_INPUT,
+            output=WARPED_OUTPUT.format("the model's painting"),
+            needs="the same as `pe-field`, and `--generator-weights`",
+        ),
+    ),
+    "flux2-klein": GeneratorLoader(
+        _load_diffusers_inpaint,
+        Flux2KleinSettings,
+        GeneratorLine(
+            input="the warped photographs with the hole painted over, the nearest photograph, and "
+            "a prompt; no mask",
+            output=WARPED_OUTPUT.format("the model's image"),
+            needs="the same as `pe-field`; downloads 8 to 13 GB",
+        ),
+    ),
+    "migan": GeneratorLoader(
+        _load_migan,
+        FileSettings,
+        GeneratorLine(
+            input=WARPED_INPUT,
+            output=WARPED_OUTPUT.format("the network's filling"),
+            needs="`pip install 'gscompleter[onnx]'`, 28 MB of weights",
+        ),
+    ),
+    "lama": GeneratorLoader(
+        _load_lama,
+        FileSettings,
+        GeneratorLine(
+            input=WARPED_INPUT,
+            output=WARPED_OUTPUT.format("the network's filling"),
+            needs="`pip install 'gscompleter[onnx]'`, 208 MB of weights",
+        ),
+    ),
 }
 """Loaders of the learned generators, called with settings, seed, photographs and a device."""

@@ -37,7 +37,7 @@ from gscompleter.splats.ply import (
     read_ply_record,
 )
 from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, add_comments
-from gscompleter.splats.splat_format import PLY_MAGIC, SplatFormat
+from gscompleter.splats.splat_format import PLY_MAGIC, FormatTexts, SplatFormat
 from gscompleter.system.damage import DamagedError, check_rows
 from gscompleter.system.files.ply import make_header, read_header
 from gscompleter.system.files.writing import replace_file
@@ -237,6 +237,18 @@ def _make_header(gaussians: Gaussians, num_chunks: int, num_rest: int) -> bytes:
 COMPRESSED_PLY = SplatFormat(
     name="compressed-ply",
     endings=(".compressed.ply",),
+    texts=FormatTexts(
+        title="SuperSplat",
+        read="with and without bounds of colours and harmonics",
+        written="with both, along a Morton curve",
+        precision="position and log-scale 11, 10, 11 bits within 256 neighbours; rotation 10 bits "
+        "a component; colour and opacity 8 bits; harmonics in steps of 1/32 up to ±4",
+        places={
+            "read_record": "the comments of a .ply",
+            "marks_antialiased": "the comments of a .ply",
+            "list_names": "those of Gaussians",
+        },
+    ),
     read=read_compressed_ply,
     starts=(PLY_MAGIC,),
     recognize=lambda path, head: is_packed(head),

@@ -165,6 +165,17 @@ def is_other_kind(path: Path) -> bool:
     return not any(row.begins(path, head) for row in SPLAT_FORMATS.values())
 
 
+def is_named_splat(path: Path) -> bool:
+    """Check whether a path is a file that is named as a splat.
+
+    Photographs with cameras may be described by a file of such a name, as a .json or a .npz; then
+    its content decides.
+    """
+    if not os.path.isfile(path) or match_ending(path) is None:
+        return False
+    return not is_other_kind(path) or find_format(path) is None
+
+
 def refuse_foreign(path: Path, head: bytes) -> None:
     """Raise InputError for a file of a known kind that is no splat; `head` are its first bytes.
 

@@ -50,7 +50,7 @@ from gscompleter.splats.provenance import NOTHING_KNOWN, Provenance, parse_prove
 from gscompleter.splats.sog import SOG_FOLDER
 from gscompleter.splats.splat_format import HEAD_BYTES, SplatFormat
 from gscompleter.splats.table import SPLAT_FORMATS as SPLAT_FORMATS
-from gscompleter.splats.table import get_written_format, match_ending
+from gscompleter.splats.table import get_written_format, match_ending, name_endings
 from gscompleter.system.damage import describe_damage
 from gscompleter.system.errors import InputError, quote_value, refuse_pointer, require_path
 from gscompleter.system.files.output_file import check_free, reserve_file
@@ -267,9 +267,10 @@ def describe_rounding(path: Path, gaussians: Gaussians) -> str | None:
     if gaussians.origin is None or row.holds_origin:
         return None
     distance = measure_distance(arrange(gaussians, row), decode_splat(path))
+    holding = name_endings(lambda other: other.write and other.holds_origin)
     return (
         f"A {row.endings[0]} file cannot hold coordinates this large: the largest rounding of a "
-        f"position is {distance:.3g}; a .ply, .glb or .usdz holds them."
+        f"position is {distance:.3g}; write {holding}."
     )
 
 
@@ -292,8 +293,8 @@ def detect_splat_format(path: Path) -> str:
     named = match_ending(path)
     if named is None or named.starts:
         raise InputError(
-            f"{quote_value(path)} holds no Gaussians in a format that is known; name a .ply, "
-            ".spz, .splat, .ksplat or .glb (docs/formats.md has them all)."
+            f"{quote_value(path)} holds no Gaussians in a format that is known; name a splat, such "
+            "as a .ply (docs/formats.md has all formats)."
         )
     return named.name
 
@@ -320,11 +321,6 @@ def describe_other_name(path: Path) -> str | None:
     ending = next(e for e in named.endings if path.name.lower().endswith(e))
     plain = "a plain .ply" if found == PLY.name else f"a {SPLAT_FORMATS[found].endings[0]}"
     return f"It is named {ending}, and holds {plain}."
-
-
-def has_splat_extension(path: Path) -> bool:
-    """Check whether a name ends as that of a splat does."""
-    return match_ending(path) is not None
 
 
 @contextlib.contextmanager

@@ -32,7 +32,7 @@ from gscompleter.splats.packing import (
     with_labels,
 )
 from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
-from gscompleter.splats.splat_format import SplatFormat
+from gscompleter.splats.splat_format import FormatTexts, SplatFormat
 from gscompleter.splats.spz import decode_spz
 from gscompleter.splats.transform import (
     HALF_TURN_Z,
@@ -497,6 +497,21 @@ def _describe_scene(
 GLB = SplatFormat(
     name="glb",
     endings=(".glb",),
+    texts=FormatTexts(
+        title="KHR_gaussian_splatting",
+        read="float and fractional attributes, a .spz in their place "
+        "(`KHR_gaussian_splatting_compression_spz` and `…_spz_2`), nodes with rotation, uniform "
+        "scale and shift, `srgb_rec709_display`",
+        written="one node, all harmonics, linear `COLOR_0` for viewers that show points",
+        precision="bit for bit, rotations normalised",
+        axes="x left, y up, z forward",
+        places={
+            "holds_labels": "attribute `_GENERATED` of the primitive",
+            "read_record": "`asset.extras.provenance`",
+            "holds_origin": "the shift of a node",
+            "list_names": "those of Gaussians",
+        },
+    ),
     read=read_glb,
     starts=(GLB_MAGIC,),
     write=write_glb,

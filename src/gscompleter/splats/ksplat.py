@@ -22,7 +22,7 @@ from gscompleter.splats.packing import (
     assemble_sh,
     build_gaussians,
 )
-from gscompleter.splats.splat_format import SplatFormat
+from gscompleter.splats.splat_format import FormatTexts, SplatFormat
 from gscompleter.system.damage import DamagedError, check_rows
 from gscompleter.system.files.reading import read_bytes
 from gscompleter.types import Gaussians, merge
@@ -158,4 +158,9 @@ def _reorder_sh(rest: Float[ndarray, "n m"]) -> Float[ndarray, "n k 3"]:
     )
 
 
-KSPLAT = SplatFormat(name="ksplat", endings=(".ksplat",), read=read_ksplat)
+KSPLAT = SplatFormat(
+    name="ksplat",
+    endings=(".ksplat",),
+    texts=FormatTexts(read="compression 0, 1 and 2, SH degree 0 to 3", precision=""),
+    read=read_ksplat,
+)

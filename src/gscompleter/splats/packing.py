@@ -19,6 +19,8 @@ NUM_SH_REST = (0, 3, 8, 15)
 MAX_LOG_SCALE = 20.0
 """Largest absolute log-scale that packed formats write, as in other writers."""
 ZIP_MAGIC = b"PK\x03\x04"
+NUMBER_KINDS = "iuf"
+"""Kinds of NumPy's types that are numbers: whole ones with and without sign, and floats."""
 FREE_GAUSSIANS = 1 << 22
 """Gaussians that any file may hold, however small: they take about a gigabyte at most."""
 
@@ -99,23 +101,37 @@ def check_count(count: int, stored: int, what: str = "Gaussians") -> None:
 
 
 def build_gaussians(
-    means: Float[ndarray, "n 3"],
-    quats: Float[ndarray, "n 4"],
-    scales: Float[ndarray, "n 3"],
-    opacities: Float[ndarray, "n"],
-    sh: Float[ndarray, "n k 3"],
+    means: Shaped[ndarray, "..."],
+    quats: Shaped[ndarray, "..."],
+    scales: Shaped[ndarray, "..."],
+    opacities: Shaped[ndarray, "..."],
+    sh: Shaped[ndarray, "..."],
 ) -> Gaussians:
-    """Build observed Gaussians (`generated` is 0) from arrays, as float32."""
-    arrays = (means, quats, scales, opacities, sh)
-    dimensions = tuple(array.ndim for array in arrays)
-    if (
-        dimensions != (2, 2, 2, 1, 3)
-        or len({len(array) for array in arrays}) > 1
-        or sh.shape[1] - 1 not in NUM_SH_REST
-    ):
-        raise DamagedError("its Gaussians do not all have the same properties")
+    """Build observed Gaussians (`generated` is 0) from arrays of numbers, as float32.
+
+    Their shapes are [n, 3], [n, 4], [n, 3], [n] and [n, k, 3]. A reader may hand over arrays as a
+    file has them: others raise DamagedError.
+    """
+    arrays = {
+        "positions": means,
+        "rotations": quats,
+        "sizes": scales,
+        "opacities": opacities,
+        "colours": sh,
+    }
+    count = len(means) if means.ndim else 0
+    coefficients = sh.shape[1] if sh.ndim == 3 else 0
+    wanted = [(count, 3), (count, 4), (count, 3), (count,), (count, coefficients, 3)]
+    for (name, array), shape in zip(arrays.items(), wanted, strict=True):
+        if array.shape != shape or array.dtype.kind not in NUMBER_KINDS:
+            given, needed = (" × ".join(map(str, one)) or "1" for one in (array.shape, shape))
+            raise DamagedError(
+                f"its {name} are no {needed} numbers" + (f" but {given}" if given != needed else "")
+            )
+    if coefficients - 1 not in NUM_SH_REST:
+        raise DamagedError(f"its colours have {coefficients} coefficients, which no degree has")
     return make_observed(
-        *[torch.from_numpy(np.require(array, np.float32, ["C", "W"])) for array in arrays]
+        *[torch.from_numpy(np.require(array, np.float32, ["C", "W"])) for array in arrays.values()]
     )
 
 

@@ -41,7 +41,7 @@ from gscompleter.splats.provenance import (
     add_comments,
     parse_comments,
 )
-from gscompleter.splats.splat_format import PLY_MAGIC, SplatFormat
+from gscompleter.splats.splat_format import PLY_MAGIC, FormatTexts, SplatFormat
 from gscompleter.system.errors import InputError, quote_value, require_path
 from gscompleter.system.files.mapping import release_pages
 from gscompleter.system.files.ply import (
@@ -246,14 +246,23 @@ def _measure_scales(rows: ndarray) -> tuple[float, float, float]:
     """Measure the largest scale of Gaussians as it is stored: low, median and high quantile."""
     names = tuple(name for name in _SCALES if name in (rows.dtype.names or ()))
     largest = read_columns(sample_rows(rows), names).max(axis=1)
-    low, median, high = np.quantile(largest, (0.01, 0.5, 0.99))
+    # Between an infinite number and another there is none; who loads the file tells of them.
+    with np.errstate(invalid="ignore"):
+        low, median, high = np.quantile(largest, (0.01, 0.5, 0.99))
     return float(low), float(median), float(high)
 
 
 def _measure_extent(rows: ndarray) -> float:
-    """Measure the largest side of the box around nearly all Gaussians, in scene units."""
+    """Measure the largest side of the box around nearly all Gaussians, in scene units.
+
+    Those whose position is not finite do not count; without any other it is 0.
+    """
     means = read_columns(sample_rows(rows), MEANS)
-    return float(np.ptp(np.quantile(means, MIDDLE_QUANTILES, axis=0), axis=0).max())
+    means = means[np.isfinite(means).all(axis=1)]
+    if len(means) == 0:
+        return 0.0
+    with np.errstate(over="ignore", invalid="ignore"):  # numbers that only float64 would hold
+        return float(np.ptp(np.quantile(means, MIDDLE_QUANTILES, axis=0), axis=0).max())
 
 
 def find_plain_opacities(rows: ndarray, has_linear_scales: bool) -> bool:
@@ -293,7 +302,8 @@ def _describe_positions(scene: SceneFile) -> list[str]:
     rows = scene.rows
     if len(rows) == 0 or has_doubles(rows):
         return []
-    middle = np.median(read_columns(sample_rows(rows), MEANS), axis=0).astype(np.float64)
+    with np.errstate(invalid="ignore"):  # an infinite position of either sign
+        middle = np.median(read_columns(sample_rows(rows), MEANS), axis=0).astype(np.float64)
     size = _measure_scales(rows)[1]
     size = size if scene.has_linear_scales else math.exp(min(size, 80))
     if not is_too_far(middle, size):
@@ -780,6 +790,23 @@ def is_packed(head: bytes) -> bool:
 PLY = SplatFormat(
     name="ply",
     endings=(".ply",),
+    texts=FormatTexts(
+        title="3DGS",
+        read="any property order, type and byte order, ASCII, SH degree 0 to 3; vertices are the "
+        "first element",
+        written="binary little-endian",
+        precision="bit for bit",
+        axes="x right, y down, z forward",
+        places={
+            "holds_labels": "property `float generated`, the last one (`uchar` in earlier files)",
+            "read_record": "after it, one `comment gscompleter-provenance/1 {…}` for each run, in "
+            "JSON",
+            "holds_origin": "positions of `double`",
+            "marks_antialiased": "`SplatRenderMode: mip`, `antialiased 1` or "
+            "`postshot.anti_aliasing=1` in a comment",
+            "list_names": "yes",
+        },
+    ),
     read=load_ply,
     starts=(PLY_MAGIC,),
     recognize=lambda path, head: not is_packed(head),

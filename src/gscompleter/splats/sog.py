@@ -41,7 +41,7 @@ from gscompleter.splats.packing import (
 )
 from gscompleter.splats.ply import encode
 from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
-from gscompleter.splats.splat_format import SplatFormat, list_zip
+from gscompleter.splats.splat_format import FormatTexts, SplatFormat, list_zip
 from gscompleter.system.damage import DamagedError
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.reading import read_bytes, read_zip_entry
@@ -391,9 +391,24 @@ def refuse_pngs_of_gsplat(folder: Path) -> None:
         )
 
 
+SOG_TEXTS = FormatTexts(
+    title="PlayCanvas",
+    read="versions 1 and 2, bundle, folder or `meta.json`",
+    written="bundle of version 2, along a Morton curve",
+    precision="position 16 bits on a logarithmic scale; rotation 8 bits a component; opacity 8 "
+    "bits; log-scales, colours and harmonics from codebooks of 256 numbers; harmonics of four "
+    "Gaussians share a row of a palette (of more from 262,144 on, of one up to 4,096)",
+    places={
+        "holds_labels": "image `generated.webp`, which `generated.files` in `meta.json` names",
+        "read_record": "`provenance` in `meta.json`",
+        "marks_antialiased": '`"model": "antialiased"` or `"antialias": true`',
+        "list_names": "those of Gaussians",
+    },
+)
 SOG = SplatFormat(
     name="sog",
     endings=(".sog",),
+    texts=SOG_TEXTS,
     read=read_sog,
     starts=(ZIP_MAGIC,),
     recognize=is_bundle,
@@ -409,6 +424,7 @@ SOG = SplatFormat(
 SOG_FOLDER = SplatFormat(
     name="sog-folder",
     endings=(META,),
+    texts=SOG_TEXTS,
     read=read_sog,
     starts=(b"{",),
     recognize=is_meta,

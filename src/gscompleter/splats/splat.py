@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from gscompleter.splats.packing import assemble_sh, build_gaussians
-from gscompleter.splats.splat_format import SplatFormat
+from gscompleter.splats.splat_format import FormatTexts, SplatFormat
 from gscompleter.system.damage import DamagedError
 from gscompleter.system.files.reading import read_bytes
 from gscompleter.system.files.writing import replace_file
@@ -53,6 +53,7 @@ def write_splat(path: Path, gaussians: Gaussians) -> None:
 SPLAT = SplatFormat(
     name="splat",
     endings=(".splat",),
+    texts=FormatTexts(precision="8 bits of colour, opacity and rotation; no harmonics"),
     read=read_splat_rows,
     write=write_splat,
     holds_harmonics=False,

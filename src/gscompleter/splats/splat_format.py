@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from gscompleter.system.files.reading import ZIP_ERRORS
@@ -16,11 +16,29 @@ HEAD_BYTES = 8192
 """Bytes read to detect a format; the header of a compressed .ply fits."""
 
 
+@dataclass(frozen=True, kw_only=True)
+class FormatTexts:
+    """What the tables of the documentation say of a format; rows that share them share a line."""
+
+    title: str = ""
+    """Whose format it is, in brackets after its endings."""
+    read: str = "yes"
+    """What is read of all that there is."""
+    written: str = ""
+    """What is written; empty for "yes", or "no" without a writer."""
+    precision: str
+    """How far a file keeps numbers; empty if it is never written."""
+    axes: str = "as the .ply"
+    places: Mapping[str, str] = field(default_factory=dict)
+    """How a file holds what fields of the row say that it holds, by their names, where "yes" says
+    too little."""
+
+
 @dataclass(frozen=True)
 class SplatFormat:
     """All that is known of a file format of Gaussians.
 
-    A format is a file of this package that ends with its row, and a line in `table.py`. Readers
+    A format is a file of this package that ends with its row, and an import in `table.py`. Readers
     return, and writers get, Gaussians in the axes of a 3DGS .ply, on the CPU.
     """
 
@@ -29,6 +47,7 @@ class SplatFormat:
     """Ends of names of its files. It is written to such a name; the first is said in sentences.
     A file that is named in the place of photographs counts as a splat by its ending alone, and so
     do names in a .zip that is no splat; of files in a folder, the content decides as well."""
+    texts: FormatTexts
     read: Callable[..., Gaussians]
     """Takes a path. Damage may be raised as any error of a decoder, best as `DamagedError`."""
     starts: tuple[bytes, ...] = ()
@@ -46,7 +65,8 @@ class SplatFormat:
     """Lists properties of a file that are not read, named as in a .ply; None for a format that can
     hold no others."""
     holds_labels: bool = False
-    """True if a file holds the labels of generated Gaussians, which otherwise lie beside it."""
+    """True if a file holds the labels of generated Gaussians, which otherwise lie beside it; the
+    record has its own field, `read_record`."""
     holds_origin: bool = False
     """True if a file holds the origin of Gaussians in float64; others get absolute positions."""
     holds_harmonics: bool = True

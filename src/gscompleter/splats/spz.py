@@ -36,7 +36,7 @@ from gscompleter.splats.packing import (
     unpack_fractions,
 )
 from gscompleter.splats.ply import encode
-from gscompleter.splats.splat_format import SplatFormat
+from gscompleter.splats.splat_format import FormatTexts, SplatFormat
 from gscompleter.splats.transform import HALF_TURN_X, rotate_half_turn
 from gscompleter.system.damage import DamagedError, check_rows
 from gscompleter.system.errors import InputError, quote_value
@@ -326,6 +326,16 @@ def is_spz(path: Path, head: bytes) -> bool:
 SPZ = SplatFormat(
     name="spz",
     endings=(".spz",),
+    texts=FormatTexts(
+        title="Niantic",
+        read="versions 2, 3 and 4; 2 and 3 also unpacked",
+        written="version 3",
+        precision="position in steps of 2⁻¹⁶, coarser for far Gaussians; log-scale in steps of "
+        "1/16 from -10 to 5.9; rotation 9 bits a component; colour and opacity 8 bits; harmonics "
+        "in steps of 1/128 up to ±1",
+        axes="x right, y up, z back",
+        places={"marks_antialiased": "a flag", "list_names": "extensions"},
+    ),
     read=read_spz,
     starts=(SPZ_MAGIC, GZIP),
     recognize=is_spz,

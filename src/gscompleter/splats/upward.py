@@ -23,7 +23,7 @@ _AXIS_LINE = re.compile(
 def read_upward(path: Path) -> Direction | None:
     """Read what is up in a file of Gaussians, in the axes of a 3DGS .ply; None if it does not say.
 
-    A .ply may say it in a comment; .spz, .glb and OpenUSD define it.
+    A .ply may say it in a comment; some formats define it.
     """
     row = SPLAT_FORMATS[detect_splat_format(path)]
     if row.is_y_up:

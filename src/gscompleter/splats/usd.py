@@ -33,7 +33,7 @@ from gscompleter.splats.packing import (
     with_labels,
 )
 from gscompleter.splats.provenance import KEY, NOTHING_KNOWN, Provenance
-from gscompleter.splats.splat_format import SplatFormat, list_zip
+from gscompleter.splats.splat_format import FormatTexts, SplatFormat, list_zip
 from gscompleter.splats.transform import (
     HALF_TURN_X,
     merge_placed,
@@ -310,6 +310,20 @@ def is_usdz(path: Path, head: bytes) -> bool:
 USDZ = SplatFormat(
     name="usdz",
     endings=(".usdz",),
+    texts=FormatTexts(
+        title="OpenUSD",
+        read="all prims `ParticleField3DGaussianSplat`, of single or half precision, with "
+        "rotation, uniform scale and shift, `upAxis` Y or Z; the first of animated values",
+        written="a prim `ParticleField3DGaussianSplat`, `upAxis` Y, one metre per unit, "
+        "`srgb_rec709_display`",
+        precision="bit for bit, rotations normalised",
+        axes="x right, y up, z back",
+        places={
+            "holds_labels": "attribute `uchar[] generated` of the prim",
+            "read_record": "`customLayerData`, `provenance`: a string of JSON",
+            "holds_origin": "the shift of a node",
+        },
+    ),
     read=read_usd,
     starts=(ZIP_MAGIC,),
     recognize=is_usdz,

@@ -231,15 +231,12 @@ def has_splat_alone(options: CompletingOptions) -> bool:
 
 def names_splat(path: Path) -> bool:
     """Check whether a path is a file named as one of Gaussians, or a folder of nothing else."""
-    if os.path.isdir(path):
-        from gscompleter.splats.foreign import holds_splat_alone
-
-        return holds_splat_alone(path)
-    if not os.path.isfile(path):
+    # Without an import of torch where there is nothing to look into.
+    if not os.path.exists(path):
         return False
-    from gscompleter.splats.formats import has_splat_extension
+    from gscompleter.splats.foreign import holds_splat_alone, is_named_splat
 
-    return has_splat_extension(path)
+    return holds_splat_alone(path) if os.path.isdir(path) else is_named_splat(path)
 
 
 def check_splat_named(options: CompletingOptions, what: str) -> None:

@@ -49,7 +49,7 @@ from gscompleter.apps.requests.completion import (
     get_completion,
 )
 from gscompleter.completer import check_target_ids
-from gscompleter.config.generators import PaintedSettings
+from gscompleter.config.generators import PaintedSettings, makes_any_image
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.scene import describe_camera, write_cameras
 from gscompleter.editing.removal import restore_surroundings
@@ -407,20 +407,13 @@ def complete_targets(ready: Prepared) -> tuple[Completion, Prepared]:
         cameras = list(ready.cameras.values())
         completion, choices = ready.explorer.explore(ready.begin(), cameras, ready.max_targets)
         ready = ready.with_choices(choices)
-    if not fills_anywhere(ready):
+    # A painter and the oracle have images of the named targets alone.
+    if not makes_any_image(ready.work.models.generator):
         return completion, ready
     reopened = find_reopened(ready, completion)
     for target in track(reopened, "target of an earlier command"):
         completion = ready.completer.advance(completion, target.camera)
     return completion, ready.with_targets((*ready.task.targets, *reopened))
-
-
-def fills_anywhere(ready: Prepared) -> bool:
-    """Return True if Φ makes an image for any camera.
-
-    A painter and the oracle have images of the named targets alone.
-    """
-    return ready.work.models.generator not in ("painted", "oracle")
 
 
 def check_target_count(ready: Prepared) -> None:

@@ -33,8 +33,7 @@ from gscompleter.data.sfm.poses import find_poses, has_photographs, list_all_pho
 from gscompleter.data.unused_files import list_unused
 from gscompleter.data.video import is_video
 from gscompleter.splats.alignment.training_size import find_training_size
-from gscompleter.splats.foreign import holds_splat_alone
-from gscompleter.splats.formats import has_splat_extension
+from gscompleter.splats.foreign import holds_splat_alone, is_named_splat
 from gscompleter.system.errors import InputError, quote_value
 from gscompleter.system.files.output_folder import FOUND_POSES_FOLDER, refuse_link
 from gscompleter.system.files.result_names import SUMMARY_FILE
@@ -77,7 +76,7 @@ def open_scene(
 
 def refuse_splat_as_photographs(folder: Path) -> None:
     """Raise InputError for a file or folder of Gaussians where photographs are wanted."""
-    is_file = os.path.isfile(folder) and has_splat_extension(folder)
+    is_file = is_named_splat(folder)
     if is_file or (os.path.isdir(folder) and holds_splat_alone(folder)):
         kind = "file" if is_file else "folder"
         raise InputError(
