@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
+import numpy as np
 import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
@@ -122,9 +123,12 @@ class Splatter:
         sky_images = blend_skies(views, skies)
         normalized = []
         for view, gain, sky, image in zip(views, gains.to(device), skies, sky_images, strict=True):
-            of_surfaces = view.normalize_exposure(gain)
-            image = image.where(sky[..., None], of_surfaces.image)
-            normalized.append(replace(of_surfaces, image=image))
+            view = view.normalize_exposure(gain)
+            if image is not None:
+                view = replace(view, image=image.where(sky[..., None], view.image))
+            normalized.append(view)
+        if all(image is None for image in sky_images):
+            skies = []
 
         if masks is not None and not any(bool(mask.any()) for mask in masks):
             empty = self.splat(normalized[0], depths[0])[:0]
@@ -230,12 +234,15 @@ class Splatter:
             ((render.alpha < CLOSED_ALPHA) & view.valid_mask).cpu().numpy()
             for render, view in zip(renders, fitted_views, strict=True)
         ]
-        occluders = [
-            find_occluders(render.image, view)
-            for render, view in zip(renders, fitted_views, strict=True)
-        ]
-        no_surfaces = [sky.cpu().numpy() for sky in skies]
-        moved = leave_free_space(layers, open_pixels, occluders, no_surfaces, transforms)
+        occluders = [np.zeros(layer.inverse.shape, np.int32) for layer in layers]
+        not_surface = [label > 0 for label in occluders]
+        if skies:
+            occluders = [
+                find_occluders(render.image, view)
+                for render, view in zip(renders, fitted_views, strict=True)
+            ]
+            not_surface = [sky.cpu().numpy() for sky in skies]
+        moved = leave_free_space(layers, open_pixels, occluders, not_surface, transforms)
         if all(after is before for after, before in zip(moved, layers, strict=True)):
             return candidates, kept, depths
         depths = [
@@ -310,12 +317,14 @@ class Splatter:
     ) -> Gaussians:
         """Fit the surfaces to three views or more, before the sky that each of them shows.
 
+        `skies` mark it, and are empty if no view shows any.
         Place, size, direction, opacity and colour are fitted together (decision 031), to views
         whose colours are `gains` times those of the scene. The sky stays as it is: what one
         photograph shows white and another one blue would pull at the surfaces before it.
         """
+        # Without a sky nothing is selected, for which the host would wait for a GPU.
         in_sky = find_sky_gaussians(scene, views[0].camera)
-        surfaces = scene[~in_sky]
+        surfaces = scene[~in_sky] if skies else scene
         # A part of a scene may be nothing but sky.
         if not len(surfaces):
             return scene
@@ -327,6 +336,8 @@ class Splatter:
         emphasis = replace(emphasis, check_views=checks)
         backdrops = [sky.to(self.fit_device) for sky in skies]
         fitted = fit_jointly(surfaces, photographs, gains, self.renderer, emphasis, backdrops)
+        if not skies:
+            return fitted
         # In the order of the scene again.
         rows = torch.cat([torch.nonzero(~in_sky), torch.nonzero(in_sky)])[:, 0]
         return merge([fitted, scene[in_sky]])[rows.argsort()]
@@ -342,13 +353,13 @@ class Splatter:
         self,
         views: Sequence[View],
         skies: Sequence[Bool[Tensor, "_ _"]],
-        sky_images: Sequence[Float[Tensor, "_ _ 3"]],
+        sky_images: Sequence[Float[Tensor, "_ _ 3"] | None],
     ) -> list[tuple[int, Gaussians, Int[Tensor, "n"]]]:
         """List view number, Gaussians and pixels of the sky behind each view's objects."""
         extended = []
-        for number, (view, sky, image) in enumerate(zip(views, skies, sky_images, strict=True)):
-            if sky.any():
-                gaussians, pixels = extend_sky(view, sky, image, self.disc_sigma)
+        for number, image in enumerate(sky_images):
+            if image is not None:
+                gaussians, pixels = extend_sky(views[number], skies[number], image, self.disc_sigma)
                 extended.append((number, gaussians, pixels))
         return extended
 

@@ -31,29 +31,31 @@ stay as their photograph shows them."""
 
 def blend_skies(
     views: Sequence[View], skies: Sequence[Bool[Tensor, "_ _"]]
-) -> list[Float[Tensor, "_ _ 3"]]:
+) -> list[Float[Tensor, "_ _ 3"] | None]:
     """Compute the colour of the sky in the direction of each pixel of each view.
 
-    `skies` mark the sky of each view. There a view keeps its own detail, in the mean tone of all
+    A view without a sky has none. `skies` mark the sky of each view. There a view keeps its own detail, in the mean tone of all
     that show the direction. Behind its surfaces it gets what others show, or else a continuation.
-    The image of a view without a sky is returned as it is. Of one or two views each keeps its own
-    colours, as on surfaces (decision 043).
+    Of one or two views each keeps its own colours, as on surfaces (decision 043).
     """
-    weights = [weigh_sky(sky) for sky in skies]
-    blended = []
-    for number, (view, sky) in enumerate(zip(views, skies, strict=True)):
-        if not sky.any():
-            blended.append(view.image)
-            continue
+    # The host waits for a GPU once and not for each view.
+    has_sky = torch.stack([sky.any() for sky in skies]).tolist()
+    numbers = [number for number, has in enumerate(has_sky) if has]
+    weights = {number: weigh_sky(skies[number]) for number in numbers}
+    blended: list[Tensor | None] = [None] * len(views)
+    for number in numbers:
+        view = views[number]
+        sky = skies[number]
         # Exposures are not normalized: a sky that is clipped to white would become grey.
         points = view.camera.center + compute_sky_depth(view.camera) * view.camera.z_rays()
         total = weights[number]
         colors = total[..., None] * view.image
-        for other, (shown, weight) in enumerate(zip(views, weights, strict=True)):
-            if other == number or len(views) <= 2 or not weight.any():
-                continue
+        others = [other for other in numbers if other != number and len(views) > 2]
+        for other in others:
+            shown = views[other]
             pixels, z = project(points, shown.camera)
-            sampled = sample(torch.cat([shown.image, weight[..., None]], dim=-1), pixels)
+            layers = torch.cat([shown.image, weights[other][..., None]], dim=-1)
+            sampled = sample(layers, pixels)
             counted = sampled[..., 3] * is_inside(pixels, z, shown.camera)
             colors = colors + counted[..., None] * sampled[..., :3]
             total = total + counted
@@ -62,7 +64,7 @@ def blend_skies(
         tone = smooth_masked((mean - view.image).where(sky[..., None], 0.0), sky, radius)
         image = (view.image + tone).clamp(0, 1).where(sky[..., None], mean)
         is_shown = sky | (total > MIN_SKY_WEIGHT)
-        blended.append(push_pull(image, is_shown.to(image.dtype)))
+        blended[number] = push_pull(image, is_shown.to(image.dtype))
     return blended
 
 
