@@ -34,9 +34,10 @@ class Photo:
     """A photograph of the scene with its error budgets."""
 
     view: View
-    """With the depth range of the scene, in the exposure of the context."""
+    """With the depth range of the scene. Photographs that Ψ made the scene of have its exposure;
+    those of a given scene keep their own."""
     budgets: tuple[ErrorBudget, ...] = ()
-    """Largest errors that additions may cause; none if no guard sets them."""
+    """Largest errors that it may have with additions; none if no guard sets them."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -64,7 +65,8 @@ class Completion(Displayed):
     """Further cameras whose free space stays empty, such as the witnesses of a splat; they need no
     photographs."""
     seconds: Mapping[str, float] = field(default_factory=dict)
-    """Wall time of context, generate, lift, register, integrate and total."""
+    """Wall time of context, generate, lift, register, integrate and total, and of explore where
+    targets were searched for."""
     exposure_gains: Float[Tensor, "v 3"] | None = None
     """Exposure gain of each original photograph relative to `views`, or None if not estimated."""
     num_new_photos: int = 0
@@ -187,7 +189,10 @@ class Completion(Displayed):
 
     @property
     def num_observed(self) -> int:
-        """Number of added Gaussians that photographs show and the given scene lacked."""
+        """Number of added Gaussians that photographs show.
+
+        The given scene lacked them, or they were made anew.
+        """
         return self.count_added("photographs")
 
     @property

@@ -43,7 +43,8 @@ class InitialContext:
 
     source: ContextScene
     views: tuple[View, ...]
-    """Context photographs, then those that check a given scene, in the exposure of the context."""
+    """Context photographs, then those that check a given scene. Those that Ψ made the scene of have
+    its exposure; those of a given scene keep their own."""
     exposure_gains: Float[Tensor, "v 3"] | None = None
     """Exposure gain per channel of each original photograph relative to the context, or None."""
     notes: tuple[str, ...] = ()

@@ -86,10 +86,10 @@ def describe_end(session: Session, journal: Journal) -> list[str]:
     out = quote_value(journal.folder)
     if not journal.has_begun:
         return [f"Not saved: {out} has neither the steps nor a result."]
-    # Where all steps are undone, nothing is left to be saved: this alone is no result.
     has_steps = journal.has_steps(session)
     steps = "has the steps, and" if has_steps else "lacks what was done last, and has"
     state = f"Not saved: {out} {steps} no result."
+    # Where all steps are undone, nothing is left to be saved: this alone is no result.
     if journal.has_saved:
         state = f"Not saved: {out} {steps} the result of an earlier Save."
         if journal.is_saved(session):
@@ -119,7 +119,7 @@ def build_page(
             view.camera.on_cpu,
             shrink_image(Image.fromarray(convert_to_pixels(view.image))),
         )
-        # A removal paints photographs over where it was; they are shown as they were taken.
+        # A removal paints over its place in photographs; they are shown without that.
         for view in first.views
     ]
     # The page itself has the same states before and after; the difference changes the latter.

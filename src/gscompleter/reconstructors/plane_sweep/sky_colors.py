@@ -34,8 +34,9 @@ def blend_skies(
 ) -> list[Float[Tensor, "_ _ 3"] | None]:
     """Compute the colour of the sky in the direction of each pixel of each view.
 
-    A view without a sky has none. `skies` mark the sky of each view. There a view keeps its own detail, in the mean tone of all
-    that show the direction. Behind its surfaces it gets what others show, or else a continuation.
+    A view without a sky has none. `skies` mark the sky of each view. There a view keeps its own
+    detail, in the mean tone of all that show the direction. Behind its surfaces it gets what others
+    show, or else a continuation.
     Of one or two views each keeps its own colours, as on surfaces (decision 043).
     """
     # The host waits for a GPU once and not for each view.

@@ -29,7 +29,8 @@ MIN_PSNR = 30.0
 """PSNR in dB of a match whatever its margin, if half of the photograph is covered: a flat one has
 no margin."""
 MAX_DRIFT = 0.25
-"""Largest displacement of an exact alignment, in pixels; a scale error of 0.5 % causes 0.5."""
+"""Largest displacement of an exact alignment, in pixels of the small images that are compared
+(`SAMPLE_SIDE`); a scale error of 0.5 % causes 0.5."""
 MIN_TRACKED_CORNERS = 15
 """Fewest tracked corners for a valid median."""
 MAX_CORNERS = 200
@@ -176,7 +177,7 @@ def measure_drift(
 def track_corners(
     before: GreyBytes, after: GreyBytes, corners: FlowCorners
 ) -> tuple[FlowCorners, Bool[np.ndarray, "n"]]:
-    """Track corners by up to about 50 px to another image, and mark those that were found."""
+    """Track corners by about 50 px at least to another image, and mark those that were found."""
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
         before, after, corners, np.zeros_like(corners), winSize=(15, 15), maxLevel=3
     )
