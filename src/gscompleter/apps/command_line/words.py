@@ -42,12 +42,11 @@ MAX_NAMED_COMMANDS = 3
 
 NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?", re.IGNORECASE)
 """A word that is meant as a number, of whatever range."""
-NEAREST_WORD = "the nearest is"
 SURPLUS = "Unrecognized options: "
 """Beginning of tyro's message on words that nothing takes."""
 OPTION_AMONG = re.compile(r"(^|, )-")
 """Option in the list of these words."""
-HINTS = {"Argument helptext:": "give", "Perhaps you meant:": NEAREST_WORD}
+HINTS = {"Argument helptext:": "give", "Perhaps you meant:": "the nearest is"}
 """Titles in tyro's messages before the option that is meant, and words for it in a sentence."""
 PLAIN_TERMINAL = {"COLUMNS": "1000000", "TERM": "dumb"}
 """Environment in which tyro breaks no line of an error, and colours none."""
@@ -170,7 +169,7 @@ def explain_words(words: Sequence[str], kinds: Mapping[str, type], box: str) -> 
     sentence = (
         describe_foreign_option(words, own, kinds)
         or explain_values(words, own, "\n".join(list_box_lines(box)))
-        or extract_sentence(box, own)
+        or extract_sentence(box)
     )
     # tyro calls all words options that nothing takes, also where none of them is one.
     surplus = sentence.removeprefix(SURPLUS)
@@ -299,11 +298,8 @@ def list_box_lines(box: str) -> list[str]:
     return [line[2:].rstrip("│ ") for line in box.splitlines()[1:]]
 
 
-def extract_sentence(box: str, own: Collection[str]) -> str:
-    """Extract the sentence from tyro's boxed error message, with the option that is meant.
-
-    tyro also suggests options of other commands; only those of this one (`own`) are named.
-    """
+def extract_sentence(box: str) -> str:
+    """Extract the sentence from tyro's boxed error message, with the option that is meant."""
     lines = list_box_lines(box)
 
     # The message is the first paragraph, up to an empty line or a rule. It may list arguments. The
@@ -322,8 +318,5 @@ def extract_sentence(box: str, own: Collection[str]) -> str:
     hint = ""
     for title, words in HINTS.items():
         if title in lines:
-            option = lines[lines.index(title) + 1].strip()
-            name = option.partition(" ")[0].removeprefix("--")
-            if words != NEAREST_WORD or name in own:
-                hint = f"; {words} {option}"
+            hint = f"; {words} {lines[lines.index(title) + 1].strip()}"
     return f"{quote_value(sentence, 200).removesuffix('.')}{hint}"
