@@ -76,8 +76,8 @@ class Completion(Displayed):
     is_remade: bool = False
     """True if Ψ made the given scene anew, which may have another exposure since."""
     seed: int = 0
-    """Seed of the completer: of RANSAC's samples, and of the cameras that measure coverage. Φ has its
-    own."""
+    """Seed of the completer: of RANSAC's samples, and of the cameras that measure coverage. Φ has
+    its own."""
     context_notes: tuple[str, ...] = ()
     """Sentences of Ψ about the context."""
     geometry: GivenGeometry | None = None

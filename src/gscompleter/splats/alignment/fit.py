@@ -177,7 +177,7 @@ def measure_drift(
 def track_corners(
     before: GreyBytes, after: GreyBytes, corners: FlowCorners
 ) -> tuple[FlowCorners, Bool[np.ndarray, "n"]]:
-    """Track corners that move by up to about 50 px to another image, and mark those that were found."""
+    """Track corners, up to about 50 px far, to another image, and mark those that were found."""
     moved, status, _ = cv2.calcOpticalFlowPyrLK(
         before, after, corners, np.zeros_like(corners), winSize=(15, 15), maxLevel=3
     )
