@@ -227,7 +227,12 @@ def test_sentences_name_the_formats_of_the_table(tmp_path):
     far = replace(plausible(30, 0), origin=(500_000.0, 4_000_000.0, 0.0))
     save_splat(tmp_path / "a.splat", far)
     (loss,) = describe_losses(tmp_path / "a.splat", far)
-    assert loss.endswith("; write .ply, .glb, .usdc or .usdz.")
+    listed = re.findall(r"\.\w+", loss.rpartition("; write ")[2].removesuffix("."))
+    rows = [row for row in SPLAT_FORMATS.values() if row.holds_origin and row.write]
+    holding = [ending for row in rows for ending in row.endings]
+    assert set(listed) <= set(holding)
+    assert {".ply", ".glb", ".usdz"} <= set(listed)
+    assert ".splat" not in listed
 
 
 ARRAYS = {
