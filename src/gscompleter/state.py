@@ -246,7 +246,7 @@ class Completion(Displayed):
 
     @cached_property
     def kept_context(self) -> Gaussians:
-        """The recoloured context without removed Gaussians."""
+        """The recoloured context without Gaussians that are gone."""
         gone = self.source.gone_mask
         return self.recolored_context[~gone] if gone.any() else self.recolored_context
 
