@@ -15,9 +15,11 @@ from functools import partial
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from gscompleter.numerics.image_ops import label_regions
 from gscompleter.numerics.kernels import stereo
 from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.reconstructors.plane_sweep.fusion import DepthLayer
@@ -92,9 +94,9 @@ def find_occluders(shown: Float[Tensor, "h w 3"], view: View) -> Labels:
     """
     error = (shown.clamp(0, 1) - view.image).cpu().numpy()
     smooth = cv2.blur(error, (WINDOW_SIDE, WINDOW_SIDE))
-    is_other = (np.abs(smooth).mean(axis=-1) > MAX_COLOR_ERROR) & view.valid_mask.cpu().numpy()
-    _, labels, stats, _ = cv2.connectedComponentsWithStats(is_other.astype(np.uint8))
-    large = np.flatnonzero(stats[:, cv2.CC_STAT_AREA] >= MIN_OCCLUDER * is_other.size)
+    is_other = torch.from_numpy(np.abs(smooth).mean(axis=-1) > MAX_COLOR_ERROR)
+    labels = label_regions(is_other & view.valid_mask.cpu())[0].numpy()
+    large = np.flatnonzero(np.bincount(labels.ravel()) >= MIN_OCCLUDER * labels.size)
     at_border = np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]])
     return np.where(np.isin(labels, np.intersect1d(large, at_border)), labels, 0)
 
