@@ -70,7 +70,7 @@ MOST = {
     "complete": (3240, 1_967_000),
     "complete, alone": (1320, 6_500_000),
     "complete, mask": (2070, 6_000_000),
-    "complete, painted": (1165, 1_550_000),
+    "complete, painted": (1350, 1_550_000),
     "update": (1190, 1_230_000),
     "repair": (2040, 2_250_000),
     "remove, mask": (1800, 1_900_000),
@@ -79,8 +79,8 @@ MOST = {
     "clean, alone": (56, 1_250_000),
     "live, repair": (2280, 2_670_000),
     "live, remove, complete": (3290, 10_400_000),
-    "batch": (740, 2_120_000),
-    "evaluate": (800, 2_110_000),
+    "batch": (830, 2_120_000),
+    "evaluate": (920, 2_110_000),
 }
 """Most waits of the host for the device in a command, and most bytes that it holds at once.
 

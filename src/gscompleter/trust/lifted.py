@@ -82,6 +82,7 @@ def find_pixel_center(scene: Gaussians) -> Float[Tensor, "3"] | None:
     if len(opaque) < MIN_DECIDING:
         return None
     chosen = opaque[torch.randperm(len(opaque), generator=generator)[:MAX_SAMPLES]]
+    chosen = chosen.to(scene.means.device)
     means = scene.means.detach()[chosen].cpu()
     # The middle one of the three scales: the largest also tells how a surface is inclined.
     sizes = scene.scales.detach()[chosen].cpu().sort(dim=1).values[:, 1].clamp_min(1e-30).log()
