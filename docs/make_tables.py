@@ -203,7 +203,7 @@ HOLDINGS = {
     "marks_antialiased": "antialiased mark",
     "list_names": "further properties are found",
 }
-"""What formats can hold, by the fields of their rows."""
+"""Titles of what formats can hold, by the fields of their rows."""
 
 
 def list_format_lines() -> dict[str, SplatFormat]:

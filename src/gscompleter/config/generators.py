@@ -29,14 +29,14 @@ class GeneratorSettings(Settings):
 
 @dataclass(frozen=True, kw_only=True)
 class GeneratorLine:
-    """What the table of `docs/generators.md` says of a generator."""
+    """Texts of a generator in the table of `docs/generators.md`."""
 
     input: str
-    """What it makes its image of."""
+    """Input of the image, such as photographs."""
     output: str
-    """What the image shows, in the hole and beside it."""
+    """Content of the image, in the hole and beside it."""
     needs: str = "nothing"
-    """What has to be installed, fetched or given."""
+    """Packages, weights and files that have to be at hand."""
 
 
 @dataclass(frozen=True, kw_only=True)

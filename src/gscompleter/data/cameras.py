@@ -33,7 +33,7 @@ PANORAMA_ADVICE = (
     "split the panoramas into perspective images with cameras, or name the folder of the panoramas "
     "alone, and cameras are found anew"
 )
-"""What to do about that model: no program undistorts a panorama into one image."""
+"""Advice on that model: no program undistorts a panorama into one image."""
 
 FLOAT_NOISE = 1e-6
 """Largest deviation from a rotation that is kept as it is."""

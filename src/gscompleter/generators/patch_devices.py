@@ -18,7 +18,7 @@ from gscompleter.generators.patch_rounds import (
     run_with_tensors,
 )
 from gscompleter.numerics.tensor_patchmatch import PATCHES_BYTES
-from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.devices import make_for_device
 
 MIN_DEVICE_PATCHES = 2**15
 """Patches from which a level is searched on a GPU. A round has some 700 launches for any number of
@@ -72,14 +72,7 @@ PATCH_DEVICES: dict[str, Callable[[str], PatchDevice]] = {
 
 def get_patch_device(name: str) -> PatchDevice:
     """Return the choice for a device such as `cuda` or `cuda:1`; InputError for an unknown one."""
-    kind = name.partition(":")[0]
-    if kind not in PATCH_DEVICES:
-        raise InputError(
-            f"There is no device '{quote_value(name)}' for warp-inpaint; choose one of "
-            f"{', '.join(PATCH_DEVICES)}.",
-            "device",
-        )
-    return PATCH_DEVICES[kind](name)
+    return make_for_device(PATCH_DEVICES, name, "warp-inpaint")
 
 
 def estimate_patch_bytes(photographs: Sequence[tuple[int, int]], target: tuple[int, int]) -> int:

@@ -50,7 +50,7 @@ class PatchRounds:
     matches: Int64[ndarray, "q 3"]
     """Source, row and column of the first match of each query; each is usable."""
     is_refined: bool
-    """Whether a coarser level found the matches, so that they vote before the first search."""
+    """True if a coarser level found the matches, so that they vote before the first search."""
     reach: int
     """Radius of the random search at its start, in pixels."""
     num_rounds: int

@@ -35,7 +35,7 @@ MAP_BORDER = 4
 RANDOM_TRIALS = range(8, 24)
 """Numbers of the random trials. One whose number three divides draws the source, too."""
 HASH_STEP = 0x9E3779B97F4A7C15
-"""What a state of the random numbers grows by before it is hashed."""
+"""Increment of a state of the random numbers before it is hashed."""
 HASH_FACTORS = (0xBF58476D1CE4E5B9, 0x94D049BB133111EB)
 """Factors of the hash."""
 
@@ -171,7 +171,8 @@ def view_patches(
     """
     rows, columns, channels = image.shape
     places = (rows - PATCHMATCH_SIDE + 1) * columns - PATCHMATCH_SIDE + 1
-    across, down = channels, columns * channels
+    across = channels
+    down = columns * channels
     return image.as_strided(
         (places, PATCHMATCH_SIDE, PATCHMATCH_SIDE, channels), (across, down, across, 1)
     )

@@ -20,7 +20,7 @@ from gscompleter.reconstructors.plane_sweep.matching import (
     search_with_tensors,
 )
 from gscompleter.reconstructors.plane_sweep.surfaces import FitHeights
-from gscompleter.system.errors import InputError, quote_value
+from gscompleter.system.devices import make_for_device
 
 MIN_DEVICE_PIXELS = 2**17
 """Pixels from which a level of the surfaces is fitted on a GPU. A coarser level has twice as many
@@ -78,11 +78,4 @@ DEPTH_DEVICES: dict[str, Callable[[str], DepthDevice]] = {
 
 def get_depth_device(name: str) -> DepthDevice:
     """Return the steps of a device such as `cuda` or `cuda:1`; InputError for an unknown one."""
-    kind = name.partition(":")[0]
-    if kind not in DEPTH_DEVICES:
-        raise InputError(
-            f"There is no device '{quote_value(name)}' for plane-sweep; choose one of "
-            f"{', '.join(DEPTH_DEVICES)}.",
-            "device",
-        )
-    return DEPTH_DEVICES[kind](name)
+    return make_for_device(DEPTH_DEVICES, name, "plane-sweep")

@@ -115,8 +115,13 @@ class Splatter:
         any view shows in its mask is built and fitted, and the sky behind surfaces. The scene of
         three views or more is fitted with `emphasis`, to its check views where it covers them.
         """
-        gains = torch.from_numpy(estimate_gains(layers, transforms)).float()
         device = views[0].image.device
+        if masks is not None and not any(bool(mask.any()) for mask in masks):
+            empty = self.splat(views[0], depths[0])[:0]
+            none = torch.zeros(0, dtype=torch.long, device=device)
+            return Reconstruction(empty, tuple(depths), none, none)
+
+        gains = torch.from_numpy(estimate_gains(layers, transforms)).float()
         skies = [
             is_sky(depth.depth, view.camera) for view, depth in zip(views, depths, strict=True)
         ]
@@ -129,11 +134,6 @@ class Splatter:
             normalized.append(view)
         if all(image is None for image in sky_images):
             skies = []
-
-        if masks is not None and not any(bool(mask.any()) for mask in masks):
-            empty = self.splat(normalized[0], depths[0])[:0]
-            none = torch.zeros(0, dtype=torch.long, device=device)
-            return Reconstruction(empty, tuple(depths), none, none)
 
         fitted_views = [view.to(self.fit_device) for view in views]
         gains = gains.to(self.fit_device)
@@ -317,17 +317,33 @@ class Splatter:
     ) -> Gaussians:
         """Fit the surfaces to three views or more, before the sky that each of them shows.
 
-        `skies` mark it, and are empty if no view shows any.
-        Place, size, direction, opacity and colour are fitted together (decision 031), to views
-        whose colours are `gains` times those of the scene. The sky stays as it is: what one
-        photograph shows white and another one blue would pull at the surfaces before it.
+        `skies` mark it, and are empty if no view shows any. It stays as it is: what one photograph
+        shows white and another one blue would pull at the surfaces before it.
         """
-        # Without a sky nothing is selected, for which the host would wait for a GPU.
+        if not skies:
+            return self.fit_many_views(scene, views, gains, skies, emphasis)
         in_sky = find_sky_gaussians(scene, views[0].camera)
-        surfaces = scene[~in_sky] if skies else scene
+        surfaces = scene[~in_sky]
         # A part of a scene may be nothing but sky.
         if not len(surfaces):
             return scene
+        fitted = self.fit_many_views(surfaces, views, gains, skies, emphasis)
+        # In the order of the scene again.
+        rows = torch.cat([torch.nonzero(~in_sky), torch.nonzero(in_sky)])[:, 0]
+        return merge([fitted, scene[in_sky]])[rows.argsort()]
+
+    def fit_many_views(
+        self,
+        surfaces: Gaussians,
+        views: Sequence[View],
+        gains: Float[Tensor, "views 3"],
+        skies: Sequence[Bool[Tensor, "_ _"]],
+        emphasis: Emphasis,
+    ) -> Gaussians:
+        """Fit place, size, direction, opacity and colour together (decision 031).
+
+        The colours of `views` are `gains` times those of the scene.
+        """
         photographs = self.replace_all_ignored(surfaces, views, gains)
         checks = [
             self.prepare_check(surfaces, view.to(self.fit_device), gains)
@@ -335,12 +351,7 @@ class Splatter:
         ]
         emphasis = replace(emphasis, check_views=checks)
         backdrops = [sky.to(self.fit_device) for sky in skies]
-        fitted = fit_jointly(surfaces, photographs, gains, self.renderer, emphasis, backdrops)
-        if not skies:
-            return fitted
-        # In the order of the scene again.
-        rows = torch.cat([torch.nonzero(~in_sky), torch.nonzero(in_sky)])[:, 0]
-        return merge([fitted, scene[in_sky]])[rows.argsort()]
+        return fit_jointly(surfaces, photographs, gains, self.renderer, emphasis, backdrops)
 
     def splat(
         self, view: View, depth: DepthMap, plane_stretch: float = MAX_DISC_STRETCH

@@ -110,10 +110,12 @@ def find_sky(image: StereoImage, measured: Measurement) -> Mask:
 def find_candidate(image: StereoImage, measured: Measurement) -> Mask:
     """Find the uniform region at the top of the image if its outline may be that of a sky."""
     region = find_even_region(image)
+    nothing = np.zeros_like(region)
+    if not is_overhead(region):
+        return nothing
     heights, is_measured, _ = measure_heights(measured, image.size)
     outline = find_outline(region) & is_measured
-    nothing = np.zeros_like(region)
-    if not is_overhead(region) or outline.sum() < MIN_OUTLINE:
+    if outline.sum() < MIN_OUTLINE:
         return nothing
     if np.median(image.image[region]) <= np.median(image.image[outline]):
         return nothing
@@ -142,13 +144,12 @@ def is_blue(image: StereoImage, region: Mask, least: float = MIN_BLUE) -> bool:
 
 def keep_distant(image: StereoImage, measured: Measurement, region: Mask) -> Mask:
     """Keep a region, which may be empty, if its outline is near infinity."""
+    if not region.any():
+        return region
     heights, is_measured, far_plane = measure_heights(measured, image.size)
     outline = find_outline(region) & is_measured
-    if not region.any() or not is_distant(
-        heights[outline], heights[is_measured & ~region], far_plane
-    ):
-        return np.zeros_like(region)
-    return region
+    is_far = is_distant(heights[outline], heights[is_measured & ~region], far_plane)
+    return region if is_far else np.zeros_like(region)
 
 
 def measure_heights(measured: Measurement, size: tuple[int, int]) -> tuple[Map, Mask, float]:
