@@ -21,7 +21,7 @@ from gscompleter.generators import (
 from gscompleter.guards import accept_at, prepare_guards
 from gscompleter.numerics.geometry import count_outside, pad_camera, pad_like
 from gscompleter.numerics.given_geometry import GivenGeometry, count_at_given_depth
-from gscompleter.numerics.image_ops import is_enclosed
+from gscompleter.numerics.image_ops import is_enclosed, keep_thin
 from gscompleter.numerics.value_checks import (
     check_camera,
     check_gaussians,
@@ -29,10 +29,10 @@ from gscompleter.numerics.value_checks import (
     check_row_mask,
 )
 from gscompleter.parts import (
-    MAX_TARGET_ID,
     EarlierWork,
     Part,
     PartOrigin,
+    check_target_ids,
     find_last_target_id,
     make_part,
 )
@@ -48,7 +48,6 @@ from gscompleter.stages.close_gaps import (
     are_worth_closing,
     continue_surfaces,
     displace_camera,
-    find_gaps,
     view_gaps,
 )
 from gscompleter.stages.context import InitialContext, choose_config, init_context
@@ -74,7 +73,7 @@ from gscompleter.state import Completion, Photo
 from gscompleter.system.errors import InputError
 from gscompleter.system.progress import show_in_notebook, track
 from gscompleter.system.tensor_checks import describe, is_whole_number
-from gscompleter.system.timing import record_seconds, timed_stage
+from gscompleter.system.timing import add_seconds, record_seconds, timed_stage
 from gscompleter.system.torch_modes import run_in_plain_torch
 from gscompleter.target_result import TargetResult
 from gscompleter.trust import Trust
@@ -171,7 +170,7 @@ class GSCompleter:
         targets = list_targets(target)
         if scene is not None:
             check_gaussians(scene, "The scene")
-            check_target_ids(scene, len(targets))
+            check_target_ids(find_last_target_id(scene), len(targets))
         begun = self.begin(views, scene, check_views, targets, geometry=geometry)
         return self.complete(begun, targets)
 
@@ -277,12 +276,12 @@ class GSCompleter:
 
             # Photographs that a splat was not trained on say nothing about the trust in it. They
             # are targets themselves, before all others (decision 041).
-            views = [photo.view for photo in state.photos]
-            new = find_new_photos(config, state.parts, views, self.scenes)
-            trained = [view for index, view in enumerate(views) if index not in new]
+            photographs = [photo.view for photo in state.photos]
+            new = find_new_photos(config, state.parts, photographs, self.scenes)
+            trained = [view for index, view in enumerate(photographs) if index not in new]
             trust = load_trust(config, state.parts, trained, self.scenes)
             state = replace(state, trust=trust)
-            state = recolor_to_photos(state, [views[i] for i in new], self.scenes)
+            state = recolor_to_photos(state, [photographs[i] for i in new], self.scenes)
         return replace(state, seconds=seconds)
 
     def name_models(self) -> dict[str, str]:
@@ -307,7 +306,6 @@ class GSCompleter:
         supports it.
         """
         check_state(state)
-        check_target_ids(state.context, len(state.targets) + 1)
         with record_seconds() as seconds:
             view = self.observe(state, target, reference)
             anchor = choose_anchor(view)  # Sec. III-D
@@ -315,7 +313,15 @@ class GSCompleter:
             outcome = TargetOutcome(state, unchanged)
             if not unchanged.skip_reason:
                 outcome = self.fill_holes(anchor, reference, unchanged)
-        return outcome.state.extended(outcome.result, seconds, outcome.parts)
+        after = outcome.state
+        added = [part for part in outcome.parts if len(part)]
+        return replace(
+            after,
+            added_parts=(*after.added_parts, *added),
+            targets=(*after.targets, outcome.result),
+            seconds=add_seconds(after.seconds, seconds),
+            is_restored=False,
+        )
 
     def fill_holes(
         self, anchor: Anchor, reference: GeneratedView | None, unchanged: TargetResult
@@ -394,7 +400,7 @@ class GSCompleter:
         for camera in displace_camera(target.camera.target, state.views, config.displacement):
             # What the camera before it closed is not a gap any more.
             view = view_gaps(state, camera, self.scenes, config)
-            gaps = find_gaps(view)
+            gaps = keep_thin(view.empty)
             if not are_worth_closing(gaps):
                 continue
             image, continued = continue_surfaces(view, gaps)
@@ -418,7 +424,7 @@ class GSCompleter:
             views = [self.observe(state, target) for target in targets]
             is_open = [not explain_skip(view) for view in views]
             images = iter(self.synthesize(list(compress(views, is_open))))
-        state = state.plus_seconds(seconds)
+        state = replace(state, seconds=add_seconds(state.seconds, seconds))
         for target, has_image in zip(targets, is_open, strict=True):
             state = self.advance(state, target, next(images) if has_image else None)
         return state
@@ -495,16 +501,6 @@ def list_targets(target: object) -> list[Camera]:
     if not targets:
         raise InputError("No target camera was given; name at least one view to complete.")
     return list(targets)
-
-
-def check_target_ids(scene: Gaussians | None, num_targets: int) -> None:
-    """Raise InputError if `generated` cannot hold the ids of `num_targets` more targets."""
-    num_before = 0 if scene is None else find_last_target_id(scene)
-    if num_before + num_targets > MAX_TARGET_ID:
-        raise InputError(
-            f"{num_targets} targets were given after {num_before} in the scene, and a .ply can "
-            f"tell {MAX_TARGET_ID} apart; complete the scene in several runs."
-        )
 
 
 def check_any_completed(state: Completion) -> None:

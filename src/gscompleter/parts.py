@@ -15,6 +15,7 @@ import torch
 from jaxtyping import Bool
 from torch import Tensor
 
+from gscompleter.system.errors import InputError
 from gscompleter.types import Gaussians
 
 OBSERVED = 0
@@ -108,3 +109,12 @@ def find_last_target_id(scene: Gaussians) -> int:
     """Find the largest target id in a scene; 0 if nothing was generated for a target."""
     ids = scene.generated.where(scene.generated != NOT_INVENTED, OBSERVED)
     return int(ids.max()) if len(ids) else 0
+
+
+def check_target_ids(last: int, num_targets: int) -> None:
+    """Raise InputError if `generated` cannot hold the ids of targets after the `last` one."""
+    if last + num_targets > MAX_TARGET_ID:
+        raise InputError(
+            f"{num_targets} targets were given after {last} in the scene, and a .ply can "
+            f"tell {MAX_TARGET_ID} apart; complete the scene in several runs."
+        )

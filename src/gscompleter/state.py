@@ -14,11 +14,10 @@ from torch import Tensor
 
 from gscompleter.config import CompleterConfig
 from gscompleter.numerics.given_geometry import GivenGeometry
-from gscompleter.parts import Part, PartKind, find_last_target_id
+from gscompleter.parts import Part, PartKind, check_target_ids, find_last_target_id
 from gscompleter.system.files.display import Displayed
 from gscompleter.system.files.mapping import change_rows, find_changed_rows, select_rows
 from gscompleter.system.plugins import load_function
-from gscompleter.system.timing import add_seconds
 from gscompleter.target_result import TargetResult
 from gscompleter.trust import Trust
 from gscompleter.types import Camera, ContextScene, ErrorBudget, Gaussians, View, merge
@@ -252,26 +251,15 @@ class Completion(Displayed):
 
     @cached_property
     def next_target_id(self) -> int:
-        """Value of `generated` for the next target; ids of a given scene are continued."""
-        return find_last_target_id(self.context) + len(self.targets) + 1
+        """Value of `generated` for the next target; ids of a given scene are continued.
+
+        Raises InputError if a .ply has no id left for it.
+        """
+        last = find_last_target_id(self.context)
+        check_target_ids(last, len(self.targets) + 1)
+        return last + len(self.targets) + 1
 
     def with_depth_range(self, camera: Camera) -> Camera:
         """Return the camera with the depth range of this completion."""
         known = self.photos[0].view.camera  # all photographs share one depth range
         return replace(camera, near=known.near, far=known.far)
-
-    def extended(
-        self,
-        result: TargetResult,
-        seconds: Mapping[str, float],
-        added: Sequence[Part] = (),
-    ) -> Completion:
-        """Append the result of one more target, and what it `added`, in the order of addition."""
-        parts = (*self.added_parts, *(part for part in added if len(part)))
-        targets = (*self.targets, result)
-        changed = replace(self, added_parts=parts, targets=targets, is_restored=False)
-        return changed.plus_seconds(seconds)
-
-    def plus_seconds(self, seconds: Mapping[str, float]) -> Completion:
-        """Add wall times stage by stage."""
-        return replace(self, seconds=add_seconds(self.seconds, seconds))

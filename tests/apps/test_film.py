@@ -69,8 +69,11 @@ def completion() -> Completion:
     drawn = load_renderer("reference").render(context, target)
     mask = torch.zeros(SIZE, SIZE, dtype=torch.bool)
     made = TargetResult(target, drawn, drawn, mask, drawn.alpha, 0, False, right)
-    return begin_with(context, [view]).extended(
-        made, {"total": 0.0}, (make_part(PartOrigin("target", 1), right),)
+    return replace(
+        begin_with(context, [view]),
+        added_parts=(make_part(PartOrigin("target", 1), right),),
+        targets=(made,),
+        seconds={"total": 0.0},
     )
 
 

@@ -22,8 +22,8 @@ from gscompleter.apps.inputs.renders import make_frames, open_renders
 from gscompleter.apps.inputs.splat import read_splat, sort_splat
 from gscompleter.apps.requests.scene import SceneRequest
 from gscompleter.apps.requests.splat import Selection, SplatRequest
-from gscompleter.completer import MAX_TARGET_ID
 from gscompleter.data.scene import write_cameras
+from gscompleter.parts import MAX_TARGET_ID
 from gscompleter.render.loading import load_renderer
 from gscompleter.system.files.image import read_image, write_image
 from gscompleter.trust.lifted import find_pixel_center

@@ -9,13 +9,13 @@ from gscompleter import CompleterConfig, load_renderer
 from gscompleter.config import GapConfig
 from gscompleter.guards import prepare_guards
 from gscompleter.numerics.geometry import compute_z_depths, pad_camera
+from gscompleter.numerics.image_ops import keep_thin
 from gscompleter.parts import PartOrigin, make_part
 from gscompleter.render.cache import SceneRenderer
 from gscompleter.stages.close_gaps import (
     are_worth_closing,
     continue_surfaces,
     displace_camera,
-    find_gaps,
     view_gaps,
 )
 from gscompleter.stages.target_view import TargetView, render_target
@@ -81,7 +81,7 @@ def test_a_photograph_at_the_target_does_not_tell_how_far_cameras_move():
 
 def test_a_gap_takes_depth_and_colour_of_the_farther_surface():
     view = look_at_gap()
-    gaps = find_gaps(view)
+    gaps = keep_thin(view.empty)
     assert gaps[SIZE // 2].nonzero()[:, 0].tolist() == [COLUMN, COLUMN + 1, COLUMN + 2]
     image, added = continue_surfaces(view, gaps)
     depths = compute_z_depths(added.means, CAMERA)
@@ -91,7 +91,7 @@ def test_a_gap_takes_depth_and_colour_of_the_farther_surface():
     after = view.frozen.composite(added)
     assert view.render.alpha[gaps].max() < 0.85
     assert after.alpha[gaps].min() > 0.85
-    assert not find_gaps(replace_frozen(view, added)).any()
+    assert not keep_thin(replace_frozen(view, added).empty).any()
 
 
 def replace_frozen(view: TargetView, added: Gaussians) -> TargetView:
@@ -101,8 +101,8 @@ def replace_frozen(view: TargetView, added: Gaussians) -> TargetView:
 
 
 def test_what_is_wide_or_opaque_is_no_gap():
-    assert not find_gaps(look_at_gap(12)).any()
-    assert not find_gaps(look_at_gap(0)).any()
+    assert not keep_thin(look_at_gap(12).empty).any()
+    assert not keep_thin(look_at_gap(0).empty).any()
 
 
 def photograph_screen(x: float) -> View:
@@ -167,7 +167,7 @@ def complete(config: CompleterConfig) -> tuple[list[int], Gaussians]:
     (result,) = done.targets
     beside = displace_camera(result.target, views, GapConfig().displacement)
     looks = [view_gaps(done, camera, completer.scenes, GapConfig()) for camera in beside]
-    return [int(find_gaps(look).sum()) for look in looks], result.added
+    return [int(keep_thin(look.empty).sum()) for look in looks], result.added
 
 
 def test_a_completion_leaves_fewer_gaps_on_each_side_under_the_number_of_its_target():

@@ -21,7 +21,7 @@ from gscompleter.stages.lift import lift_pair
 from gscompleter.stages.select_anchor import select_anchor
 from gscompleter.state import Completion
 from gscompleter.system.errors import InputError, quote_value
-from gscompleter.system.timing import record_seconds, timed_stage
+from gscompleter.system.timing import add_seconds, record_seconds, timed_stage
 from gscompleter.types import Camera, Gaussians, View, merge
 from gscompleter.virtual_capture.around_target import choose_cameras_around
 from gscompleter.virtual_capture.render_views import render_views
@@ -128,7 +128,7 @@ def complete_bare(state: Completion, target: Camera, models: Models) -> Predicti
             "complete it from; leave out the method bare, or choose another target."
         )
     done = completer.advance(completer.begin(views, state.scene), unranged)
-    prediction = predict(done.plus_seconds(seconds))
+    prediction = predict(replace(done, seconds=add_seconds(done.seconds, seconds)))
     # The anchor is a render, and not one of the photographs of the state.
     return replace(prediction, anchor=None)
 

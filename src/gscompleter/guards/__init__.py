@@ -97,12 +97,17 @@ def accept_at(
 ) -> Additions:
     """Accept candidates at a target, where guards place and verify them."""
     guards = load_guards(view.state.config)
-    return accept(
-        candidates,
-        place=lambda candidates: place(candidates, view, guards),
-        refine=lambda placed: refine(placed, image, view),
-        verify=lambda added, refined: verify(added, Attempt(view, image, affine, refined), guards),
-    )
+
+    def place_at_view(candidates: Additions) -> Additions:
+        return place(candidates, view, guards)
+
+    def refine_at_view(placed: Gaussians) -> Refined:
+        return refine(placed, image, view)
+
+    def verify_at_view(added: Additions, refined: Refined) -> Additions:
+        return verify(added, Attempt(view, image, affine, refined), guards)
+
+    return accept(candidates, place_at_view, refine_at_view, verify_at_view)
 
 
 def load_guards(config: CompleterConfig) -> list[Guard]:

@@ -95,8 +95,10 @@ def run_reconstructor(
     With `pixel_mask`, only these pixels of the first view need Gaussians; Ψ may return more.
     """
     if pixel_mask is not None and isinstance(reconstructor, Lifter):
-        return accept_reconstruction(reconstructor.lift(views, pixel_mask), views)
-    return accept_reconstruction(reconstructor(views), views)
+        made = reconstructor.lift(views, pixel_mask)
+    else:
+        made = reconstructor(views)
+    return accept_reconstruction(made, views)
 
 
 def run_part_reconstructor(
@@ -107,8 +109,10 @@ def run_part_reconstructor(
     Ψ may return more. Raises InputError as `run_reconstructor`.
     """
     if isinstance(reconstructor, PartReconstructor):
-        return accept_reconstruction(reconstructor.reconstruct_part(views, choose_masks), views)
-    return accept_reconstruction(reconstructor(views), views)
+        made = reconstructor.reconstruct_part(views, choose_masks)
+    else:
+        made = reconstructor(views)
+    return accept_reconstruction(made, views)
 
 
 def run_fitting_reconstructor(
@@ -122,14 +126,15 @@ def run_fitting_reconstructor(
     There may be none of either. Raises InputError as `run_reconstructor`, and for check views that
     Ψ cannot use; a Ψ that cannot favour targets makes the same scene for all.
     """
-    if not isinstance(reconstructor, FittingReconstructor):
-        if not check_views:
-            return run_reconstructor(reconstructor, views)
+    if isinstance(reconstructor, FittingReconstructor):
+        made = reconstructor.reconstruct_and_fit(views, check_views, targets)
+    elif check_views:
         raise InputError(
             "Check views need a scene that they check, or a reconstructor that fits its own to "
             "them, such as plane-sweep; leave them out."
         )
-    made = reconstructor.reconstruct_and_fit(views, check_views, targets)
+    else:
+        made = reconstructor(views)
     return accept_reconstruction(made, views)
 
 

@@ -98,16 +98,14 @@ def replace_first(frozen: FrozenScene, known: Parts, first: Gaussians) -> Frozen
     before, *later = known
     if before is first:
         return frozen
-    if differ_in_color(before, first):
-        rows = find_changed_rows(before.sh, first.sh).nonzero()[:, 0]
-        return frozen.repaint(rows, first[rows])
-    if not isinstance(frozen, HidingScene):
-        return None
     hidden = find_hidden(before, first)
-    if hidden is None:
+    if hidden is not None and isinstance(frozen, HidingScene):
+        # Of the later parts nothing is hidden.
+        return frozen.hide(pad(hidden, (0, sum(map(len, later)))), (first, *later))
+    if not differ_in_color(before, first):
         return None
-    # Of the later parts nothing is hidden.
-    return frozen.hide(pad(hidden, (0, sum(map(len, later)))), (first, *later))
+    rows = find_changed_rows(before.sh, first.sh).nonzero()[:, 0]
+    return frozen.repaint(rows, first[rows])
 
 
 def differ_in_color(one: Gaussians, other: Gaussians) -> bool:

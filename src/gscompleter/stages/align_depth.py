@@ -45,7 +45,7 @@ def align_depth(lift: Lift, anchor: Anchor, view: TargetView, rng: torch.Generat
     if config.align_at == "none":
         return DepthAffine()
 
-    at_target = compare_depth_maps(lift.reference_depth, view.render.depth_map())
+    at_target = compare_depth_maps(lift.reference_depth, view.depth)
     if config.align_at == "target":
         affine = fit_affine(at_target, rng)
         return replace(affine, pairs=sample_depth_pairs("target", at_target, affine))

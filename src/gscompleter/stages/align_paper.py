@@ -56,7 +56,7 @@ def compare_at_anchor(lift: Lift, anchor: Anchor) -> ComparedDepths:
     The anchor bridges both depths: Ψ predicts its depth with that of the target, and the context is
     rendered there, which has holes at the target.
     """
-    return compare_depth_maps(lift.anchor_depth, anchor.render.depth_map())
+    return compare_depth_maps(lift.anchor_depth, anchor.depth)
 
 
 def fit_affine(depths: ComparedDepths, rng: torch.Generator) -> DepthAffine:

@@ -18,7 +18,7 @@ from torch.nn.functional import max_pool2d
 
 from gscompleter.config import GapConfig
 from gscompleter.numerics.geometry import adapt_to_mode, measure_baseline, pad_camera
-from gscompleter.numerics.image_ops import dilate, keep_thin
+from gscompleter.numerics.image_ops import dilate
 from gscompleter.numerics.smooth import continue_smoothly
 from gscompleter.reconstructors.plane_sweep.gaussians import DISC_SIGMA, compute_normals, make_discs
 from gscompleter.render.cache import SceneRenderer
@@ -86,11 +86,6 @@ def view_gaps(
     holes = replace(state.config.holes, max_alpha=config.max_alpha, dilation=GAP_RIM)
     strict = replace(state, config=replace(state.config, holes=holes))
     return render_target(strict, pad_camera(camera, 0.0), scenes)
-
-
-def find_gaps(view: TargetView) -> Bool[Tensor, "h w"]:
-    """Find the thin parts of the holes of a view."""
-    return keep_thin(view.empty)
 
 
 def are_worth_closing(gaps: Bool[Tensor, "h w"]) -> bool:

@@ -84,13 +84,13 @@ def recolor(reference: GeneratedView, view: TargetView, origin: PartOrigin) -> R
     if len(rows) == 0:
         return unchanged
 
+    # Trusted at later targets: otherwise targets in a row compound their errors (decision 038).
+    trust = state.trust.accept(view.frozen, camera, rows)
     recolored = replace(
         context,
         sh=change_rows(context.sh, rows, delta.add_(select_rows(context.sh, rows))),
         generated=context.generated.index_fill(0, rows, origin.label),
     )
-    # Trusted at later targets: otherwise targets in a row compound their errors (decision 038).
-    trust = state.trust.accept(view.frozen, camera, rows)
     return Recolored(replace(state, rendered_context=recolored, trust=trust), view, rows)
 
 

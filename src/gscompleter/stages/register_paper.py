@@ -74,8 +74,8 @@ def optimize_paper_distances(
     target = reference.camera
     # D_ctx^tgt and D_ctx^anc are rendered from G_ctx once, since G_ctx is frozen. It contains what
     # earlier targets added.
-    context_at_target = view.render.depth_map()
-    context_at_anchor = anchor.render.depth_map()
+    context_at_target = view.depth
+    context_at_anchor = anchor.depth
     move = MOTIONS[config.degrees_of_freedom]
 
     # Adam changes δ_i, beginning with 0, in d_i = d_i^init + δ_i (scene units). Its steps depend on

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 from gscompleter.config import AnchorConfig
 from gscompleter.numerics.geometry import (
@@ -17,7 +18,7 @@ from gscompleter.numerics.geometry import (
 )
 from gscompleter.stages.target_view import TargetView
 from gscompleter.system.timing import timed_stage
-from gscompleter.types import Camera, Render, View
+from gscompleter.types import Camera, DepthMap, Render, View
 
 SURFACE_TOLERANCE = 0.1
 """Tolerated distance behind the anchor's depth map, relative to depth, for the same surface."""
@@ -51,6 +52,11 @@ class Anchor:
     def render(self) -> Render:
         """Render of the scene at its camera, made when it is first asked for."""
         return self.target.view_renders[self.index]
+
+    @cached_property
+    def depth(self) -> DepthMap:
+        """z-depth of that render, D_ctx^anc of the paper."""
+        return self.render.depth_map()
 
 
 def find_nearest_view(target: Camera, views: Sequence[View]) -> int:

@@ -60,6 +60,11 @@ class TargetView:
         return self.frozen.render
 
     @cached_property
+    def depth(self) -> DepthMap:
+        """z-depth of the render, D_ctx^tgt of the paper if nothing is padded."""
+        return self.render.depth_map()
+
+    @cached_property
     def surfaces(self) -> DepthMap:
         """z-depth of the render, valid on surfaces: not in the sky, whose depth is our choice."""
         return mask_out_sky(self.render, self.camera.padded)
@@ -169,42 +174,46 @@ def render_target(state: Completion, camera: PaddedCamera, scenes: SceneRenderer
 
     frozen = scenes.freeze(state.parts, camera.padded)
     alpha = state.trust.compute_alpha(frozen, camera.padded)
-    confirmed_alpha = None
-    if state.confirmation is not None:
-        confirmed_alpha = state.confirmation.compute_alpha(frozen, camera.padded)
-    edits = find_hole_edits(state, camera, frozen.render.alpha, confirmed_alpha, scenes)
+    edits = find_hole_edits(state, camera, frozen, scenes)
     masks = find_hole_masks(frozen.render, alpha, camera, state.config.holes, edits, render_at)
     return TargetView(state, scenes, camera, frozen, alpha, masks)
 
 
 def find_hole_edits(
-    state: Completion,
-    camera: PaddedCamera,
-    alpha: Float[Tensor, "h w"],
-    confirmed_alpha: Float[Tensor, "h w"] | None,
-    scenes: SceneRenderer,
+    state: Completion, camera: PaddedCamera, frozen: FrozenScene, scenes: SceneRenderer
 ) -> HoleEdits:
     """Find where a removal may have opened holes, and where the user marked the scene as wrong.
 
-    Both are masks of the padded image, as is `alpha` of the scene. `confirmed_alpha` is that
-    weighted by what photographs confirm; None if they do not decide.
+    Both are masks of the padded image. `frozen` is the scene at the padded camera.
     """
     config = state.config
     if len(state.source.removed) == 0:
         return HoleEdits()
     if not (config.completes_removals_only or config.holes.forces_removed):
         return HoleEdits()
+    confirmed = find_confirmed(state, camera, frozen)
     removed = find_removed(state.source, camera.padded, scenes.renderer)
     opened = add_border(removed) if config.completes_removals_only else None
     if not config.holes.forces_removed:
         return HoleEdits(opened)
-    if confirmed_alpha is not None:
-        is_covered = ~compute_hole_mask(alpha, config.holes)
-        # A surface that photographs confirm shows the place as it is: there is nothing to fill.
-        removed = removed & ~(is_covered & (confirmed_alpha >= COVERED))
     # What an earlier target filled is no hole any more.
     filled = [part.gaussians for part in state.added_parts if part.origin.is_invented]
-    if sum(map(len, filled)) == 0:
-        return HoleEdits(opened, removed)
-    filled_alpha = scenes.renderer.render(merge(filled), camera.padded).alpha
-    return HoleEdits(opened, removed & compute_hole_mask(filled_alpha, config.holes))
+    if sum(map(len, filled)) > 0:
+        filled_alpha = scenes.renderer.render(merge(filled), camera.padded).alpha
+        removed = removed & compute_hole_mask(filled_alpha, config.holes)
+    # A surface that photographs confirm shows the place as it is: there is nothing to fill.
+    return HoleEdits(opened, removed if confirmed is None else removed & ~confirmed)
+
+
+def find_confirmed(
+    state: Completion, camera: PaddedCamera, frozen: FrozenScene
+) -> Bool[Tensor, "h w"] | None:
+    """Find the pixels that show a surface which photographs confirm after a removal.
+
+    None if photographs do not decide what stays.
+    """
+    if state.confirmation is None:
+        return None
+    is_covered = ~compute_hole_mask(frozen.render.alpha, state.config.holes)
+    confirmed_alpha = state.confirmation.compute_alpha(frozen, camera.padded)
+    return is_covered & (confirmed_alpha >= COVERED)

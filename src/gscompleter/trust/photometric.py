@@ -200,6 +200,7 @@ def measure_agreement(
     valid = view.valid_mask.to(agrees)
     layers = torch.stack([valid, valid * agrees, torch.zeros_like(agrees)], dim=-1)
     sums = to_float32(frozen.backproject(layers)[: len(means)])
+    pose = convert_camera(view.camera)
     area = np.empty(len(means), np.float32)
     agreement = np.empty(len(means), np.float32)
     share(
@@ -207,7 +208,7 @@ def measure_agreement(
         len(means),
         sums,
         to_float32(means),
-        convert_camera(view.camera),
+        pose,
         area,
         agreement,
     )
@@ -257,6 +258,7 @@ def compute_trust(
     This is trust_i of the method page. `sums` are the summed compositing weights of each Gaussian
     in the image of `camera`.
     """
+    pose = convert_camera(camera)
     values = np.empty(len(sums), np.float32)
     share(
         kernels.accumulate_trust,
@@ -266,7 +268,7 @@ def compute_trust(
         to_float32(observations.agreement),
         to_float32(observations.means),
         to_float32(sums),
-        convert_camera(camera),
+        pose,
         np.float32(math.radians(config.angle_sigma)),
         np.float32(FULL_TRUST_FRACTION),
         values,

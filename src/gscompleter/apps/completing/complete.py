@@ -48,7 +48,6 @@ from gscompleter.apps.requests.completion import (
     UpdateRequest,
     get_completion,
 )
-from gscompleter.completer import check_target_ids
 from gscompleter.config.generators import PaintedSettings, makes_any_image
 from gscompleter.data.local_origin import compute_frame_from_photographs
 from gscompleter.data.scene import describe_camera, write_cameras
@@ -59,6 +58,7 @@ from gscompleter.evaluation.metrics.coverage import (
     sample_held_out_cameras,
 )
 from gscompleter.numerics.kernels.parallel import run_in_background
+from gscompleter.parts import check_target_ids, find_last_target_id
 from gscompleter.splats.alignment.similarity import transform_camera_exactly
 from gscompleter.splats.alignment.trainer_files import write_trainer_cameras
 from gscompleter.splats.edits import EditDraft
@@ -419,7 +419,9 @@ def complete_targets(ready: Prepared) -> tuple[Completion, Prepared]:
 def check_target_count(ready: Prepared) -> None:
     """Raise InputError, before any is completed, if a .ply cannot tell all targets apart."""
     if ready.targets is not None:
-        check_target_ids(ready.task.scene, len(ready.task.targets) or ready.max_targets)
+        scene = ready.task.scene
+        last = 0 if scene is None else find_last_target_id(scene)
+        check_target_ids(last, len(ready.task.targets) or ready.max_targets)
 
 
 def write_targets(folder: Path, task: CompletionTask) -> None:

@@ -38,12 +38,11 @@ def draw_hole(view: TargetView) -> HolePictures:
     camera = view.camera.target
     context = make_generator_input(view)
     nearest = context.views[find_nearest_view(camera, context.views)]
-    depth = view.render.depth_map()
     return HolePictures(
         image=view.render.image,
         # Pixels at the rim of a hole are a blend with the black behind it.
         mask=dilate(view.holes, BORDER_WIDTH),
         warped=complete_warp(nearest, camera, context).image,
-        depth=torch.where(depth.valid, depth.depth, 0.0),
+        depth=torch.where(view.depth.valid, view.depth.depth, 0.0),
         reference=nearest,
     )

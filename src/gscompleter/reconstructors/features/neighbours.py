@@ -71,8 +71,8 @@ class Neighbours:
 
 def find_neighbours(images: Sequence[StereoImage], count: int = NUM_SOURCES) -> Neighbours:
     """Select up to `count` best neighbours for each image, and one that covers the rest."""
-    features = map_in_parallel(detect_features, images)
     pairs = find_close_pairs(images)
+    features = map_in_parallel(detect_features, images)
     matched = map_in_parallel(
         match_features, [features[i] for i, _ in pairs], [features[j] for _, j in pairs]
     )

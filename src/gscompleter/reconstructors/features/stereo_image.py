@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import torch
 from jaxtyping import Bool, Float, Float32
 
 from gscompleter.system.errors import InputError
@@ -80,12 +81,14 @@ def make_stereo_images(views: Sequence[View]) -> tuple[list[StereoImage], float]
 
 def has_distinct_centers(views: Sequence[View]) -> bool:
     """Check whether the cameras of views stand in different places."""
-    return measure_widest_baseline(stack_centers(views)) > 0
+    centers = stack_centers(views)
+    return measure_widest_baseline(centers) > 0
 
 
 def stack_centers(views: Sequence[View]) -> Float[np.ndarray, "n 3"]:
     """Stack the camera centres of views, in scene units."""
-    return np.stack([view.camera.center.detach().cpu().double().numpy() for view in views])
+    centers = torch.stack([view.camera.center for view in views])
+    return centers.double().numpy(force=True)
 
 
 def measure_widest_baseline(centers: Float[np.ndarray, "n 3"]) -> float:
@@ -98,16 +101,16 @@ def _make_stereo_image(view: View, center: Float[np.ndarray, "3"], unit: float) 
     camera = view.camera
     given = np.zeros(view.image.shape[:2], np.float32)
     if view.given_depth is not None:
-        depth = view.given_depth.detach().cpu().numpy()
+        depth = view.given_depth.numpy(force=True)
         inverse = unit / np.maximum(depth, MIN_GIVEN_DEPTH * unit)
         given = np.where(depth > 0, inverse, 0).astype(np.float32)
     return StereoImage(
-        np.ascontiguousarray(view.image.detach().cpu().float().numpy()),
-        camera.K.detach().cpu().double().numpy(),
-        camera.c2w[:3, :3].detach().cpu().double().numpy(),
+        np.ascontiguousarray(view.image.float().numpy(force=True)),
+        camera.K.double().numpy(force=True),
+        camera.c2w[:3, :3].double().numpy(force=True),
         center,
         given,
-        None if view.ignore_mask is None else view.ignore_mask.cpu().numpy(),
+        None if view.ignore_mask is None else view.ignore_mask.numpy(force=True),
     )
 
 
