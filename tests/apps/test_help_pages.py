@@ -17,9 +17,12 @@ import pytest
 from command import run
 from gscompleter import __version__
 from gscompleter.apps.command_line.help_pages import HELP_GROUPS, LAST
-from gscompleter.apps.command_line.words import list_options
+from gscompleter.apps.command_line.words import list_options, show_config
 from gscompleter.cli import COMMANDS, OptionClasses, parse_command
+from gscompleter.config import CompleterConfig
+from gscompleter.splats.ply import save_ply
 from paths import TESTS
+from scenes import random_gaussians
 from sources import list_nodes, parse_package
 
 ROOT = TESTS.parent
@@ -150,6 +153,23 @@ def test_a_page_names_options_that_there_are(command):
                     assert word.partition("=")[0] in options, (name, code)
         for word in re.findall(r"(?<![\w`-])--[a-z][\w.-]*", re.sub(r"`[^`]*`", "", sentence)):
             assert word.rstrip(".") in own, (name, word)
+
+
+def test_a_page_shows_the_config_of_the_command_that_asks_for_it(tmp_path):
+    splat = tmp_path / "splat.ply"
+    save_ply(splat, random_gaussians(3))
+    alone = CompleterConfig.bare()
+    for words, config in (
+        (["complete", "photographs"], CompleterConfig()),
+        (["complete", "photographs", "--scene", "s.ply"], CompleterConfig.splat()),
+        (["complete", str(splat)], alone),
+        (["live", str(splat)], alone),
+        (["complete", str(splat), "--mask", "m.png"], alone.for_marks()),
+        (["repair", str(splat)], alone.for_marks()),
+        (["remove", str(splat)], alone.for_removal()),
+        (["remove", "photographs"], CompleterConfig.splat().for_removal()),
+    ):
+        assert show_config([*words, "--help-all"])[0] == config, words
 
 
 @pytest.mark.parametrize("command", COMMANDS)

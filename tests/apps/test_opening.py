@@ -9,7 +9,7 @@ from PIL import Image
 
 from command import run
 from exact_room import make_cameras, write_photographs, write_transforms
-from gscompleter.apps.commands.shared_decisions import names_splat
+from gscompleter.apps.command_line.named_splat import names_splat
 from gscompleter.apps.inputs.named_photographs import (
     check_target_files,
     read_targets,

@@ -509,6 +509,16 @@ def test_depth_of_the_sky_does_not_reach_the_surface_before_it():
     assert torch.allclose(found.depth[12:], torch.tensor(5.0))
 
 
+def test_depth_of_0_beside_a_surface_does_not_reach_it():
+    camera = camera_at(0.0, size=32)
+    window = Window(top=0, left=0, height=32, width=32, scale_x=1.0, scale_y=1.0)
+    depth = torch.full((32, 32), 5.0)
+    depth[:, 16:] = 0.0
+    found = window.resample_depth_map(depth, (depth == 5).float(), camera)
+    assert found.valid[:, :16].all()
+    assert torch.allclose(found.depth[:, :16], torch.tensor(5.0))
+
+
 def test_each_pixel_of_the_window_belongs_to_the_pixel_it_lies_in():
     views = photographs(size=40)
     (image,) = create_any_view_batch(views[:1], ResizeConfig(56), 1).windows

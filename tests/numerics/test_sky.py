@@ -11,7 +11,13 @@ import torch
 from gscompleter.data.formats import open_photographs
 from gscompleter.guards.free_space import respect_free_space
 from gscompleter.numerics.geometry import project
-from gscompleter.numerics.sky import SKY_DEPTH, extend_sky, is_sky, mask_out_sky
+from gscompleter.numerics.sky import (
+    SKY_DEPTH,
+    extend_sky,
+    find_sky_gaussians,
+    is_sky,
+    mask_out_sky,
+)
 from gscompleter.reconstructors.features.depth_range import get_depth_range, set_depth_range
 from gscompleter.reconstructors.features.stereo_image import make_stereo_images
 from gscompleter.reconstructors.plane_sweep import PlaneSweep
@@ -28,6 +34,7 @@ from scenes import (
     cast,
     gaussians_of,
     open_street,
+    random_gaussians,
     view_of,
 )
 
@@ -283,6 +290,12 @@ def test_a_hole_beside_the_sky_is_sky_if_it_shows_its_colour():
     assert is_sky(z[:8, 3:6], camera).all()
     z[:8, 3:6] = 5.0
     torch.testing.assert_close(z, torch.full((16, 16), 5.0), atol=1e-4, rtol=0)
+
+
+def test_a_surface_at_the_end_of_a_drive_is_no_sky():
+    drive = [replace(camera_at(z=z), near=1.0, far=10.0) for z in (0.0, 20.0, 40.0)]
+    points = replace(random_gaussians(2), means=torch.tensor([[0.0, 0, 45], [0, 0, 120]]))
+    assert find_sky_gaussians(points, drive).tolist() == [False, True]
 
 
 def test_without_a_sky_no_candidate_moves():

@@ -76,23 +76,25 @@ def extend_sky(
     return gaussians, pixels
 
 
-def find_sky_gaussians(gaussians: Gaussians, camera: Camera) -> Bool[Tensor, "n"]:
-    """Find the Gaussians of the sky; `camera` is any of those that see them."""
-    # Distances and not z-depths, as a Gaussian may lie beside the view of this one camera. Surfaces
-    # end at the far plane, and the sky is so much farther away that both tell the same.
-    return is_sky((gaussians.means - camera.center).norm(dim=-1), camera)
+def find_sky_gaussians(gaussians: Gaussians, cameras: Sequence[Camera]) -> Bool[Tensor, "n"]:
+    """Find the Gaussians of the sky, which is far from all cameras of a scene."""
+    # Distances and not z-depths, as a Gaussian may lie beside the view of a camera. Surfaces end at
+    # the far plane, and the sky is so much farther away that both tell the same. At the end of a
+    # long drive they are far from the first camera, so that all of them are asked.
+    far = [is_sky((gaussians.means - camera.center).norm(dim=-1), camera) for camera in cameras]
+    return torch.stack(far).all(dim=0)
 
 
-def restore_sky_colors(made: Gaussians, fitted: Gaussians, camera: Camera) -> Gaussians:
+def restore_sky_colors(made: Gaussians, fitted: Gaussians, cameras: Sequence[Camera]) -> Gaussians:
     """Restore the colours that Gaussians of the sky had before colours were fitted.
 
     Fitting compensates for blur, which makes a bright line of sky along roofs; parallax would
-    reveal it. `camera` is any of those that see the Gaussians.
+    reveal it. `cameras` are those of the photographs.
     """
-    in_sky = find_sky_gaussians(made, camera)
+    in_sky = find_sky_gaussians(made, cameras)
     if not in_sky.any():
         return fitted
     # The fit may have added harmonics, which the sky does not have.
     sh = torch.where(in_sky[:, None, None], 0, fitted.sh)
     sh[in_sky, : made.sh.shape[1]] = made.sh[in_sky]
-    return replace(fitted, sh=sh, encoded=None)
+    return replace(fitted, sh=sh)

@@ -62,4 +62,4 @@ def fit_colors(
         step = relaxation * sums / weights.clamp_min(DAMPED_WEIGHT)[:, None]
         change = (change + step).clamp(least, most)
     fitted = new.sh[:, :1] + change[:, None] / SH_C0
-    return replace(new, sh=torch.cat([fitted, new.sh[:, 1:]], dim=1), encoded=None)
+    return replace(new, sh=torch.cat([fitted, new.sh[:, 1:]], dim=1))

@@ -306,7 +306,7 @@ def reconstruct_lacking(
     # No more harmonics than the scene has, whose file has no place for them. The fit of colours
     # that follows makes up for them.
     sh = part.sh[:, : state.context.sh.shape[1]]
-    return replace(part, sh=sh, encoded=None), reconstruction.notes
+    return replace(part, sh=sh), reconstruction.notes
 
 
 @dataclass(frozen=True)

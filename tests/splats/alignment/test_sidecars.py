@@ -290,6 +290,21 @@ def test_a_splat_of_a_part_of_a_drive_is_found_in_it(splat, drive, tmp_path):
         found_for(tmp_path / "s.ply", random_gaussians(300), drive)
 
 
+def test_samples_reach_the_end_of_a_drive(drive):
+    shown = [view.frame for view in sample_views(open_photographs(drive), (0, 1, 2, 3))]
+    assert shown[:4] == [0, 1, 2, 3]
+    assert shown[4:] == [4, 9, 14, 19]
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_photographs_from_one_place_refuse_a_foreign_splat_as_others_do(tmp_path, count):
+    cameras = [camera_at(0.0, yaw=10 * number, size=96) for number in range(count)]
+    folder = photographed(tmp_path / "tripod", cameras)
+    foreign = InputSplat(tmp_path / "s.ply", random_gaussians(300), np.zeros(3), folder)
+    with pytest.raises(InputError, match="does not show what the photographs show"):
+        align_splat(foreign, open_photographs(folder), (0,), RENDERER)
+
+
 def test_the_photographs_that_a_splat_was_made_of_are_asked(splat, drive, tmp_path):
     photographs = open_photographs(drive)
     given = InputSplat(tmp_path / "s.ply", splat, np.zeros(3), drive)

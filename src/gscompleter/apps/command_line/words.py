@@ -9,6 +9,7 @@ from dataclasses import fields, is_dataclass
 from functools import cache
 from io import StringIO
 from itertools import pairwise
+from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
 import tyro
@@ -22,6 +23,7 @@ from gscompleter.apps.command_line.chosen_config import (
 )
 from gscompleter.apps.command_line.command_list import HELP, HELP_ALL
 from gscompleter.apps.command_line.help_pages import Rule, describe_command, make_help_rule
+from gscompleter.apps.command_line.named_splat import names_splat
 from gscompleter.apps.command_line.old_spellings import refuse_old_spellings
 from gscompleter.apps.command_line.wrong_values import explain_values
 from gscompleter.apps.requests.completion import DEFAULT_NUM_TARGETS
@@ -271,7 +273,10 @@ def prepare_help(words: Sequence[str]) -> tuple[list[str], list[Rule]]:
 
 
 def show_config(words: Sequence[str]) -> tuple[CompleterConfig, list[str]]:
-    """Load the config that a help page shows, and return it with the words but `--config NAME`."""
+    """Load the config that a help page shows, and return it with the words but `--config NAME`.
+
+    A splat in the place of SCENE counts where SCENE is the first word after the command.
+    """
     others: list[str] = []
     name = ChosenConfig.name
     for before, word in pairwise(("", *words)):
@@ -285,9 +290,13 @@ def show_config(words: Sequence[str]) -> tuple[CompleterConfig, list[str]]:
             name = value
     if not words or words[0] not in CONFIGURED:
         return CompleterConfig(), others
-    has_scene = any(word.partition("=")[0] == "--scene" for word in others)
-    adapt = ADAPTED.get(words[0], lambda config: config)
-    return load_config(name, has_scene or words[0] in OF_SPLATS, adapt=adapt), others
+    given = {word.partition("=")[0] for word in others}
+    is_alone = len(words) > 1 and names_splat(Path(words[1]))
+    is_splat = is_alone or "--scene" in given or words[0] in OF_SPLATS
+    # With a mask `complete` does what `repair` does.
+    does = "repair" if "--mask" in given else words[0]
+    adapt = ADAPTED.get(does, lambda config: config)
+    return load_config(name, is_splat, not is_alone, adapt), others
 
 
 def list_box_lines(box: str) -> list[str]:
@@ -302,15 +311,16 @@ def extract_sentence(box: str) -> str:
     """Extract the sentence from tyro's boxed error message, with the option that is meant."""
     lines = list_box_lines(box)
 
-    # The message is the first paragraph, up to an empty line or a rule. It may list arguments. The
-    # help of each stands below it, indented once more, and is no part of a sentence.
+    # The message is the first paragraph, up to an empty line or a rule. It may list arguments,
+    # which tyro indents by 4 spaces. The help of each stands below it, indented by 8, and is no
+    # part of a sentence.
     paragraph: list[str] = []
     for line in lines:
         if line.strip("─- "):
             paragraph.append(line)
         elif paragraph:
             break
-    sentence = " ".join(line.strip() for line in paragraph if not line.startswith(" " * 5))
+    sentence = " ".join(line.strip() for line in paragraph if not line.startswith(" " * 8))
     # A value that cannot be read comes with tyro's words on where.
     sentence = re.sub(r"^Error parsing [\w.-]+: ", "", sentence)
 

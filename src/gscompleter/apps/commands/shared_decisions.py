@@ -11,6 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
+from gscompleter.apps.command_line.named_splat import names_splat
 from gscompleter.apps.commands.shared_options import (
     CompletingOptions,
     ReconstructorOptions,
@@ -227,16 +228,6 @@ def stop_recoloring(config: CompleterConfig) -> CompleterConfig:
 def has_splat_alone(options: CompletingOptions) -> bool:
     """Return True for a splat without photographs: SCENE is left out, or is the splat itself."""
     return options.folder is None or names_splat(options.folder)
-
-
-def names_splat(path: Path) -> bool:
-    """Check whether a path is a file named as one of Gaussians, or a folder of nothing else."""
-    # Without an import of torch where there is nothing to look into.
-    if not os.path.exists(path):
-        return False
-    from gscompleter.splats.foreign import holds_splat_alone, is_named_splat
-
-    return holds_splat_alone(path) if os.path.isdir(path) else is_named_splat(path)
 
 
 def check_splat_named(options: CompletingOptions, what: str) -> None:

@@ -10,6 +10,7 @@ import tyro
 from annotated_types import Interval
 
 from gscompleter.apps.command_line.chosen_config import ChosenConfig
+from gscompleter.apps.command_line.named_splat import names_splat
 from gscompleter.apps.commands.shared_decisions import (
     check_context,
     decide_models,
@@ -17,7 +18,6 @@ from gscompleter.apps.commands.shared_decisions import (
     decide_results,
     decide_splat,
     make_two_splats_error,
-    names_splat,
     stop_recoloring,
 )
 from gscompleter.apps.commands.shared_options import (

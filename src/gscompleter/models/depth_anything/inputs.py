@@ -95,9 +95,9 @@ class Window:
         """
         places = self.locate_pixels(camera).to(depth.device)
         # Inverse depth is linear in the image on a plane; confidence may be a mask, and is not
-        # mixed.
+        # mixed. Depth without confidence may be 0, whose inverse times a weight of 0 is no number.
         inverse = 1 / depth[..., None]
-        mixed = sample(inverse, places)[..., 0]
+        mixed = sample(inverse.where(confidence[..., None] > 0, 0.0), places)[..., 0]
         sure = sample(confidence[..., None], places, "nearest")[..., 0]
         # Depth without confidence, as that of the sky, is any number, and is not mixed either.
         unsure = sample((confidence[..., None] <= 0).to(depth), places)[..., 0]

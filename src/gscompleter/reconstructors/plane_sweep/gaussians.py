@@ -155,7 +155,7 @@ class Splatter:
             fitted = self.fit_before_sky(scene, fitted_views, gains, skies, emphasis)
         else:
             fitted = self.fit_gaussians(scene, self.replace_all_ignored(scene, fitted_views, gains))
-            fitted = restore_sky_colors(scene, fitted, fitted_views[0].camera)
+            fitted = restore_sky_colors(scene, fitted, [view.camera for view in fitted_views])
 
         # View and pixel of each Gaussian, in the order of the scene.
         sizes = [view.valid_mask.numel() for view in views]
@@ -322,7 +322,7 @@ class Splatter:
         """
         if not skies:
             return self.fit_many_views(scene, views, gains, skies, emphasis)
-        in_sky = find_sky_gaussians(scene, views[0].camera)
+        in_sky = find_sky_gaussians(scene, [view.camera for view in views])
         surfaces = scene[~in_sky]
         # A part of a scene may be nothing but sky.
         if not len(surfaces):

@@ -16,6 +16,7 @@ from gscompleter.data.cameras import Poses
 from gscompleter.data.photographs import Photographs
 from gscompleter.numerics.sampling import sample_evenly
 from gscompleter.reconstructors.features.depth_range import estimate_depth_range
+from gscompleter.reconstructors.features.stereo_image import has_distinct_centers
 from gscompleter.render.lod import build_proxy, thin_gaussians
 from gscompleter.render.protocols import Renderer
 from gscompleter.splats.alignment.fit import SplatFit, render_from, score_image, score_splat
@@ -42,6 +43,8 @@ MIN_SHOWN = 2
 """Fewest of them that have to match: a single one may do so by chance."""
 SAMPLE_SIDE = 320
 """Longer side of the samples in pixels: enough for features and for a blur of one pixel."""
+GRID_STEP = 16
+"""Pixels of the samples from one point of a grid to the next: some hundred points for each."""
 MIN_IMPROVEMENT = 2.0
 """Gain in dB by which a frame must fit better than a simpler one; blur alone can cause 1 dB."""
 DRIFT_WARNING = 2.0
@@ -172,9 +175,9 @@ def sample_views(
         return views
     # Half of the samples are the frames of the context, half are from all over.
     named = list(frames)[: NUM_SAMPLE_VIEWS // 2]
-    spread = sample_evenly(range(len(photographs)), NUM_SAMPLE_VIEWS)
-    others = [frame for frame in spread if frame not in named][: NUM_SAMPLE_VIEWS - len(named)]
-    return photographs.views(named, SAMPLE_SIDE) + read_views(photographs, others)
+    others = [frame for frame in range(len(photographs)) if frame not in named]
+    spread = sample_evenly(others, NUM_SAMPLE_VIEWS - len(named))
+    return photographs.views(named, SAMPLE_SIDE) + read_views(photographs, spread)
 
 
 def read_views(photographs: Photographs, frames: Sequence[int]) -> list[View]:
@@ -235,6 +238,9 @@ def align_by_features(
     if best.fit.is_match:
         starts: Iterable[Matrix] = [best.transform]
     else:
+        # From one place nothing tells the size of a frame.
+        if not has_distinct_centers(data.views):
+            return best
         if points is None:
             points = estimate_points(data.views)
         scene = thin_gaussians(data.scene)
@@ -251,11 +257,15 @@ def align_by_features(
 
 
 def estimate_points(views: Sequence[View]) -> Points:
-    """Estimate scene points without a sparse cloud: a grid at the median depth of each view."""
+    """Estimate scene points without a sparse cloud: a grid of pixels of each view, at one depth.
+
+    The points tell where the scene lies and how large it is, so that a rough depth will do: the
+    geometric mean of the nearest and the farthest that features show.
+    """
     near, far = estimate_depth_range(views)
     depth = float(np.sqrt(near * far))
     points = []
     for view in views:
-        rays = view.camera.z_rays()[::16, ::16].reshape(-1, 3)
+        rays = view.camera.z_rays()[::GRID_STEP, ::GRID_STEP].reshape(-1, 3)
         points.append(view.camera.center + depth * rays)
     return torch.cat(points).double().cpu().numpy()
