@@ -260,7 +260,7 @@ def test_a_part_that_is_nothing_but_sky_is_not_fitted():
     scene = gaussians_of(view, torch.full((32, 32), SKY_DEPTH * 10.0))
     whole = torch.ones(32, 32, dtype=torch.bool)
     fitted = PlaneSweep().fit_before_sky(
-        scene, [view] * 3, torch.ones(3, 3), [whole] * 3, Emphasis()
+        scene, whole.flatten(), [view] * 3, torch.ones(3, 3), [whole] * 3, Emphasis()
     )
     assert fitted is scene
 
@@ -292,10 +292,12 @@ def test_a_hole_beside_the_sky_is_sky_if_it_shows_its_colour():
     torch.testing.assert_close(z, torch.full((16, 16), 5.0), atol=1e-4, rtol=0)
 
 
-def test_a_surface_at_the_end_of_a_drive_is_no_sky():
-    drive = [replace(camera_at(z=z), near=1.0, far=10.0) for z in (0.0, 20.0, 40.0)]
-    points = replace(random_gaussians(2), means=torch.tensor([[0.0, 0, 45], [0, 0, 120]]))
-    assert find_sky_gaussians(points, drive).tolist() == [False, True]
+def test_only_the_camera_of_a_gaussian_tells_whether_it_is_sky():
+    """The sky of a drive's first photograph is near its last one, whose surfaces are far away."""
+    drive = [replace(camera_at(z=z), near=1.0, far=10.0) for z in (0.0, 20.0, 60.0)]
+    points = replace(random_gaussians(2), means=torch.tensor([[0.0, 0, 80], [0, 0, 69]]))
+    found = find_sky_gaussians(points, torch.tensor([0, 2]), drive)
+    assert found.tolist() == [True, False]
 
 
 def test_without_a_sky_no_candidate_moves():

@@ -104,9 +104,11 @@ def test_photographs_contradict_a_mesh_that_is_not_in_their_frame(geometry, word
 
 def test_geometry_that_stereo_contradicts_in_half_the_photographs_is_refused():
     given = [replace(view, given_depth=torch.ones(SIZE, SIZE)) for view in VIEWS]
-    require_uncontradicted(MESH, given, given)
+    require_uncontradicted(MESH, VIEWS, given, given)
     with pytest.raises(InputError, match="surfaces of room.ply .* in 1 of 2 photographs"):
-        require_uncontradicted(MESH, given, [given[0], VIEWS[1]])
+        require_uncontradicted(MESH, VIEWS, given, [given[0], VIEWS[1]])
+    # Depth that came with a photograph says nothing about the geometry.
+    require_uncontradicted(MESH, [VIEWS[0], given[1]], given, [given[0], VIEWS[1]])
 
 
 def test_photographs_keep_the_depth_that_was_measured_with_them():

@@ -9,6 +9,7 @@ import torch
 from jaxtyping import Bool, Float, Int
 from torch import Tensor
 
+from gscompleter.numerics.geometry import compute_z_depths
 from gscompleter.numerics.image_ops import dilate
 from gscompleter.types import Camera, DepthMap, Gaussians, Render, View, make_observed, sh_from_rgb
 
@@ -76,22 +77,27 @@ def extend_sky(
     return gaussians, pixels
 
 
-def find_sky_gaussians(gaussians: Gaussians, cameras: Sequence[Camera]) -> Bool[Tensor, "n"]:
-    """Find the Gaussians of the sky, which is far from all cameras of a scene."""
-    # Distances and not z-depths, as a Gaussian may lie beside the view of a camera. Surfaces end at
-    # the far plane, and the sky is so much farther away that both tell the same. At the end of a
-    # long drive they are far from the first camera, so that all of them are asked.
-    far = [is_sky((gaussians.means - camera.center).norm(dim=-1), camera) for camera in cameras]
-    return torch.stack(far).all(dim=0)
+def find_sky_gaussians(
+    gaussians: Gaussians, view_index: Int[Tensor, "n"], cameras: Sequence[Camera]
+) -> Bool[Tensor, "n"]:
+    """Find the Gaussians of the sky, as the camera of the photograph that each is of sees them.
+
+    Another one may stand far from it, as at the other end of a drive. `view_index` is the number of
+    that camera among `cameras`.
+    """
+    in_sky = torch.zeros_like(gaussians.opacities, dtype=torch.bool)
+    for number, camera in enumerate(cameras):
+        own = view_index == number
+        in_sky[own] = is_sky(compute_z_depths(gaussians.means[own], camera), camera)
+    return in_sky
 
 
-def restore_sky_colors(made: Gaussians, fitted: Gaussians, cameras: Sequence[Camera]) -> Gaussians:
+def restore_sky_colors(made: Gaussians, fitted: Gaussians, in_sky: Bool[Tensor, "n"]) -> Gaussians:
     """Restore the colours that Gaussians of the sky had before colours were fitted.
 
     Fitting compensates for blur, which makes a bright line of sky along roofs; parallax would
-    reveal it. `cameras` are those of the photographs.
+    reveal it.
     """
-    in_sky = find_sky_gaussians(made, cameras)
     if not in_sky.any():
         return fitted
     # The fit may have added harmonics, which the sky does not have.

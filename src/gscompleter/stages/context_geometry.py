@@ -13,7 +13,7 @@ from gscompleter.numerics.given_geometry import GivenGeometry
 from gscompleter.numerics.place_geometry import place_geometry
 from gscompleter.numerics.sky import mask_out_sky
 from gscompleter.render.cache import SceneRenderer
-from gscompleter.stages.context import InitialContext
+from gscompleter.stages.context import InitialContext, sort_by_frame
 from gscompleter.stages.given_geometry import (
     ContradictedError,
     give_depth_before_scene,
@@ -59,9 +59,10 @@ def init_from_depth(placed: GivenGeometry, views: Sequence[View], init: InitFrom
 
     Raises ContradictedError if they measure something else.
     """
+    views = sort_by_frame(views)  # as those of the context are
     given, notes = give_depth_before_scene(placed, views)
     context = init(given)
-    require_uncontradicted(placed, given, context.views)
+    require_uncontradicted(placed, views, given, context.views)
     return replace(context, notes=(*notes, *context.notes), geometry=placed)
 
 

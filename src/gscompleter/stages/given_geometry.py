@@ -121,15 +121,24 @@ def give_depth_before_scene(
 
 
 def require_uncontradicted(
-    geometry: GivenGeometry, given: Sequence[View], used: Sequence[View]
+    geometry: GivenGeometry,
+    views: Sequence[View],
+    given: Sequence[View],
+    used: Sequence[View],
 ) -> None:
     """Raise ContradictedError if Ψ left out the depth of geometry in half the photographs, or more.
 
-    `given` are the photographs before the scene was made of them, `used` those after it, which have
-    no depth any more where stereo contradicts it.
+    `views` are the photographs as they came, some of which have a depth of their own, `given` those
+    with the depth of geometry, and `used` those of which the scene was made. In these the depth is
+    missing where stereo contradicts it. All are in the same order.
     """
-    num_given = sum(view.given_depth is not None for view in given)
-    num_dropped = num_given - sum(view.given_depth is not None for view in used)
+    of_geometry = [
+        after
+        for before, with_depth, after in zip(views, given, used, strict=True)
+        if before.given_depth is None and with_depth.given_depth is not None
+    ]
+    num_given = len(of_geometry)
+    num_dropped = sum(view.given_depth is None for view in of_geometry)
     if num_given and 2 * num_dropped >= num_given:
         raise ContradictedError(
             f"The surfaces of {geometry.name} contradict what stereo measures in {num_dropped} of "

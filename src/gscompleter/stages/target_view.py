@@ -191,7 +191,7 @@ def find_hole_edits(
         return HoleEdits()
     if not (config.completes_removals_only or config.holes.forces_removed):
         return HoleEdits()
-    confirmed = find_confirmed(state, camera, frozen)
+    confirmed = mark_confirmed(state, camera, frozen)
     removed = find_removed(state.source, camera.padded, scenes.renderer)
     opened = add_border(removed) if config.completes_removals_only else None
     if not config.holes.forces_removed:
@@ -205,10 +205,10 @@ def find_hole_edits(
     return HoleEdits(opened, removed if confirmed is None else removed & ~confirmed)
 
 
-def find_confirmed(
+def mark_confirmed(
     state: Completion, camera: PaddedCamera, frozen: FrozenScene
 ) -> Bool[Tensor, "h w"] | None:
-    """Find the pixels that show a surface which photographs confirm after a removal.
+    """Mark the pixels that show a surface which photographs confirm after a removal.
 
     None if photographs do not decide what stays.
     """

@@ -156,7 +156,6 @@ def call_tyro(
     marks = (
         tyro.conf.DisallowNone,
         tyro.conf.FlagCreatePairsOff,
-        tyro.conf.OmitSubcommandPrefixes,
         *more_marks,
     )
     return tyro.cli(
@@ -275,7 +274,8 @@ def prepare_help(words: Sequence[str]) -> tuple[list[str], list[Rule]]:
 def show_config(words: Sequence[str]) -> tuple[CompleterConfig, list[str]]:
     """Load the config that a help page shows, and return it with the words but `--config NAME`.
 
-    A splat in the place of SCENE counts where SCENE is the first word after the command.
+    A splat is alone in the place of SCENE, or if `--scene` names it and SCENE is left out. SCENE is
+    seen where it stands behind no option.
     """
     others: list[str] = []
     name = ChosenConfig.name
@@ -291,10 +291,12 @@ def show_config(words: Sequence[str]) -> tuple[CompleterConfig, list[str]]:
     if not words or words[0] not in CONFIGURED:
         return CompleterConfig(), others
     given = {word.partition("=")[0] for word in others}
-    is_alone = len(words) > 1 and names_splat(Path(words[1]))
+    # SCENE is the first word behind another one that is no option.
+    scenes = [word for before, word in pairwise(words) if "-" not in (before[:1], word[:1])]
+    is_alone = names_splat(Path(scenes[0])) if scenes else "--scene" in given
     is_splat = is_alone or "--scene" in given or words[0] in OF_SPLATS
     # With a mask `complete` does what `repair` does.
-    does = "repair" if "--mask" in given else words[0]
+    does = "repair" if words[0] == "complete" and "--mask" in given else words[0]
     adapt = ADAPTED.get(does, lambda config: config)
     return load_config(name, is_splat, not is_alone, adapt), others
 

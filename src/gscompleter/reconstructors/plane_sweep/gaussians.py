@@ -151,11 +151,6 @@ class Splatter:
             for number, gaussians, pixels in self.extend_skies(views, skies, sky_images)
         ]
         scene = merge([candidates[kept], *(gaussians for _, gaussians, _ in extensions)])
-        if len(views) > 2:
-            fitted = self.fit_before_sky(scene, fitted_views, gains, skies, emphasis)
-        else:
-            fitted = self.fit_gaussians(scene, self.replace_all_ignored(scene, fitted_views, gains))
-            fitted = restore_sky_colors(scene, fitted, [view.camera for view in fitted_views])
 
         # View and pixel of each Gaussian, in the order of the scene.
         sizes = [view.valid_mask.numel() for view in views]
@@ -163,11 +158,20 @@ class Splatter:
         numbers = torch.cat([torch.full((size,), i) for i, size in enumerate(sizes)])
         numbers = numbers.to(kept.device)[kept]
         sky_numbers = [torch.full_like(sky_pixels, i) for i, _, sky_pixels in extensions]
+        view_index = torch.cat([numbers, *sky_numbers])
+        pixel_index = torch.cat([pixels, *(sky_pixels for _, _, sky_pixels in extensions)])
+
+        in_sky = find_sky_gaussians(scene, view_index, [view.camera for view in fitted_views])
+        if len(views) > 2:
+            fitted = self.fit_before_sky(scene, in_sky, fitted_views, gains, skies, emphasis)
+        else:
+            fitted = self.fit_gaussians(scene, self.replace_all_ignored(scene, fitted_views, gains))
+            fitted = restore_sky_colors(scene, fitted, in_sky)
         return Reconstruction(
             fitted.to(device),
             tuple(depths),
-            torch.cat([numbers, *sky_numbers]).to(device),
-            torch.cat([pixels, *(sky_pixels for _, _, sky_pixels in extensions)]).to(device),
+            view_index.to(device),
+            pixel_index.to(device),
             None if (gains == 1).all() else gains.to(device),
         )
 
@@ -310,6 +314,7 @@ class Splatter:
     def fit_before_sky(
         self,
         scene: Gaussians,
+        in_sky: Bool[Tensor, "n"],
         views: Sequence[View],
         gains: Float[Tensor, "views 3"],
         skies: Sequence[Bool[Tensor, "_ _"]],
@@ -317,12 +322,12 @@ class Splatter:
     ) -> Gaussians:
         """Fit the surfaces to three views or more, before the sky that each of them shows.
 
-        `skies` mark it, and are empty if no view shows any. It stays as it is: what one photograph
+        `in_sky` marks the Gaussians of the sky, and `skies` its pixels in each view; they are empty
+        if no view shows any. It stays as it is: what one photograph
         shows white and another one blue would pull at the surfaces before it.
         """
         if not skies:
             return self.fit_many_views(scene, views, gains, skies, emphasis)
-        in_sky = find_sky_gaussians(scene, [view.camera for view in views])
         surfaces = scene[~in_sky]
         # A part of a scene may be nothing but sky.
         if not len(surfaces):

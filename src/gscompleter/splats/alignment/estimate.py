@@ -42,11 +42,13 @@ MAX_ASKED_VIEWS = 40
 MIN_SHOWN = 2
 """Fewest of them that have to match: a single one may do so by chance."""
 SAMPLE_SIDE = 320
-"""Longer side of the samples in pixels: enough for features and for a blur of one pixel."""
+"""Longer side of the samples in pixels: enough for features, and for a frame that is off by a pixel
+of them to show as a blur."""
 GRID_STEP = 16
 """Pixels of the samples from one point of a grid to the next: some hundred points for each."""
 MIN_IMPROVEMENT = 2.0
-"""Gain in dB by which a frame must fit better than a simpler one; blur alone can cause 1 dB."""
+"""Gain in dB by which a frame must fit better than a simpler one. A blurred splat in the right
+frame gains one from being a little smaller."""
 DRIFT_WARNING = 2.0
 """Displacement in pixels of the small photographs from which the user is warned."""
 
