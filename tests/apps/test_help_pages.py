@@ -165,7 +165,7 @@ def test_a_page_shows_the_config_of_the_command_that_asks_for_it(tmp_path):
         (["complete", str(splat)], alone),
         (["live", str(splat)], alone),
         (["complete", "--scene", "s.ply"], alone),
-        (["complete", "--out", "o", "photographs", "--scene", "s.ply"], CompleterConfig.splat()),
+        (["complete", "--scene", "s.ply", "--resolution", "480", "640"], alone),
         (["remove", str(splat), "--mask", "m.png"], alone.for_removal()),
         (["complete", str(splat), "--mask", "m.png"], alone.for_marks()),
         (["repair", str(splat)], alone.for_marks()),

@@ -111,6 +111,12 @@ def test_geometry_that_stereo_contradicts_in_half_the_photographs_is_refused():
     require_uncontradicted(MESH, [VIEWS[0], given[1]], given, [given[0], VIEWS[1]])
 
 
+def test_one_photograph_cannot_tell_where_geometry_belongs():
+    behind = MESH.move(np.array([0.0, 0.0, -100.0]))
+    with pytest.raises(InputError, match="room.ply covers hardly anything"):
+        GSCompleter().begin(VIEWS[:1], geometry=behind)
+
+
 def test_photographs_keep_the_depth_that_was_measured_with_them():
     measured = torch.full((SIZE, SIZE), 4.0)
     views = [replace(VIEWS[0], given_depth=measured), VIEWS[1]]

@@ -20,6 +20,7 @@ from gscompleter.stages.given_geometry import (
     give_photographs_depth,
     require_uncontradicted,
 )
+from gscompleter.system.errors import InputError
 from gscompleter.types import DepthMap, View
 
 InitFrom = Callable[[Sequence[View]], InitialContext]
@@ -45,9 +46,14 @@ def init_with_geometry(
         return replace(context, views=given, geometry=placed)
     try:
         return init_from_depth(geometry, views, init)
-    except ContradictedError:
-        # It may be in a frame of its own, which the scene that Ψ makes without it tells.
-        placed, _ = place_in_context(geometry, init(views), scenes)
+    except ContradictedError as contradiction:
+        # It may be in a frame of its own, which the scene that Ψ makes without it tells. From a
+        # single photograph Ψ makes none.
+        try:
+            context = init(views)
+        except InputError:
+            raise contradiction from None
+        placed, _ = place_in_context(geometry, context, scenes)
         # The same object, if the scene shows it where it stands: the contradiction remains.
         if placed is geometry:
             raise

@@ -274,8 +274,8 @@ def prepare_help(words: Sequence[str]) -> tuple[list[str], list[Rule]]:
 def show_config(words: Sequence[str]) -> tuple[CompleterConfig, list[str]]:
     """Load the config that a help page shows, and return it with the words but `--config NAME`.
 
-    A splat is alone in the place of SCENE, or if `--scene` names it and SCENE is left out. SCENE is
-    seen where it stands behind no option.
+    A splat is alone in the place of SCENE, or if `--scene` names it and SCENE is left out. SCENE
+    counts as the first word after the command: behind options it may be one of their values.
     """
     others: list[str] = []
     name = ChosenConfig.name
@@ -291,9 +291,8 @@ def show_config(words: Sequence[str]) -> tuple[CompleterConfig, list[str]]:
     if not words or words[0] not in CONFIGURED:
         return CompleterConfig(), others
     given = {word.partition("=")[0] for word in others}
-    # SCENE is the first word behind another one that is no option.
-    scenes = [word for before, word in pairwise(words) if "-" not in (before[:1], word[:1])]
-    is_alone = names_splat(Path(scenes[0])) if scenes else "--scene" in given
+    has_first = len(words) > 1 and not words[1].startswith("-")
+    is_alone = names_splat(Path(words[1])) if has_first else "--scene" in given
     is_splat = is_alone or "--scene" in given or words[0] in OF_SPLATS
     # With a mask `complete` does what `repair` does.
     does = "repair" if words[0] == "complete" and "--mask" in given else words[0]

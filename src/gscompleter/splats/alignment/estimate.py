@@ -37,6 +37,7 @@ from gscompleter.system.errors import InputError
 from gscompleter.types import Gaussians, View
 
 NUM_SAMPLE_VIEWS = 8
+"""Photographs at which a frame is judged."""
 MAX_ASKED_VIEWS = 40
 """Most photographs that are asked before a splat is refused: it may cover few of them."""
 MIN_SHOWN = 2
@@ -161,6 +162,7 @@ def align_splat(
             f"{100 * best.given_fit.coverage:.0f} % of the pixels and matches them at "
             f"{best.given_fit.psnr:.1f} dB; give the photographs and poses that it was trained on."
         )
+    # These match the splat as it is, so that the alignment cannot fail any more.
     return align(shown)
 
 
@@ -200,14 +202,16 @@ def estimate_alignment(
     """Estimate the frame of the splat by how well it fits its photographs, if it does.
 
     Frames are tried from the simplest on, up to the first that is exact. One that fits is replaced
-    only by one that fits better by `MIN_IMPROVEMENT`. `poses` are camera-to-world of all
+    only by one that fits better by `MIN_IMPROVEMENT`. A splat that matches as it is needs no other
+    frame: features alone correct what is slightly off. `poses` are camera-to-world of all
     photographs, `points` sparse points in their frame.
     """
     given = data.score_transform(np.eye(4))
     side = max(max(view.camera.width, view.camera.height) for view in data.views)
     best = SplatAlignment("given", np.eye(4), given, given, side)
 
-    # Frames that trainers' files state come before computed ones, which are made when tried.
+    # In another frame. Those that trainers' files state come before computed ones, which are made
+    # when tried.
     if not given.is_match:
         computed = compute_trainer_frames(poses, points)
         normalised: Iterable[FrameProposal] = (("normalised", frame) for frame in computed)
