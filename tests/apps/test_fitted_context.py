@@ -81,13 +81,13 @@ def count_context(opened: Opened, is_fitted: bool, targets: tuple[str, ...] = ()
     return len(read_task(opened, None, targets, "cpu", False, is_fitted).views)
 
 
-def test_half_of_the_photographs_are_the_context_of_a_fitted_scene(tmp_path):
+def test_three_quarters_of_the_photographs_are_the_context_of_a_fitted_scene(tmp_path):
     few = open_room(tmp_path / "few", 9)
     more = open_room(tmp_path / "more", 24)
     many = open_room(tmp_path / "many", 40)
     assert count_context(few, is_fitted=True) == 8
-    assert count_context(more, is_fitted=True) == 12
-    assert count_context(many, is_fitted=True) == 16
+    assert count_context(more, is_fitted=True) == 18
+    assert count_context(many, is_fitted=True) == 24
     # A network was trained with few.
     assert count_context(many, is_fitted=False) == 8
 
@@ -105,8 +105,9 @@ def test_up_to_eight_photographs_are_the_context_of_a_scene_fitted_for_targets(t
 def test_large_photographs_are_no_more_than_before():
     def limit(width: int, height: int) -> int:
         camera = replace(camera_at(0.0), width=width, height=height)
-        return limit_fitted_context([camera] * 100, 16)
+        return limit_fitted_context([camera] * 100, 3 / 4, 24)
 
+    assert limit(640, 320) == 24
     assert limit(640, 480) == 16
     assert limit(800, 600) == 10
     # Whatever is asked at least is more than that.
@@ -120,9 +121,9 @@ def test_a_run_says_what_it_was_fitted_to_and_scores_others(tmp_path, monkeypatc
     room = opened.request.folder
     assert run(monkeypatch, "complete", room, "--auto", 1, "--out", out) == 0
     said = capsys.readouterr()
-    assert "fitted to 3 more" in said.out + said.err
+    assert "fitted to 2 more" in said.out + said.err
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
-    assert summary["scene"]["fitted"] == 3
+    assert summary["scene"]["fitted"] == 2
     assert len(summary["held_out"]) == 3
     named = tmp_path / "named"
     context = [str(row["frame"]) for row in summary["context"]]

@@ -23,14 +23,20 @@ NUM_CONTEXT = 3
 """Number of context photographs if targets but no context are named (decision 030)."""
 MAX_TARGET_CONTEXT = 8
 """Most of them if the scene is fitted jointly, with those near the targets first (decision 143)."""
+TARGET_CONTEXT_SHARE = 1 / 2
+"""Share of the photographs that they are at most: far ones gain nothing at the targets."""
 NUM_CONTEXT_WITH_SPLAT = 8
 """Number of context photographs with an input splat. It is also the smallest number without one if
 no targets are named either, so that the photographs have to show the whole scene (decision 030)."""
-MAX_FITTED_CONTEXT = 16
+MAX_FITTED_CONTEXT = 24
 """Most photographs of a context that has to show the whole scene and is fitted jointly (decision
-140)."""
-MAX_FITTED_PIXELS = MAX_FITTED_CONTEXT * 640 * 480
-"""Most pixels of such a context, for its time and memory; of large photographs there are fewer."""
+157)."""
+FITTED_CONTEXT_SHARE = 3 / 4
+"""Share of the photographs that it is at most: to some of the others it is fitted, too, and the
+rest scores it."""
+MAX_FITTED_PIXELS = 16 * 640 * 480
+"""Most pixels of a context that is fitted jointly, for its time and memory; of large photographs
+there are fewer."""
 NUM_DEPTH_VIEWS = 6
 """Number of photographs from which a depth range is estimated."""
 CHECK_VIEW_SIZE = 320
@@ -104,24 +110,26 @@ def _choose_frames(
     if not targets:
         count = NUM_CONTEXT_WITH_SPLAT
         if is_fitted:
-            count = max(count, limit_fitted_context(candidates, MAX_FITTED_CONTEXT))
+            limit = limit_fitted_context(candidates, FITTED_CONTEXT_SHARE, MAX_FITTED_CONTEXT)
+            count = max(count, limit)
         chosen = select_overview(candidates, points, count)
     else:
         count = NUM_CONTEXT_WITH_SPLAT if has_splat else NUM_CONTEXT
         if is_fitted:
-            count = max(NUM_CONTEXT, limit_fitted_context(candidates, MAX_TARGET_CONTEXT))
+            limit = limit_fitted_context(candidates, TARGET_CONTEXT_SHARE, MAX_TARGET_CONTEXT)
+            count = max(NUM_CONTEXT, limit)
         chosen = select_context(target_cameras, candidates, points, count)
     frames = list(cameras)
     return tuple(frames[index] for index in chosen)
 
 
-def limit_fitted_context(cameras: Sequence[Camera], most: int) -> int:
+def limit_fitted_context(cameras: Sequence[Camera], share: float, most: int) -> int:
     """Limit the context of a scene that is fitted to the photographs at `cameras`.
 
-    Half of them at most: to some of the others it is fitted, too, and the rest scores it.
+    It is at most a `share` of these, and no more than `most`.
     """
     pixels = max(camera.width * camera.height for camera in cameras)
-    return min(most, len(cameras) // 2, MAX_FITTED_PIXELS // pixels)
+    return min(most, int(share * len(cameras)), MAX_FITTED_PIXELS // pixels)
 
 
 def collect_usable_cameras(
