@@ -124,7 +124,7 @@ def test_a_run_says_what_it_was_fitted_to_and_scores_others(tmp_path, monkeypatc
     assert "fitted to 2 more" in said.out + said.err
     summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
     assert summary["scene"]["fitted"] == 2
-    assert len(summary["held_out"]) == 3
+    assert len(summary["held_out"]) == 2
     named = tmp_path / "named"
     context = [str(row["frame"]) for row in summary["context"]]
     chosen = ["--context", *context]
