@@ -2,7 +2,7 @@
 
 Within `Elsewhere()` the device `meta` holds tensors that compute values and gradients on the CPU.
 As on a GPU, mixing one with a CPU tensor in an operation is an error, and `.numpy()` needs `.cpu()`
-first. It is stricter in one thing: a CPU index, which a GPU waits for, is refused as well.
+first, or `force=True`. It is stricter in one thing: a CPU index, which a GPU waits for, is refused as well.
 """
 
 from __future__ import annotations
@@ -45,6 +45,10 @@ class There(Tensor):
     def tolist(self) -> Any:
         """Wait for the device and copy, as on a GPU."""
         return self.inner.tolist()
+
+    def numpy(self, *, force: bool = False) -> Any:
+        """Copy to the CPU only if that is asked for, as on a GPU."""
+        return self.inner.numpy(force=True) if force else super().numpy()
 
     @classmethod
     def __torch_dispatch__(cls, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:

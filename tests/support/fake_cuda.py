@@ -216,7 +216,9 @@ class FakeCudaTensor(Tensor):
         get_device().counts.wait("tolist")
         return self.values.tolist()
 
-    def numpy(self, **_: Any) -> Any:
+    def numpy(self, *, force: bool = False) -> Any:
+        if force:
+            return self.detach().cpu().numpy()
         raise TypeError(
             "can't convert cuda:0 device type tensor to numpy. Use Tensor.cpu() to copy the tensor "
             "to host memory first."

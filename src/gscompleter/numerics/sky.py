@@ -87,8 +87,8 @@ def find_sky_gaussians(
     """
     in_sky = torch.zeros_like(gaussians.opacities, dtype=torch.bool)
     for number, camera in enumerate(cameras):
-        own = view_index == number
-        in_sky[own] = is_sky(compute_z_depths(gaussians.means[own], camera), camera)
+        depths = compute_z_depths(gaussians.means, camera)
+        in_sky |= (view_index == number) & is_sky(depths, camera)
     return in_sky
 
 

@@ -152,14 +152,11 @@ class Splatter:
         ]
         scene = merge([candidates[kept], *(gaussians for _, gaussians, _ in extensions)])
 
-        # View and pixel of each Gaussian, in the order of the scene.
+        # View of each Gaussian, in the order of the scene.
         sizes = [view.valid_mask.numel() for view in views]
-        pixels = torch.cat([torch.arange(size) for size in sizes]).to(kept.device)[kept]
-        numbers = torch.cat([torch.full((size,), i) for i, size in enumerate(sizes)])
-        numbers = numbers.to(kept.device)[kept]
-        sky_numbers = [torch.full_like(sky_pixels, i) for i, _, sky_pixels in extensions]
-        view_index = torch.cat([numbers, *sky_numbers])
-        pixel_index = torch.cat([pixels, *(sky_pixels for _, _, sky_pixels in extensions)])
+        of_pixels = torch.cat([torch.full((size,), i) for i, size in enumerate(sizes)])
+        of_skies = [torch.full_like(sky_pixels, i) for i, _, sky_pixels in extensions]
+        view_index = torch.cat([of_pixels.to(kept.device)[kept], *of_skies])
 
         in_sky = find_sky_gaussians(scene, view_index, [view.camera for view in fitted_views])
         if len(views) > 2:
@@ -167,6 +164,9 @@ class Splatter:
         else:
             fitted = self.fit_gaussians(scene, self.replace_all_ignored(scene, fitted_views, gains))
             fitted = restore_sky_colors(scene, fitted, in_sky)
+
+        pixels = torch.cat([torch.arange(size) for size in sizes]).to(kept.device)[kept]
+        pixel_index = torch.cat([pixels, *(sky_pixels for _, _, sky_pixels in extensions)])
         return Reconstruction(
             fitted.to(device),
             tuple(depths),
