@@ -2,7 +2,8 @@
 
 Within `Elsewhere()` the device `meta` holds tensors that compute values and gradients on the CPU.
 As on a GPU, mixing one with a CPU tensor in an operation is an error, and `.numpy()` needs `.cpu()`
-first, or `force=True`. It is stricter in one thing: a CPU index, which a GPU waits for, is refused as well.
+first, or `force=True`. It is stricter in one thing: a CPU index, which a GPU waits for, is refused
+as well.
 """
 
 from __future__ import annotations
