@@ -50,6 +50,9 @@ GRID_STEP = 16
 MIN_IMPROVEMENT = 2.0
 """Gain in dB by which a frame must fit better than a simpler one. A blurred splat in the right
 frame gains one from being a little smaller."""
+MIN_KEPT_COVERAGE = 0.5
+"""Least coverage of a frame, relative to that of the one that it replaces: one that moves most of
+the splat out of the photographs may fit well what is left."""
 DRIFT_WARNING = 2.0
 """Displacement in pixels of the small photographs from which the user is warned."""
 
@@ -156,14 +159,15 @@ def align_splat(
     spread = sample_evenly(range(len(photographs)), MAX_ASKED_VIEWS)
     others = [view.to(device) for view in read_views(photographs, spread)]
     shown = AlignmentData(splat.scene, others, renderer).find_shown()
-    if len(shown) < MIN_SHOWN:
+    if len(shown) >= MIN_SHOWN:
+        best = align(shown)
+    if not best.fit.is_match:
         raise InputError(
             f"The splat does not show what the photographs show: at their cameras it covers "
             f"{100 * best.given_fit.coverage:.0f} % of the pixels and matches them at "
             f"{best.given_fit.psnr:.1f} dB; give the photographs and poses that it was trained on."
         )
-    # These match the splat as it is, so that the alignment cannot fail any more.
-    return align(shown)
+    return best
 
 
 def sample_views(
@@ -229,10 +233,11 @@ def estimate_alignment(
 
 
 def is_better(fit: SplatFit, than: SplatFit) -> bool:
-    """Return True if a fit is a match and clearly better, with at least half of the coverage."""
+    """Return True if a fit is a match and clearly better, and covers enough of the photographs."""
     if not fit.is_match or not than.is_match:
         return fit.is_match
-    return fit.coverage >= 0.5 * than.coverage and fit.margin > than.margin + MIN_IMPROVEMENT
+    has_coverage = fit.coverage >= MIN_KEPT_COVERAGE * than.coverage
+    return has_coverage and fit.margin > than.margin + MIN_IMPROVEMENT
 
 
 def align_by_features(
