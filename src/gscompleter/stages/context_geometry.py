@@ -52,6 +52,8 @@ def init_with_geometry(
         try:
             context = init(views)
         except InputError:
+            if len(views) > 1:
+                raise
             raise contradiction from None
         placed, _ = place_in_context(geometry, context, scenes)
         # The same object, if the scene shows it where it stands: the contradiction remains.
