@@ -259,8 +259,9 @@ def test_a_part_that_is_nothing_but_sky_is_not_fitted():
     view = View(torch.tensor(BLUE).repeat(32, 32, 1), camera)
     scene = gaussians_of(view, torch.full((32, 32), SKY_DEPTH * 10.0))
     whole = torch.ones(32, 32, dtype=torch.bool)
+    first = torch.zeros(32 * 32, dtype=torch.long)
     fitted = PlaneSweep().fit_before_sky(
-        scene, whole.flatten(), [view] * 3, torch.ones(3, 3), [whole] * 3, Emphasis()
+        scene, first, [view] * 3, torch.ones(3, 3), [whole] * 3, Emphasis()
     )
     assert fitted is scene
 

@@ -47,14 +47,12 @@ def init_with_geometry(
     try:
         return init_from_depth(geometry, views, init)
     except ContradictedError as contradiction:
-        # It may be in a frame of its own, which the scene that Ψ makes without it tells. From a
-        # single photograph Ψ makes none.
+        # It may be in a frame of its own, which the scene that Ψ makes without it tells.
         try:
             context = init(views)
-        except InputError:
-            if len(views) > 1:
-                raise
-            raise contradiction from None
+        except InputError as refusal:
+            # Ψ makes no scene of a single photograph without depth, which geometry was to give.
+            raise (contradiction if len(views) == 1 else refusal) from None
         placed, _ = place_in_context(geometry, context, scenes)
         # The same object, if the scene shows it where it stands: the contradiction remains.
         if placed is geometry:

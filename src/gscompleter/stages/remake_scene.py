@@ -68,15 +68,15 @@ def remake_scene(
     invented = mark_rendered(state.source, earlier.invented)
     if not gone.all():
         shown = list(render_at_views(made.source.gaussians, views, renderer))
-        exposure = measure_exposure(given, shown, views)
-        adapted = multiply_exposure(made, views, exposure)
         overlying = find_overlying(
             state.rendered_context, invented, gone, made.source.gaussians, views, shown, renderer
         )
         gone = gone | overlying
+    if not gone.all():
         # What was invented and stays has the exposure of the given scene. Else the new one keeps
         # its own, in which no photograph is brightened until it is clipped.
-        made = made if gone.all() else adapted
+        exposure = measure_exposure(given, shown, views)
+        made = multiply_exposure(made, views, exposure)
     part = make_part(PartOrigin("photographs"), made.source.gaussians)
     # The scene has one exposure, which photographs of the context share from here on.
     context = tuple(Photo(view) for view in made.views)

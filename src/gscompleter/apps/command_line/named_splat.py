@@ -1,4 +1,4 @@
-"""Whether what is named on the command line is a splat, before it is opened."""
+"""Recognise a splat by the path that the command line names, before it is opened."""
 
 from __future__ import annotations
 

@@ -158,11 +158,11 @@ class Splatter:
         of_skies = [torch.full_like(sky_pixels, i) for i, _, sky_pixels in extensions]
         view_index = torch.cat([of_pixels.to(kept.device)[kept], *of_skies])
 
-        in_sky = find_sky_gaussians(scene, view_index, [view.camera for view in fitted_views])
         if len(views) > 2:
-            fitted = self.fit_before_sky(scene, in_sky, fitted_views, gains, skies, emphasis)
+            fitted = self.fit_before_sky(scene, view_index, fitted_views, gains, skies, emphasis)
         else:
             fitted = self.fit_gaussians(scene, self.replace_all_ignored(scene, fitted_views, gains))
+            in_sky = find_sky_gaussians(scene, view_index, [view.camera for view in fitted_views])
             fitted = restore_sky_colors(scene, fitted, in_sky)
 
         pixels = torch.cat([torch.arange(size) for size in sizes]).to(kept.device)[kept]
@@ -314,7 +314,7 @@ class Splatter:
     def fit_before_sky(
         self,
         scene: Gaussians,
-        in_sky: Bool[Tensor, "n"],
+        view_index: Int[Tensor, "n"],
         views: Sequence[View],
         gains: Float[Tensor, "views 3"],
         skies: Sequence[Bool[Tensor, "_ _"]],
@@ -322,12 +322,13 @@ class Splatter:
     ) -> Gaussians:
         """Fit the surfaces to three views or more, before the sky that each of them shows.
 
-        `in_sky` marks the Gaussians of the sky, and `skies` its pixels in each view; they are empty
-        if no view shows any. It stays as it is: what one photograph
-        shows white and another one blue would pull at the surfaces before it.
+        `view_index` is the number of the view that each Gaussian is of. `skies` mark the sky, and
+        are empty if no view shows any. It stays as it is: what one photograph shows white and
+        another one blue would pull at the surfaces before it.
         """
         if not skies:
             return self.fit_many_views(scene, views, gains, skies, emphasis)
+        in_sky = find_sky_gaussians(scene, view_index, [view.camera for view in views])
         surfaces = scene[~in_sky]
         # A part of a scene may be nothing but sky.
         if not len(surfaces):
