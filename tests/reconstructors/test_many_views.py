@@ -312,9 +312,9 @@ def test_what_stands_before_the_surfaces_of_others_moves_behind_them():
     first, *others = leave_free_space(layers, open_pixels, *no_occluders(layers), transforms)
     assert all(after is before for after, before in zip(others, layers[1:], strict=True))
     surfaces = [Surfaces.measured_in(layer) for layer in layers]
-    was_before = find_seen_through(0, wrong, surfaces, transforms) & open_pixels[0]
+    was_before = find_seen_through(0, wrong, open_pixels[0], surfaces, transforms)
     assert was_before.sum() > 200
-    assert not (find_seen_through(0, first.inverse, surfaces, transforms) & open_pixels[0]).any()
+    assert not find_seen_through(0, first.inverse, open_pixels[0], surfaces, transforms).any()
     assert (first.inverse < wrong)[was_before].all()
     # Nothing else moved: neither what is measured nor what something else covers.
     assert np.array_equal(first.inverse[~was_before], wrong[~was_before])
@@ -368,7 +368,7 @@ def test_a_branch_before_the_sky_of_others_comes_nearer(share):
     assert moved[branch].mean() > 0.5
     assert (first.inverse > inverse)[moved].all()
     surfaces = [Surfaces.measured_in(layer) for layer in layers]
-    assert not find_seen_through(0, first.inverse, surfaces, transforms)[moved].any()
+    assert not find_seen_through(0, first.inverse, moved, surfaces, transforms).any()
     assert first.inverse.max() <= NEAREST_OCCLUDER * inverse.max()
 
 

@@ -134,7 +134,11 @@ def test_what_only_one_view_sees_past_an_object_is_found_occluded():
     inverse = [(unit / view.depth).float().numpy() for view in views]
     right_from_left = compute_source_from_reference(left, right)
     left_from_right = compute_source_from_reference(right, left)
-    visible, _ = stereo.reproject(*inverse, right_from_left, left_from_right)
+    visible, ratio = stereo.reproject(*inverse, right_from_left, left_from_right)
+    rows, columns = np.nonzero(visible > 1.5)
+    some = stereo.reproject_pixels(rows, columns, *inverse, right_from_left, left_from_right)
+    assert len(rows) > 50
+    assert np.array_equal(some, [visible[rows, columns], ratio[rows, columns]])
     hidden = find_hidden_pixels(inverse[0], [(inverse[1], right_from_left, left_from_right)])
     assert hidden.sum() > 50
     assert not hidden[(visible >= 0) & (visible < 1.5)].any()

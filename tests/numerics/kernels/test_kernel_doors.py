@@ -68,6 +68,8 @@ for odd in map(float, sys.argv[2:]):
             transform[row, column] = odd
             stereo.compute_matching_costs(image, image, transform, planes, bands, 2, noise, detail)
             stereo.reproject(image[..., 0], image[..., 1], transform, transform)
+            pixels = np.nonzero(image[..., 0] > 0.5)
+            stereo.reproject_pixels(*pixels, image[..., 0], image[..., 1], transform, transform)
             ran += 1
     odd_planes = np.full(6, odd, np.float32)
     stereo.compute_matching_costs(image, image, transform, odd_planes, bands, 2, noise, detail)

@@ -463,52 +463,79 @@ def reproject(inverse, other, b_from_a, a_from_b):
     if it falls outside b or behind a camera; and its z-depth in b relative to b's own, 1 where the
     distance is -1. Both are [h, w].
     """
-    error = np.full(inverse.shape, np.float32(-1), np.float32)
-    ratio = np.ones(inverse.shape, np.float32)
+    error = np.empty(inverse.shape, np.float32)
+    ratio = np.empty(inverse.shape, np.float32)
     share(_reproject, len(inverse), inverse, other, b_from_a, a_from_b, error, ratio)
+    return error, ratio
+
+
+def reproject_pixels(rows, columns, inverse, other, b_from_a, a_from_b):
+    """Project some pixels as `reproject` does, at `rows` and `columns` [n] int64 of `inverse`.
+
+    Returns distances and ratios [n].
+    """
+    error = np.empty(len(rows), np.float32)
+    ratio = np.empty(len(rows), np.float32)
+    # Those of `np.nonzero` are strided, for which a second kernel would be compiled.
+    rows, columns = np.ascontiguousarray(rows), np.ascontiguousarray(columns)
+    arguments = (rows, columns, inverse, other, b_from_a, a_from_b, error, ratio)
+    share(_reproject_pixels, len(rows), *arguments)
     return error, ratio
 
 
 @njit(nogil=True, fastmath={"contract"})
 def _reproject(begin, end, inverse, other, b_from_a, a_from_b, error, ratio):
-    w = inverse.shape[1]
-    H, W = other.shape
     for y in range(begin, end):
-        for x in range(w):
-            px = np.float32(x + 0.5)
-            py = np.float32(y + 0.5)
-            own = inverse[y, x]
-            # Into b: the homogeneous pixel and, as its third entry, the ratio of z-depths.
-            q2 = b_from_a[2, 0] * px + b_from_a[2, 1] * py + b_from_a[2, 2] + b_from_a[2, 3] * own
-            if q2 <= np.float32(1e-3):
-                continue
-            sx = b_from_a[0, 0] * px + b_from_a[0, 1] * py + b_from_a[0, 2] + b_from_a[0, 3] * own
-            sy = b_from_a[1, 0] * px + b_from_a[1, 1] * py + b_from_a[1, 2] + b_from_a[1, 3] * own
-            sx /= q2
-            sy /= q2
-            if not (sx >= 0 and sx < W and sy >= 0 and sy < H):
-                continue
-            # The four pixels around may lie on two surfaces; the one that agrees best counts.
-            best = np.float32(1e9)
-            expected = own / q2
-            value = other[int(sy), int(sx)]
-            x0, y0 = int(np.floor(sx - 0.5)), int(np.floor(sy - 0.5))
-            for k in range(4):
-                xx = min(max(x0 + k % 2, 0), W - 1)
-                yy = min(max(y0 + k // 2, 0), H - 1)
-                if abs(other[yy, xx] - expected) < best:
-                    best = abs(other[yy, xx] - expected)
-                    value = other[yy, xx]
-            # And back, with the inverse depth that b has there.
-            r2 = a_from_b[2, 0] * sx + a_from_b[2, 1] * sy + a_from_b[2, 2] + a_from_b[2, 3] * value
-            if r2 <= np.float32(1e-3):
-                continue
-            rx = a_from_b[0, 0] * sx + a_from_b[0, 1] * sy + a_from_b[0, 2] + a_from_b[0, 3] * value
-            ry = a_from_b[1, 0] * sx + a_from_b[1, 1] * sy + a_from_b[1, 2] + a_from_b[1, 3] * value
-            rx = rx / r2 - px
-            ry = ry / r2 - py
-            error[y, x] = np.sqrt(rx * rx + ry * ry)
-            ratio[y, x] = value / max(expected, np.float32(1e-12))
+        for x in range(inverse.shape[1]):
+            moved = _reproject_pixel(x, y, inverse[y, x], other, b_from_a, a_from_b)
+            error[y, x], ratio[y, x] = moved
+
+
+@njit(nogil=True, fastmath={"contract"})
+def _reproject_pixels(begin, end, rows, columns, inverse, other, b_from_a, a_from_b, error, ratio):
+    for k in range(begin, end):
+        x, y = columns[k], rows[k]
+        moved = _reproject_pixel(x, y, inverse[y, x], other, b_from_a, a_from_b)
+        error[k], ratio[k] = moved
+
+
+@njit(nogil=True, fastmath={"contract"})
+def _reproject_pixel(x, y, own, other, b_from_a, a_from_b):
+    """Return distance and ratio of one pixel of inverse depth `own`, as `reproject` does."""
+    H, W = other.shape
+    outside = np.float32(-1), np.float32(1)
+    px = np.float32(x + 0.5)
+    py = np.float32(y + 0.5)
+    # Into b: the homogeneous pixel and, as its third entry, the ratio of z-depths.
+    q2 = b_from_a[2, 0] * px + b_from_a[2, 1] * py + b_from_a[2, 2] + b_from_a[2, 3] * own
+    if q2 <= np.float32(1e-3):
+        return outside
+    sx = b_from_a[0, 0] * px + b_from_a[0, 1] * py + b_from_a[0, 2] + b_from_a[0, 3] * own
+    sy = b_from_a[1, 0] * px + b_from_a[1, 1] * py + b_from_a[1, 2] + b_from_a[1, 3] * own
+    sx /= q2
+    sy /= q2
+    if not (sx >= 0 and sx < W and sy >= 0 and sy < H):
+        return outside
+    # The four pixels around may lie on two surfaces; the one that agrees best counts.
+    best = np.float32(1e9)
+    expected = own / q2
+    value = other[int(sy), int(sx)]
+    x0, y0 = int(np.floor(sx - 0.5)), int(np.floor(sy - 0.5))
+    for k in range(4):
+        xx = min(max(x0 + k % 2, 0), W - 1)
+        yy = min(max(y0 + k // 2, 0), H - 1)
+        if abs(other[yy, xx] - expected) < best:
+            best = abs(other[yy, xx] - expected)
+            value = other[yy, xx]
+    # And back, with the inverse depth that b has there.
+    r2 = a_from_b[2, 0] * sx + a_from_b[2, 1] * sy + a_from_b[2, 2] + a_from_b[2, 3] * value
+    if r2 <= np.float32(1e-3):
+        return outside
+    rx = a_from_b[0, 0] * sx + a_from_b[0, 1] * sy + a_from_b[0, 2] + a_from_b[0, 3] * value
+    ry = a_from_b[1, 0] * sx + a_from_b[1, 1] * sy + a_from_b[1, 2] + a_from_b[1, 3] * value
+    rx = rx / r2 - px
+    ry = ry / r2 - py
+    return np.sqrt(rx * rx + ry * ry), value / max(expected, np.float32(1e-12))
 
 
 def fill_background(values, known):

@@ -120,7 +120,7 @@ def leave_free_space(
     def move(number: int) -> DepthLayer:
         layer = layers[number]
         start = layer.inverse
-        sees_through = partial(find_seen_through, number, surfaces=surfaces, transforms=transforms)
+        find_before = partial(find_seen_through, number, surfaces=surfaces, transforms=transforms)
         of_surfaces = start[~skies[number]]
         if not len(of_surfaces):
             return layer
@@ -128,11 +128,11 @@ def leave_free_space(
         highest = of_surfaces.max() * NEAREST_OCCLUDER
         labels = np.where(layer.measured_mask, 0, occluders[number])
         waiting = (open_pixels[number] & ~layer.measured_mask) | (labels > 0)
-        back = move_pixels(start, waiting, 1 / STEP, lowest, highest, sees_through)
+        back = move_pixels(start, waiting, 1 / STEP, lowest, highest, find_before)
         # A part of it may have a place on a surface behind it, of another colour.
-        has_no_place = (back == start) & sees_through(start)
+        has_no_place = find_before(start, (labels > 0) & (back == start))
         nearer = find_components(labels, has_no_place, MIN_WITHOUT_PLACE)
-        inverse = move_pixels(start, nearer, STEP, lowest, highest, sees_through)
+        inverse = move_pixels(start, nearer, STEP, lowest, highest, find_before)
         inverse = np.where(open_pixels[number] & (inverse == start), back, inverse)
         return layer if np.array_equal(inverse, start) else replace(layer, inverse=inverse)
 
@@ -154,15 +154,16 @@ def move_pixels(
     factor: np.float32,
     lowest: np.float32,
     highest: np.float32,
-    sees_through: Callable[[Map], Mask],
+    find_before: Callable[[Map, Mask], Mask],
 ) -> Map:
     """Multiply inverse depths by a factor, while other views see through them.
 
-    Pixels that reach the lowest or highest inverse depth go back to where they started.
+    `find_before` finds the pixels in a mask that stand before what others see. Pixels that reach
+    the lowest or highest inverse depth go back to where they started.
     """
     inverse = start
     while waiting.any():
-        waiting = waiting & sees_through(inverse)
+        waiting = find_before(inverse, waiting)
         inverse = np.where(waiting, inverse * factor, inverse)
         is_lost = waiting & ((inverse < lowest) | (inverse > highest))
         inverse = np.where(is_lost, start, inverse)
@@ -171,21 +172,24 @@ def move_pixels(
 
 
 def find_seen_through(
-    number: int, inverse: Map, surfaces: Sequence[Surfaces], transforms: Transforms
+    number: int, inverse: Map, mask: Mask, surfaces: Sequence[Surfaces], transforms: Transforms
 ) -> Mask:
-    """Find the pixels of a view that stand before a surface of another view.
+    """Find the pixels in the mask of a view that stand before a surface of another view.
 
     Unlike `compare_with_views` it tolerates no distance before a surface, which would stand there
     twice.
     """
-    seen_through = np.zeros(inverse.shape, bool)
+    rows, columns = np.nonzero(mask)
     for other, surface in enumerate(surfaces):
         if other == number:
             continue
         there = surface.transform_from(transforms[number, other])
         back = surface.transform_to(transforms[other, number])
         # `ratio` is z as expected in the other view over z as measured there; near 0 it is unknown.
-        error, ratio = stereo.reproject(inverse, surface.inverse, there, back)
-        is_apart = (error > MAX_RETURN_ERROR) & (ratio > 1e-3)
-        seen_through |= is_apart & (ratio < 1)
+        error, ratio = stereo.reproject_pixels(rows, columns, inverse, surface.inverse, there, back)
+        is_before = (error > MAX_RETURN_ERROR) & (ratio > 1e-3) & (ratio < 1)
+        # One other view is enough.
+        rows, columns = rows[~is_before], columns[~is_before]
+    seen_through = mask.copy()
+    seen_through[rows, columns] = False
     return seen_through

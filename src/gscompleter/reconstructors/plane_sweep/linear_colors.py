@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn.functional import normalize
 
@@ -104,9 +104,12 @@ class LinearColorFit:
     reference: Float[Tensor, "n 3"]
     renderer: Renderer
 
-    def compute_offsets(self, view: View) -> Float[Tensor, "n 3"]:
-        """Compute how the unit rays of a camera differ from the reference."""
-        return normalize(self.scene.means - view.camera.center, dim=-1) - self.reference
+    def compute_offsets(
+        self, view: View, rows: Int[Tensor, "shown"] | slice = slice(None)
+    ) -> Float[Tensor, "shown 3"]:
+        """Compute how the unit rays of a camera to some Gaussians differ from the reference."""
+        rays = normalize(self.scene.means[rows] - view.camera.center, dim=-1)
+        return rays - self.reference[rows]
 
     def measure_moments(
         self, images: Sequence[FittedImage], weights: Sequence[Float[Tensor, "n"]]
@@ -116,11 +119,12 @@ class LinearColorFit:
         first = torch.zeros_like(self.reference)
         second = torch.zeros_like(first)[..., None].repeat(1, 1, 3)
         for image, seen in zip(images, weights, strict=True):
-            offsets = self.compute_offsets(image.view)
-            weighted = seen[:, None] * offsets
+            rows = find_shown_rows(seen)
+            offsets = self.compute_offsets(image.view, rows)
+            weighted = seen[rows, None] * offsets
             total += seen[:, None]
-            first += weighted
-            second += multiply_outer(weighted, offsets)
+            first[rows] += weighted
+            second[rows] += multiply_outer(weighted, offsets)
         return Moments(total, first, second)
 
     def improve(
@@ -152,8 +156,10 @@ class LinearColorFit:
             weights = []
             sums = get_view_map(color_pull)(measure, images)
             for image, (residual, seen) in zip(images, sums, strict=True):
+                rows = find_shown_rows(seen)
+                offsets = self.compute_offsets(image.view, rows)
                 color_pull += residual
-                turning += multiply_outer(self.compute_offsets(image.view), residual)
+                turning[rows] += multiply_outer(offsets, residual[rows])
                 weights.append(seen)
             if equations is None:
                 # What the images show of a Gaussian does not depend on its colours.
@@ -235,6 +241,11 @@ def fit_linear_colors(
     colors, spread = fit.improve(colors, photographs, None, LINEAR_RELAXATIONS[0])
     colors, _ = fit.improve(colors, all_images, spread, LINEAR_RELAXATIONS[1])
     return replace(scene, sh=colors.to_sh())
+
+
+def find_shown_rows(seen: Float[Tensor, "n"]) -> Int[Tensor, "shown"]:
+    """Find the rows of the Gaussians that an image shows: few, where images are many."""
+    return torch.nonzero(seen)[:, 0]
 
 
 def multiply_outer(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
