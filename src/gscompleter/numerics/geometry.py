@@ -226,6 +226,22 @@ def slerp_rotation(rotation: Float[Tensor, "3 3"], share: float) -> Float[Tensor
     return axis_angle_to_matrix(axis, share * 2 * torch.atan2(length, real[0]).item()).to(rotation)
 
 
+def move_camera(camera: Camera, turn: Float[Tensor, "3 3"], shift: Float[Tensor, "3"]) -> Camera:
+    """Rotate a camera by `turn` and shift its centre by `shift`, both in world axes."""
+    c2w = camera.c2w.clone()
+    c2w[:3, :3] = turn @ camera.c2w[:3, :3]
+    c2w[:3, 3] += shift
+    return replace(camera, c2w=c2w)
+
+
+def interpolate_camera(first: Camera, second: Camera, share: float) -> Camera:
+    """Move `first` by a `share` in [0, 1] of the way to the pose of `second`."""
+    # The rotation, in world axes, that turns the first camera into the second.
+    turn = second.c2w[:3, :3].double() @ first.c2w[:3, :3].double().T
+    shift = share * (second.center - first.center)
+    return move_camera(first, slerp_rotation(turn, share).to(first.c2w), shift)
+
+
 def stack_matrices(*rows: list[Float[Tensor, "*n"]]) -> Float[Tensor, "*n r c"]:
     """Stack entries, given row by row, to matrices."""
     return torch.stack([torch.stack(row, dim=-1) for row in rows], dim=-2)

@@ -9,7 +9,7 @@ scene (`stays_beside`).
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from jaxtyping import Bool, Float
@@ -22,9 +22,10 @@ from gscompleter.numerics.geometry import (
     compute_field_of_view,
     embed_cameras,
     estimate_up,
+    interpolate_camera,
+    move_camera,
     project,
     resize_camera,
-    slerp_rotation,
     unproject,
 )
 from gscompleter.types import Camera, Render
@@ -159,22 +160,6 @@ def orbit_camera(
         for sign in (1, -1)
     ]
     return [move_camera(camera, turn, turn @ arm - arm) for turn in turns]
-
-
-def move_camera(camera: Camera, turn: Float[Tensor, "3 3"], shift: Float[Tensor, "3"]) -> Camera:
-    """Rotate a camera by `turn` and shift its centre by `shift`, both in world axes."""
-    c2w = camera.c2w.clone()
-    c2w[:3, :3] = turn @ camera.c2w[:3, :3]
-    c2w[:3, 3] += shift
-    return replace(camera, c2w=c2w)
-
-
-def interpolate_camera(first: Camera, second: Camera, share: float) -> Camera:
-    """Move `first` by a `share` in [0, 1] of the way to the pose of `second`."""
-    # The rotation, in world axes, that turns the first camera into the second.
-    turn = second.c2w[:3, :3].double() @ first.c2w[:3, :3].double().T
-    shift = share * (second.center - first.center)
-    return move_camera(first, slerp_rotation(turn, share).to(first.c2w), shift)
 
 
 def is_in_free_space(

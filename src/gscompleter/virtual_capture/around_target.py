@@ -23,13 +23,13 @@ from gscompleter.numerics.geometry import (
     is_inside,
     look_along,
     measure_baseline,
+    move_camera,
     project,
     sample,
     shrink_camera,
     unproject,
 )
 from gscompleter.numerics.image_ops import dilate
-from gscompleter.planning.candidates import move_camera
 from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, thin_gaussians
 from gscompleter.render.protocols import Renderer
 from gscompleter.render.view_map import get_view_map

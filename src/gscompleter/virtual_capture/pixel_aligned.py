@@ -13,8 +13,7 @@ from jaxtyping import Float
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from gscompleter.numerics.geometry import look_along
-from gscompleter.planning.candidates import move_camera
+from gscompleter.numerics.geometry import look_along, move_camera
 from gscompleter.types import Camera, Gaussians
 
 INNER = 0.93

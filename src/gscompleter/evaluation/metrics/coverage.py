@@ -17,10 +17,11 @@ from gscompleter.config.settings import COVERED
 from gscompleter.numerics.geometry import (
     axis_angle_to_matrix,
     compute_spacing,
+    interpolate_camera,
     measure_baseline,
+    move_camera,
     shrink_camera,
 )
-from gscompleter.planning.candidates import interpolate_camera, move_camera
 from gscompleter.render.lod import MAX_PREVIEW_GAUSSIANS, choose_thinned_rows, thin_gaussians
 from gscompleter.render.protocols import FrozenScene, Renderer
 from gscompleter.render.view_map import get_view_map

@@ -15,9 +15,8 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from gscompleter.numerics.geometry import measure_baseline
+from gscompleter.numerics.geometry import interpolate_camera, measure_baseline
 from gscompleter.numerics.image_ops import keep_thin
-from gscompleter.planning.candidates import interpolate_camera
 from gscompleter.render.protocols import Renderer
 from gscompleter.types import Camera, Gaussians, Render
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import cv2
 import numpy as np
@@ -23,6 +22,7 @@ from gscompleter.numerics.image_ops import label_regions
 from gscompleter.numerics.kernels import stereo
 from gscompleter.numerics.kernels.parallel import map_in_parallel
 from gscompleter.reconstructors.plane_sweep.fusion import DepthLayer
+from gscompleter.reconstructors.plane_sweep.passages import Passages
 from gscompleter.reconstructors.plane_sweep.rig import Transform, Transforms
 from gscompleter.reconstructors.plane_sweep.sweep import MAX_RETURN_ERROR, UNKNOWN, Map, Mask
 from gscompleter.types import View
@@ -107,20 +107,25 @@ def leave_free_space(
     occluders: Sequence[Labels],
     skies: Sequence[Mask],
     transforms: Transforms,
+    passages: Passages = Passages(),
 ) -> list[DepthLayer]:
     """Move pixels of each view that are not measured, until no other view sees through them.
 
-    The `open_pixels` move back, and come to rest on or behind the surfaces of the other views, or
-    beside these. `occluders` that have no such place, as where the others see the sky, come nearer
-    until the others do not see them. Pixels without a place stay, and so does a layer of which none
-    moves. `skies` mark the sky of each view.
+    Nor do they block `passages` then. The `open_pixels` move back, and come to rest on or behind
+    the surfaces of the other views, or beside these. `occluders` that have no such place, as where
+    the others see the sky, come nearer until the others do not see them. Pixels without a place
+    stay, and so does a layer of which none moves. `skies` mark the sky of each view.
     """
     surfaces = [Surfaces.measured_in(layer) for layer in layers]
 
     def move(number: int) -> DepthLayer:
         layer = layers[number]
         start = layer.inverse
-        find_before = partial(find_seen_through, number, surfaces=surfaces, transforms=transforms)
+
+        def find_before(inverse: Map, mask: Mask) -> Mask:
+            seen_through = find_seen_through(number, inverse, mask, surfaces, transforms)
+            return seen_through | passages.find_blocking(number, inverse, mask & ~seen_through)
+
         of_surfaces = start[~skies[number]]
         if not len(of_surfaces):
             return layer

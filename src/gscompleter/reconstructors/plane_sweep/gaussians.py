@@ -39,6 +39,7 @@ from gscompleter.reconstructors.plane_sweep.fusion import (
     find_free_pixels,
     measure_ratio,
 )
+from gscompleter.reconstructors.plane_sweep.passages import Passages, find_passages
 from gscompleter.reconstructors.plane_sweep.rig import Transforms
 from gscompleter.reconstructors.plane_sweep.sky_colors import blend_skies
 from gscompleter.reconstructors.plane_sweep.sweep import Mask
@@ -137,7 +138,10 @@ class Splatter:
 
         fitted_views = [view.to(self.fit_device) for view in views]
         gains = gains.to(self.fit_device)
-        candidates, kept, depths = self.fuse(normalized, depths, layers, skies, transforms)
+        passages = find_passages(views, emphasis.check_views, depths[0], layers[0].inverse)
+        candidates, kept, depths = self.fuse(
+            normalized, depths, layers, skies, transforms, passages
+        )
         # Nothing is reconstructed from masked pixels.
         kept &= flatten_masks([view.valid_mask for view in fitted_views])
         if masks is not None:
@@ -198,12 +202,17 @@ class Splatter:
         views: Sequence[View],
         layers: Sequence[DepthLayer],
         transforms: Transforms,
+        passages: Passages,
     ) -> Bool[Tensor, "n"]:
         """Select the pixels that form the scene: a mask over the pixels of all views in turn."""
         if len(views) <= 2:
             return torch.ones_like(gaussians.opacities, dtype=torch.bool)
-        # `free` marks pixels without contradiction: other views do not see through their points.
+        # `free` marks pixels without contradiction: other views do not see through their points,
+        # and what is not measured blocks no passage.
         free = find_free_pixels(layers, transforms)
+        for number, layer in enumerate(layers):
+            unsure = free[number] & ~layer.measured_mask
+            free[number] &= ~passages.find_blocking(number, layer.inverse, unsure)
         kept = flatten_masks(find_finest_pixels(layers, free, transforms)).to(self.fit_device)
         # Where the finer views do not close a surface, a view gets its own pixels back. Each view
         # sees what those before it restored.
@@ -222,6 +231,7 @@ class Splatter:
         layers: Sequence[DepthLayer],
         skies: Sequence[Bool[Tensor, "_ _"]],
         transforms: Transforms,
+        passages: Passages,
     ) -> tuple[Gaussians, Bool[Tensor, "n"], Sequence[DepthMap]]:
         """Create a disc for every pixel of every view, and mark those that form the scene.
 
@@ -230,7 +240,7 @@ class Splatter:
         """
         fitted_views = [view.to(self.fit_device) for view in views]
         candidates = self.splat_all(views, depths)
-        kept = self.select_pixels(candidates, fitted_views, layers, transforms)
+        kept = self.select_pixels(candidates, fitted_views, layers, transforms, passages)
         if len(views) <= 2:
             return candidates, kept, depths
         renders = [self.renderer.render(candidates[kept], view.camera) for view in fitted_views]
@@ -246,7 +256,7 @@ class Splatter:
                 for render, view in zip(renders, fitted_views, strict=True)
             ]
             not_surface = [sky.cpu().numpy() for sky in skies]
-        moved = leave_free_space(layers, open_pixels, occluders, not_surface, transforms)
+        moved = leave_free_space(layers, open_pixels, occluders, not_surface, transforms, passages)
         if all(after is before for after, before in zip(moved, layers, strict=True)):
             return candidates, kept, depths
         depths = [
@@ -256,7 +266,8 @@ class Splatter:
         # Discs take most of the memory, and those before are not needed any more.
         del candidates
         candidates = self.splat_all(views, depths)
-        return candidates, self.select_pixels(candidates, fitted_views, moved, transforms), depths
+        kept = self.select_pixels(candidates, fitted_views, moved, transforms, passages)
+        return candidates, kept, depths
 
     def splat_all(self, views: Sequence[View], depths: Sequence[DepthMap]) -> Gaussians:
         """Create the discs of all pixels of all views in turn, where they are fitted."""
