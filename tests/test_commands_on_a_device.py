@@ -71,7 +71,7 @@ MOST = {
     "complete, alone": (1320, 6_500_000),
     "complete, mask": (2070, 6_000_000),
     "complete, painted": (1350, 1_550_000),
-    "update": (1190, 1_240_000),
+    "update": (1190, 1_230_000),
     "repair": (2040, 2_250_000),
     "remove, mask": (1800, 1_900_000),
     "remove, box": (1980, 5_120_000),

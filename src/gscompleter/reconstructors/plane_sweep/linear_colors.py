@@ -157,9 +157,10 @@ class LinearColorFit:
             sums = get_view_map(color_pull)(measure, images)
             for image, (residual, seen) in zip(images, sums, strict=True):
                 rows = find_shown_rows(seen)
-                offsets = self.compute_offsets(image.view, rows)
                 color_pull += residual
-                turning[rows] += multiply_outer(offsets, residual[rows])
+                turning[rows] += multiply_outer(
+                    self.compute_offsets(image.view, rows), residual[rows]
+                )
                 weights.append(seen)
             if equations is None:
                 # What the images show of a Gaussian does not depend on its colours.
@@ -243,9 +244,12 @@ def fit_linear_colors(
     return replace(scene, sh=colors.to_sh())
 
 
-def find_shown_rows(seen: Float[Tensor, "n"]) -> Int[Tensor, "shown"]:
-    """Find the rows of the Gaussians that an image shows: few, where images are many."""
-    return torch.nonzero(seen)[:, 0]
+def find_shown_rows(seen: Float[Tensor, "n"]) -> Int[Tensor, "shown"] | slice:
+    """Find the rows of the Gaussians that an image shows: few, where images are many.
+
+    On a GPU these are all rows, since it would have to be waited for their number.
+    """
+    return torch.nonzero(seen)[:, 0] if seen.device.type == "cpu" else slice(None)
 
 
 def multiply_outer(a: Float[Tensor, "n 3"], b: Float[Tensor, "n 3"]) -> Float[Tensor, "n 3 3"]:
