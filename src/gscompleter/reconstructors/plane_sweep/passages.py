@@ -7,13 +7,17 @@ looks from such a place sees little else (decision 158).
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 import torch
+from jaxtyping import Float32
+from torch import Tensor
 
-from gscompleter.numerics.geometry import interpolate_camera, is_inside, project
+from gscompleter.numerics.geometry import interpolate_camera
 from gscompleter.reconstructors.plane_sweep.sweep import Map, Mask
 from gscompleter.types import Camera, DepthMap, View
 
@@ -28,6 +32,9 @@ MIN_PASSAGE_COSINE = 0.5
 """Least cosine of the angle between the directions of neighbours. What lies between cameras that
 look elsewhere is not known."""
 
+POINTS_AT_ONCE = 4096
+"""Points that are projected into all passages at a time, to save memory."""
+
 
 @dataclass(frozen=True)
 class Passages:
@@ -41,21 +48,61 @@ class Passages:
     unit: float = 1.0
     """Unit of length of their inverse depths, in scene units."""
 
+    @cached_property
+    def matrices(self) -> Float32[np.ndarray, "passages 3 4"]:
+        """Matrices from world points to homogeneous pixels, whose third entry is z-depth."""
+        return np.stack([compute_projection(passage) for passage in self.cameras])
+
+    @cached_property
+    def centers(self) -> Float32[Tensor, "passages 3"]:
+        """Centres of the cameras."""
+        return torch.stack([passage.center for passage in self.cameras]).float()
+
+    @cached_property
+    def reach(self) -> float:
+        """Largest distance, in scene units, of a point that stands right before a passage."""
+        return self.depth * max(measure_longest_ray(passage) for passage in self.cameras)
+
     def find_blocking(self, number: int, inverse: Map, mask: Mask) -> Mask:
         """Find the pixels in the mask of a view that stand right before a passage."""
-        if not self.cameras:
-            return np.zeros_like(mask)
-        camera = self.of_views[number]
+        blocking = np.zeros_like(mask)
         rows, columns = np.nonzero(mask)
+        if not self.cameras or not len(rows):
+            return blocking
+        camera = self.of_views[number]
         depth = torch.from_numpy(self.unit / inverse[rows, columns]).to(camera.c2w)
         points = camera.center + depth[:, None] * camera.z_rays()[rows, columns]
-        is_blocking = torch.zeros_like(depth, dtype=torch.bool)
-        for passage in self.cameras:
-            pixel, z = project(points, passage)
-            is_blocking |= is_inside(pixel, z, passage) & (z < self.depth)
-        blocking = mask.copy()
-        blocking[rows, columns] = is_blocking.numpy(force=True)
+        # Some at a time, to save memory. Most are far from all passages.
+        starts = range(0, len(points), POINTS_AT_ONCE)
+        distance = [
+            torch.cdist(points[i : i + POINTS_AT_ONCE], self.centers).amin(dim=1) for i in starts
+        ]
+        is_near = (torch.cat(distance) < self.reach).numpy()
+        rows, columns, near = rows[is_near], columns[is_near], points.numpy()[is_near]
+
+        width, height = np.array([[p.width, p.height] for p in self.cameras], np.float32).T
+        for start in range(0, len(near), POINTS_AT_ONCE):
+            part = slice(start, start + POINTS_AT_ONCE)
+            homogeneous = self.matrices[..., :3] @ near[part].T + self.matrices[..., 3:]
+            x, y, z = homogeneous.swapaxes(0, 1)
+            is_inside = (x >= 0) & (x < width[:, None] * z) & (y >= 0) & (y < height[:, None] * z)
+            blocking[rows[part], columns[part]] = (is_inside & (z < self.depth)).any(axis=0)
         return blocking
+
+
+def measure_longest_ray(camera: Camera) -> float:
+    """Measure the longest ray of a camera of unit z, to a corner of its image."""
+    (fx, _, cx), (_, fy, cy), _ = camera.K.tolist()
+    x = max(cx, camera.width - cx) / fx
+    y = max(cy, camera.height - cy) / fy
+    return math.hypot(x, y, 1)
+
+
+def compute_projection(camera: Camera) -> Float32[np.ndarray, "3 4"]:
+    """Compute the matrix from world points to homogeneous pixels, whose third entry is z-depth."""
+    world_to_camera = torch.linalg.inv(camera.c2w.double())[:3]
+    projection: Float32[np.ndarray, "3 4"] = (camera.K.double() @ world_to_camera).float().numpy()
+    return projection
 
 
 def find_passages(
