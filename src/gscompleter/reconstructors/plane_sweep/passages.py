@@ -71,7 +71,7 @@ class Passages:
             return blocking
         camera = self.of_views[number]
         depth = torch.from_numpy(self.unit / inverse[rows, columns]).to(camera.c2w)
-        points = camera.center + depth[:, None] * camera.z_rays()[rows, columns]
+        points = (camera.center + depth[:, None] * camera.z_rays()[rows, columns]).float()
         # Some at a time, to save memory. Most are far from all passages.
         starts = range(0, len(points), POINTS_AT_ONCE)
         distance = [
