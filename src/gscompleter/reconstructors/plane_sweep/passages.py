@@ -1,4 +1,4 @@
-"""Places that a camera passed: nothing but what is measured stands right before them.
+"""Keep what is not measured away from places that a camera passed.
 
 Surfaces that only one photograph shows continue those beside them, and may hang in the air where
 other cameras were carried along. No photograph of the context sees through them there, but whoever
@@ -31,7 +31,6 @@ PASSAGE_SHARES = 0.25, 0.5, 0.75
 MIN_PASSAGE_COSINE = 0.5
 """Least cosine of the angle between the directions of neighbours. What lies between cameras that
 look elsewhere is not known."""
-
 POINTS_AT_ONCE = 4096
 """Points that are projected into all passages at a time, to save memory."""
 
@@ -72,7 +71,8 @@ class Passages:
         camera = self.of_views[number]
         depth = torch.from_numpy(self.unit / inverse[rows, columns]).to(camera.c2w)
         points = (camera.center + depth[:, None] * camera.z_rays()[rows, columns]).float()
-        # Some at a time, to save memory. Most are far from all passages.
+        # Points in world axes and scene units, some at a time to save memory. Most are far from all
+        # passages, which their distances tell before they are projected.
         starts = range(0, len(points), POINTS_AT_ONCE)
         distance = [
             torch.cdist(points[i : i + POINTS_AT_ONCE], self.centers).amin(dim=1) for i in starts
@@ -84,6 +84,8 @@ class Passages:
         for start in range(0, len(near), POINTS_AT_ONCE):
             part = slice(start, start + POINTS_AT_ONCE)
             homogeneous = self.matrices[..., :3] @ near[part].T + self.matrices[..., 3:]
+            # x and y are pixels times z, so that nothing is divided by a z near 0; behind a camera,
+            # where z is negative, none is inside.
             x, y, z = homogeneous.swapaxes(0, 1)
             is_inside = (x >= 0) & (x < width[:, None] * z) & (y >= 0) & (y < height[:, None] * z)
             blocking[rows[part], columns[part]] = (is_inside & (z < self.depth)).any(axis=0)
@@ -119,6 +121,7 @@ def find_passages(
     of_views = [view.camera.to("cpu") for view in views]
     cameras = [*of_views, *(view.camera.to("cpu") for view in check_views)]
     centers = torch.stack([camera.center for camera in cameras])
+    # The nearest to each camera is itself.
     nearest = torch.cdist(centers, centers).argsort(dim=1, stable=True)[:, : PASSAGE_NEIGHBOURS + 1]
     pairs = {
         (min(number, other), max(number, other))
@@ -132,5 +135,6 @@ def find_passages(
         if float(cameras[first].c2w[:3, 2] @ cameras[second].c2w[:3, 2]) >= MIN_PASSAGE_COSINE
         for share in PASSAGE_SHARES
     ]
+    # The same in all pixels but for rounding.
     unit = float((depth.depth.cpu() * torch.from_numpy(inverse)).median())
     return Passages([*cameras, *between], PASSAGE_DEPTH * near, of_views, unit)
